@@ -1,0 +1,25 @@
+//! `corotate init`: print a shipped scenario.
+
+use crate::{Exit, fail};
+use corotate::config::SHIPPED;
+
+/// Options of `corotate init`.
+#[derive(clap::Args)]
+pub struct Arguments {
+    /// Name of a shipped scenario: rigid-pair, rigid-pair-hyperbolic, rigid-trio
+    name: String,
+}
+
+/// Prints a scenario.
+pub fn init(arguments: &Arguments) -> Exit {
+    match SHIPPED.iter().find(|(name, _)| *name == arguments.name) {
+        Some((_, text)) => {
+            print!("{text}");
+            Exit::Ok
+        }
+        None => {
+            let known = SHIPPED.map(|(name, _)| name).join(", ");
+            fail(Exit::Usage, &format!("there is no scenario `{}`; there are: {known}", arguments.name))
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
+
+mod check;
+mod init;
+mod role;
+mod run;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Bodies move together although not everything about them can be measured.
+///
+/// Without a command: runs the scenario `rigid-pair`, 10 s in real time, four processes.
+#[derive(Parser)]
+#[command(version, max_term_width = 100, after_help = EXIT_CODES)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Option<Command>,
+}
+
+const EXIT_CODES: &str = "\
+Exit codes: 0 ok, 1 failure while running, 2 usage or configuration, 3 acceptance criteria not met,
+            4 a process died or hung, 5 required privilege not granted, 128+n ended in order by signal n
+
+Examples:
+  corotate                                       the shipped scenario rigid-pair
+  corotate init rigid-trio > trio.toml           a commented scenario to start from
+  corotate check trio.toml                       validate it, print what is proven of it
+  corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits";
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run a scenario to its end and tell how it went
+    Run(run::Arguments),
+    /// Validate scenarios; print each as resolved, with its convergence certificate
+    Check(check::Arguments),
+    /// Print a commented scenario to start from
+    Init(init::Arguments),
+    /// Take the seat of a body in a run (the launcher starts it; so can you)
+    Plant(role::PlantArguments),
+    /// Take the observer's seat in a run
+    Observer(role::Arguments),
+    /// Take the controller's seat in a run
+    Controller(role::Arguments),
+    /// Clean up after a launcher that was killed
+    #[command(hide = true)]
+    Janitor,
+}
+
+/// What the process says to its parent.
+#[derive(Clone, Copy)]
+enum Exit {
+    Ok,
+    Failure,
+    Usage,
+    NotAccepted,
+    ProcessLost,
+    PrivilegeMissing,
+    Signal(usize),
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(match exit {
+            Exit::Ok => 0,
+            Exit::Failure => 1,
+            Exit::Usage => 2,
+            Exit::NotAccepted => 3,
+            Exit::ProcessLost => 4,
+            Exit::PrivilegeMissing => 5,
+            Exit::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
+        })
+    }
+}
+
+/// Prints an error, one paragraph per line of it, and gives the exit code.
+fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
+    for line in error.to_string().lines() {
+        eprintln!("corotate: {line}");
+    }
+    exit
+}
+
+fn main() -> ExitCode {
+    let exit = match Arguments::parse().command {
+        None => run::run(&run::Arguments::default()),
+        Some(Command::Run(arguments)) => run::run(&arguments),
+        Some(Command::Check(arguments)) => check::check(&arguments),
+        Some(Command::Init(arguments)) => init::init(&arguments),
+        Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
+        Some(Command::Observer(arguments)) => role::role("observer", &arguments),
+        Some(Command::Controller(arguments)) => role::role("controller", &arguments),
+        Some(Command::Janitor) => {
+            corotate::launch::janitor(std::io::stdin());
+            Exit::Ok
+        }
+    };
+    exit.into()
+}

@@ -1,0 +1,64 @@
+//! `corotate plant|observer|controller`: one role, as the launcher starts it.
+
+use crate::{Exit, fail};
+use corotate::runtime::{RoleError, RoleSeat, run_role};
+use signal_hook::consts::{SIGINT, SIGTERM};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// Options of every role.
+#[derive(clap::Args)]
+pub struct Arguments {
+    /// The run's domain, as `corotate run --external ROLE` prints it
+    #[arg(long, value_name = "DIR")]
+    domain: PathBuf,
+    /// How often this role has been started in this run, from 1
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    generation: u64,
+    /// Die with this process (the launcher gives its own id)
+    #[arg(long, value_name = "PID", hide = true)]
+    parent: Option<i32>,
+}
+
+/// Options of `corotate plant`.
+#[derive(clap::Args)]
+pub struct PlantArguments {
+    /// The body's name
+    #[arg(long, value_name = "NAME")]
+    pub body: String,
+    #[command(flatten)]
+    pub seat: Arguments,
+}
+
+/// Serves a role to the end of the run.
+pub fn role(name: &str, arguments: &Arguments) -> Exit {
+    if let Some(Err(exit)) = arguments.parent.map(die_with) {
+        return exit;
+    }
+    let terminated = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        if let Err(error) = signal_hook::flag::register(signal, terminated.clone()) {
+            return fail(Exit::Failure, &error);
+        }
+    }
+    let seat = RoleSeat { domain: arguments.domain.clone(), role: name.to_owned(), generation: arguments.generation };
+    match run_role(&seat, &terminated) {
+        Ok(()) => Exit::Ok,
+        Err(error) => {
+            let usage = matches!(error, RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. });
+            fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
+        }
+    }
+}
+
+/// Asks the kernel to kill this process when its parent dies.
+fn die_with(parent: i32) -> Result<(), Exit> {
+    use rustix::process::{Signal, getppid, set_parent_process_death_signal};
+    set_parent_process_death_signal(Some(Signal::KILL)).map_err(|error| fail(Exit::Failure, &error))?;
+    // The parent may have died before the request.
+    match getppid() {
+        Some(pid) if pid.as_raw_nonzero().get() == parent => Ok(()),
+        _ => Err(fail(Exit::Failure, &"the launcher is gone")),
+    }
+}

@@ -1,0 +1,207 @@
+//! `corotate run`: one scenario from file to verdict.
+
+use crate::{Exit, fail};
+use corotate::config::{SHIPPED, Scenario};
+use corotate::launch::{Launch, LaunchError, Progress, Summary, table, write_run};
+use indicatif::{ProgressBar, ProgressStyle};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
+
+/// Options of `corotate run`.
+#[derive(clap::Args, Default)]
+pub struct Arguments {
+    /// Scenario file; without one, the shipped rigid-pair
+    file: Option<PathBuf>,
+    /// What drives the ticks: realtime, lockstep or in-process
+    #[arg(long, value_name = "CLOCK")]
+    clock: Option<String>,
+    /// Length of the run, s
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    duration: Option<String>,
+    /// Ticks per second, Hz
+    #[arg(long, value_name = "HZ", allow_negative_numbers = true)]
+    tick_hz: Option<String>,
+    /// Override any key of the scenario, as leader.measured_axes=[1,3] or follower.0.name=chaser
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Directory for the results [default: runs/<utc>-<name>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Do not run without every privilege that the scenario asks for
+    #[arg(long)]
+    require_rt: bool,
+    /// Do not start this role; somebody else will, in the domain that is printed
+    #[arg(long, value_name = "ROLE")]
+    external: Vec<String>,
+    /// Print the summary as one JSON object on stdout, everything else on stderr
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    fn overrides(&self) -> Vec<String> {
+        let named = [("clock", &self.clock), ("duration_s", &self.duration), ("tick_hz", &self.tick_hz)];
+        let named = named.into_iter().filter_map(|(key, value)| value.as_ref().map(|value| format!("{key}={value}")));
+        self.set.iter().cloned().chain(named).collect()
+    }
+
+    fn scenario(&self) -> Result<Scenario, Exit> {
+        let loaded = match &self.file {
+            Some(path) => Scenario::load(path, &self.overrides()),
+            None => Scenario::parse(SHIPPED[0].1, &format!("{}.toml", SHIPPED[0].0), &self.overrides()),
+        };
+        let scenario = loaded.map_err(|error| fail(Exit::Usage, &error))?;
+        let roles: Vec<&str> =
+            corotate::runtime::RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
+        match self.external.iter().find(|role| !roles.contains(&role.as_str())) {
+            Some(role) => {
+                let known = roles.join(", ");
+                Err(fail(Exit::Usage, &format!("--external {role}: there is no such role; this scenario has: {known}")))
+            }
+            None => Ok(scenario),
+        }
+    }
+}
+
+/// Runs a scenario.
+pub fn run(arguments: &Arguments) -> Exit {
+    attempt(arguments).unwrap_or_else(|exit| exit)
+}
+
+fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
+    let scenario = arguments.scenario()?;
+    let started = jiff::Timestamp::now();
+    let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
+        .map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory with --out")))?;
+    let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+    let program = std::env::current_exe().map_err(|error| fail(Exit::Failure, &error))?;
+    let mut screen = Screen::default();
+    let outcome = corotate::launch::run(
+        &scenario,
+        &mut Launch {
+            program,
+            external: arguments.external.clone(),
+            require_realtime: arguments.require_rt,
+            signal: &signal,
+            progress: &mut |progress| screen.show(progress),
+        },
+    );
+    screen.clear();
+    let outcome = outcome.map_err(|error| fail(exit_of(&error), &error))?;
+    let summary = Summary::new(&scenario, &outcome, started);
+    let written = write_run(&directory, &scenario, &summary);
+    report(arguments, &summary, &directory);
+    written.map_err(|error| fail(Exit::Failure, &format!("cannot write the results: {error}")))?;
+    Ok(verdict(&summary))
+}
+
+fn report(arguments: &Arguments, summary: &Summary, directory: &Path) {
+    let text = format!("{}results in {}", table(summary), directory.display());
+    if arguments.json {
+        eprintln!("{text}");
+        println!("{}", serde_json::to_string(summary).expect("a summary of plain values is JSON"));
+    } else {
+        println!("{text}");
+    }
+}
+
+fn verdict(summary: &Summary) -> Exit {
+    if !summary.books.balanced {
+        return fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
+    }
+    if summary.signal != 0 {
+        eprintln!("corotate: ended in order by signal {}", summary.signal);
+        return Exit::Signal(summary.signal);
+    }
+    for criterion in summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)) {
+        let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
+        fail(Exit::NotAccepted, &format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
+    }
+    if summary.accepted { Exit::Ok } else { Exit::NotAccepted }
+}
+
+fn exit_of(error: &LaunchError) -> Exit {
+    match error {
+        LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
+        LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
+        LaunchError::Domain(_) | LaunchError::Bus(_) | LaunchError::Write { .. } | LaunchError::Spawn { .. } => {
+            Exit::Failure
+        }
+    }
+}
+
+fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
+    let signal = Arc::new(AtomicUsize::new(0));
+    for number in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register_usize(number, signal.clone(), number as usize)?;
+    }
+    Ok(signal)
+}
+
+/// The directory for the results: as given, or a new one under `runs/`.
+fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
+    let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
+    if let Some(path) = given {
+        return std::fs::create_dir_all(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
+    }
+    let runs = Path::new("runs");
+    std::fs::create_dir_all(runs).map_err(|error| named(runs, error))?;
+    let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
+    for attempt in 1.. {
+        let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
+        match std::fs::create_dir(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
+        }
+    }
+    unreachable!("the loop over all numbers does not end")
+}
+
+/// Progress on a terminal; silence elsewhere, but for what a person must do.
+#[derive(Default)]
+struct Screen {
+    bar: Option<ProgressBar>,
+    asked: bool,
+}
+
+impl Screen {
+    fn show(&mut self, progress: &Progress<'_>) {
+        match progress {
+            Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
+                self.asked = true;
+                for role in external {
+                    eprintln!("waiting for {role}: start it with\n  {}", by_hand(role, domain));
+                }
+            }
+            Progress::Waiting { .. } => {}
+            Progress::Running { tick, last_tick, metric } => {
+                let bar = self.bar.get_or_insert_with(|| bar(*last_tick));
+                bar.set_position(*tick);
+                bar.set_message(format!("{metric:.2e}"));
+            }
+        }
+    }
+
+    fn clear(&mut self) {
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn by_hand(role: &str, domain: &Path) -> String {
+    let domain = domain.display();
+    match role {
+        "observer" | "controller" => format!("corotate {role} --domain {domain}"),
+        body => format!("corotate plant --body {body} --domain {domain}"),
+    }
+}
+
+fn bar(last_tick: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40} tick {pos}/{len} {eta} left, error {msg}");
+    // Drawn on stderr, and only if that is a terminal.
+    ProgressBar::new(last_tick).with_style(style.expect("the template is a constant that parses"))
+}

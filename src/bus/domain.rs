@@ -1,0 +1,214 @@
+//! A run's domain: the directory and the name prefix under which everything it shares lives, so that two runs never meet.
+//!
+//! Knows files and locks, not the transport. The lock says whether the run is alive; the kernel lets go of it when the
+//! launcher dies, however it dies. Must not touch a domain whose lock is held.
+
+use rustix::fs::{FlockOperation, flock, fstat};
+use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+/// Where the transport's shared memory appears as files.
+const SHARED_MEMORY: &str = "/dev/shm";
+/// What the names of a domain's files in [`SHARED_MEMORY`] begin with, before its id.
+const PREFIX: &str = "corotate_";
+/// What the transport's socket paths may not exceed, less what it appends: see sockaddr_un.
+const MAX_ROOT_LENGTH: usize = 48;
+
+/// A domain that this process uses.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Domain {
+    root: PathBuf,
+}
+
+/// A domain that this process owns; it is removed with everything in it when this is dropped.
+#[derive(Debug)]
+pub struct OwnedDomain {
+    domain: Domain,
+    _lock: File,
+}
+
+/// Why a domain could not be made or joined.
+#[derive(Debug, thiserror::Error)]
+pub enum DomainError {
+    /// A directory or file could not be made.
+    #[error("cannot make {}: {source}; set XDG_RUNTIME_DIR to a directory that you may write", path.display())]
+    Create {
+        /// What could not be made.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The directory's path is too long for the transport's sockets.
+    #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for socket names; set XDG_RUNTIME_DIR to a shorter one", path.display())]
+    TooLong {
+        /// The path.
+        path: PathBuf,
+    },
+    /// The path is not a domain.
+    #[error("{} is not the domain of a run; `corotate run` prints it", path.display())]
+    NotADomain {
+        /// The path as given.
+        path: PathBuf,
+    },
+}
+
+/// The directory that holds this user's domains.
+fn base() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR").filter(|directory| !directory.is_empty()) {
+        Some(directory) => PathBuf::from(directory).join("corotate"),
+        None => PathBuf::from(format!("/tmp/corotate-{}", rustix::process::getuid().as_raw())),
+    }
+}
+
+impl OwnedDomain {
+    /// Makes a new domain, after removing those that dead runs of this user left behind.
+    ///
+    /// # Errors
+    /// [`DomainError`].
+    pub fn create() -> Result<Self, DomainError> {
+        let base = base();
+        let create = |path: &Path, source| DomainError::Create { path: path.to_owned(), source };
+        DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
+        remove_dead(&base);
+        loop {
+            let id = random_id();
+            let root = base.join(&id);
+            if root.as_os_str().len() > MAX_ROOT_LENGTH {
+                return Err(DomainError::TooLong { path: root });
+            }
+            // The lock comes first: a domain without a lock that is held counts as dead.
+            let path = lock_path(&root);
+            let Some(lock) = lock(&path, true).map_err(|error| create(&path, error))? else { continue };
+            DirBuilder::new().mode(0o700).create(&root).map_err(|error| create(&root, error))?;
+            return Ok(Self { domain: Domain { root }, _lock: lock });
+        }
+    }
+
+    /// The domain, to be used.
+    pub fn domain(&self) -> &Domain {
+        &self.domain
+    }
+}
+
+impl Drop for OwnedDomain {
+    fn drop(&mut self) {
+        self.domain.remove();
+    }
+}
+
+impl Domain {
+    /// The domain at a directory that a launcher made.
+    ///
+    /// # Errors
+    /// [`DomainError::NotADomain`].
+    pub fn join(root: &Path) -> Result<Self, DomainError> {
+        let named = root.file_name().is_some_and(|name| name.len() == 8);
+        if named && root.is_dir() && lock_path(root).is_file() {
+            Ok(Self { root: root.to_owned() })
+        } else {
+            Err(DomainError::NotADomain { path: root.to_owned() })
+        }
+    }
+
+    /// Its directory, open to this user alone.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// What the names of its files in shared memory begin with.
+    pub fn prefix(&self) -> String {
+        format!("{PREFIX}{}_", self.root.file_name().unwrap_or_default().to_string_lossy())
+    }
+
+    /// Removes every trace of the domain. What is gone already is no error.
+    fn remove(&self) {
+        let prefix = self.prefix();
+        for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                let _ = fs::remove_file(entry.path());
+            }
+        }
+        let _ = fs::remove_dir_all(&self.root);
+        let _ = fs::remove_file(lock_path(&self.root));
+    }
+}
+
+/// Removes the domains of this user whose launcher is dead.
+pub fn remove_dead_domains() {
+    remove_dead(&base());
+}
+
+fn remove_dead(base: &Path) {
+    for entry in fs::read_dir(base).into_iter().flatten().flatten() {
+        let path = entry.path();
+        if path.extension().is_some_and(|extension| extension == "lock")
+            && let Ok(Some(_held)) = lock(&path, false)
+        {
+            Domain { root: path.with_extension("") }.remove();
+        }
+    }
+}
+
+fn lock_path(root: &Path) -> PathBuf {
+    root.with_extension("lock")
+}
+
+/// Takes a lock file; `None` if another process holds it or took it away meanwhile.
+fn lock(path: &Path, new: bool) -> io::Result<Option<File>> {
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(new).mode(0o600);
+    let file = match options.open(path) {
+        Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
+            // A missing directory is an error, a name already taken or just removed is not.
+            return if new && error.kind() == io::ErrorKind::NotFound { Err(error) } else { Ok(None) };
+        }
+        other => other?,
+    };
+    if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+        return Ok(None);
+    }
+    // Whoever cleans up takes the lock, removes the file, lets go: a lock on a removed file protects nothing.
+    let same = fs::metadata(path).is_ok_and(|at_path| fstat(&file).is_ok_and(|held| held.st_ino == at_path.ino()));
+    Ok(same.then_some(file))
+}
+
+fn random_id() -> String {
+    use std::hash::{BuildHasher, Hasher};
+    // The standard library seeds every RandomState from the system's randomness.
+    let random = std::collections::hash_map::RandomState::new().build_hasher().finish();
+    format!("{:08x}", random as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_domain_is_private_and_goes_without_a_trace() {
+        let owned = OwnedDomain::create().unwrap();
+        let domain = owned.domain().clone();
+        assert_eq!(fs::metadata(domain.root()).unwrap().mode() & 0o777, 0o700);
+        assert_eq!(Domain::join(domain.root()).unwrap(), domain);
+        let shared = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
+        fs::write(&shared, b"x").unwrap();
+        drop(owned);
+        assert!(!shared.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
+        assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
+    }
+
+    #[test]
+    fn the_dead_are_removed_and_the_living_are_not() {
+        let base = tempfile::tempdir().unwrap();
+        let (dead, living) = (base.path().join("0000dead"), base.path().join("00000001"));
+        let mut held = None;
+        for root in [&dead, &living] {
+            fs::create_dir(root).unwrap();
+            held = lock(&lock_path(root), true).unwrap();
+        }
+        remove_dead(base.path());
+        assert!(!dead.exists() && !lock_path(&dead).exists());
+        assert!(living.exists() && held.is_some());
+    }
+}

@@ -1,0 +1,144 @@
+//! The bus within one thread: the same semantics as [`super::iox`], no shared memory, no files.
+
+use super::{Bus, BusError, Depths, Read, Reader, Topic, Write};
+use crate::sample::Sample;
+use std::any::Any;
+use std::cell::RefCell;
+use std::collections::{HashMap, VecDeque};
+use std::rc::Rc;
+
+/// One reader's waiting samples, the newest last; beyond the depth the oldest gives way.
+struct Waiting<S> {
+    samples: VecDeque<S>,
+    depth: usize,
+}
+
+type Queue<S> = Rc<RefCell<Waiting<S>>>;
+/// The queues of a signal's readers.
+type Queues<S> = Rc<RefCell<Vec<Queue<S>>>>;
+
+/// A bus that lives in one thread.
+pub struct MemoryBus {
+    depths: Depths,
+    topics: RefCell<HashMap<String, Box<dyn Any>>>,
+}
+
+impl MemoryBus {
+    /// A bus without signals.
+    pub fn new(depths: Depths) -> Self {
+        Self { depths, topics: RefCell::new(HashMap::new()) }
+    }
+
+    fn queues<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<Queues<S>, BusError> {
+        let service = topic.to_string();
+        let mut topics = self.topics.borrow_mut();
+        let entry = topics.entry(service.clone()).or_insert_with(|| Box::new(Queues::<S>::default()));
+        entry.downcast_ref::<Queues<S>>().cloned().ok_or_else(|| BusError::Open {
+            service,
+            end,
+            reason: format!("it carries another type than {}", S::TYPE_NAME),
+        })
+    }
+}
+
+impl Bus for MemoryBus {
+    type Writer<S: Sample> = MemoryWriter<S>;
+    type Reader<S: Sample> = MemoryReader<S>;
+
+    fn writer<S: Sample>(&self, topic: &Topic) -> Result<MemoryWriter<S>, BusError> {
+        Ok(MemoryWriter { queues: self.queues(topic, "writer")?, slot: S::default() })
+    }
+
+    fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<MemoryReader<S>, BusError> {
+        let depth = self.depths.of(reader);
+        let queue: Queue<S> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
+        self.queues(topic, "reader")?.borrow_mut().push(queue.clone());
+        Ok(MemoryReader { queue, current: None })
+    }
+}
+
+/// The writing end.
+pub struct MemoryWriter<S> {
+    queues: Queues<S>,
+    slot: S,
+}
+
+impl<S: Sample> Write<S> for MemoryWriter<S> {
+    #[inline]
+    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        fill(&mut self.slot);
+        for queue in self.queues.borrow().iter() {
+            let mut queue = queue.borrow_mut();
+            if queue.samples.len() == queue.depth {
+                queue.samples.pop_front();
+            }
+            queue.samples.push_back(self.slot);
+        }
+        Ok(())
+    }
+
+    fn prepare(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
+}
+
+/// The reading end.
+pub struct MemoryReader<S> {
+    queue: Queue<S>,
+    current: Option<S>,
+}
+
+impl<S: Sample> Read<S> for MemoryReader<S> {
+    #[inline]
+    fn advance(&mut self) -> Result<bool, BusError> {
+        let next = self.queue.borrow_mut().samples.pop_front();
+        let moved = next.is_some();
+        if moved {
+            self.current = next;
+        }
+        Ok(moved)
+    }
+
+    #[inline]
+    fn current(&self) -> Option<&S> {
+        self.current.as_ref()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Signal;
+    use super::*;
+    use crate::sample::{RateCommand, RateTruth};
+
+    fn topic() -> Topic {
+        Topic { scenario: "s".to_owned(), body: "b".to_owned(), signal: Signal::Command }
+    }
+
+    #[test]
+    fn a_deep_reader_gets_every_sample_in_order_and_a_shallow_one_the_newest() {
+        let bus = MemoryBus::new(Depths { role: 1, scorer: 8 });
+        let mut newest = bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
+        let mut every = bus.reader::<RateCommand>(&topic(), Reader::Scorer).unwrap();
+        let mut writer = bus.writer::<RateCommand>(&topic()).unwrap();
+        assert!(!newest.advance().unwrap() && newest.current().is_none());
+        for tick in 0..5 {
+            writer.send(|sample| sample.stamp.tick = tick).unwrap();
+        }
+        assert!(newest.advance().unwrap());
+        assert_eq!(newest.current().unwrap().stamp.tick, 4);
+        assert!(!newest.advance().unwrap());
+        assert_eq!(newest.current().unwrap().stamp.tick, 4, "the sample at hand stays");
+        for tick in 0..5 {
+            assert!(every.advance().unwrap());
+            assert_eq!(every.current().unwrap().stamp.tick, tick);
+        }
+    }
+
+    #[test]
+    fn refuses_a_signal_of_another_type() {
+        let bus = MemoryBus::new(Depths { role: 1, scorer: 8 });
+        bus.writer::<RateCommand>(&topic()).unwrap();
+        assert!(matches!(bus.reader::<RateTruth>(&topic(), Reader::Role), Err(BusError::Open { .. })));
+    }
+}

@@ -1,0 +1,127 @@
+//! Links between roles: one writer and some readers per signal, samples loaned, written in place and sent.
+//!
+//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
+
+pub mod domain;
+pub mod iox;
+pub mod memory;
+mod names;
+
+pub use names::{Signal, Topic};
+
+use crate::sample::Sample;
+
+/// Why a link failed. The run cannot go on without it.
+#[derive(Debug, thiserror::Error)]
+pub enum BusError {
+    /// The shared-memory domain could not be entered.
+    #[error(
+        "cannot enter the shared-memory domain {domain}: {reason}; check that /dev/shm and the domain's directory are writable"
+    )]
+    Domain {
+        /// Where.
+        domain: String,
+        /// The transport's reason.
+        reason: String,
+    },
+    /// A signal could not be opened.
+    #[error(
+        "cannot open {service} as {end}: {reason}; is another process of this run its {end}, or of another version?"
+    )]
+    Open {
+        /// The service's name.
+        service: String,
+        /// `writer` or `reader`.
+        end: &'static str,
+        /// The transport's reason.
+        reason: String,
+    },
+    /// A sample could not be sent.
+    #[error("cannot send on {service}: {reason}")]
+    Send {
+        /// The service's name.
+        service: String,
+        /// The transport's reason.
+        reason: String,
+    },
+    /// A sample could not be received.
+    #[error("cannot receive on {service}: {reason}")]
+    Receive {
+        /// The service's name.
+        service: String,
+        /// The transport's reason.
+        reason: String,
+    },
+}
+
+/// What reads a signal, and so how many samples may wait for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reader {
+    /// A role: the newest sample only in real time, all of them in lockstep.
+    Role,
+    /// The scorer, which looks only now and then but wants every sample.
+    Scorer,
+}
+
+/// How many samples may wait for each kind of reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Depths {
+    /// For [`Reader::Role`].
+    pub role: usize,
+    /// For [`Reader::Scorer`].
+    pub scorer: usize,
+}
+
+impl Depths {
+    /// For this kind of reader.
+    pub fn of(&self, reader: Reader) -> usize {
+        match reader {
+            Reader::Role => self.role,
+            Reader::Scorer => self.scorer,
+        }
+    }
+}
+
+/// Opens links.
+pub trait Bus {
+    /// The writing end.
+    type Writer<S: Sample>: Write<S>;
+    /// The reading end.
+    type Reader<S: Sample>: Read<S>;
+
+    /// Opens a signal for writing; there is one writer per signal.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError>;
+    /// Opens a signal for reading.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError>;
+}
+
+/// The writing end of a link.
+pub trait Write<S> {
+    /// Fills a sample in place and sends it. Never waits for a reader.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError>;
+    /// Gets ready for the next [`send`](Self::send), so that it has less to do then.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn prepare(&mut self) -> Result<(), BusError>;
+}
+
+/// The reading end of a link.
+pub trait Read<S> {
+    /// Moves on to the next sample; false, and nothing changed, if there is none. Never waits.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn advance(&mut self) -> Result<bool, BusError>;
+    /// The sample at hand, in place; none before the first.
+    fn current(&self) -> Option<&S>;
+}

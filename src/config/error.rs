@@ -1,0 +1,72 @@
+//! What can be wrong with a scenario, told so that its author can mend it.
+
+use std::path::PathBuf;
+
+/// Why a scenario was refused. Nothing has been started.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or print one with `corotate init rigid-pair`", path.display())]
+    Read {
+        /// The path as given.
+        path: PathBuf,
+        /// The system's reason.
+        reason: String,
+    },
+    /// The text is not TOML, or a key appears twice.
+    #[error("{place}: {reason}; correct the line")]
+    Syntax {
+        /// File, line and column.
+        place: String,
+        /// The parser's reason.
+        reason: String,
+    },
+    /// No key of this name is known.
+    #[error("{place}: {key}: unknown key; {remedy}")]
+    UnknownKey {
+        /// File and line, or the option.
+        place: String,
+        /// The key's full path.
+        key: String,
+        /// The nearest known key or the list of them.
+        remedy: String,
+    },
+    /// A key has a value of the wrong type, or is missing.
+    #[error("{place}: {key}: {reason}")]
+    Value {
+        /// File and line, or the option.
+        place: String,
+        /// The key's full path.
+        key: String,
+        /// Reason and remedy.
+        reason: String,
+    },
+    /// An override on the command line has not the form key=value, or leads nowhere.
+    #[error(
+        "--set {argument}: {reason}; write --set key=value, for example --set leader.initial_rate_rad_s=[0.6,-0.4,0.8] or --set follower.0.name=chaser"
+    )]
+    Override {
+        /// The argument as given.
+        argument: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Values that are well-formed but make no sense, all of them at once.
+    #[error("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Invalid {
+        /// One entry per finding, at least one.
+        problems: Vec<Problem>,
+    },
+}
+
+/// One value that makes no sense.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{place}: {key}: {reason}")]
+pub struct Problem {
+    /// File and line, or the option.
+    pub place: String,
+    /// The key's full path.
+    pub key: String,
+    /// Reason and remedy.
+    pub reason: String,
+}

@@ -1,0 +1,23 @@
+//! Scenario files: text as typed, then a [`Scenario`] as resolved. Nothing is started on a scenario that is not valid.
+//!
+//! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
+
+mod document;
+mod error;
+mod raw;
+mod scenario;
+
+pub use document::Document;
+pub use error::{ConfigError, Problem};
+pub use raw::{ClockKind, Cores, NamedCores, Realtime};
+pub use scenario::{Accept, Scenario};
+
+pub(crate) use document::nearest;
+pub(crate) use scenario::{Checks, finite_positive};
+
+/// The scenarios that ship with the program: name and text.
+pub const SHIPPED: [(&str, &str); 3] = [
+    ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
+    ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
+    ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
+];

@@ -1,0 +1,137 @@
+//! The part of a scenario that every rig shares, as typed: the serde mirror of the file with its defaults.
+//!
+//! Must not judge values; [`super::scenario`] does.
+
+use crate::role::Rearm;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Raw {
+    pub name: String,
+    pub rig: String,
+    #[serde(default)]
+    pub clock: ClockKind,
+    pub tick_hz: f64,
+    pub duration_s: f64,
+    #[serde(default)]
+    pub actuator: Actuator,
+    #[serde(default)]
+    pub realtime: Realtime,
+    #[serde(default)]
+    pub launch: Launch,
+    #[serde(default)]
+    pub accept: BTreeMap<String, f64>,
+}
+
+/// What makes the ticks of a run follow one another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ClockKind {
+    /// Absolute deadlines on the monotonic clock, one process per role.
+    #[default]
+    Realtime,
+    /// Every role waits for its inputs, nobody looks at the time; one process per role.
+    Lockstep,
+    /// The same roles in one thread, over links in memory.
+    InProcess,
+}
+
+impl ClockKind {
+    /// The name that a scenario and the command line use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Realtime => "realtime",
+            Self::Lockstep => "lockstep",
+            Self::InProcess => "in-process",
+        }
+    }
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Actuator {
+    pub command_timeout_ticks: u64,
+    #[serde(with = "RearmName")]
+    pub rearm: Rearm,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Rearm", rename_all = "kebab-case")]
+enum RearmName {
+    Auto,
+    Manual,
+}
+
+impl Default for Actuator {
+    fn default() -> Self {
+        Self { command_timeout_ticks: 20, rearm: Rearm::Auto }
+    }
+}
+
+/// What a real-time run asks of the machine. Whatever is not granted is reported, and the run goes on without it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Realtime {
+    /// SCHED_FIFO priority of the leader, 4 to 99; followers, observer and controller get 1, 2, 3 less. 0: do not ask.
+    pub priority: i32,
+    /// The cores of the roles.
+    pub cores: Cores,
+    /// Whether roles lock their memory.
+    pub lock_memory: bool,
+    /// Whether the launcher holds `/dev/cpu_dma_latency` at 0, which keeps idle cores from sleeping deeply.
+    pub low_latency_idle: bool,
+    /// How long before a tick a role wakes to spin, µs.
+    pub wake_lead_us: f64,
+    /// How long a role spins for a sample that is due before it naps between looks, µs.
+    pub spin_us: f64,
+    /// The part of the period after which the controller goes on without samples that are still missing, 0 to 1.
+    pub cutoff: f64,
+}
+
+impl Default for Realtime {
+    fn default() -> Self {
+        Self {
+            priority: 80,
+            cores: Cores::Named(NamedCores::Auto),
+            lock_memory: true,
+            low_latency_idle: true,
+            wake_lead_us: 60.0,
+            spin_us: 200.0,
+            cutoff: 0.75,
+        }
+    }
+}
+
+/// Where the roles run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected \"auto\", \"any\", or a list of core numbers such as [0, 1]")]
+pub enum Cores {
+    /// `"auto"` or `"any"`.
+    Named(NamedCores),
+    /// These, in turn: plants from the first on, observer and controller together on the last.
+    List(Vec<usize>),
+}
+
+/// The named choices of [`Cores`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NamedCores {
+    /// As a list of all cores that the process may use.
+    Auto,
+    /// Leave it to the scheduler.
+    Any,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Launch {
+    pub startup_timeout_s: f64,
+}
+
+impl Default for Launch {
+    fn default() -> Self {
+        Self { startup_timeout_s: 30.0 }
+    }
+}

@@ -1,0 +1,253 @@
+//! A scenario as resolved: every value checked, every default filled in, ready to run.
+
+use super::raw::Raw;
+use super::{ClockKind, ConfigError, Document, Problem, Realtime, nearest};
+use crate::rig::{self, AnyRig};
+use crate::role::{Actuation, Rearm};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// The longest time a latency histogram holds, s; a tick must be shorter.
+const MAX_PERIOD_S: f64 = 10.0;
+/// The shortest tick: below it the clock reads alone would fill the period.
+const MIN_PERIOD_S: f64 = 1e-5;
+/// The most ticks of one run: ten years at 1 kHz.
+const MAX_TICKS: f64 = 3.2e11;
+/// The tables whose content belongs to the rig.
+const RIG_SECTIONS: [&str; 4] = ["leader", "follower", "observer", "controller"];
+
+/// A scenario that can be run.
+#[derive(Debug)]
+pub struct Scenario {
+    /// Its name: part of service names and of the run directory's.
+    pub name: String,
+    /// What drives the ticks.
+    pub clock: ClockKind,
+    /// The period h, ns.
+    pub period_ns: u64,
+    /// The last tick; the first is 0.
+    pub last_tick: u64,
+    /// After how many missing commands a driven body goes to its safe command.
+    pub command_timeout_ticks: u64,
+    /// What ends the safe command.
+    pub rearm: Rearm,
+    /// What a real-time run asks of the machine.
+    pub realtime: Realtime,
+    /// How long the roles may take until all are ready, s.
+    pub startup_timeout_s: f64,
+    /// What the run is judged by.
+    pub accept: Accept,
+    /// Bodies, observer and laws.
+    pub rig: AnyRig,
+    /// The scenario as a file that resolves to itself.
+    pub resolved: toml::Table,
+}
+
+/// Acceptance criteria. Without any, every run that ends is accepted.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Accept {
+    /// From this time on the limits apply, s.
+    pub settled_by_s: f64,
+    /// Largest allowed value per metric of the rig, after settling.
+    pub metric_max: BTreeMap<String, f64>,
+    /// Most ticks that all roles together may miss.
+    pub missed_ticks_max: Option<u64>,
+    /// Limit of the 99th percentile of the estimate and of the control step, µs.
+    pub step_latency_p99_us_max: Option<f64>,
+}
+
+impl Scenario {
+    /// Reads a file, applies overrides, checks everything.
+    ///
+    /// # Errors
+    /// [`ConfigError`], with the place, the reason and the remedy.
+    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        Self::build(Document::read(path)?, overrides)
+    }
+
+    /// The same from a text; `origin` stands for the file in error messages.
+    ///
+    /// # Errors
+    /// [`ConfigError`].
+    pub fn parse(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        Self::build(Document::parse(text, origin)?, overrides)
+    }
+
+    fn build(mut document: Document, overrides: &[String]) -> Result<Self, ConfigError> {
+        for argument in overrides {
+            document.set(argument)?;
+        }
+        let sections = document.split_off(&RIG_SECTIONS);
+        let raw: Raw = document.read_into()?;
+        let mut checks = Checks::new(&document);
+        check_common(&raw, &mut checks);
+        let period_ns = (1e9 / raw.tick_hz).round() as u64;
+        let tick_s = period_ns as f64 / 1e9;
+        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, tick_s, &mut checks)?;
+        let accept =
+            resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map_or(&[], AnyRig::metrics), &mut checks);
+        let rig = checks.finish(rig)?;
+        let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+        resolved.extend(rig_table);
+        Ok(Self {
+            name: raw.name,
+            clock: raw.clock,
+            period_ns,
+            last_tick: (raw.duration_s * 1e9 / period_ns as f64).round() as u64,
+            command_timeout_ticks: raw.actuator.command_timeout_ticks,
+            rearm: raw.actuator.rearm,
+            realtime: raw.realtime,
+            startup_timeout_s: raw.launch.startup_timeout_s,
+            accept,
+            rig,
+            resolved,
+        })
+    }
+
+    /// The period h, s.
+    pub fn tick_s(&self) -> f64 {
+        self.period_ns as f64 / 1e9
+    }
+
+    /// The time of a tick since the first, s.
+    pub fn time_s(&self, tick: u64) -> f64 {
+        tick as f64 * self.tick_s()
+    }
+
+    /// How the actuators of a body treat their commands.
+    pub fn actuation(&self, driven: bool) -> Actuation {
+        Actuation { driven, timeout_ticks: self.command_timeout_ticks, rearm: self.rearm }
+    }
+
+    /// The scenario as the text of a file.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(&self.resolved).expect("a scenario of plain values is TOML")
+    }
+}
+
+/// Collects findings, so that all of them are told at once.
+pub(crate) struct Checks<'a> {
+    document: &'a Document,
+    problems: Vec<Problem>,
+}
+
+impl<'a> Checks<'a> {
+    fn new(document: &'a Document) -> Self {
+        Self { document, problems: Vec::new() }
+    }
+
+    /// Notes that the value at `key` makes no sense.
+    pub fn refuse(&mut self, key: &str, reason: impl Into<String>) {
+        let place = self.document.place(key);
+        self.problems.push(Problem { place, key: key.to_owned(), reason: reason.into() });
+    }
+
+    /// Notes it unless `holds`.
+    pub fn require(&mut self, holds: bool, key: &str, reason: impl FnOnce() -> String) {
+        if !holds {
+            self.refuse(key, reason());
+        }
+    }
+
+    /// Takes the value, or notes why there is none.
+    pub fn accept<T>(&mut self, key: &str, value: Result<T, impl std::fmt::Display>) -> Option<T> {
+        value.map_err(|error| self.refuse(key, error.to_string())).ok()
+    }
+
+    fn finish<T>(self, value: Option<T>) -> Result<T, ConfigError> {
+        match value {
+            Some(value) if self.problems.is_empty() => Ok(value),
+            _ => Err(ConfigError::Invalid { problems: self.problems }),
+        }
+    }
+}
+
+/// Notes a number that is not positive. Non-finite numbers never get so far.
+pub(crate) fn finite_positive(checks: &mut Checks<'_>, key: &str, value: f64) {
+    checks.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
+}
+
+fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
+    let named = !raw.name.is_empty()
+        && raw.name.len() <= 32
+        && raw.name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+    checks.require(named, "name", || {
+        format!("`{}` cannot name services and files; use 1 to 32 of a-z, 0-9 and -", raw.name)
+    });
+    let period_s = 1.0 / raw.tick_hz;
+    let period_ok = (MIN_PERIOD_S..=MAX_PERIOD_S).contains(&period_s);
+    checks.require(period_ok, "tick_hz", || {
+        format!(
+            "a tick of {} Hz is outside what latencies are kept for ({} to {} Hz); choose a rate between",
+            raw.tick_hz,
+            1.0 / MAX_PERIOD_S,
+            1.0 / MIN_PERIOD_S
+        )
+    });
+    if period_ok {
+        let ticks = raw.duration_s * raw.tick_hz;
+        checks.require((1.0..=MAX_TICKS).contains(&ticks), "duration_s", || {
+            format!("{} s is {ticks} ticks; a run has between 1 and {MAX_TICKS:e}", raw.duration_s)
+        });
+    }
+    checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", || {
+        "0 would make every tick unsafe; give at least 1".to_owned()
+    });
+    check_realtime(&raw.realtime, period_s, checks);
+    checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
+        format!("{} is not between 0.1 and 3600", raw.launch.startup_timeout_s)
+    });
+}
+
+fn check_realtime(realtime: &Realtime, period_s: f64, checks: &mut Checks<'_>) {
+    let priority = realtime.priority;
+    checks.require(priority == 0 || (4..=99).contains(&priority), "realtime.priority", || {
+        format!("{priority} is no SCHED_FIFO priority; give 4 to 99, or 0 not to ask for it")
+    });
+    for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
+        checks.require((0.0..=100_000.0).contains(&value), key, || {
+            format!("{value} is not between 0 and 100000; spinning is for the last moments before a sample")
+        });
+    }
+    checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", || {
+        format!("{} is not a part of the period ({period_s} s); give a number above 0, up to 1", realtime.cutoff)
+    });
+    if let super::Cores::List(cores) = &realtime.cores {
+        checks.require(!cores.is_empty() && cores.iter().all(|core| *core < 1024), "realtime.cores", || {
+            "the list is empty or names a core beyond 1023; name cores of this machine, \"auto\" or \"any\"".to_owned()
+        });
+    }
+}
+
+fn resolve_accept(raw: &BTreeMap<String, f64>, duration_s: f64, metrics: &[&str], checks: &mut Checks<'_>) -> Accept {
+    let mut accept = Accept::default();
+    for (key, &value) in raw {
+        let path = format!("accept.{key}");
+        checks.require(value >= 0.0, &path, || format!("{value} is below zero; no result can be"));
+        match key.as_str() {
+            "settled_by_s" => {
+                accept.settled_by_s = value;
+                checks.require(value < duration_s, &path, || {
+                    format!("{value} s is not before the end of the run at {duration_s} s; nothing would be judged")
+                });
+            }
+            "missed_ticks_max" => {
+                accept.missed_ticks_max = Some(value as u64);
+                checks.require(value.fract() == 0.0, &path, || format!("{value} is not a whole number of ticks"));
+            }
+            "step_latency_p99_us_max" => accept.step_latency_p99_us_max = Some(value),
+            _ => match key.strip_suffix("_max").filter(|metric| metrics.contains(metric)) {
+                Some(metric) => {
+                    accept.metric_max.insert(metric.to_owned(), value);
+                }
+                None => {
+                    let mut known: Vec<String> = metrics.iter().map(|metric| format!("{metric}_max")).collect();
+                    known.extend(["settled_by_s", "missed_ticks_max", "step_latency_p99_us_max"].map(str::to_owned));
+                    let known: Vec<&str> = known.iter().map(String::as_str).collect();
+                    checks.refuse(&path, format!("unknown criterion; {}", nearest(key, &known)));
+                }
+            },
+        }
+    }
+    accept
+}

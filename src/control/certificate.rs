@@ -1,0 +1,151 @@
+//! The proof obligations of the synchronising law, as numbers: \[D\](15)-(19), the exact condition, and the sampled loop.
+//!
+//! Must only report; whether a condition that fails is an error is for its reader to decide.
+
+use nalgebra::Vector3;
+
+/// A sampled axis with |k|·h above this answers visibly slower or rings; warned about well before it is unstable.
+const COMFORTABLE_GAIN_STEP: f64 = 0.25;
+
+/// One sufficient condition: what is there, what is needed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Condition {
+    /// The quantity that the designer chose.
+    pub value: f64,
+    /// What it must exceed.
+    pub required: f64,
+}
+
+impl Condition {
+    /// Whether the value exceeds what is required.
+    pub fn holds(&self) -> bool {
+        self.value > self.required
+    }
+}
+
+/// What is proven of one follower's synchronisation with a leader whose axis k is hidden.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Certificate {
+    /// M, the bound on the leader's angular velocity, rad/s.
+    pub rate_bound_rad_s: f64,
+    /// \[D\](19): |k_i| > |a_i| M, |k_j| > |a_j| M, −λ > |a_i| M + |a_j| M + |k_k|/2, 1/s. Sufficient.
+    pub paper: [Condition; 3],
+    /// −λ > M²/4·max(a_i²/|k_i|, a_j²/|k_j|) + |k_k|/4, 1/s: necessary and sufficient for V̇ < 0 wherever |ω| ≤ M, where
+    /// V = ½(|e|² + ε²) of \[D\](15). The Schur complement of the error system (14).
+    pub exact: Condition,
+    /// The slowest exponent of the error, 1/s: min(|k_1|, |k_2|, |k_3|, −λ). The error decays so in any case, since the
+    /// observer's error does not depend on the others.
+    pub rate_per_s: f64,
+    /// Largest |k|·h: with one tick of delay an axis obeys z² − z + |k|h = 0 and is stable below 1; predicted,
+    /// z = 1 − |k|h, stable below 2.
+    pub gain_step: Condition,
+}
+
+impl Certificate {
+    /// The certificate of a loop with tick `tick_s`.
+    ///
+    /// `coefficients` are the a of \[D\](2), `hidden_axis` is 1 to 3, `gain_per_s` = −k and `decay_rate_per_s` = −λ are
+    /// positive, `rate_bound_rad_s` is M; `predict` tells whether the law predicts over the delay.
+    pub fn new(
+        coefficients: &Vector3<f64>,
+        hidden_axis: usize,
+        gain_per_s: &Vector3<f64>,
+        decay_rate_per_s: f64,
+        rate_bound_rad_s: f64,
+        tick_s: f64,
+        predict: bool,
+    ) -> Self {
+        let [i, j, k] = [hidden_axis % 3, (hidden_axis + 1) % 3, (hidden_axis - 1) % 3];
+        let m = rate_bound_rad_s;
+        let pull = [i, j].map(|axis| coefficients[axis].abs() * m);
+        let schur = [i, j].map(|axis| coefficients[axis] * coefficients[axis] / gain_per_s[axis]);
+        Self {
+            rate_bound_rad_s: m,
+            paper: [
+                Condition { value: gain_per_s[i], required: pull[0] },
+                Condition { value: gain_per_s[j], required: pull[1] },
+                Condition { value: decay_rate_per_s, required: pull[0] + pull[1] + gain_per_s[k] / 2.0 },
+            ],
+            exact: Condition {
+                value: decay_rate_per_s,
+                required: m * m / 4.0 * schur[0].max(schur[1]) + gain_per_s[k] / 4.0,
+            },
+            rate_per_s: gain_per_s.min().min(decay_rate_per_s),
+            gain_step: Condition { value: if predict { 2.0 } else { 1.0 }, required: gain_per_s.max() * tick_s },
+        }
+    }
+
+    /// Whether the sampled loop is stable at this tick.
+    pub fn stable_when_sampled(&self) -> bool {
+        self.gain_step.holds()
+    }
+
+    /// Whether the tick is so coarse that the sampled loop visibly differs from the continuous one.
+    pub fn coarse_tick(&self) -> bool {
+        self.gain_step.required > COMFORTABLE_GAIN_STEP
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Matrix4;
+
+    /// V̇ as a quadratic form in (e1, e2, e3, ε) at a given ω, from the error system (14) with the hidden axis 3.
+    fn form(a: &Vector3<f64>, gain: &Vector3<f64>, decay: f64, w1: f64, w2: f64) -> Matrix4<f64> {
+        let mut q = Matrix4::from_diagonal(&nalgebra::Vector4::new(-gain.x, -gain.y, -gain.z, -decay));
+        for (row, half) in [(0, -a.x * w2 / 2.0), (1, -a.y * w1 / 2.0), (2, -gain.z / 2.0)] {
+            q[(row, 3)] = half;
+            q[(3, row)] = half;
+        }
+        q
+    }
+
+    fn worst_eigenvalue(a: &Vector3<f64>, gain: &Vector3<f64>, decay: f64, m: f64) -> f64 {
+        (0..=90)
+            .map(|step| f64::from(step).to_radians())
+            .map(|angle| form(a, gain, decay, m * angle.cos(), m * angle.sin()).symmetric_eigenvalues().max())
+            .fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    #[test]
+    fn the_exact_condition_is_where_the_largest_eigenvalue_changes_its_sign() {
+        let (a, gain, m) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0), 1.5);
+        let needed = Certificate::new(&a, 3, &gain, 1.0, m, 1e-3, false).exact.required;
+        assert!(worst_eigenvalue(&a, &gain, needed * 1.001, m) < 0.0);
+        assert!(worst_eigenvalue(&a, &gain, needed * 0.999, m) > 0.0);
+    }
+
+    #[test]
+    fn the_paper_s_condition_implies_the_exact_one() {
+        let (a, gain) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0));
+        let loose = Certificate::new(&a, 3, &gain, 1.0, 1.5, 1e-3, false);
+        let certificate = Certificate::new(&a, 3, &gain, loose.paper[2].required * 1.01, 1.5, 1e-3, false);
+        assert!(certificate.paper.iter().all(Condition::holds) && certificate.exact.holds());
+        assert!(!loose.paper[2].holds());
+    }
+
+    #[test]
+    fn relabelling_the_axes_moves_the_condition_with_them() {
+        let (a, gain) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0));
+        let turned = |v: &Vector3<f64>| Vector3::new(v.z, v.x, v.y);
+        let third = Certificate::new(&a, 3, &gain, 5.0, 1.5, 1e-3, false);
+        let first = Certificate::new(&turned(&a), 1, &turned(&gain), 5.0, 1.5, 1e-3, false);
+        assert_eq!(third.exact, first.exact);
+        assert_eq!(third.paper, first.paper);
+    }
+
+    /// The sampled axis e(n+1) = e(n) − g h e(n−1) really is stable up to the limit and not beyond.
+    #[test]
+    fn the_sampled_limit_is_the_real_one() {
+        let grows = |gain_step: f64| {
+            let (mut e, mut before) = (1.0_f64, 1.0_f64);
+            for _ in 0..2000 {
+                (e, before) = (e - gain_step * before, e);
+            }
+            e.abs() > 1.0
+        };
+        let limit = Certificate::new(&Vector3::zeros(), 3, &Vector3::repeat(1.0), 1.0, 1.0, 1.0, false).gain_step.value;
+        assert!(!grows(limit * 0.99) && grows(limit * 1.01));
+    }
+}

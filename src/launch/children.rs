@@ -1,0 +1,168 @@
+//! The processes of a run: started from this program, listened to, reaped; and the janitor that outlives the launcher.
+//!
+//! A role dies with its launcher by the kernel's hand (parent-death signal); the janitor then removes what is left in
+//! shared memory. Must not leave a zombie.
+
+use super::LaunchError;
+use crate::bus::domain::{self, Domain};
+use crate::config::Scenario;
+use crate::runtime::RoleId;
+use std::collections::VecDeque;
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// How long a role may take to end once it has been told to.
+const END_LIMIT: Duration = Duration::from_secs(5);
+/// How much of a role's error output is kept.
+const LAST_LINES: usize = 8;
+
+/// A role's process.
+pub(super) struct RoleProcess {
+    pub name: String,
+    child: Child,
+    status: Option<ExitStatus>,
+    last_words: Arc<Mutex<VecDeque<String>>>,
+    listener: Option<JoinHandle<()>>,
+}
+
+impl RoleProcess {
+    /// Starts a role of a scenario in a domain.
+    pub fn start(program: &Path, scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
+        let name = role.name(scenario).to_owned();
+        let kind = match role {
+            RoleId::Plant(_) => "plant",
+            RoleId::Observer => "observer",
+            RoleId::Controller => "controller",
+        };
+        let mut command = Command::new(program);
+        command.arg(kind).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
+        if let RoleId::Plant(_) = role {
+            command.arg("--body").arg(&name);
+        }
+        // A group of its own: Ctrl-C reaches the launcher alone, and the launcher ends the roles in order.
+        command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().map_err(|source| LaunchError::Spawn { role: name.clone(), source })?;
+        let last_words = Arc::new(Mutex::new(VecDeque::new()));
+        let listener = child.stderr.take().map(|stderr| listen(name.clone(), stderr, last_words.clone()));
+        Ok(Self { name, child, status: None, last_words, listener })
+    }
+
+    /// How the process ended, if it has.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        if self.status.is_none() {
+            self.status = self.child.try_wait().ok().flatten();
+        }
+        self.status
+    }
+
+    /// The error for a role that ended before its time.
+    pub fn died(&mut self, status: ExitStatus) -> LaunchError {
+        self.stop_listening();
+        let cause = match (status.code(), status.signal()) {
+            (Some(code), _) => format!("it exited with code {code}"),
+            (None, Some(signal)) => format!("it was killed by {}", signal_name(signal)),
+            (None, None) => "it ended".to_owned(),
+        };
+        let words = self.last_words.lock().map(|lines| lines.iter().cloned().collect::<Vec<_>>()).unwrap_or_default();
+        LaunchError::Died { role: self.name.clone(), cause, last_words: words.join(" | ") }
+    }
+
+    fn stop_listening(&mut self) {
+        if let Some(listener) = self.listener.take() {
+            let _ = listener.join();
+        }
+    }
+}
+
+impl Drop for RoleProcess {
+    fn drop(&mut self) {
+        if self.ended().is_none() {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+        self.stop_listening();
+    }
+}
+
+/// Waits for processes that have been told to end, and kills those that do not.
+pub(super) fn await_end(processes: &mut [RoleProcess]) {
+    let limit = Instant::now() + END_LIMIT;
+    while processes.iter_mut().any(|process| process.ended().is_none()) && Instant::now() < limit {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+fn signal_name(signal: i32) -> String {
+    match signal {
+        libc::SIGKILL => "SIGKILL".to_owned(),
+        libc::SIGSEGV => "SIGSEGV".to_owned(),
+        libc::SIGBUS => "SIGBUS (is /dev/shm full?)".to_owned(),
+        libc::SIGABRT => "SIGABRT".to_owned(),
+        libc::SIGTERM => "SIGTERM".to_owned(),
+        _ => format!("signal {signal}"),
+    }
+}
+
+/// Passes a role's error output on, its name in front, and keeps the end of it.
+fn listen(name: String, stderr: impl Read + Send + 'static, last: Arc<Mutex<VecDeque<String>>>) -> JoinHandle<()> {
+    std::thread::spawn(move || {
+        for line in BufReader::new(stderr).lines().map_while(Result::ok) {
+            eprintln!("[{name}] {line}");
+            if let Ok(mut last) = last.lock() {
+                last.push_back(line);
+                while last.len() > LAST_LINES {
+                    last.pop_front();
+                }
+            }
+        }
+    })
+}
+
+/// The process that cleans up if the launcher cannot.
+pub(super) struct Janitor {
+    child: Child,
+    /// Held open: the kernel closes it when the launcher dies, and the janitor sees the end of its input.
+    line: Option<ChildStdin>,
+}
+
+impl Janitor {
+    /// Starts the janitor.
+    pub fn start(program: &Path) -> Result<Self, LaunchError> {
+        let mut child = Command::new(program)
+            .arg("janitor")
+            .process_group(0)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
+        let line = child.stdin.take();
+        Ok(Self { child, line })
+    }
+}
+
+impl Drop for Janitor {
+    fn drop(&mut self) {
+        if let Some(mut line) = self.line.take() {
+            let _ = line.write_all(b"all clean");
+        }
+        let _ = self.child.wait();
+    }
+}
+
+/// The janitor's work: waits for the end of `line`; if the launcher said nothing before, removes what it left behind.
+pub fn janitor(mut line: impl Read) {
+    if io::copy(&mut line, &mut io::sink()).is_ok_and(|said| said > 0) {
+        return;
+    }
+    // Roles whose launcher was killed are dying at this moment; what they still hold goes in a later round.
+    for pause_ms in [0, 50, 500] {
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        domain::remove_dead_domains();
+    }
+}

@@ -1,0 +1,130 @@
+//! Starts a run, supervises it, ends it, and tells how it went.
+//!
+//! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
+
+mod children;
+mod in_process;
+mod outcome;
+mod processes;
+mod score;
+mod table;
+
+pub use children::janitor;
+pub use outcome::{Criterion, Outcome, Summary, write_run};
+pub use score::{MetricScore, Score, Scorer};
+pub use table::table;
+
+use crate::bus::BusError;
+use crate::bus::domain::DomainError;
+use crate::config::{ClockKind, Scenario};
+use crate::telemetry::Grant;
+use std::io;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicUsize;
+
+/// What a run needs besides its scenario.
+pub struct Launch<'a> {
+    /// The program whose subcommands are the roles: this one.
+    pub program: PathBuf,
+    /// Roles that somebody else starts.
+    pub external: Vec<String>,
+    /// Refuse to run without every privilege that was asked for.
+    pub require_realtime: bool,
+    /// The signal that asked the run to end; 0 while none has.
+    pub signal: &'a AtomicUsize,
+    /// Called now and then.
+    pub progress: &'a mut dyn FnMut(&Progress<'_>),
+}
+
+/// How far a run is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Progress<'a> {
+    /// Waits for roles; these are started by somebody else, in this domain.
+    Waiting {
+        /// Roles that are not ready.
+        roles: Vec<&'a str>,
+        /// External roles among them.
+        external: Vec<&'a str>,
+        /// The domain's directory.
+        domain: PathBuf,
+    },
+    /// Ticks run.
+    Running {
+        /// The last tick scored.
+        tick: u64,
+        /// The last tick of the run.
+        last_tick: u64,
+        /// The latest value of the rig's first metric.
+        metric: f64,
+    },
+}
+
+/// Why a run failed. Whatever had been started is gone.
+#[derive(Debug, thiserror::Error)]
+pub enum LaunchError {
+    /// The domain could not be made.
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    /// A link failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A file of the domain could not be written.
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A process could not be started.
+    #[error("cannot start {role}: {source}")]
+    Spawn {
+        /// The role.
+        role: String,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A role ended before its time.
+    #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; it said: {last_words}") })]
+    Died {
+        /// The role.
+        role: String,
+        /// Exit status or signal.
+        cause: String,
+        /// The end of its error output.
+        last_words: String,
+    },
+    /// Roles were not ready in time.
+    #[error("not ready within {limit_s} s: {roles}; on a slow machine raise launch.startup_timeout_s")]
+    StartUp {
+        /// The limit.
+        limit_s: f64,
+        /// The roles.
+        roles: String,
+    },
+    /// Roles stopped making progress.
+    #[error("no progress for {limit_s} s; furthest behind: {roles}")]
+    Hung {
+        /// The limit.
+        limit_s: f64,
+        /// The roles.
+        roles: String,
+    },
+    /// A privilege was required and not granted.
+    #[error("required and not granted: {}", denied.iter().map(|(role, grant)| format!("{role}: {} {} ({})", grant.privilege, grant.asked, grant.reason)).collect::<Vec<_>>().join("; "))]
+    Privileges {
+        /// Role and privilege.
+        denied: Vec<(String, Grant)>,
+    },
+}
+
+/// Runs a scenario to its end.
+///
+/// # Errors
+/// [`LaunchError`] if the run could not be started, or a role failed.
+pub fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
+    match scenario.clock {
+        ClockKind::InProcess => in_process::run(scenario, launch),
+        ClockKind::Realtime | ClockKind::Lockstep => processes::run(scenario, launch),
+    }
+}

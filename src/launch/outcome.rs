@@ -1,0 +1,384 @@
+//! What a run came to: verdict, books, hash, latencies; and the files that say so.
+//!
+//! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
+
+use super::Score;
+use crate::config::Scenario;
+use crate::rig::CertificateReport;
+use crate::telemetry::{
+    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, combine, write_hgrm, write_hlog,
+};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Layout version of `summary.json`.
+const SCHEMA: &str = "corotate/summary/v1";
+
+/// Everything that a run left in memory.
+#[derive(Debug)]
+pub struct Outcome {
+    /// The roles' own accounts, in the order of a tick.
+    pub reports: Vec<RoleReport>,
+    /// The score.
+    pub score: Score,
+    /// The launcher's own privileges.
+    pub grants: Vec<Grant>,
+    /// The domain that was used, if there was one.
+    pub domain: Option<PathBuf>,
+    /// The signal that ended the run before its time, or 0.
+    pub signal: usize,
+}
+
+/// A run's summary, as it is written to `summary.json`.
+#[derive(Debug, Serialize)]
+pub struct Summary {
+    schema: &'static str,
+    version: &'static str,
+    revision: &'static str,
+    /// The scenario's name.
+    pub scenario: String,
+    /// The clock's name.
+    pub clock: &'static str,
+    /// Ticks per second.
+    pub tick_hz: f64,
+    /// The last tick of the scenario.
+    pub last_tick: u64,
+    started_utc: String,
+    host: Host,
+    domain: Option<PathBuf>,
+    /// The signal that ended the run before its time, or 0.
+    pub signal: usize,
+    /// Whether every criterion that could be judged holds.
+    pub accepted: bool,
+    /// One entry per criterion.
+    pub criteria: Vec<Criterion>,
+    /// The score.
+    pub score: Score,
+    /// What is proven of the loop.
+    pub certificates: Vec<CertificateReport>,
+    /// The books.
+    pub books: Books,
+    /// The state hash.
+    pub state: State,
+    /// One entry per role and stage, in the order of a tick.
+    pub latencies: Vec<StageFigures>,
+    /// Everything that was asked of the machine.
+    pub privileges: Vec<RoleGrant>,
+}
+
+/// A criterion and its verdict.
+#[derive(Debug, Clone, Serialize)]
+pub struct Criterion {
+    /// The key in `[accept]`.
+    pub name: String,
+    /// The limit.
+    pub limit: f64,
+    /// The value; none if it was not measured.
+    pub value: Option<f64>,
+    /// Whether it holds; none if it cannot be judged.
+    pub holds: Option<bool>,
+}
+
+/// The books of a run.
+#[derive(Debug, Serialize)]
+pub struct Books {
+    /// Whether they balance.
+    pub balanced: bool,
+    /// Where they do not.
+    pub problems: Vec<String>,
+    /// Per role.
+    pub roles: BTreeMap<String, Ticks>,
+    /// Per reading end.
+    pub links: Vec<LinkBook>,
+    /// Ticks missed or starved, all roles together.
+    pub missed_ticks: u64,
+}
+
+/// One reading end beside its writing end.
+#[derive(Debug, Serialize)]
+pub struct LinkBook {
+    /// The service.
+    pub service: String,
+    /// The reading role.
+    pub reader: String,
+    /// Samples sent.
+    pub published: u64,
+    /// Samples received.
+    pub received: u64,
+    /// Ticks for which the writer sent none.
+    pub skipped: u64,
+    /// Ticks for which the reader received none, up to its last.
+    pub gaps: u64,
+    /// Sent after the reader's last look.
+    pub unread: u64,
+}
+
+/// The state hash of a run, comparable between clocks.
+#[derive(Debug, Serialize)]
+pub struct State {
+    /// The hash over everything that was published.
+    pub hash: String,
+    /// The first tick whose samples may differ from an undisturbed run's, if any.
+    pub first_disturbed_tick: Option<u64>,
+    /// How many ticks from the first on are covered by `clean_hash`.
+    pub clean_ticks: u64,
+    /// The hash over those ticks.
+    pub clean_hash: String,
+    #[serde(skip)]
+    checkpoints: Vec<(u64, u64)>,
+}
+
+/// One stage's figures.
+#[derive(Debug, Serialize)]
+pub struct StageFigures {
+    /// The role.
+    pub role: String,
+    /// The stage.
+    pub stage: String,
+    /// The figures.
+    #[serde(flatten)]
+    pub figures: Percentiles,
+    #[serde(skip)]
+    latency: Latency,
+}
+
+/// A privilege of a role.
+#[derive(Debug, Serialize)]
+pub struct RoleGrant {
+    /// The role, or `launcher`.
+    pub role: String,
+    /// What it asked for and got.
+    #[serde(flatten)]
+    pub grant: Grant,
+}
+
+#[derive(Debug, Serialize)]
+struct Host {
+    name: String,
+    kernel: String,
+    cores: usize,
+    cpu: String,
+}
+
+impl Summary {
+    /// Draws up the summary of a run that began at `started`.
+    pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
+        let latencies = latencies(&outcome.reports);
+        let books = Books::new(scenario, &outcome.reports, outcome.signal != 0);
+        let criteria = judge(scenario, outcome, &books, &latencies);
+        Self {
+            schema: SCHEMA,
+            version: env!("CARGO_PKG_VERSION"),
+            revision: env!("COROTATE_REVISION"),
+            scenario: scenario.name.clone(),
+            clock: scenario.clock.name(),
+            tick_hz: 1e9 / scenario.period_ns as f64,
+            last_tick: scenario.last_tick,
+            started_utc: started.to_string(),
+            host: Host::this(),
+            domain: outcome.domain.clone(),
+            signal: outcome.signal,
+            accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
+            criteria,
+            score: outcome.score.clone(),
+            certificates: scenario.rig.certificates(),
+            state: State::new(&outcome.reports, &books),
+            books,
+            latencies,
+            privileges: privileges(outcome),
+        }
+    }
+}
+
+impl Books {
+    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool) -> Self {
+        let mut problems = Vec::new();
+        let written: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
+        for report in reports {
+            let Ticks { elapsed, executed, missed, .. } = report.ticks;
+            if executed + missed != elapsed || (!interrupted && elapsed != scenario.last_tick + 1) {
+                problems.push(format!("{}: {executed} executed + {missed} missed of {elapsed} ticks", report.role));
+            }
+        }
+        for link in &written {
+            if link.published + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
+                problems.push(format!("{}: published and skipped do not add up", link.service));
+            }
+        }
+        let mut links = Vec::new();
+        for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
+            if let Some(written) = written.iter().find(|written| written.service == read.service) {
+                links.push(LinkBook::new(&report.role, written, read, scenario, &mut problems));
+            }
+        }
+        Self {
+            balanced: problems.is_empty(),
+            problems,
+            missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
+            roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
+            links,
+        }
+    }
+}
+
+impl LinkBook {
+    fn new(
+        reader: &str,
+        written: &LinkWritten,
+        read: &LinkRead,
+        scenario: &Scenario,
+        problems: &mut Vec<String>,
+    ) -> Self {
+        let covered = read.last_tick.map_or(0, |tick| tick + 1);
+        let book = Self {
+            service: read.service.clone(),
+            reader: reader.to_owned(),
+            published: written.published,
+            received: read.received,
+            skipped: written.skipped,
+            gaps: read.gaps,
+            unread: written.last_tick.map_or(0, |tick| tick + 1).saturating_sub(covered),
+        };
+        let lossless = scenario.clock != crate::config::ClockKind::Realtime;
+        let balanced = read.received + read.gaps == covered
+            && read.last_tick <= written.last_tick
+            && read.stale == 0
+            && book.published + book.skipped == book.received + book.gaps + book.unread
+            && (!lossless || read.gaps == 0);
+        if !balanced {
+            problems.push(format!(
+                "{} at {reader}: {} published, {} received, {} gaps, {} stale",
+                book.service, book.published, book.received, book.gaps, read.stale
+            ));
+        }
+        book
+    }
+}
+
+impl State {
+    fn new(reports: &[RoleReport], books: &Books) -> Self {
+        let mut links: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
+        links.sort_by(|a, b| a.service.cmp(&b.service));
+        let stride = links.iter().map(|link| link.hash.stride).max().unwrap_or(1);
+        let count = links.iter().map(|link| link.hash.hashes.len()).min().unwrap_or(0);
+        let checkpoints: Vec<(u64, u64)> = (0..count)
+            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|link| link.hash.hashes[index]))))
+            .collect();
+        let first_disturbed_tick = books.roles.values().filter_map(|ticks| ticks.first_disturbed).min();
+        let clean =
+            checkpoints.iter().rev().find(|(ticks, _)| first_disturbed_tick.is_none_or(|first| *ticks <= first));
+        let (clean_ticks, clean_hash) = clean.copied().unwrap_or((0, 0));
+        let hash = combine(links.iter().map(|link| link.hash.last));
+        Self {
+            hash: format!("{hash:016x}"),
+            first_disturbed_tick,
+            clean_ticks,
+            clean_hash: format!("{clean_hash:016x}"),
+            checkpoints,
+        }
+    }
+}
+
+fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {
+    let figures = |report: &RoleReport, stage: &crate::telemetry::StageReport| {
+        let latency = stage.latency();
+        StageFigures { role: report.role.clone(), stage: stage.stage.clone(), figures: latency.percentiles(), latency }
+    };
+    reports.iter().flat_map(|report| report.stages.iter().map(move |stage| figures(report, stage))).collect()
+}
+
+fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {
+    let own = outcome.grants.iter().map(|grant| RoleGrant { role: "launcher".to_owned(), grant: grant.clone() });
+    let roles = outcome.reports.iter().flat_map(|report| {
+        report.grants.iter().map(|grant| RoleGrant { role: report.role.clone(), grant: grant.clone() })
+    });
+    own.chain(roles).collect()
+}
+
+fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[StageFigures]) -> Vec<Criterion> {
+    let accept = &scenario.accept;
+    let mut criteria = Vec::new();
+    let mut add = |name: String, limit: f64, value: Option<f64>, judged: bool| {
+        let holds = judged.then(|| value.is_some_and(|value| value <= limit));
+        criteria.push(Criterion { name, limit, value, holds });
+    };
+    for (metric, limit) in &accept.metric_max {
+        let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
+        add(format!("{metric}_max"), *limit, score.and_then(|score| score.settled_max), true);
+    }
+    if let Some(limit) = accept.missed_ticks_max {
+        add("missed_ticks_max".to_owned(), limit as f64, Some(books.missed_ticks as f64), true);
+    }
+    if let Some(limit) = accept.step_latency_p99_us_max {
+        let step = |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
+        let worst = latencies.iter().filter(step).map(|stage| stage.figures.p99_us).reduce(f64::max);
+        // Without a clock there is no latency to judge; in real time a missing one is a failure.
+        let judged = scenario.clock == crate::config::ClockKind::Realtime;
+        add("step_latency_p99_us_max".to_owned(), limit, worst, judged);
+    }
+    criteria
+}
+
+impl Host {
+    fn this() -> Self {
+        let system = rustix::system::uname();
+        let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+        let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+        Self {
+            name: system.nodename().to_string_lossy().into_owned(),
+            kernel: format!("{} {}", system.release().to_string_lossy(), system.version().to_string_lossy()),
+            cores: std::thread::available_parallelism().map_or(0, usize::from),
+            cpu: model.map_or("unknown".to_owned(), |(_, name)| name.trim().to_owned()),
+        }
+    }
+}
+
+/// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `hashes.txt`, `latency/`.
+///
+/// # Errors
+/// Those of the file system, with the file's name.
+pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io::Result<()> {
+    write(&directory.join("scenario.toml"), |out| out.write_all(scenario.to_toml().as_bytes()))?;
+    write(&directory.join("summary.json"), |out| {
+        serde_json::to_writer_pretty(&mut *out, summary)?;
+        writeln!(out)
+    })?;
+    write(&directory.join("hashes.txt"), |out| {
+        writeln!(out, "# ticks covered, hash over everything published in them")?;
+        summary.state.checkpoints.iter().try_for_each(|(ticks, hash)| writeln!(out, "{ticks} {hash:016x}"))
+    })?;
+    if summary.latencies.is_empty() {
+        return Ok(());
+    }
+    let latency = directory.join("latency");
+    fs::create_dir_all(&latency).map_err(|error| named(&latency, &error))?;
+    for stage in &summary.latencies {
+        let path = latency.join(format!("{}.{}.hgrm", stage.role, stage.stage));
+        write(&path, |out| write_hgrm(&stage.latency, out))?;
+    }
+    let names: Vec<String> = summary.latencies.iter().map(|stage| format!("{}.{}", stage.role, stage.stage)).collect();
+    let run_s = summary.last_tick as f64 / summary.tick_hz;
+    write(&latency.join("latency.hlog"), |out| {
+        write_hlog(
+            names.iter().map(String::as_str).zip(summary.latencies.iter().map(|stage| &stage.latency)),
+            run_s,
+            out,
+        )
+    })
+}
+
+fn write(path: &Path, content: impl FnOnce(&mut BufWriter<fs::File>) -> io::Result<()>) -> io::Result<()> {
+    let attempt = || {
+        let mut out = BufWriter::new(fs::File::create(path)?);
+        content(&mut out)?;
+        out.flush()
+    };
+    attempt().map_err(|error: io::Error| named(path, &error))
+}
+
+fn named(path: &Path, error: &io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
+}

@@ -1,0 +1,184 @@
+//! Scores a run from the truth and the estimates, which nobody in the loop ever sees together.
+//!
+//! Must not hold the loop up, except by the credit it gives in lockstep.
+
+use crate::bus::{Bus, BusError, Reader, Signal};
+use crate::config::{Accept, Scenario};
+use crate::rig::{Estimate, Rig, Truth};
+use crate::runtime::{Input, Seek, topic};
+use crate::with_rig;
+use serde::Serialize;
+
+/// The score of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Score {
+    /// Ticks at which every sample was there.
+    pub scored_ticks: u64,
+    /// Ticks at which some sample was missing.
+    pub unscored_ticks: u64,
+    /// One entry per metric of the rig.
+    pub metrics: Vec<MetricScore>,
+}
+
+/// The score by one metric.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MetricScore {
+    /// Its name; the unit is the last part.
+    pub name: String,
+    /// At the last tick that could be scored.
+    pub last: f64,
+    /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
+    pub settled_max: Option<f64>,
+    /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
+    pub settled_at_s: Option<f64>,
+    #[serde(skip)]
+    last_above: Option<u64>,
+}
+
+/// Follows a run.
+pub trait Scorer {
+    /// Scores up to `budget` ticks that have arrived; returns how many.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn poll(&mut self, budget: u64) -> Result<u64, BusError>;
+    /// The next tick to score: every tick before it has been consumed.
+    fn next_tick(&self) -> u64;
+    /// The latest value of the first metric.
+    fn latest(&self) -> f64;
+    /// Scores what is there, complete or not, and closes the account.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn finish(&mut self) -> Result<Score, BusError>;
+}
+
+/// Opens a scorer on the run's bus.
+///
+/// # Errors
+/// [`BusError::Open`].
+pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B) -> Result<Box<dyn Scorer>, BusError> {
+    fn typed<R: Rig, B: Bus + 'static>(rig: &R, scenario: &Scenario, bus: &B) -> Result<Box<dyn Scorer>, BusError> {
+        Ok(Box::new(RigScorer::open(rig, scenario, bus)?))
+    }
+    with_rig!(&scenario.rig, rig => typed(rig, scenario, bus))
+}
+
+struct RigScorer<R: Rig, B: Bus> {
+    rig: R,
+    accept: Accept,
+    tick_s: f64,
+    truths: Vec<Input<B, Truth<R>>>,
+    estimate: Input<B, Estimate<R>>,
+    next_tick: u64,
+    last_tick: u64,
+    values: Vec<f64>,
+    score: Score,
+}
+
+impl<R: Rig, B: Bus> RigScorer<R, B> {
+    fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
+        let bodies = rig.bodies().iter();
+        let metric = |name: &&str| MetricScore {
+            name: (*name).to_owned(),
+            last: f64::NAN,
+            settled_max: None,
+            settled_at_s: None,
+            last_above: None,
+        };
+        Ok(Self {
+            rig: rig.clone(),
+            accept: scenario.accept.clone(),
+            tick_s: scenario.tick_s(),
+            truths: bodies
+                .map(|body| Input::open(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
+                .collect::<Result<_, _>>()?,
+            estimate: Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
+            next_tick: 0,
+            last_tick: scenario.last_tick,
+            values: vec![f64::NAN; rig.metrics().len()],
+            score: Score { scored_ticks: 0, unscored_ticks: 0, metrics: rig.metrics().iter().map(metric).collect() },
+        })
+    }
+
+    /// Whether no sample of the next tick can still come.
+    fn settled(&mut self) -> Result<bool, BusError> {
+        let mut settled = self.estimate.seek(self.next_tick)? != Seek::NotYet;
+        for truth in &mut self.truths {
+            settled &= truth.seek(self.next_tick)? != Seek::NotYet;
+        }
+        Ok(settled)
+    }
+
+    fn score_tick(&mut self) {
+        let tick = self.next_tick;
+        let estimate = at(&self.estimate, tick);
+        let complete = estimate.is_some() && self.truths.iter().all(|truth| at(truth, tick).is_some());
+        *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
+        self.rig.score(|body| at(&self.truths[body], tick), estimate, &mut self.values);
+        let time_s = tick as f64 * self.tick_s;
+        for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
+            metric.take(tick, value, &self.accept, time_s);
+        }
+        self.next_tick += 1;
+    }
+}
+
+/// The sample at hand if it is that tick's.
+fn at<B: Bus, S: crate::sample::Sample>(input: &Input<B, S>, tick: u64) -> Option<&S> {
+    input.sample().filter(|sample| sample.stamp().tick == tick)
+}
+
+impl MetricScore {
+    fn take(&mut self, tick: u64, value: f64, accept: &Accept, time_s: f64) {
+        if value.is_nan() {
+            return;
+        }
+        self.last = value;
+        if time_s >= accept.settled_by_s {
+            self.settled_max = Some(self.settled_max.map_or(value, |worst| worst.max(value)));
+        }
+        if accept.metric_max.get(&self.name).is_some_and(|limit| value > *limit) {
+            self.last_above = Some(tick);
+        }
+    }
+}
+
+impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
+    fn poll(&mut self, budget: u64) -> Result<u64, BusError> {
+        let before = self.next_tick;
+        while self.next_tick <= self.last_tick && self.next_tick < before + budget && self.settled()? {
+            self.score_tick();
+        }
+        Ok(self.next_tick - before)
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.next_tick
+    }
+
+    fn latest(&self) -> f64 {
+        self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
+    }
+
+    fn finish(&mut self) -> Result<Score, BusError> {
+        // What has not come by now never will: go on as long as anything newer waits anywhere.
+        loop {
+            self.poll(u64::MAX)?;
+            let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.next_tick);
+            let more = newest(self.estimate.report().last_tick)
+                || self.truths.iter().any(|truth| newest(truth.report().last_tick));
+            if !more || self.next_tick > self.last_tick {
+                break;
+            }
+            self.score_tick();
+        }
+        let (tick_s, ticks) = (self.tick_s, self.next_tick);
+        for metric in &mut self.score.metrics {
+            let first_within = metric.last_above.map_or(0, |tick| tick + 1);
+            let limited = self.accept.metric_max.contains_key(&metric.name);
+            metric.settled_at_s = (limited && first_within < ticks).then_some(first_within as f64 * tick_s);
+        }
+        Ok(self.score.clone())
+    }
+}

@@ -1,0 +1,115 @@
+//! The end of a run on the screen.
+
+use super::Summary;
+use comfy_table::presets::NOTHING;
+use comfy_table::{CellAlignment, Table};
+use std::fmt::Write;
+
+/// The summary as text for people, at most 100 columns wide.
+pub fn table(summary: &Summary) -> String {
+    let mut text = String::new();
+    let seconds = summary.last_tick as f64 / summary.tick_hz;
+    let _ = writeln!(
+        text,
+        "{}: {} at {} Hz, {} ticks ({seconds} s)",
+        summary.scenario,
+        summary.clock,
+        summary.tick_hz,
+        summary.last_tick + 1
+    );
+    results(summary, &mut text);
+    if !summary.latencies.is_empty() {
+        let _ = writeln!(text, "\n{}", latencies(summary));
+    }
+    books(summary, &mut text);
+    privileges(summary, &mut text);
+    text
+}
+
+fn results(summary: &Summary, text: &mut String) {
+    let mut rows = plain(&["result", "at the end", "settled max", "limit", "within from", "verdict"]);
+    for metric in &summary.score.metrics {
+        let criterion = summary.criteria.iter().find(|criterion| criterion.name == format!("{}_max", metric.name));
+        rows.add_row([
+            metric.name.clone(),
+            format!("{:.2e}", metric.last),
+            metric.settled_max.map_or("-".to_owned(), |value| format!("{value:.2e}")),
+            criterion.map_or("-".to_owned(), |criterion| format!("{:.0e}", criterion.limit)),
+            metric.settled_at_s.map_or("-".to_owned(), |time| format!("{time:.3} s")),
+            verdict(criterion.and_then(|criterion| criterion.holds)),
+        ]);
+    }
+    let of_metric = |name: &str| summary.score.metrics.iter().any(|metric| name == format!("{}_max", metric.name));
+    for criterion in summary.criteria.iter().filter(|criterion| !of_metric(&criterion.name)) {
+        let value = criterion.value.map_or("not measured".to_owned(), |value| format!("{value}"));
+        let limit = format!("{}", criterion.limit);
+        rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
+    }
+    let _ = writeln!(text, "\n{rows}");
+}
+
+fn verdict(holds: Option<bool>) -> String {
+    match holds {
+        Some(true) => "holds",
+        Some(false) => "FAILS",
+        None => "-",
+    }
+    .to_owned()
+}
+
+fn latencies(summary: &Summary) -> Table {
+    let mut rows = plain(&["latency, us", "stage", "count", "p50", "p90", "p99", "p99.9", "max"]);
+    for stage in &summary.latencies {
+        let f = &stage.figures;
+        let mut row = vec![stage.role.clone(), stage.stage.clone(), f.count.to_string()];
+        row.extend([f.p50_us, f.p90_us, f.p99_us, f.p999_us, f.max_us].map(|us| format!("{us:.2}")));
+        rows.add_row(row);
+    }
+    rows
+}
+
+fn books(summary: &Summary, text: &mut String) {
+    let (books, state) = (&summary.books, &summary.state);
+    let executed: u64 = books.roles.values().map(|ticks| ticks.executed).sum();
+    let _ = writeln!(
+        text,
+        "\nbooks {}: {executed} ticks executed by {} roles, {} missed or starved; {} of {} ticks scored",
+        if books.balanced { "balance" } else { "DO NOT BALANCE" },
+        books.roles.len(),
+        books.missed_ticks,
+        summary.score.scored_ticks,
+        summary.score.scored_ticks + summary.score.unscored_ticks,
+    );
+    for problem in &books.problems {
+        let _ = writeln!(text, "  {problem}");
+    }
+    let _ = match state.first_disturbed_tick {
+        None => writeln!(text, "state hash {} (every tick undisturbed)", state.hash),
+        Some(tick) => writeln!(
+            text,
+            "state hash {}; first disturbed tick {tick}, hash of the {} ticks before {}",
+            state.hash, state.clean_ticks, state.clean_hash
+        ),
+    };
+}
+
+fn privileges(summary: &Summary, text: &mut String) {
+    if summary.privileges.is_empty() {
+        return;
+    }
+    let granted = summary.privileges.iter().filter(|entry| entry.grant.granted).count();
+    let _ = writeln!(text, "privileges: {granted} of {} granted", summary.privileges.len());
+    for entry in summary.privileges.iter().filter(|entry| !entry.grant.granted) {
+        let grant = &entry.grant;
+        let _ = writeln!(text, "  {}: {} {} not granted: {}", entry.role, grant.privilege, grant.asked, grant.reason);
+    }
+}
+
+fn plain(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table.load_style(NOTHING).set_header(header);
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    table
+}

@@ -1,0 +1,45 @@
+//! corotate: bodies move together although not everything about them can be measured.
+//!
+//! This file is the map of the crate and holds no logic. Arrows between modules point down only:
+//!
+//! | module | duty | builds without `runtime` |
+//! |---|---|---|
+//! | [`model`] | bodies and their motion | yes, `no_std` |
+//! | [`observe`] | invariant relations and the filter that serves them all | yes, `no_std` |
+//! | [`control`] | control laws and their certificates | yes, `no_std` |
+//! | [`sample`] | the fixed-size samples that travel between roles | yes, `no_std` |
+//! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
+//! | `rig` | the registry: which plant, observer and law belong together | no |
+//! | `config` | scenario files: as typed, then as resolved | no |
+//! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
+//! | `clock` | the time grid and how to wait on it | no |
+//! | `telemetry` | histograms and counters, exported after the loop | no |
+//! | `runtime` | drives one role on a bus with a clock | no |
+//! | `launch` | starts, supervises and ends a run; scores it | no |
+//!
+//! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
+//! rigid bodies*; \[SZ\] V. F. Shcherbak, N. V. Zhogoleva, *Identification of the moments of inertia of a rigid body*;
+//! \[S\] S. A. Shatkov, *State observers in the restricted two-body problem*.
+
+#![cfg_attr(not(feature = "runtime"), no_std)]
+
+pub mod control;
+pub mod model;
+pub mod observe;
+pub mod role;
+pub mod sample;
+
+#[cfg(feature = "runtime")]
+pub mod bus;
+#[cfg(feature = "runtime")]
+pub mod clock;
+#[cfg(feature = "runtime")]
+pub mod config;
+#[cfg(feature = "runtime")]
+pub mod launch;
+#[cfg(feature = "runtime")]
+pub mod rig;
+#[cfg(feature = "runtime")]
+pub mod runtime;
+#[cfg(feature = "runtime")]
+pub mod telemetry;

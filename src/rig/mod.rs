@@ -1,0 +1,146 @@
+//! Rigs: which plant, observer and control law belong together, with their parameters.
+//!
+//! A new rig is its mathematics, one file here, one line in each of the three places marked "registry" below, and a
+//! scenario in `config/`. Must not know how roles are driven, nor what carries their samples.
+
+mod rigid_body;
+
+pub use rigid_body::RigidBodyRig;
+
+use crate::config::{Checks, ConfigError, Document, nearest};
+use crate::role::{Body, Estimator, Law};
+use serde::Serialize;
+
+/// The samples of a rig, by signal.
+pub type Truth<R> = <<R as Rig>::Body as Body>::Truth;
+/// The samples of a rig, by signal.
+pub type Measurement<R> = <<R as Rig>::Body as Body>::Measurement;
+/// The samples of a rig, by signal.
+pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
+/// The samples of a rig, by signal.
+pub type Command<R> = <<R as Rig>::Body as Body>::Command;
+
+/// One body of a rig.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BodyInfo {
+    /// The name of its role and its part of service names.
+    pub name: String,
+    /// Whether the controller drives it.
+    pub driven: bool,
+}
+
+/// A plant, an observer and a control law that belong together.
+pub trait Rig: Clone + Send + Sync + 'static {
+    /// The kind of body.
+    type Body: Body;
+    /// What observes the first body.
+    type Estimator: Estimator<Measurement = Measurement<Self>>;
+    /// What drives a driven body.
+    type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>>;
+
+    /// The bodies; the first is the observed one.
+    fn bodies(&self) -> &[BodyInfo];
+    /// A body at its initial state.
+    fn body(&self, index: usize) -> Self::Body;
+    /// The observer at its initial guess.
+    fn estimator(&self) -> Self::Estimator;
+    /// The law of a driven body.
+    fn law(&self, index: usize) -> Self::Law;
+    /// What a run is scored by; the unit is the last part of each name.
+    fn metrics(&self) -> &'static [&'static str];
+    /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample. `truth` gives the
+    /// truth of a body by its index.
+    fn score<'a>(
+        &self,
+        truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
+        estimate: Option<&Estimate<Self>>,
+        out: &mut [f64],
+    );
+    /// What is proven of the closed loop, one entry per driven body.
+    fn certificates(&self) -> Vec<CertificateReport>;
+}
+
+/// A certificate as told to people and written to the summary.
+#[derive(Debug, Clone, Serialize)]
+pub struct CertificateReport {
+    /// The driven body.
+    pub body: String,
+    /// One entry per condition.
+    pub conditions: Vec<ConditionReport>,
+    /// The slowest exponent of the error, 1/s.
+    pub rate_per_s: f64,
+    /// The bound M on the leader's motion.
+    pub rate_bound_rad_s: f64,
+    /// What a careful engineer would change.
+    pub warnings: Vec<String>,
+}
+
+/// One condition of a certificate.
+#[derive(Debug, Clone, Serialize)]
+pub struct ConditionReport {
+    /// Which one, with its source.
+    pub name: String,
+    /// What is there.
+    pub value: f64,
+    /// What it must exceed.
+    pub required: f64,
+    /// Whether it does.
+    pub holds: bool,
+}
+
+/// Registry: any of the rigs.
+#[derive(Debug)]
+pub enum AnyRig {
+    /// Rigid bodies turning about their centres of mass.
+    RigidBody(RigidBodyRig),
+}
+
+/// Registry: runs an expression with the rig at hand, whichever it is.
+#[macro_export]
+macro_rules! with_rig {
+    ($any:expr, $rig:ident => $body:expr) => {
+        match $any {
+            $crate::rig::AnyRig::RigidBody($rig) => $body,
+        }
+    };
+}
+
+impl AnyRig {
+    /// The bodies; the first is the observed one.
+    pub fn bodies(&self) -> &[BodyInfo] {
+        with_rig!(self, rig => rig.bodies())
+    }
+
+    /// What a run is scored by.
+    pub fn metrics(&self) -> &'static [&'static str] {
+        with_rig!(self, rig => rig.metrics())
+    }
+
+    /// What is proven of the closed loop.
+    pub fn certificates(&self) -> Vec<CertificateReport> {
+        with_rig!(self, rig => rig.certificates())
+    }
+}
+
+/// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.
+///
+/// # Errors
+/// [`ConfigError`] for keys that are unknown, missing or of the wrong type.
+pub(crate) fn resolve(
+    name: &str,
+    sections: &Document,
+    tick_s: f64,
+    checks: &mut Checks<'_>,
+) -> Result<(Option<AnyRig>, toml::Table), ConfigError> {
+    // Registry.
+    match name {
+        "rigid-body" => {
+            let (rig, table) = rigid_body::resolve(sections, tick_s, checks)?;
+            Ok((rig.map(AnyRig::RigidBody), table))
+        }
+        _ => {
+            checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &["rigid-body"])));
+            Ok((None, toml::Table::new()))
+        }
+    }
+}

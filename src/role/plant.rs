@@ -1,0 +1,155 @@
+//! The plant: a body behind its sensors and actuators, and the actuators' own protection against silence.
+//!
+//! Logical execution time: what was computed from the measurement of tick k−1 acts from tick k on, never earlier, never
+//! later. Must not need any other role to be alive.
+
+use crate::sample::{Sample, Stamp, status};
+
+/// A body: what moves, what is measured of it, and what holds its input.
+pub trait Body {
+    /// The full state, for recording and scoring.
+    type Truth: Sample;
+    /// What the sensors report.
+    type Measurement: Sample;
+    /// What the actuators take.
+    type Command: Sample;
+
+    /// Takes a new input, to be held until the next. Returns whether it was usable; an unusable one changes nothing.
+    fn apply(&mut self, command: &Self::Command) -> bool;
+    /// Holds the safe input from now on.
+    fn apply_safe(&mut self);
+    /// Writes the full state, with the given status bits, everything but the stamp.
+    fn truth(&self, status: u64, out: &mut Self::Truth);
+    /// Writes the measurement, with the given status bits, everything but the stamp.
+    fn measure(&self, status: u64, out: &mut Self::Measurement);
+    /// Moves the body by `dt_s` seconds under the held input.
+    fn flow(&mut self, dt_s: f64);
+}
+
+/// What ends the safe command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rearm {
+    /// The next command that is in time.
+    Auto,
+    /// Nothing in this run.
+    Manual,
+}
+
+/// How an actuator treats its commands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Actuation {
+    /// Whether the body is driven at all; a free body expects no command and misses none.
+    pub driven: bool,
+    /// After so many consecutive missing commands the safe command takes over. At least 1.
+    pub timeout_ticks: u64,
+    /// What ends it.
+    pub rearm: Rearm,
+}
+
+/// What became of the command due at a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CommandEvent {
+    /// None was due: the body is free or the tick is the first.
+    NotDue,
+    /// It was in time and is applied.
+    Applied,
+    /// It was in time, but the safe command is latched for good.
+    Refused,
+    /// It was absent, late or unusable: the last input is held.
+    Held,
+    /// It was absent for so long that the safe command took over at this tick.
+    Expired,
+    /// It is still absent, and the safe command acts.
+    Safe,
+}
+
+impl CommandEvent {
+    /// Whether a command was due and did not come in time.
+    pub fn missed(self) -> bool {
+        matches!(self, Self::Held | Self::Expired | Self::Safe)
+    }
+}
+
+/// A body with its actuators' expiry logic.
+#[derive(Debug)]
+pub struct Plant<B> {
+    body: B,
+    actuation: Actuation,
+    tick_s: f64,
+    silent_ticks: u64,
+    safe: bool,
+}
+
+impl<B: Body> Plant<B> {
+    /// A plant at its initial state. `tick_s` is the period h in seconds.
+    pub fn new(body: B, actuation: Actuation, tick_s: f64) -> Self {
+        Self { body, actuation, tick_s, silent_ticks: 0, safe: false }
+    }
+
+    /// Whether the plant takes commands.
+    pub fn driven(&self) -> bool {
+        self.actuation.driven
+    }
+
+    /// Decides the input from tick `tick` on: the command computed from measurement `tick` − 1, if it is there.
+    #[inline]
+    pub fn command(&mut self, tick: u64, command: Option<&B::Command>) -> CommandEvent {
+        if !self.actuation.driven || tick == 0 {
+            return CommandEvent::NotDue;
+        }
+        let latched = self.safe && self.actuation.rearm == Rearm::Manual;
+        match command.filter(|command| command.stamp().tick == tick - 1) {
+            Some(_) if latched => CommandEvent::Refused,
+            Some(command) if self.body.apply(command) => {
+                self.silent_ticks = 0;
+                self.safe = false;
+                CommandEvent::Applied
+            }
+            _ => self.silence(),
+        }
+    }
+
+    fn silence(&mut self) -> CommandEvent {
+        self.silent_ticks += 1;
+        if self.safe {
+            CommandEvent::Safe
+        } else if self.silent_ticks >= self.actuation.timeout_ticks {
+            self.safe = true;
+            self.body.apply_safe();
+            CommandEvent::Expired
+        } else {
+            CommandEvent::Held
+        }
+    }
+
+    /// Writes the measurement of the present state under the given stamp.
+    #[inline]
+    pub fn measure(&self, stamp: &Stamp, out: &mut B::Measurement) {
+        self.body.measure(self.status(), out);
+        *out.stamp_mut() = *stamp;
+    }
+
+    /// Writes the present state under the given stamp.
+    #[inline]
+    pub fn truth(&self, stamp: &Stamp, out: &mut B::Truth) {
+        self.body.truth(self.status(), out);
+        *out.stamp_mut() = *stamp;
+    }
+
+    /// Moves the body on by `ticks` ticks, the input held.
+    #[inline]
+    pub fn advance(&mut self, ticks: u64) {
+        // Tick by tick, not in one flow of ticks·h: what an executed and a skipped tick do to the body is the same.
+        for _ in 0..ticks {
+            self.body.flow(self.tick_s);
+        }
+    }
+
+    fn status(&self) -> u64 {
+        match (self.safe, self.silent_ticks > 0) {
+            (true, _) => status::SAFE,
+            (false, true) => status::HOLDING,
+            (false, false) => 0,
+        }
+    }
+}

@@ -1,0 +1,250 @@
+//! Decides when a node runs: by the time grid, or by its inputs. One driver per clock.
+//!
+//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then naps; what is late is skipped
+//! and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
+
+use super::WINDOW_TICKS;
+use super::node::{Gate, Node, Poll, ReadyNode};
+use crate::bus::{Bus, BusError, Read, Write};
+use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
+use crate::config::Realtime;
+use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// How often a role looks at the schedule and says how it is, ns.
+const TURN_NS: u64 = 20_000_000;
+/// How long a role naps between two looks for a sample that did not come within the spin, ns.
+const NAP_NS: u64 = 50_000;
+/// How long after its last tick a role still waits for inputs, ns and periods.
+const GRACE_NS: u64 = 1_000_000_000;
+const GRACE_PERIODS: u64 = 5;
+/// Lockstep turns between two looks at the schedule.
+const TURN_TICKS: u64 = 256;
+
+/// How a drive ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// The last tick is done.
+    Finished,
+    /// The launcher or a signal said stop.
+    Stopped,
+}
+
+/// A role's line to the launcher.
+pub struct Control<'a, B: Bus> {
+    schedule: B::Reader<Schedule>,
+    health: B::Writer<Health>,
+    generation: u64,
+    denied: u64,
+    terminated: &'a AtomicBool,
+}
+
+impl<'a, B: Bus> Control<'a, B> {
+    /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
+    /// that asks the process to end.
+    pub fn new(
+        schedule: B::Reader<Schedule>,
+        health: B::Writer<Health>,
+        generation: u64,
+        denied: u64,
+        terminated: &'a AtomicBool,
+    ) -> Self {
+        Self { schedule, health, generation, denied, terminated }
+    }
+
+    /// Tells the launcher how the role is.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn announce(&mut self, state: RoleState, node: &dyn Node) -> Result<(), BusError> {
+        let (ticks, generation, denied) = (node.ticks(), self.generation, self.denied);
+        self.health.send(|health| {
+            let sent_ns = monotonic_ns();
+            health.stamp = Stamp { tick: ticks.elapsed, generation, origin_ns: sent_ns, sent_ns };
+            health.state = state as u64;
+            health.executed = ticks.executed;
+            health.missed = ticks.missed;
+            health.denied = denied;
+        })?;
+        self.health.prepare()
+    }
+
+    /// The launcher's last word.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn schedule(&mut self) -> Result<Schedule, BusError> {
+        while self.schedule.advance()? {}
+        Ok(self.schedule.current().copied().unwrap_or_default())
+    }
+
+    /// Whether the run is over for this role.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn stopped(&mut self) -> Result<bool, BusError> {
+        Ok(self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop)
+    }
+}
+
+/// What a driver needs besides its node.
+pub struct Drive<'a, 'b, B: Bus> {
+    control: &'a mut Control<'b, B>,
+    last_tick: u64,
+    next_turn_ns: u64,
+}
+
+impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
+    /// A drive up to `last_tick`.
+    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64) -> Self {
+        Self { control, last_tick, next_turn_ns: 0 }
+    }
+
+    /// Drives a node on the time grid.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Ended, BusError> {
+        let lead_ns = (settings.wake_lead_us * 1e3) as u64;
+        while node.next_tick() <= self.last_tick {
+            let due_ns = grid.due_ns(node.next_tick());
+            if self.idle_until(due_ns.saturating_sub(lead_ns), node)? {
+                return Ok(Ended::Stopped);
+            }
+            let executed = if node.time_triggered() {
+                self.on_time(node, grid, lead_ns)?
+            } else {
+                self.on_arrival(node, grid, settings)?
+            };
+            match executed {
+                Some(Poll::Executed) => node.settle()?,
+                Some(Poll::Waiting) => {}
+                None => return Ok(Ended::Stopped),
+            }
+            if self.turn(node)? {
+                return Ok(Ended::Stopped);
+            }
+        }
+        Ok(Ended::Finished)
+    }
+
+    /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
+    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Option<Poll>, BusError> {
+        let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
+        node.poll(Gate::Now { tick: grid.tick_at(now_ns), now_ns }).map(Some)
+    }
+
+    /// Another role's tick: when its inputs are there. Spins for a while, then naps between looks.
+    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Option<Poll>, BusError> {
+        let tick = node.next_tick();
+        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * settings.cutoff) as u64;
+        let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
+        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + (settings.spin_us * 1e3) as u64;
+        loop {
+            let now_ns = monotonic_ns();
+            let gate = if now_ns >= overdue_ns { Gate::Overdue } else { Gate::Arrived };
+            if node.poll(gate)? == Poll::Executed {
+                return Ok(Some(Poll::Executed));
+            }
+            if now_ns < spin_end_ns {
+                std::hint::spin_loop();
+            } else if now_ns > end_ns {
+                node.skip_to(self.last_tick + 1);
+                return Ok(Some(Poll::Waiting));
+            } else {
+                sleep_until(now_ns + NAP_NS);
+                if self.turn(node)? {
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
+    fn idle_until(&mut self, until_ns: u64, node: &dyn Node) -> Result<bool, BusError> {
+        while monotonic_ns() < until_ns {
+            sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
+            if until_ns > monotonic_ns() && self.turn(node)? {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Now and then: how this role is, and whether the run is over.
+    fn turn(&mut self, node: &dyn Node) -> Result<bool, BusError> {
+        let now_ns = monotonic_ns();
+        if now_ns < self.next_turn_ns {
+            return Ok(false);
+        }
+        self.next_turn_ns = now_ns + TURN_NS;
+        self.control.announce(RoleState::Running, node)?;
+        self.control.stopped()
+    }
+
+    /// Drives a node by its inputs alone, at most [`WINDOW_TICKS`] ahead of the slowest consumer.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    pub fn lockstep(&mut self, node: &mut dyn Node) -> Result<Ended, BusError> {
+        let mut up_to = WINDOW_TICKS.min(self.last_tick);
+        let mut backoff = Backoff::default();
+        while node.next_tick() <= self.last_tick {
+            if node.poll(Gate::Inputs { up_to })? == Poll::Executed {
+                node.settle()?;
+                backoff = Backoff::default();
+                if !node.next_tick().is_multiple_of(TURN_TICKS) {
+                    continue;
+                }
+                self.control.announce(RoleState::Running, node)?;
+            } else {
+                backoff.wait();
+            }
+            if self.control.stopped()? {
+                return Ok(Ended::Stopped);
+            }
+            up_to = (self.control.schedule()?.credit_tick + WINDOW_TICKS).min(self.last_tick);
+        }
+        Ok(Ended::Finished)
+    }
+}
+
+/// Waits longer the longer there is nothing to do: spins, then yields, then naps.
+#[derive(Default)]
+pub struct Backoff {
+    rounds: u32,
+}
+
+impl Backoff {
+    /// One round of waiting.
+    pub fn wait(&mut self) {
+        self.rounds = self.rounds.saturating_add(1);
+        match self.rounds {
+            0..50 => std::hint::spin_loop(),
+            50..250 => std::thread::yield_now(),
+            _ => sleep_until(monotonic_ns() + NAP_NS),
+        }
+    }
+}
+
+/// Drives all nodes in one thread, each tick through all of them in the order given.
+///
+/// # Errors
+/// [`BusError`] if a link failed, or if the roles wait for one another in a circle.
+pub fn in_turn(
+    nodes: &mut [ReadyNode],
+    last_tick: u64,
+    mut after_tick: impl FnMut(u64) -> bool,
+) -> Result<Ended, BusError> {
+    for tick in 0..=last_tick {
+        for node in nodes.iter_mut() {
+            if node.poll(Gate::Inputs { up_to: tick })? == Poll::Executed {
+                node.settle()?;
+            }
+        }
+        if !after_tick(tick) {
+            return Ok(Ended::Stopped);
+        }
+    }
+    Ok(Ended::Finished)
+}

@@ -1,0 +1,36 @@
+//! Drives roles: a node is one role on a bus with its books; a driver decides when it runs.
+//!
+//! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
+//! arrive from outside. Must not decide what a run is for, nor start processes.
+
+mod drive;
+mod link;
+mod node;
+mod privileges;
+mod process;
+
+pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use link::{Input, Output, Seek};
+pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, topic};
+pub use privileges::hold_low_latency_idle;
+pub use process::{RoleError, RoleSeat, run_role};
+pub(crate) use process::{report_path, scenario_path, write_whole};
+
+use crate::bus::Depths;
+use crate::config::{ClockKind, Scenario};
+
+/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks.
+pub const WINDOW_TICKS: u64 = 64;
+
+/// How deep the links of a scenario are.
+pub fn depths(scenario: &Scenario) -> Depths {
+    // The scorer looks about every 20 ms; a quarter of a second is slack for a loaded machine.
+    let quarter_second = (250_000_000 / scenario.period_ns).next_power_of_two() as usize;
+    match scenario.clock {
+        ClockKind::Realtime => Depths { role: 1, scorer: quarter_second.clamp(64, 8192) },
+        // Nobody is more than the window ahead of anybody: twice that never overflows.
+        ClockKind::Lockstep | ClockKind::InProcess => {
+            Depths { role: 2 * WINDOW_TICKS as usize, scorer: 2 * WINDOW_TICKS as usize }
+        }
+    }
+}

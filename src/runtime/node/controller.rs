@@ -1,0 +1,176 @@
+//! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
+
+use super::{Gate, Node, Poll, Seat, TickBook};
+use crate::bus::{Bus, BusError, Signal};
+use crate::clock::{Clock, Grid};
+use crate::rig::{Command, Estimate, Measurement, Rig};
+use crate::role::Controller;
+use crate::runtime::link::{Input, Output, Seek};
+use crate::sample::Sample;
+use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+
+/// One driven body, seen from the controller.
+struct Channel<R: Rig, B: Bus> {
+    controller: Controller<R::Law>,
+    measurement: Input<B, Measurement<R>>,
+    command: Output<B, Command<R>>,
+    /// Whether the measurement of the tick at hand is there.
+    ready: bool,
+    /// When the command at hand was begun and sent, ns; sent at 0 if there is none.
+    began_ns: u64,
+    sent_ns: u64,
+}
+
+/// A controller with its links and books.
+pub struct ControllerNode<R: Rig, B: Bus> {
+    estimate: Input<B, Estimate<R>>,
+    channels: Vec<Channel<R, B>>,
+    clock: Clock,
+    book: TickBook,
+    /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
+    origin_ns: u64,
+    estimate_sent_ns: u64,
+    received_ns: u64,
+    hop: Latency,
+    step: Latency,
+    age: Latency,
+}
+
+impl<R: Rig, B: Bus> ControllerNode<R, B> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+        let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+        let channel = |(index, body): (usize, &crate::rig::BodyInfo)| {
+            Ok(Channel {
+                controller: Controller::new(rig.law(index)),
+                measurement: seat.input(&body.name, Signal::Measurement)?,
+                command: seat.output(&body.name, Signal::Command)?,
+                ready: false,
+                began_ns: 0,
+                sent_ns: 0,
+            })
+        };
+        Ok(Self {
+            estimate: seat.input(&rig.bodies()[0].name, Signal::Estimate)?,
+            channels: driven.map(channel).collect::<Result<_, BusError>>()?,
+            clock: seat.clock,
+            book: TickBook::default(),
+            origin_ns: 0,
+            estimate_sent_ns: 0,
+            received_ns: 0,
+            hop: Latency::default(),
+            step: Latency::default(),
+            age: Latency::default(),
+        })
+    }
+
+    /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
+    #[inline]
+    fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
+        if self.estimate.seek(self.book.next)? == Seek::NotYet {
+            return Ok(false);
+        }
+        let Some(estimate) = self.estimate.sample() else { return Ok(false) };
+        let tick = estimate.stamp().tick;
+        let mut complete = true;
+        for channel in &mut self.channels {
+            let found = channel.measurement.seek(tick)?;
+            channel.ready = found == Seek::Found;
+            complete &= found != Seek::NotYet;
+        }
+        Ok(complete || overdue)
+    }
+
+    #[inline]
+    fn execute(&mut self) -> Result<Poll, BusError> {
+        self.received_ns = self.clock.now_ns();
+        let Some(estimate) = self.estimate.sample() else { return Ok(Poll::Waiting) };
+        let stamp = *estimate.stamp();
+        let clock = self.clock;
+        let mut began_ns = self.received_ns;
+        let mut starved = false;
+        for Channel { controller, measurement, command, ready, began_ns: began, sent_ns } in &mut self.channels {
+            let Some(measurement) = measurement.sample().filter(|_| *ready) else {
+                starved = true;
+                continue;
+            };
+            command.send(|sample| {
+                controller.step(estimate, measurement, sample);
+                *sent_ns = clock.now_ns();
+                sample.stamp_mut().sent_ns = *sent_ns;
+            })?;
+            *began = began_ns;
+            began_ns = *sent_ns;
+        }
+        (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
+        self.skip_to(stamp.tick);
+        if starved {
+            self.book.starved(stamp.tick);
+        }
+        Ok(Poll::Executed)
+    }
+}
+
+impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
+    fn time_triggered(&self) -> bool {
+        false
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.book.next
+    }
+
+    fn start(&mut self, _grid: Grid) {}
+
+    #[inline]
+    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next > up_to);
+        if allowed && self.gather(gate == Gate::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
+    }
+
+    #[inline]
+    fn settle(&mut self) -> Result<(), BusError> {
+        let timed = self.clock == Clock::Monotonic;
+        if timed {
+            self.hop.record(self.estimate_sent_ns, self.received_ns);
+        }
+        for channel in self.channels.iter_mut().filter(|channel| channel.ready) {
+            if timed {
+                self.step.record(channel.began_ns, channel.sent_ns);
+                self.age.record(self.origin_ns, channel.sent_ns);
+            }
+            channel.command.settle()?;
+        }
+        self.book.executed();
+        Ok(())
+    }
+
+    fn skip_to(&mut self, tick: u64) {
+        self.book.skip_to(tick);
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        self.estimate.warm_up()?;
+        for channel in &mut self.channels {
+            channel.measurement.warm_up()?;
+            channel.command.warm_up()?;
+        }
+        Ok(())
+    }
+
+    fn ticks(&self) -> Ticks {
+        self.book.report()
+    }
+
+    fn written(&self) -> Vec<LinkWritten> {
+        self.channels.iter().map(|channel| channel.command.report()).collect()
+    }
+
+    fn read(&self) -> Vec<LinkRead> {
+        let measurements = self.channels.iter().map(|channel| channel.measurement.report());
+        std::iter::once(self.estimate.report()).chain(measurements).collect()
+    }
+
+    fn stages(&self) -> Vec<StageReport> {
+        StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+    }
+}

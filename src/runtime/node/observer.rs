@@ -1,0 +1,122 @@
+//! An observer on a bus: the leader's measurement in, the estimate out.
+
+use super::{Gate, Node, Poll, Seat, TickBook};
+use crate::bus::{Bus, BusError, Signal};
+use crate::clock::{Clock, Grid};
+use crate::rig::{Estimate, Measurement, Rig};
+use crate::role::Observer;
+use crate::runtime::link::{Input, Output};
+use crate::sample::Sample;
+use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+
+/// The instants of one executed tick, ns.
+#[derive(Debug, Clone, Copy, Default)]
+struct Instants {
+    origin: u64,
+    sent: u64,
+    received: u64,
+    done: u64,
+}
+
+/// An observer with its links and books.
+pub struct ObserverNode<R: Rig, B: Bus> {
+    observer: Observer<R::Estimator>,
+    measurement: Input<B, Measurement<R>>,
+    estimate: Output<B, Estimate<R>>,
+    clock: Clock,
+    book: TickBook,
+    instants: Instants,
+    hop: Latency,
+    step: Latency,
+    age: Latency,
+}
+
+impl<R: Rig, B: Bus> ObserverNode<R, B> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+        let leader = &rig.bodies()[0].name;
+        Ok(Self {
+            observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),
+            measurement: seat.input(leader, Signal::Measurement)?,
+            estimate: seat.output(leader, Signal::Estimate)?,
+            clock: seat.clock,
+            book: TickBook::default(),
+            instants: Instants::default(),
+            hop: Latency::default(),
+            step: Latency::default(),
+            age: Latency::default(),
+        })
+    }
+
+    #[inline]
+    fn execute(&mut self) -> Result<Poll, BusError> {
+        let received = self.clock.now_ns();
+        let Some(measurement) = self.measurement.sample() else { return Ok(Poll::Waiting) };
+        let stamp = *measurement.stamp();
+        let (observer, clock) = (&mut self.observer, self.clock);
+        let mut done = 0;
+        self.estimate.send(|sample| {
+            observer.step(measurement, sample);
+            done = clock.now_ns();
+            sample.stamp_mut().sent_ns = done;
+        })?;
+        self.instants = Instants { origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
+        self.skip_to(stamp.tick);
+        Ok(Poll::Executed)
+    }
+}
+
+impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
+    fn time_triggered(&self) -> bool {
+        false
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.book.next
+    }
+
+    fn start(&mut self, _grid: Grid) {}
+
+    #[inline]
+    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next > up_to);
+        if allowed && self.measurement.advance()? { self.execute() } else { Ok(Poll::Waiting) }
+    }
+
+    #[inline]
+    fn settle(&mut self) -> Result<(), BusError> {
+        if self.clock == Clock::Monotonic {
+            let Instants { origin, sent, received, done } = self.instants;
+            self.hop.record(sent, received);
+            self.step.record(received, done);
+            self.age.record(origin, done);
+        }
+        self.estimate.settle()?;
+        self.book.executed();
+        Ok(())
+    }
+
+    fn skip_to(&mut self, tick: u64) {
+        self.book.skip_to(tick);
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        self.measurement.warm_up()?;
+        self.estimate.warm_up()
+    }
+
+    fn ticks(&self) -> Ticks {
+        self.book.report()
+    }
+
+    fn written(&self) -> Vec<LinkWritten> {
+        vec![self.estimate.report()]
+    }
+
+    fn read(&self) -> Vec<LinkRead> {
+        vec![self.measurement.report()]
+    }
+
+    fn stages(&self) -> Vec<StageReport> {
+        StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+    }
+}

@@ -1,0 +1,166 @@
+//! A plant on a bus: command in; measurement, then truth out; then the body moves on.
+
+use super::{Gate, Node, Poll, Seat, TickBook};
+use crate::bus::{Bus, BusError, Signal};
+use crate::clock::{Clock, Grid};
+use crate::rig::{Command, Measurement, Rig, Truth};
+use crate::role::{CommandEvent, Plant};
+use crate::runtime::link::{Input, Output, Seek};
+use crate::sample::{Sample, Stamp};
+use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+
+/// A plant with its links and books.
+pub struct PlantNode<R: Rig, B: Bus> {
+    plant: Plant<R::Body>,
+    command: Option<Input<B, Command<R>>>,
+    measurement: Output<B, Measurement<R>>,
+    truth: Output<B, Truth<R>>,
+    clock: Clock,
+    grid: Grid,
+    last_tick: u64,
+    book: TickBook,
+    lateness: Latency,
+    age: Latency,
+    step: Latency,
+}
+
+impl<R: Rig, B: Bus> PlantNode<R, B> {
+    pub fn open(rig: &R, index: usize, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+        let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
+        let command = body.driven.then(|| seat.input(&body.name, Signal::Command)).transpose()?;
+        Ok(Self {
+            plant: Plant::new(rig.body(index), scenario.actuation(body.driven), scenario.tick_s()),
+            command,
+            measurement: seat.output(&body.name, Signal::Measurement)?,
+            truth: seat.output(&body.name, Signal::Truth)?,
+            clock: seat.clock,
+            grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
+            last_tick: scenario.last_tick,
+            book: TickBook::default(),
+            lateness: Latency::default(),
+            age: Latency::default(),
+            step: Latency::default(),
+        })
+    }
+
+    fn inputs_ready(&mut self) -> Result<bool, BusError> {
+        match &mut self.command {
+            Some(command) if self.book.next > 0 => Ok(command.seek(self.book.next - 1)? != Seek::NotYet),
+            _ => Ok(true),
+        }
+    }
+
+    /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
+    fn catch_up(&mut self, tick: u64, now_ns: u64) {
+        for missed in self.book.next..tick {
+            self.lateness.record(self.grid.due_ns(missed), now_ns);
+        }
+        self.skip_to(tick);
+    }
+
+    #[inline]
+    fn execute(&mut self, now_ns: u64) -> Result<Poll, BusError> {
+        let tick = self.book.next;
+        let event = self.take_command(tick, now_ns)?;
+        if event.missed() {
+            self.book.starved(tick);
+        }
+        self.book.ticks.safe += u64::from(matches!(event, CommandEvent::Expired | CommandEvent::Safe));
+        let (plant, clock) = (&self.plant, self.clock);
+        let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
+        self.measurement.send(|sample| {
+            stamp.sent_ns = clock.now_ns();
+            plant.measure(&stamp, sample);
+        })?;
+        Ok(Poll::Executed)
+    }
+
+    #[inline]
+    fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, BusError> {
+        let Some(input) = &mut self.command else { return Ok(self.plant.command(tick, None)) };
+        let found = tick > 0 && input.seek(tick - 1)? == Seek::Found;
+        let command = input.sample().filter(|_| found);
+        let event = self.plant.command(tick, command);
+        if let (CommandEvent::Applied, Some(command), Clock::Monotonic) = (event, command, self.clock) {
+            self.age.record(command.stamp().origin_ns, now_ns);
+        }
+        Ok(event)
+    }
+}
+
+impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
+    fn time_triggered(&self) -> bool {
+        true
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.book.next
+    }
+
+    fn start(&mut self, grid: Grid) {
+        self.grid = grid;
+    }
+
+    #[inline]
+    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        match gate {
+            Gate::Inputs { up_to } if self.book.next <= up_to && self.inputs_ready()? => self.execute(0),
+            Gate::Now { tick, now_ns } => {
+                self.catch_up(tick.min(self.last_tick + 1), now_ns);
+                if self.book.next > self.last_tick {
+                    return Ok(Poll::Waiting);
+                }
+                self.lateness.record(self.grid.due_ns(tick), now_ns);
+                self.execute(now_ns)
+            }
+            Gate::Inputs { .. } | Gate::Arrived | Gate::Overdue => Ok(Poll::Waiting),
+        }
+    }
+
+    #[inline]
+    fn settle(&mut self) -> Result<(), BusError> {
+        let (plant, clock) = (&self.plant, self.clock);
+        let (tick, origin_ns) = (self.book.next, self.grid.due_ns(self.book.next));
+        self.truth.send(|sample| {
+            plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
+        })?;
+        let before_ns = self.clock.now_ns();
+        self.plant.advance(1);
+        if self.clock == Clock::Monotonic {
+            self.step.record(before_ns, self.clock.now_ns());
+        }
+        self.measurement.settle()?;
+        self.truth.settle()?;
+        self.book.executed();
+        Ok(())
+    }
+
+    fn skip_to(&mut self, tick: u64) {
+        let missed = self.book.skip_to(tick);
+        self.plant.advance(missed);
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        if let Some(command) = &mut self.command {
+            command.warm_up()?;
+        }
+        self.measurement.warm_up()?;
+        self.truth.warm_up()
+    }
+
+    fn ticks(&self) -> Ticks {
+        self.book.report()
+    }
+
+    fn written(&self) -> Vec<LinkWritten> {
+        vec![self.measurement.report(), self.truth.report()]
+    }
+
+    fn read(&self) -> Vec<LinkRead> {
+        self.command.iter().map(Input::report).collect()
+    }
+
+    fn stages(&self) -> Vec<StageReport> {
+        StageReport::all(&[("lateness", &self.lateness), ("age", &self.age), ("step", &self.step)])
+    }
+}

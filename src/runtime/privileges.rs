@@ -1,0 +1,138 @@
+//! Real-time privileges: asked for, taken where granted, and reported either way.
+//!
+//! Must not fail a run: whether a missing privilege matters is decided by `--require-rt`.
+
+use super::node::RoleId;
+use crate::config::{Cores, NamedCores, Realtime};
+use crate::telemetry::Grant;
+use rustix::mm::{MlockAllFlags, mlockall};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
+
+/// Locks this process's memory, present and future. To be done before links are opened.
+fn lock_memory() -> io::Result<()> {
+    Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?)
+}
+
+/// Takes what a role asks for, for the calling thread.
+pub fn take(settings: &Realtime, role: RoleId) -> Vec<Grant> {
+    let mut grants = Vec::new();
+    if settings.lock_memory {
+        let remedy = "raise the memlock limit (ulimit -l) or grant CAP_IPC_LOCK";
+        grants.push(grant("locked memory", "all".to_owned(), lock_memory(), remedy));
+    }
+    if let Some(core) = core_of(settings, role) {
+        let mut set = CpuSet::new();
+        set.set(core);
+        let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
+        grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
+    }
+    if settings.priority > 0 {
+        let priority = settings.priority - behind_leader(role);
+        let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
+        grants.push(grant("SCHED_FIFO", priority.to_string(), set_fifo(priority), remedy));
+    }
+    grants
+}
+
+/// Opens `/dev/cpu_dma_latency` and asks for 0 µs. The request lasts as long as the file is open.
+pub fn hold_low_latency_idle(settings: &Realtime) -> (Option<File>, Vec<Grant>) {
+    if !settings.low_latency_idle {
+        return (None, Vec::new());
+    }
+    let opened = OpenOptions::new().write(true).open("/dev/cpu_dma_latency").and_then(|mut file| {
+        file.write_all(&0_i32.to_ne_bytes())?;
+        Ok(file)
+    });
+    let (file, result) = match opened {
+        Ok(file) => (Some(file), Ok(())),
+        Err(error) => (None, Err(error)),
+    };
+    let remedy = "allow this user to write /dev/cpu_dma_latency";
+    (file, vec![grant("low-latency idle", "0 us".to_owned(), result, remedy)])
+}
+
+fn grant(privilege: &str, asked: String, result: io::Result<()>, remedy: &str) -> Grant {
+    let reason = result.as_ref().err().map_or(String::new(), |error| format!("{error}; {remedy}"));
+    Grant { privilege: privilege.to_owned(), asked, granted: result.is_ok(), reason }
+}
+
+/// How far below the leader a role's priority lies: the order in which one tick passes through the roles, so that on a
+/// shared core none that waits by spinning keeps the one it waits for from running.
+fn behind_leader(role: RoleId) -> i32 {
+    match role {
+        RoleId::Plant(0) => 0,
+        RoleId::Plant(_) => 1,
+        RoleId::Observer => 2,
+        RoleId::Controller => 3,
+    }
+}
+
+/// The core of a role: plants in turn from the first core on, observer and controller together on the last.
+fn core_of(settings: &Realtime, role: RoleId) -> Option<usize> {
+    let cores = match &settings.cores {
+        Cores::List(cores) => cores.clone(),
+        Cores::Named(NamedCores::Any) => return None,
+        Cores::Named(NamedCores::Auto) => {
+            let allowed = sched_getaffinity(None).ok()?;
+            (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()
+        }
+    };
+    let (last, plants) = cores.split_last()?;
+    match role {
+        RoleId::Plant(index) if !plants.is_empty() => Some(plants[index % plants.len()]),
+        _ => Some(*last),
+    }
+}
+
+fn set_fifo(priority: i32) -> io::Result<()> {
+    set_scheduler(libc::SCHED_FIFO, priority)
+}
+
+/// Gives the real-time priority of the calling thread back: what follows the last tick must not delay another role's.
+pub fn release() {
+    // Failing to give up what one has harms nobody but the last tick.
+    let _ = set_scheduler(libc::SCHED_OTHER, 0);
+}
+
+#[allow(unsafe_code)]
+fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
+    let parameters = libc::sched_param { sched_priority: priority };
+    // SAFETY: pid 0 is the calling thread, and the pointer is to a live, fully initialised sched_param.
+    match unsafe { libc::sched_setscheduler(0, policy, &raw const parameters) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(cores: &[usize]) -> Realtime {
+        Realtime { cores: Cores::List(cores.to_vec()), ..Realtime::default() }
+    }
+
+    #[test]
+    fn plants_share_the_first_cores_and_the_others_the_last() {
+        let core = |cores: &[usize], role| core_of(&settings(cores), role);
+        assert_eq!(core(&[4, 5], RoleId::Plant(0)), Some(4));
+        assert_eq!(core(&[4, 5], RoleId::Plant(1)), Some(4));
+        assert_eq!(core(&[4, 5], RoleId::Observer), Some(5));
+        assert_eq!(core(&[4, 5, 6], RoleId::Plant(1)), Some(5));
+        assert_eq!(core(&[4, 5, 6], RoleId::Plant(2)), Some(4));
+        assert_eq!(core(&[7], RoleId::Plant(0)), Some(7));
+        assert_eq!(core(&[7], RoleId::Controller), Some(7));
+    }
+
+    #[test]
+    fn what_is_not_granted_is_reported_with_a_remedy() {
+        let grants = take(
+            &Realtime { lock_memory: false, priority: 0, cores: Cores::List(vec![1023]), ..Realtime::default() },
+            RoleId::Observer,
+        );
+        assert_eq!(grants.len(), 1);
+        assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");
+    }
+}

@@ -1,0 +1,240 @@
+//! One role as a process: enter the domain, take privileges, open links, warm up, run, report.
+//!
+//! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
+
+use super::drive::{Control, Drive, Ended};
+use super::node::{self, ReadyNode, RoleId, topic};
+use super::{depths, privileges};
+use crate::bus::domain::{Domain, DomainError};
+use crate::bus::iox::IoxBus;
+use crate::bus::{Bus, BusError, Reader, Signal};
+use crate::clock::{Grid, monotonic_ns, sleep_until};
+use crate::config::{ClockKind, ConfigError, Scenario};
+use crate::sample::{Phase, RoleState, Schedule};
+use crate::telemetry::{Grant, Latency, RoleReport, StageReport};
+use crate::with_rig;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// How often a role looks for the next phase before its ticks, ns.
+const LOOK_NS: u64 = 1_000_000;
+/// Samples that every link carries before the first tick.
+const WARM_UP_SAMPLES: usize = 200;
+/// The pause between them, ns.
+const WARM_UP_PAUSE_NS: u64 = 100_000;
+/// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
+const BASELINE_WAKES: usize = 100;
+const BASELINE_PERIOD_NS: u64 = 1_000_000;
+/// How long a role that is done waits for the launcher's leave, ns.
+const LEAVE_NS: u64 = 10_000_000_000;
+
+/// Which role to take, where.
+#[derive(Debug, Clone)]
+pub struct RoleSeat {
+    /// The domain's directory.
+    pub domain: PathBuf,
+    /// The role's name.
+    pub role: String,
+    /// How often the role has been started in this run, from 1.
+    pub generation: u64,
+}
+
+/// Why a role ended without a report.
+#[derive(Debug, thiserror::Error)]
+pub enum RoleError {
+    /// The domain is none.
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    /// The scenario in the domain was refused.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The scenario has no such role.
+    #[error("there is no role `{role}` in this scenario; it has: {known}")]
+    NoSuchRole {
+        /// As given.
+        role: String,
+        /// The roles there are.
+        known: String,
+    },
+    /// A link failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The launcher did not give the word in time.
+    #[error("no word from the launcher for {waited_s} s; is `corotate run` alive in this domain?")]
+    NoLauncher {
+        /// How long the role waited, s.
+        waited_s: f64,
+    },
+    /// The report could not be written.
+    #[error("cannot write the report {}: {source}", path.display())]
+    Report {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+}
+
+/// The file in a domain that holds the scenario of its run.
+pub fn scenario_path(domain: &Domain) -> PathBuf {
+    domain.root().join("scenario.toml")
+}
+
+/// The file in a domain's directory that a role leaves its report in.
+pub fn report_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.report.json"))
+}
+
+/// Takes a role's seat in a run and serves it to the end. `terminated` is set by a signal that asks the process to end.
+///
+/// # Errors
+/// [`RoleError`].
+pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleError> {
+    let domain = Domain::join(&seat.domain)?;
+    let scenario = Scenario::load(&scenario_path(&domain), &[])?;
+    let roles = RoleId::all(&scenario);
+    let role = *roles.iter().find(|role| role.name(&scenario) == seat.role).ok_or_else(|| RoleError::NoSuchRole {
+        role: seat.role.clone(),
+        known: roles.iter().map(|role| role.name(&scenario)).collect::<Vec<_>>().join(", "),
+    })?;
+    // Before any link is opened, so that the links' memory is locked as it is mapped.
+    let realtime = scenario.clock == ClockKind::Realtime;
+    let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
+    let bus = IoxBus::enter(&domain, &seat.role, depths(&scenario))?;
+    serve(&scenario, role, &bus, seat.generation, terminated, grants, |report| write_report(&domain, report))
+}
+
+fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
+    let path = report_path(domain.root(), &report.role);
+    let failed = |source| RoleError::Report { path: path.clone(), source };
+    let text = serde_json::to_vec(report).map_err(|error| failed(error.into()))?;
+    write_whole(&path, &text).map_err(failed)
+}
+
+/// Writes a file so that nobody ever sees a part of it.
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let part = path.with_extension("part");
+    std::fs::write(&part, bytes)?;
+    std::fs::rename(&part, path)
+}
+
+/// Serves a role on a bus: the phases of a run, from open links to the report.
+fn serve<B: Bus + 'static>(
+    scenario: &Scenario,
+    role: RoleId,
+    bus: &B,
+    generation: u64,
+    terminated: &AtomicBool,
+    grants: Vec<Grant>,
+    deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
+) -> Result<(), RoleError> {
+    let name = role.name(scenario);
+    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, generation))?;
+    let mut control = Control::<B>::new(
+        bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
+        bus.writer(&topic(scenario, name, Signal::Health))?,
+        generation,
+        grants.iter().filter(|grant| !grant.granted).count() as u64,
+        terminated,
+    );
+    let mut stages = Vec::new();
+    let ended = match begin(scenario, role, &mut node, &mut control, &mut stages)? {
+        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule)?,
+        None => Ended::Stopped,
+    };
+    if scenario.clock == ClockKind::Realtime {
+        privileges::release();
+    }
+    stages.extend(node.stages());
+    let report = RoleReport {
+        role: name.to_owned(),
+        ticks: node.ticks(),
+        written: node.written(),
+        read: node.read(),
+        stages,
+        grants,
+    };
+    deliver(&report)?;
+    // Samples may still wait to be read: the links stay open until everybody is done.
+    if ended == Ended::Finished {
+        let leave_ns = monotonic_ns() + LEAVE_NS;
+        while monotonic_ns() < leave_ns && !control.stopped()? {
+            control.announce(RoleState::Done, &*node)?;
+            sleep_until(monotonic_ns() + LOOK_NS);
+        }
+    }
+    Ok(())
+}
+
+/// From open links to the word to run; `None` if the run was stopped before.
+fn begin<B: Bus>(
+    scenario: &Scenario,
+    role: RoleId,
+    node: &mut ReadyNode,
+    control: &mut Control<'_, B>,
+    stages: &mut Vec<StageReport>,
+) -> Result<Option<Schedule>, RoleError> {
+    if await_phase(scenario, node, control, RoleState::Open, Phase::WarmUp)?.is_none() {
+        return Ok(None);
+    }
+    for _ in 0..WARM_UP_SAMPLES {
+        node.warm_up()?;
+        sleep_until(monotonic_ns() + WARM_UP_PAUSE_NS);
+    }
+    if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) {
+        stages.extend(StageReport::all(&[("baseline", &baseline())]));
+    }
+    await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
+}
+
+/// The machine's own lateness on this core at this priority: bare absolute sleeps, nothing else.
+fn baseline() -> Latency {
+    let mut latency = Latency::default();
+    let mut due_ns = monotonic_ns();
+    for _ in 0..BASELINE_WAKES {
+        due_ns += BASELINE_PERIOD_NS;
+        sleep_until(due_ns);
+        latency.record(due_ns, monotonic_ns());
+    }
+    latency
+}
+
+fn await_phase<B: Bus>(
+    scenario: &Scenario,
+    node: &mut ReadyNode,
+    control: &mut Control<'_, B>,
+    state: RoleState,
+    phase: Phase,
+) -> Result<Option<Schedule>, RoleError> {
+    let waited_s = 2.0 * scenario.startup_timeout_s;
+    let end_ns = monotonic_ns() + (waited_s * 1e9) as u64;
+    while monotonic_ns() < end_ns {
+        control.announce(state, &**node)?;
+        if control.stopped()? {
+            return Ok(None);
+        }
+        let schedule = control.schedule()?;
+        if Phase::from_number(schedule.phase) >= phase {
+            return Ok(Some(schedule));
+        }
+        sleep_until(monotonic_ns() + LOOK_NS);
+    }
+    Err(RoleError::NoLauncher { waited_s })
+}
+
+fn drive<B: Bus>(
+    scenario: &Scenario,
+    node: &mut ReadyNode,
+    control: &mut Control<'_, B>,
+    schedule: &Schedule,
+) -> Result<Ended, RoleError> {
+    let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
+    node.start(grid);
+    let mut drive = Drive::new(control, scenario.last_tick);
+    let ended = match scenario.clock {
+        ClockKind::Realtime => drive.realtime(&mut **node, grid, &scenario.realtime),
+        ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
+    };
+    Ok(ended?)
+}

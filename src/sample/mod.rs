@@ -1,0 +1,166 @@
+//! What travels between roles: fixed-size plain data, the same bytes in memory, on the wire and in a recording.
+//!
+//! Every sample is a `repr(C)` struct of `u64` and `f64` without padding, begins with a [`Stamp`], and carries a versioned
+//! type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of layout changes the
+//! version in the name. Must not know how samples travel.
+
+mod rigid;
+mod run;
+
+pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
+pub use run::{Health, Phase, RoleState, Schedule};
+
+/// What every sample begins with.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Stamp {
+    /// The tick k whose instant T_k this sample belongs to.
+    pub tick: u64,
+    /// How often the sender has started in this run, from 1. 0 marks a warm-up sample, which no role uses.
+    pub generation: u64,
+    /// When the tick was due at the body whose measurement began this chain, ns on the monotonic clock. Copied along.
+    pub origin_ns: u64,
+    /// When the sample was handed to the link, ns on the monotonic clock.
+    pub sent_ns: u64,
+}
+
+/// The type of one field's elements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FieldKind {
+    /// Unsigned 64-bit integer.
+    U64,
+    /// IEEE 754 double.
+    F64,
+}
+
+/// Where one field lies within a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Field {
+    /// Its name; the unit is its last part.
+    pub name: &'static str,
+    /// Bytes from the start of the sample.
+    pub offset: usize,
+    /// The type of its elements.
+    pub kind: FieldKind,
+    /// How many elements: 1 for a scalar.
+    pub count: usize,
+}
+
+/// A type that a sample may have as a field: 8-byte elements, so that natural alignment leaves no padding.
+pub trait FieldType {
+    /// The type of the elements.
+    const KIND: FieldKind;
+    /// How many.
+    const COUNT: usize;
+}
+
+impl FieldType for u64 {
+    const KIND: FieldKind = FieldKind::U64;
+    const COUNT: usize = 1;
+}
+
+impl FieldType for f64 {
+    const KIND: FieldKind = FieldKind::F64;
+    const COUNT: usize = 1;
+}
+
+impl<T: FieldType, const N: usize> FieldType for [T; N] {
+    const KIND: FieldKind = T::KIND;
+    const COUNT: usize = N * T::COUNT;
+}
+
+/// A sample: plain bytes, a stamp at the start, a versioned name, a table of its fields.
+pub trait Sample: bytemuck::Pod + Default + PartialEq + core::fmt::Debug + Send + Sync {
+    /// Name and version of the layout, unique among all samples.
+    const TYPE_NAME: &'static str;
+    /// The fields after the stamp, in order.
+    const FIELDS: &'static [Field];
+
+    /// The stamp.
+    fn stamp(&self) -> &Stamp;
+    /// The stamp, to be written.
+    fn stamp_mut(&mut self) -> &mut Stamp;
+
+    /// The bytes of everything but the stamp: what the state hash covers.
+    fn content(&self) -> &[u8] {
+        &bytemuck::bytes_of(self)[size_of::<Stamp>()..]
+    }
+}
+
+/// Defines a sample. `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8.
+macro_rules! sample {
+    ($(#[$doc:meta])* $name:ident = $type_name:literal { $($(#[$field_doc:meta])* $field:ident: $ty:ty,)+ }) => {
+        $(#[$doc])*
+        #[repr(C)]
+        #[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+        pub struct $name {
+            /// When, in which life of the sender, and for which tick.
+            pub stamp: $crate::sample::Stamp,
+            $($(#[$field_doc])* pub $field: $ty,)+
+        }
+
+        impl $crate::sample::Sample for $name {
+            const TYPE_NAME: &'static str = $type_name;
+            const FIELDS: &'static [$crate::sample::Field] = &[$($crate::sample::Field {
+                name: stringify!($field),
+                offset: core::mem::offset_of!($name, $field),
+                kind: <$ty as $crate::sample::FieldType>::KIND,
+                count: <$ty as $crate::sample::FieldType>::COUNT,
+            },)+];
+
+            fn stamp(&self) -> &$crate::sample::Stamp {
+                &self.stamp
+            }
+
+            fn stamp_mut(&mut self) -> &mut $crate::sample::Stamp {
+                &mut self.stamp
+            }
+        }
+
+        const _: () = {
+            let fields = 0 $(+ <$ty as $crate::sample::FieldType>::COUNT)+;
+            assert!(size_of::<$name>() == size_of::<$crate::sample::Stamp>() + 8 * fields);
+            assert!(align_of::<$name>() == 8 && core::mem::offset_of!($name, stamp) == 0);
+        };
+    };
+}
+pub(crate) use sample;
+
+/// Bits of a sample's status word.
+pub mod status {
+    /// The plant had no command for this tick in time and holds the last one.
+    pub const HOLDING: u64 = 1 << 0;
+    /// The plant applies its safe command.
+    pub const SAFE: u64 = 1 << 1;
+    /// The estimate is the configured guess: nothing has been observed yet.
+    pub const INITIAL: u64 = 1 << 2;
+    /// The motion did not reveal the unknown since the last sample: the estimate moved by the model alone.
+    pub const UNOBSERVABLE: u64 = 1 << 3;
+    /// The measurement lacked a component that the observer needs, or was not finite: the estimate is the previous one.
+    pub const UNUSABLE: u64 = 1 << 4;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check<S: Sample>() {
+        let mut next = size_of::<Stamp>();
+        for field in S::FIELDS {
+            assert_eq!(field.offset, next, "{}: {} follows its predecessor", S::TYPE_NAME, field.name);
+            next += 8 * field.count;
+        }
+        assert_eq!(next, size_of::<S>(), "{}: the fields fill the sample", S::TYPE_NAME);
+        assert_eq!(S::default().content().len() + size_of::<Stamp>(), size_of::<S>());
+    }
+
+    #[test]
+    fn the_field_tables_describe_the_bytes() {
+        check::<RateTruth>();
+        check::<RateMeasurement>();
+        check::<RateEstimate>();
+        check::<RateCommand>();
+        check::<Schedule>();
+        check::<Health>();
+    }
+}

@@ -1,0 +1,76 @@
+//! Samples by which the launcher and the roles of a run agree on its phases. The same in every rig.
+
+use super::sample;
+
+sample! {
+    /// The launcher's word to all roles. The stamp's tick counts the announcements.
+    Schedule = "corotate/run/schedule/v1" {
+        /// A [`Phase`] as a number.
+        phase: u64,
+        /// T_0 on the monotonic clock, ns; meaningful from [`Phase::Run`] on, in real time.
+        epoch_ns: u64,
+        /// Ticks up to this one have been seen by the slowest consumer (lockstep).
+        credit_tick: u64,
+    }
+}
+
+sample! {
+    /// A role's word to the launcher. The stamp's tick is the next one that the role will execute.
+    Health = "corotate/run/health/v1" {
+        /// A [`RoleState`] as a number.
+        state: u64,
+        /// Ticks executed.
+        executed: u64,
+        /// Ticks missed.
+        missed: u64,
+        /// Privileges that were asked for and not granted.
+        denied: u64,
+    }
+}
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u64)]
+pub enum Phase {
+    /// Roles open their links.
+    Gather = 0,
+    /// Roles exercise their links with samples of generation 0.
+    WarmUp = 1,
+    /// The epoch is set; ticks run.
+    Run = 2,
+    /// Roles end after the tick at hand.
+    Stop = 3,
+}
+
+impl Phase {
+    /// The phase with this number; an unknown number reads as [`Phase::Stop`], the safe one.
+    pub fn from_number(number: u64) -> Self {
+        [Self::Gather, Self::WarmUp, Self::Run].into_iter().find(|phase| *phase as u64 == number).unwrap_or(Self::Stop)
+    }
+}
+
+/// Where a role stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u64)]
+pub enum RoleState {
+    /// Not heard of yet.
+    Absent = 0,
+    /// All links are open.
+    Open = 1,
+    /// All links have been exercised; waits for the epoch.
+    Ready = 2,
+    /// Ticks run.
+    Running = 3,
+    /// The last tick is done and the report written.
+    Done = 4,
+}
+
+impl RoleState {
+    /// The state with this number; an unknown number reads as [`RoleState::Absent`].
+    pub fn from_number(number: u64) -> Self {
+        [Self::Open, Self::Ready, Self::Running, Self::Done]
+            .into_iter()
+            .find(|state| *state as u64 == number)
+            .unwrap_or(Self::Absent)
+    }
+}

@@ -1,0 +1,114 @@
+//! The state hash: one number for everything that was published, so that two runs can be compared at a glance.
+//!
+//! It covers ticks and values, no generation and no time. Checkpoints make it comparable up to any tick.
+
+use crate::sample::Sample;
+use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
+
+/// The most checkpoints that a writer keeps; longer runs keep every second, third, … tick.
+const MAX_CHECKPOINTS: u64 = 16_384;
+
+/// The hash of one signal, chained over its samples (XXH3-64, each sample's hash seeded by the last).
+#[derive(Debug)]
+pub struct StateHash {
+    value: u64,
+    stride: u64,
+    checkpoints: Vec<u64>,
+}
+
+/// The hashes of one signal after ticks stride − 1, 2·stride − 1, …
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Checkpoints {
+    /// Ticks per checkpoint.
+    pub stride: u64,
+    /// The hash over all samples of the first (n + 1)·stride ticks.
+    pub hashes: Vec<u64>,
+    /// The hash over all samples.
+    pub last: u64,
+}
+
+impl StateHash {
+    /// An empty hash for a run whose last tick is `last_tick`. All memory is taken now.
+    pub fn new(last_tick: u64) -> Self {
+        let stride = (last_tick + 1).div_ceil(MAX_CHECKPOINTS).max(1);
+        Self { value: 0, stride, checkpoints: Vec::with_capacity(((last_tick + 1) / stride) as usize) }
+    }
+
+    /// Takes in a sample. Ticks rise.
+    #[inline]
+    pub fn absorb(&mut self, sample: &impl Sample) {
+        let tick = sample.stamp().tick;
+        self.checkpoint(tick);
+        self.value = xxh3_64_with_seed(sample.content(), self.value ^ tick.rotate_left(32));
+        self.checkpoint(tick + 1);
+    }
+
+    /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
+    #[inline]
+    fn checkpoint(&mut self, ticks: u64) {
+        while (self.checkpoints.len() as u64 + 1) * self.stride <= ticks
+            && self.checkpoints.len() < self.checkpoints.capacity()
+        {
+            self.checkpoints.push(self.value);
+        }
+    }
+
+    /// What has been gathered.
+    pub fn checkpoints(&self) -> Checkpoints {
+        Checkpoints { stride: self.stride, hashes: self.checkpoints.clone(), last: self.value }
+    }
+}
+
+/// One hash for several signals' hashes; the order matters.
+pub fn combine(hashes: impl IntoIterator<Item = u64>) -> u64 {
+    let bytes: Vec<u8> = hashes.into_iter().flat_map(u64::to_le_bytes).collect();
+    xxh3_64(&bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample::{RateCommand, Stamp};
+
+    fn sample(tick: u64, value: f64, sent_ns: u64) -> RateCommand {
+        let stamp = Stamp { tick, sent_ns, origin_ns: sent_ns / 2, generation: sent_ns };
+        RateCommand { stamp, acceleration_rad_s2: [value, 0.0, 0.0] }
+    }
+
+    fn hash(samples: &[(u64, f64, u64)]) -> Checkpoints {
+        let mut hash = StateHash::new(9);
+        samples.iter().for_each(|&(tick, value, sent)| hash.absorb(&sample(tick, value, sent)));
+        hash.checkpoints()
+    }
+
+    #[test]
+    fn depends_on_ticks_and_values_and_on_no_time() {
+        let reference = hash(&[(0, 1.0, 5), (1, 2.0, 6)]).last;
+        assert_eq!(reference, hash(&[(0, 1.0, 50), (1, 2.0, 60)]).last);
+        for other in [[(0, 1.0, 5), (2, 2.0, 6)], [(0, 1.0, 5), (1, -2.0, 6)], [(0, 2.0, 5), (1, 1.0, 6)]] {
+            assert_ne!(reference, hash(&other).last);
+        }
+    }
+
+    #[test]
+    fn checkpoints_agree_up_to_the_first_difference_and_stay_aligned_across_gaps() {
+        let (whole, gap) = (
+            hash(&[(0, 1.0, 0), (1, 2.0, 0), (2, 3.0, 0), (3, 4.0, 0)]),
+            hash(&[(0, 1.0, 0), (1, 2.0, 0), (3, 4.0, 0)]),
+        );
+        assert_eq!(whole.hashes.len(), gap.hashes.len());
+        assert_eq!(whole.hashes[..2], gap.hashes[..2]);
+        assert_eq!(gap.hashes[2], gap.hashes[1], "nothing was published at tick 2");
+        assert_ne!(whole.hashes[3], gap.hashes[3]);
+        assert_eq!(whole.hashes[3], whole.last);
+    }
+
+    #[test]
+    fn a_long_run_keeps_a_bounded_number_of_checkpoints() {
+        let mut hash = StateHash::new(MAX_CHECKPOINTS * 5);
+        let capacity = hash.checkpoints.capacity();
+        (0..=MAX_CHECKPOINTS * 5).for_each(|tick| hash.absorb(&sample(tick, 0.5, 0)));
+        assert_eq!(hash.checkpoints.capacity(), capacity, "nothing was allocated on the way");
+        assert!(capacity as u64 <= MAX_CHECKPOINTS && hash.stride == 6);
+    }
+}

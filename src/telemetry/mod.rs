@@ -1,0 +1,13 @@
+//! What a role remembers of its run: latency histograms, counters, and the hash of what it published.
+//!
+//! Everything is allocated before the loop and only counted in it; export and arithmetic come after. Must not log.
+
+mod export;
+mod hash;
+mod latency;
+mod report;
+
+pub use export::{write_hgrm, write_hlog};
+pub use hash::{Checkpoints, StateHash, combine};
+pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};
+pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks};

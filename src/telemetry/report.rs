@@ -1,0 +1,108 @@
+//! What a role says of its run when it ends: the books, the hash, the histograms, the privileges.
+
+use super::{Checkpoints, Latency};
+use serde::{Deserialize, Serialize};
+
+/// A role's account of itself.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct RoleReport {
+    /// The role's name.
+    pub role: String,
+    /// Its ticks.
+    pub ticks: Ticks,
+    /// What it wrote, by signal.
+    pub written: Vec<LinkWritten>,
+    /// What it read, by signal.
+    pub read: Vec<LinkRead>,
+    /// Its latencies, by stage.
+    pub stages: Vec<StageReport>,
+    /// What it asked of the machine, and what it got.
+    pub grants: Vec<Grant>,
+}
+
+/// The books of a role's ticks: `elapsed` = `executed` + `missed`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Ticks {
+    /// Ticks that the role should have executed until it ended.
+    pub elapsed: u64,
+    /// Ticks that it executed, on whatever inputs.
+    pub executed: u64,
+    /// Ticks that it did not execute.
+    pub missed: u64,
+    /// Ticks at which an input that was due was absent: a plant's command, a controller's measurement.
+    pub starved: u64,
+    /// Ticks at which a plant applied its safe command.
+    pub safe: u64,
+    /// The first tick whose result differs from an undisturbed run's, if any does.
+    pub first_disturbed: Option<u64>,
+}
+
+/// The books of a signal's writing end: `published` + `skipped` = `last_tick` + 1.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct LinkWritten {
+    /// The service.
+    pub service: String,
+    /// Samples sent.
+    pub published: u64,
+    /// Ticks without a sample.
+    pub skipped: u64,
+    /// The tick of the last sample.
+    pub last_tick: Option<u64>,
+    /// The hash of what was sent.
+    pub hash: Checkpoints,
+}
+
+/// The books of a signal's reading end: `received` + `gaps` = `last_tick` + 1.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LinkRead {
+    /// The service.
+    pub service: String,
+    /// Samples received.
+    pub received: u64,
+    /// Ticks between them without one: skipped by the writer, or overtaken by a newer sample.
+    pub gaps: u64,
+    /// Samples that were not newer than the one before.
+    pub stale: u64,
+    /// The tick of the last sample.
+    pub last_tick: Option<u64>,
+}
+
+/// One stage's latencies.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct StageReport {
+    /// `lateness`, `hop`, `step`, `age`, `baseline`.
+    pub stage: String,
+    /// HdrHistogram V2 encoding, ns.
+    pub histogram: Vec<u8>,
+    /// Values beyond the histogram's range.
+    pub clipped: u64,
+}
+
+impl StageReport {
+    /// Packs the stages that have values.
+    pub fn all(stages: &[(&str, &Latency)]) -> Vec<Self> {
+        let pack = |(stage, latency): &(&str, &Latency)| {
+            let (histogram, clipped) = latency.encode();
+            Self { stage: (*stage).to_owned(), histogram, clipped }
+        };
+        stages.iter().filter(|(_, latency)| !latency.is_empty()).map(pack).collect()
+    }
+
+    /// The latencies; empty if the bytes are damaged.
+    pub fn latency(&self) -> Latency {
+        Latency::decode(&self.histogram, self.clipped).unwrap_or_default()
+    }
+}
+
+/// A privilege: asked for, granted or not.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Grant {
+    /// What.
+    pub privilege: String,
+    /// The value asked for.
+    pub asked: String,
+    /// Whether the machine granted it.
+    pub granted: bool,
+    /// If not, the machine's reason and what to do.
+    pub reason: String,
+}
