@@ -70,17 +70,17 @@ impl OwnedDomain {
     pub fn create() -> Result<Self, DomainError> {
         let base = base();
         let create = |path: &Path, source| DomainError::Create { path: path.to_owned(), source };
-        DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
         remove_dead(&base);
         loop {
-            let id = random_id();
-            let root = base.join(&id);
+            // Within the loop: another run that ends may remove the directory as long as it is empty.
+            DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
+            let root = base.join(random_id());
             if root.as_os_str().len() > MAX_ROOT_LENGTH {
                 return Err(DomainError::TooLong { path: root });
             }
             // The lock comes first: a domain without a lock that is held counts as dead.
             let path = lock_path(&root);
-            let Some(lock) = lock(&path, true).map_err(|error| create(&path, error))? else { continue };
+            let Some(lock) = lock(&path, Lock::New).map_err(|error| create(&path, error))? else { continue };
             DirBuilder::new().mode(0o700).create(&root).map_err(|error| create(&root, error))?;
             return Ok(Self { domain: Domain { root }, _lock: lock });
         }
@@ -132,6 +132,8 @@ impl Domain {
         }
         let _ = fs::remove_dir_all(&self.root);
         let _ = fs::remove_file(lock_path(&self.root));
+        // The directory of all domains goes with the last; it is not empty while another run lives.
+        let _ = self.root.parent().map(fs::remove_dir);
     }
 }
 
@@ -144,7 +146,7 @@ fn remove_dead(base: &Path) {
     for entry in fs::read_dir(base).into_iter().flatten().flatten() {
         let path = entry.path();
         if path.extension().is_some_and(|extension| extension == "lock")
-            && let Ok(Some(_held)) = lock(&path, false)
+            && let Ok(Some(_held)) = lock(&path, Lock::Existing)
         {
             Domain { root: path.with_extension("") }.remove();
         }
@@ -155,14 +157,18 @@ fn lock_path(root: &Path) -> PathBuf {
     root.with_extension("lock")
 }
 
-/// Takes a lock file; `None` if another process holds it or took it away meanwhile.
-fn lock(path: &Path, new: bool) -> io::Result<Option<File>> {
-    let mut options = OpenOptions::new();
-    options.write(true).create_new(new).mode(0o600);
-    let file = match options.open(path) {
+/// Whether a lock is to be made or taken over.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Lock {
+    New,
+    Existing,
+}
+
+/// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
+fn lock(path: &Path, lock: Lock) -> io::Result<Option<File>> {
+    let file = match OpenOptions::new().write(true).create_new(lock == Lock::New).mode(0o600).open(path) {
         Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
-            // A missing directory is an error, a name already taken or just removed is not.
-            return if new && error.kind() == io::ErrorKind::NotFound { Err(error) } else { Ok(None) };
+            return Ok(None);
         }
         other => other?,
     };
@@ -205,7 +211,7 @@ mod tests {
         let mut held = None;
         for root in [&dead, &living] {
             fs::create_dir(root).unwrap();
-            held = lock(&lock_path(root), true).unwrap();
+            held = lock(&lock_path(root), Lock::New).unwrap();
         }
         remove_dead(base.path());
         assert!(!dead.exists() && !lock_path(&dead).exists());

@@ -13,7 +13,7 @@ pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Input, Output, Seek};
 pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, topic};
 pub use privileges::hold_low_latency_idle;
-pub use process::{RoleError, RoleSeat, run_role};
+pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{report_path, scenario_path, write_whole};
 
 use crate::bus::Depths;

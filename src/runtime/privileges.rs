@@ -6,13 +6,26 @@ use super::node::RoleId;
 use crate::config::{Cores, NamedCores, Realtime};
 use crate::telemetry::Grant;
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use rustix::process::{Resource, getrlimit};
+use rustix::thread::{CapabilitySet, CpuSet, capabilities, sched_getaffinity, sched_setaffinity};
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 
+/// What a limit on locked memory must allow a role, bytes. Its own need is far below.
+const ENOUGH_LOCKED: u64 = 256 << 20;
+
 /// Locks this process's memory, present and future. To be done before links are opened.
+///
+/// Not under a limit that the process could reach: there the next allocation, or the stack's growth, would kill it.
 fn lock_memory() -> io::Result<()> {
-    Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?)
+    let unlimited = capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::IPC_LOCK));
+    match getrlimit(Resource::Memlock).current {
+        Some(limit) if !unlimited && limit < ENOUGH_LOCKED => {
+            let (limit, enough) = (limit >> 10, ENOUGH_LOCKED >> 10);
+            Err(io::Error::other(format!("the memlock limit is {limit} KiB, and less than {enough} is not safe")))
+        }
+        _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?),
+    }
 }
 
 /// Takes what a role asks for, for the calling thread.

@@ -119,8 +119,11 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a role on a bus: the phases of a run, from open links to the report.
-fn serve<B: Bus + 'static>(
+/// Serves a role on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken.
+///
+/// # Errors
+/// [`RoleError`].
+pub fn serve<B: Bus + 'static>(
     scenario: &Scenario,
     role: RoleId,
     bus: &B,

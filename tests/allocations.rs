@@ -1,0 +1,181 @@
+//! The hot path allocates nothing of our own: between the first tick and the report of every role, counted by the
+//! allocator itself. iceoryx2 makes one small allocation per loan; it is counted apart, and is off the critical path.
+
+use corotate::bus::domain::OwnedDomain;
+use corotate::bus::iox::IoxBus;
+use corotate::bus::{Bus, BusError, Read, Reader, Signal, Topic, Write};
+use corotate::config::Scenario;
+use corotate::runtime::{RoleId, depths, serve, topic};
+use corotate::sample::{Health, Phase, RoleState, Sample, Schedule};
+use corotate::telemetry::RoleReport;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+/// What this thread counts, and where.
+#[derive(Clone, Copy)]
+struct Count {
+    armed: bool,
+    in_prepare: bool,
+    prepares: u64,
+    of_ours: u64,
+    of_the_transport: u64,
+    /// `of_ours` at the last real sample: what the report takes afterwards is not of the loop.
+    of_ours_in_the_loop: u64,
+}
+
+impl Count {
+    const NOTHING: Self =
+        Self { armed: false, in_prepare: false, prepares: 0, of_ours: 0, of_the_transport: 0, of_ours_in_the_loop: 0 };
+}
+
+thread_local! {
+    static COUNT: Cell<Count> = const { Cell::new(Count::NOTHING) };
+}
+
+fn update(change: impl FnOnce(&mut Count)) {
+    // The allocator is also called while a thread is being taken down.
+    let _ = COUNT.try_with(|count| {
+        let mut value = count.get();
+        change(&mut value);
+        count.set(value);
+    });
+}
+
+struct CountingAllocator;
+
+#[allow(unsafe_code)]
+// SAFETY: every call is passed on unchanged to the system's allocator; counting touches a thread-local cell only.
+unsafe impl GlobalAlloc for CountingAllocator {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        update(|count| {
+            if count.armed && count.in_prepare {
+                count.of_the_transport += 1;
+            } else if count.armed {
+                count.of_ours += 1;
+            }
+        });
+        // SAFETY: the caller's promises about `layout` are the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: `pointer` came from `alloc` above, which is the system's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+/// The real bus, with the counting switched on by the first real sample that a role sends.
+struct CountedBus(IoxBus);
+struct CountedWriter<W>(W);
+
+impl Bus for CountedBus {
+    type Writer<S: Sample> = CountedWriter<<IoxBus as Bus>::Writer<S>>;
+    type Reader<S: Sample> = <IoxBus as Bus>::Reader<S>;
+
+    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
+        self.0.writer(topic).map(CountedWriter)
+    }
+
+    fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
+        self.0.reader(topic, reader)
+    }
+}
+
+impl<S: Sample, W: Write<S>> Write<S> for CountedWriter<W> {
+    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        let mut real = false;
+        self.0.send(|sample| {
+            fill(sample);
+            real = S::TYPE_NAME != Health::TYPE_NAME && sample.stamp().generation != 0;
+        })?;
+        if real {
+            update(|count| (count.armed, count.of_ours_in_the_loop) = (true, count.of_ours));
+        }
+        Ok(())
+    }
+
+    fn prepare(&mut self) -> Result<(), BusError> {
+        update(|count| {
+            count.in_prepare = true;
+            count.prepares += u64::from(count.armed);
+        });
+        let prepared = self.0.prepare();
+        update(|count| count.in_prepare = false);
+        prepared
+    }
+}
+
+/// Serves one role in this thread and gives its report and what it allocated.
+fn count_role(scenario: &Scenario, role: RoleId, domain: &OwnedDomain) -> (RoleReport, Count) {
+    let bus = CountedBus(IoxBus::enter(domain.domain(), role.name(scenario), depths(scenario)).unwrap());
+    let terminated = AtomicBool::new(false);
+    let mut result = None;
+    serve(scenario, role, &bus, 1, &terminated, Vec::new(), |report| {
+        result = Some((report.clone(), COUNT.get()));
+        Ok(())
+    })
+    .unwrap();
+    result.unwrap()
+}
+
+/// Leads the roles through a real-time run as the launcher does.
+fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
+    let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
+    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
+    let mut health: Vec<_> = RoleId::all(scenario)
+        .iter()
+        .map(|role| bus.reader::<Health>(&topic(scenario, role.name(scenario), Signal::Health), Reader::Role).unwrap())
+        .collect();
+    let end = Instant::now() + Duration::from_secs(120);
+    let steps = [(Phase::Gather, RoleState::Open), (Phase::WarmUp, RoleState::Ready), (Phase::Run, RoleState::Done)];
+    for (phase, state) in steps {
+        let epoch_ns = corotate::clock::monotonic_ns() + 100_000_000;
+        let reached = |health: &mut <IoxBus as Bus>::Reader<Health>| {
+            while health.advance().unwrap() {}
+            health.current().is_some_and(|health| RoleState::from_number(health.state) >= state)
+        };
+        while !health.iter_mut().all(reached) {
+            assert!(Instant::now() < end, "the run hung");
+            schedule
+                .send(|word| {
+                    (word.phase, word.epoch_ns, word.credit_tick) = (phase as u64, epoch_ns, scenario.last_tick)
+                })
+                .unwrap();
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+    schedule.send(|word| word.phase = Phase::Stop as u64).unwrap();
+}
+
+fn counts(text: &str) -> Vec<(RoleReport, Count)> {
+    let overrides = ["clock=realtime", "duration_s=1", "accept={}"].map(str::to_owned);
+    let scenario = Scenario::parse(text, "test", &overrides).unwrap();
+    let domain = OwnedDomain::create().unwrap();
+    let roles = RoleId::all(&scenario);
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = roles.iter().map(|role| scope.spawn(|| count_role(&scenario, *role, &domain))).collect();
+        conduct(&scenario, &domain);
+        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+    })
+}
+
+#[test]
+fn no_role_allocates_between_its_first_tick_and_its_last() {
+    for (name, text) in corotate::config::SHIPPED {
+        for (report, count) in counts(text) {
+            let ticks = report.ticks.executed;
+            println!(
+                "{name} {}: {ticks} ticks, {} allocations of ours, {} of iceoryx2 in {} loans",
+                report.role, count.of_ours_in_the_loop, count.of_the_transport, count.prepares
+            );
+            assert!(count.armed && ticks > 0, "{name} {}: nothing was counted", report.role);
+            assert_eq!(count.of_ours_in_the_loop, 0, "{name} {}", report.role);
+            assert!(count.of_the_transport <= count.prepares, "{name} {}: one per loan at most", report.role);
+        }
+    }
+}

@@ -1,0 +1,224 @@
+//! Runs the real program as a user would, in a directory and a runtime directory of its own, under a watchdog.
+
+#![allow(dead_code, reason = "every test file uses its own part of this")]
+
+use std::io::Read;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Nothing here takes so long, however loaded the machine is; what does, hangs.
+pub const WATCHDOG: Duration = Duration::from_secs(120);
+
+/// A place to run in, with nothing of any other run in it.
+pub struct Bench {
+    directory: tempfile::TempDir,
+    runtime: tempfile::TempDir,
+    /// The user to run as, if not this one.
+    user: Option<u32>,
+}
+
+/// A program that is running.
+pub struct Running {
+    child: Child,
+    stdout: Option<JoinHandle<String>>,
+    stderr: Option<JoinHandle<String>>,
+}
+
+/// A program that has ended.
+#[derive(Debug)]
+pub struct Done {
+    pub code: Option<i32>,
+    pub signal: Option<i32>,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl Bench {
+    pub fn new() -> Self {
+        // Socket names limit the length of the runtime directory's path.
+        let runtime = tempfile::Builder::new().prefix("ct").rand_bytes(6).tempdir_in("/tmp").unwrap();
+        Self { directory: tempfile::tempdir().unwrap(), runtime, user: None }
+    }
+
+    /// A bench whose programs run as `nobody` where this process is root.
+    pub fn unprivileged() -> Self {
+        let mut bench = Self::new();
+        if rustix::process::getuid().is_root() {
+            const NOBODY: u32 = 65534;
+            for directory in [&bench.directory, &bench.runtime] {
+                std::os::unix::fs::chown(directory.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+            }
+            // The build's own directory may be closed to others.
+            std::fs::copy(env!("CARGO_BIN_EXE_corotate"), bench.path("corotate")).unwrap();
+            bench.user = Some(NOBODY);
+        }
+        bench
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    pub fn command(&self) -> Command {
+        let mut command = Command::new(match self.user {
+            Some(_) => self.path("corotate"),
+            None => env!("CARGO_BIN_EXE_corotate").into(),
+        });
+        if let Some(user) = self.user {
+            command.uid(user).gid(user);
+        }
+        command.current_dir(self.directory.path()).env("XDG_RUNTIME_DIR", self.runtime.path());
+        command
+    }
+
+    pub fn start(&self, arguments: &[&str]) -> Running {
+        Running::new(self.command().args(arguments))
+    }
+
+    pub fn run(&self, arguments: &[&str]) -> Done {
+        self.start(arguments).wait()
+    }
+
+    /// Runs a shipped scenario and returns its summary; it must end well.
+    pub fn summary(&self, scenario: &str, arguments: &[&str]) -> serde_json::Value {
+        let file = self.path(&format!("{scenario}.toml"));
+        std::fs::copy(shipped(scenario), &file).unwrap();
+        let done = self.run(&[&["run", file.to_str().unwrap(), "--json"], arguments].concat());
+        assert_eq!(done.code, Some(0), "{done:?}");
+        serde_json::from_str(&done.stdout).unwrap()
+    }
+
+    /// The domains that exist in this bench's runtime directory.
+    pub fn domains(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.runtime.path().join("corotate")).into_iter().flatten();
+        entries.map(|entry| entry.unwrap().path()).filter(|path| path.is_dir()).collect()
+    }
+
+    /// Asserts that no process, file or shared memory of any run in this bench is left; waits for the dying.
+    pub fn assert_clean(&self, domains: &[PathBuf]) {
+        let left = || {
+            let ids: Vec<String> =
+                domains.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect();
+            let files = |directory: &Path| -> Vec<PathBuf> {
+                std::fs::read_dir(directory).into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+            };
+            let mut left = files(&self.runtime.path().join("corotate"));
+            let named = |path: &PathBuf| ids.iter().any(|id| path.to_string_lossy().contains(id));
+            left.extend(files(Path::new("/dev/shm")).into_iter().filter(named));
+            left.extend(self.processes().into_iter().map(|pid| PathBuf::from(format!("/proc/{pid}"))));
+            left
+        };
+        let end = Instant::now() + WATCHDOG;
+        while !left().is_empty() {
+            assert!(Instant::now() < end, "left behind: {:?}", left());
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Every process of the program that runs in this bench, zombies apart.
+    pub fn processes(&self) -> Vec<u32> {
+        let mark = format!("XDG_RUNTIME_DIR={}", self.runtime.path().display());
+        let pids =
+            std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+        pids.filter(|pid: &u32| {
+            let of = |file: &str| std::fs::read(format!("/proc/{pid}/{file}")).unwrap_or_default();
+            String::from_utf8_lossy(&of("environ")).split('\0').any(|entry| entry == mark)
+        })
+        .collect()
+    }
+
+    /// The process of a role, once it runs.
+    pub fn await_role(&self, role: &str) -> u32 {
+        let is_role = |pid: &u32| {
+            let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+            let words: Vec<String> = line.split(|byte| *byte == 0).map(|w| String::from_utf8_lossy(w).into()).collect();
+            let body = words.iter().position(|word| word == "--body").map(|index| words[index + 1].as_str());
+            words.len() > 2 && words[1] != "run" && (words[1] == role || body == Some(role))
+        };
+        await_some(|| self.processes().into_iter().find(is_role))
+    }
+}
+
+impl Running {
+    fn new(command: &mut Command) -> Self {
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = await_some(|| match command.spawn() {
+            // Another test's child held the copied program open for writing when it was forked; it execs soon.
+            Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => None,
+            spawned => Some(spawned.unwrap()),
+        });
+        let stdout = child.stdout.take().map(collect);
+        let stderr = child.stderr.take().map(collect);
+        Self { child, stdout, stderr }
+    }
+
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn signal(&self, signal: i32) {
+        send_signal(self.pid(), signal);
+    }
+
+    pub fn wait(mut self) -> Done {
+        let end = Instant::now() + WATCHDOG;
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            if Instant::now() > end {
+                self.child.kill().unwrap();
+                panic!("the program hung");
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        };
+        let text = |reader: Option<JoinHandle<String>>| reader.unwrap().join().unwrap();
+        Done {
+            code: status.code(),
+            signal: status.signal(),
+            stdout: text(self.stdout.take()),
+            stderr: text(self.stderr.take()),
+        }
+    }
+}
+
+fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        pipe.read_to_end(&mut bytes).unwrap();
+        String::from_utf8_lossy(&bytes).into_owned()
+    })
+}
+
+pub fn send_signal(pid: u32, signal: i32) {
+    let pid = rustix::process::Pid::from_raw(pid as i32).unwrap();
+    let signal = rustix::process::Signal::from_named_raw(signal).unwrap();
+    let _ = rustix::process::kill_process(pid, signal);
+}
+
+/// Polls until there is something, under the watchdog.
+pub fn await_some<T>(mut look: impl FnMut() -> Option<T>) -> T {
+    let end = Instant::now() + WATCHDOG;
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(Instant::now() < end, "it never came");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// A scenario that ships with the program.
+pub fn shipped(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(format!("{name}.toml"))
+}
+
+/// The rows of a reference file in `tests/data`, its header left out.
+pub fn reference(name: &str) -> Vec<Vec<f64>> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name);
+    let text = std::fs::read_to_string(path).unwrap();
+    text.lines().skip(1).map(|line| line.split(',').map(|word| word.parse().unwrap()).collect()).collect()
+}

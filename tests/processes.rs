@@ -1,0 +1,295 @@
+//! A run as processes, from outside: signals, killed roles, a killed launcher, two runs at once, roles started by hand.
+//! After each of them nothing may be left: no process, no file.
+
+mod common;
+
+use common::{Bench, Running, await_some, send_signal, shipped};
+use serde_json::Value;
+use std::path::PathBuf;
+
+const SIGINT: i32 = 2;
+const SIGKILL: i32 = 9;
+const SIGTERM: i32 = 15;
+
+/// Starts a run that lasts until it is stopped, and waits until its ticks run.
+fn start_endless(bench: &Bench, arguments: &[&str]) -> (Running, Vec<PathBuf>) {
+    let file = shipped("rigid-pair");
+    let common = ["run", file.to_str().unwrap(), "--duration", "100000", "--out", "out", "--set", "accept={}"];
+    let running = bench.start(&[&common[..], arguments].concat());
+    for role in ["leader", "follower", "observer", "controller"] {
+        bench.await_role(role);
+    }
+    let domains = bench.domains();
+    assert_eq!(domains.len(), 1);
+    // A reader of the schedule would need a seat in the run; ticks are certain a little after the roles are up.
+    std::thread::sleep(std::time::Duration::from_millis(1000));
+    (running, domains)
+}
+
+#[test]
+fn a_signal_ends_a_run_in_order_with_its_results_written() {
+    for (signal, clock) in [(SIGINT, "realtime"), (SIGTERM, "lockstep"), (SIGINT, "lockstep"), (SIGTERM, "realtime")] {
+        let bench = Bench::new();
+        let (running, domains) = start_endless(&bench, &["--clock", clock]);
+        running.signal(signal);
+        let done = running.wait();
+        assert_eq!(done.code, Some(128 + signal), "{done:?}");
+        assert!(done.stderr.contains("ended in order by signal"), "{done:?}");
+        let summary: Value = serde_json::from_slice(&std::fs::read(bench.path("out/summary.json")).unwrap()).unwrap();
+        assert_eq!(summary["signal"], signal);
+        assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+        for role in ["leader", "follower", "observer", "controller"] {
+            assert!(summary["books"]["roles"][role]["executed"].as_u64().unwrap() > 0, "{role}");
+        }
+        bench.assert_clean(&domains);
+    }
+}
+
+#[test]
+fn an_in_process_run_ends_in_order_too() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let arguments = ["run", file.to_str().unwrap(), "--clock", "in-process", "--duration", "10000000", "--out", "out"];
+    let running = bench.start(&arguments);
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    running.signal(SIGINT);
+    let done = running.wait();
+    assert_eq!(done.code, Some(130), "{done:?}");
+    assert!(bench.path("out/summary.json").is_file());
+    assert!(bench.domains().is_empty(), "an in-process run needs no domain");
+}
+
+#[test]
+fn a_killed_role_ends_the_run_by_name_and_cause() {
+    for role in ["leader", "follower", "observer", "controller"] {
+        let bench = Bench::new();
+        let (running, domains) = start_endless(&bench, &[]);
+        send_signal(bench.await_role(role), SIGKILL);
+        let done = running.wait();
+        assert_eq!(done.code, Some(4), "{done:?}");
+        assert!(done.stderr.contains(&format!("{role} died: it was killed by SIGKILL")), "{done:?}");
+        bench.assert_clean(&domains);
+    }
+}
+
+#[test]
+fn a_killed_launcher_takes_everything_with_it() {
+    for clock in ["realtime", "lockstep"] {
+        let bench = Bench::new();
+        let (running, domains) = start_endless(&bench, &["--clock", clock]);
+        running.signal(SIGKILL);
+        assert_eq!(running.wait().signal, Some(SIGKILL));
+        bench.assert_clean(&domains);
+    }
+}
+
+/// Launcher and janitor both killed: the next run of the same user cleans up.
+#[test]
+fn the_next_run_removes_what_a_killed_janitor_could_not() {
+    let bench = Bench::new();
+    let (running, domains) = start_endless(&bench, &[]);
+    send_signal(bench.await_role("janitor"), SIGKILL);
+    running.signal(SIGKILL);
+    running.wait();
+    // The roles die by the kernel's hand at once.
+    await_some(|| bench.processes().is_empty().then_some(()));
+    assert_eq!(bench.domains(), domains, "this test is about a domain that is left");
+    bench.summary("rigid-pair", &["--clock", "lockstep", "--duration", "0.1", "--set", "accept={}"]);
+    bench.assert_clean(&domains);
+}
+
+#[test]
+fn two_runs_at_once_do_not_meet() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let start = |out: &str| {
+        let run = ["run", file.to_str().unwrap(), "--clock", "lockstep", "--json", "--out", out];
+        bench.start(&run)
+    };
+    let runs = [start("a"), start("b")];
+    let hashes = runs.map(|run| {
+        let done = run.wait();
+        assert_eq!(done.code, Some(0), "{done:?}");
+        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        summary["state"]["hash"].as_str().unwrap().to_owned()
+    });
+    assert_eq!(hashes[0], hashes[1]);
+    bench.assert_clean(&[]);
+}
+
+/// Two default runs in one directory get result directories of their own.
+#[test]
+fn runs_of_the_same_second_do_not_overwrite_each_other() {
+    let bench = Bench::new();
+    let run = || bench.start(&["run", shipped("rigid-pair").to_str().unwrap(), "--clock", "in-process"]);
+    for run in [run(), run(), run()] {
+        assert_eq!(run.wait().code, Some(0));
+    }
+    assert_eq!(std::fs::read_dir(bench.path("runs")).unwrap().count(), 3);
+}
+
+#[test]
+fn a_role_can_be_started_by_hand() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let run =
+        ["run", file.to_str().unwrap(), "--clock", "lockstep", "--json", "--external", "observer", "--out", "out"];
+    let running = bench.start(&run);
+    bench.await_role("controller");
+    let domain = bench.domains().remove(0);
+    let by_hand = bench.start(&["observer", "--domain", domain.to_str().unwrap()]);
+    let (run, role) = (running.wait(), by_hand.wait());
+    assert_eq!((run.code, role.code), (Some(0), Some(0)), "{run:?} {role:?}");
+    assert!(run.stderr.contains("corotate observer --domain"), "{run:?}");
+    let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(summary["books"]["roles"]["observer"]["executed"], 10_001);
+    assert_eq!(summary["state"]["hash"], bench.summary("rigid-pair", &["--clock", "in-process"])["state"]["hash"]);
+    bench.assert_clean(&[domain]);
+}
+
+/// A core that no machine has cannot be granted, whoever asks.
+const UNGRANTABLE: [&str; 2] = ["--set", "realtime.cores=[1023]"];
+
+#[test]
+fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it() {
+    let bench = Bench::new();
+    let short = ["--duration", "0.2", "--set", "accept={}", "--clock", "realtime"];
+    let summary = bench.summary("rigid-pair", &[&short[..], &UNGRANTABLE].concat());
+    let denied = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["granted"] == false);
+    assert!(denied.clone().filter(|grant| grant["privilege"] == "core").count() == 4, "{summary:#}");
+    assert!(denied.clone().all(|grant| !grant["reason"].as_str().unwrap().is_empty()));
+
+    let file = shipped("rigid-pair");
+    let run = [&["run", file.to_str().unwrap(), "--require-rt"], &short[..], &UNGRANTABLE].concat();
+    let done = bench.run(&run);
+    assert_eq!(done.code, Some(5), "{done:?}");
+    assert!(done.stderr.contains("leader: core 1023") && done.stderr.contains("realtime.cores"), "{done:?}");
+    bench.assert_clean(&[]);
+}
+
+#[test]
+fn a_criterion_that_does_not_hold_gives_exit_code_3_and_says_which() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let set = ["--set", "accept.settled_by_s=0.5", "--set", "accept.sync_error_rad_s_max=1e-6"];
+    for clock in ["in-process", "lockstep", "realtime"] {
+        let run = [&["run", file.to_str().unwrap(), "--duration", "1", "--clock", clock][..], &set].concat();
+        let done = bench.run(&run);
+        assert_eq!(done.code, Some(3), "{done:?}");
+        assert!(done.stderr.contains("accept.sync_error_rad_s_max"), "{done:?}");
+        assert!(done.stdout.contains("FAILS"), "{done:?}");
+    }
+    bench.assert_clean(&[]);
+}
+
+/// The job of the whole program: the hidden component is never published, and yet the bodies synchronise.
+#[test]
+fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures() {
+    let bench = Bench::new();
+    let summary = bench.summary("rigid-pair", &["--out", "out"]);
+    assert_eq!(summary["clock"], "realtime");
+    let metric = &summary["score"]["metrics"][0];
+    assert_eq!(metric["name"], "sync_error_rad_s");
+    assert!(metric["last"].as_f64().unwrap() < 1e-9, "{metric}");
+    assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+    let stages: Vec<(&str, &str)> = summary["latencies"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|stage| (stage["role"].as_str().unwrap(), stage["stage"].as_str().unwrap()))
+        .collect();
+    for stage in [
+        ("leader", "baseline"),
+        ("leader", "lateness"),
+        ("follower", "lateness"),
+        ("follower", "age"),
+        ("observer", "hop"),
+        ("observer", "step"),
+        ("controller", "hop"),
+        ("controller", "step"),
+        ("controller", "age"),
+    ] {
+        assert!(stages.contains(&stage), "{stage:?} in {stages:?}");
+        let file = bench.path(&format!("out/latency/{}.{}.hgrm", stage.0, stage.1));
+        assert!(std::fs::read_to_string(file).unwrap().contains("#[Max"), "{stage:?}");
+    }
+    assert!(std::fs::read_to_string(bench.path("out/latency/latency.hlog")).unwrap().contains("Tag=observer.step"));
+    bench.assert_clean(&[]);
+}
+
+/// Every tick of a plant has a lateness, the skipped ones too: nothing is omitted because nobody was there.
+#[test]
+fn lateness_is_counted_for_every_tick() {
+    let bench = Bench::new();
+    let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}"]);
+    for role in ["leader", "follower"] {
+        let lateness = summary["latencies"].as_array().unwrap().iter();
+        let lateness = lateness.clone().find(|stage| stage["role"] == role && stage["stage"] == "lateness").unwrap();
+        assert_eq!(lateness["count"], 1001, "{role}");
+    }
+}
+
+/// The resolved scenario in the run directory is the run: it gives the same bits again.
+#[test]
+fn the_resolved_scenario_repeats_the_run() {
+    let bench = Bench::new();
+    let first = bench.summary("rigid-trio", &["--clock", "lockstep", "--out", "first"]);
+    let again = bench.path("first/scenario.toml");
+    let done = bench.run(&["run", again.to_str().unwrap(), "--clock", "in-process", "--json"]);
+    let again: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(first["state"]["hash"], again["state"]["hash"]);
+}
+
+/// The truth has one reader, the scorer: asked of the transport itself, while the loop runs.
+#[test]
+fn the_truth_is_open_to_the_scorer_alone() {
+    use iceoryx2::prelude::*;
+    let bench = Bench::new();
+    let (running, domains) = start_endless(&bench, &["--clock", "realtime"]);
+    let mut config = Config::default();
+    config.global.set_root_path(&Path::new(domains[0].to_str().unwrap().as_bytes()).unwrap());
+    let id = domains[0].file_name().unwrap().to_str().unwrap();
+    config.global.prefix = FileName::new(format!("corotate_{id}_").as_bytes()).unwrap();
+    let parties = |signal: &str| {
+        let mut parties = None;
+        ipc::Service::list(&config, |service| {
+            if service.static_details.name().as_str() == format!("corotate/rigid-pair/leader/{signal}") {
+                parties = Some(service.dynamic_details.unwrap().nodes.len());
+            }
+            CallbackProgression::Continue
+        })
+        .unwrap();
+        parties.unwrap()
+    };
+    assert_eq!(parties("truth"), 2, "the leader and the launcher");
+    assert_eq!(parties("estimate"), 3, "observer, controller and launcher");
+    running.signal(SIGTERM);
+    running.wait();
+    bench.assert_clean(&domains);
+}
+
+/// Without any privilege (as nobody, where the test itself runs as root) everything works, and every refusal is told.
+#[test]
+fn a_run_without_privileges_works_and_says_what_it_lacks() {
+    let bench = Bench::unprivileged();
+    let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}", "--clock", "realtime"]);
+    let fifo = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["privilege"] == "SCHED_FIFO");
+    assert_eq!(fifo.clone().count(), 4);
+    if rustix::process::getuid().is_root() {
+        assert!(fifo.clone().all(|grant| grant["granted"] == false && grant["reason"] != ""), "{summary:#}");
+    }
+    assert_eq!(summary["books"]["balanced"], true);
+    bench.assert_clean(&[]);
+}
+
+/// Neither the observer nor the controller reads the truth: their books name every signal they read.
+#[test]
+fn the_truth_is_read_by_nobody_in_the_loop() {
+    let bench = Bench::new();
+    let summary = bench.summary("rigid-trio", &["--clock", "lockstep", "--duration", "0.5", "--set", "accept={}"]);
+    let links = summary["books"]["links"].as_array().unwrap();
+    assert_eq!(links.len(), 6, "leader -> observer -> controller, and both ways for two followers: {links:?}");
+    for link in links {
+        assert!(!link["service"].as_str().unwrap().ends_with("/truth"), "{link}");
+    }
+}
