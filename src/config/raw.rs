@@ -84,7 +84,7 @@ pub struct Realtime {
     pub low_latency_idle: bool,
     /// How long before a tick a role wakes to spin, µs.
     pub wake_lead_us: f64,
-    /// How long a role spins for a sample that is due before it naps between looks, µs.
+    /// How long a role spins for a sample that is due before it naps between looks, µs. Only where SCHED_FIFO is granted.
     pub spin_us: f64,
     /// The part of the period after which the controller goes on without samples that are still missing, 0 to 1.
     pub cutoff: f64,
@@ -118,7 +118,7 @@ pub enum Cores {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NamedCores {
-    /// As a list of all cores that the process may use.
+    /// As a list of all cores that the process may use, where SCHED_FIFO is granted; otherwise as `any`.
     Auto,
     /// Leave it to the scheduler.
     Any,

@@ -3,6 +3,7 @@
 use super::Summary;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// The summary as text for people, at most 100 columns wide.
@@ -99,9 +100,13 @@ fn privileges(summary: &Summary, text: &mut String) {
     }
     let granted = summary.privileges.iter().filter(|entry| entry.grant.granted).count();
     let _ = writeln!(text, "privileges: {granted} of {} granted", summary.privileges.len());
+    // One line per reason, not per role.
+    let mut denied: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
     for entry in summary.privileges.iter().filter(|entry| !entry.grant.granted) {
-        let grant = &entry.grant;
-        let _ = writeln!(text, "  {}: {} {} not granted: {}", entry.role, grant.privilege, grant.asked, grant.reason);
+        denied.entry((&entry.grant.privilege, &entry.grant.reason)).or_default().push(&entry.role);
+    }
+    for ((privilege, reason), roles) in denied {
+        let _ = writeln!(text, "  no {privilege} for {}: {reason}", roles.join(", "));
     }
 }
 

@@ -7,10 +7,14 @@ use crate::config::{Cores, NamedCores, Realtime};
 use crate::telemetry::Grant;
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::process::{Resource, getrlimit};
-use rustix::thread::{CapabilitySet, CpuSet, capabilities, sched_getaffinity, sched_setaffinity};
+use rustix::thread::{
+    CapabilitySet, CpuSet, capabilities, sched_getaffinity, sched_setaffinity, set_current_timer_slack,
+};
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
+use std::num::NonZero;
 
+const FIFO: &str = "SCHED_FIFO";
 /// What a limit on locked memory must allow a role, bytes. Its own need is far below.
 const ENOUGH_LOCKED: u64 = 256 << 20;
 
@@ -28,23 +32,31 @@ fn lock_memory() -> io::Result<()> {
     }
 }
 
+/// Whether a role with these grants runs before all ordinary processes.
+pub fn first_served(grants: &[Grant]) -> bool {
+    grants.iter().any(|grant| grant.privilege == FIFO && grant.granted)
+}
+
 /// Takes what a role asks for, for the calling thread.
 pub fn take(settings: &Realtime, role: RoleId) -> Vec<Grant> {
+    // No privilege: without SCHED_FIFO the kernel would let timers run late by 50 us to save power.
+    let _ = set_current_timer_slack(NonZero::new(1));
     let mut grants = Vec::new();
     if settings.lock_memory {
         let remedy = "raise the memlock limit (ulimit -l) or grant CAP_IPC_LOCK";
         grants.push(grant("locked memory", "all".to_owned(), lock_memory(), remedy));
     }
-    if let Some(core) = core_of(settings, role) {
+    if settings.priority > 0 {
+        let priority = settings.priority - behind_leader(role);
+        let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
+        grants.push(grant(FIFO, priority.to_string(), set_fifo(priority), remedy));
+    }
+    // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
+    if let Some(core) = core_of(settings, role, first_served(&grants)) {
         let mut set = CpuSet::new();
         set.set(core);
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
-    }
-    if settings.priority > 0 {
-        let priority = settings.priority - behind_leader(role);
-        let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
-        grants.push(grant("SCHED_FIFO", priority.to_string(), set_fifo(priority), remedy));
     }
     grants
 }
@@ -83,14 +95,14 @@ fn behind_leader(role: RoleId) -> i32 {
 }
 
 /// The core of a role: plants in turn from the first core on, observer and controller together on the last.
-fn core_of(settings: &Realtime, role: RoleId) -> Option<usize> {
+fn core_of(settings: &Realtime, role: RoleId, first_served: bool) -> Option<usize> {
     let cores = match &settings.cores {
         Cores::List(cores) => cores.clone(),
-        Cores::Named(NamedCores::Any) => return None,
-        Cores::Named(NamedCores::Auto) => {
+        Cores::Named(NamedCores::Auto) if first_served => {
             let allowed = sched_getaffinity(None).ok()?;
             (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()
         }
+        Cores::Named(_) => return None,
     };
     let (last, plants) = cores.split_last()?;
     match role {
@@ -129,7 +141,7 @@ mod tests {
 
     #[test]
     fn plants_share_the_first_cores_and_the_others_the_last() {
-        let core = |cores: &[usize], role| core_of(&settings(cores), role);
+        let core = |cores: &[usize], role| core_of(&settings(cores), role, false);
         assert_eq!(core(&[4, 5], RoleId::Plant(0)), Some(4));
         assert_eq!(core(&[4, 5], RoleId::Plant(1)), Some(4));
         assert_eq!(core(&[4, 5], RoleId::Observer), Some(5));
@@ -137,6 +149,12 @@ mod tests {
         assert_eq!(core(&[4, 5, 6], RoleId::Plant(2)), Some(4));
         assert_eq!(core(&[7], RoleId::Plant(0)), Some(7));
         assert_eq!(core(&[7], RoleId::Controller), Some(7));
+    }
+
+    #[test]
+    fn nobody_is_bound_to_a_core_without_being_served_first_there() {
+        assert_eq!(core_of(&Realtime::default(), RoleId::Observer, false), None);
+        assert!(core_of(&Realtime::default(), RoleId::Observer, true).is_some());
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::{ClockKind, ConfigError, Scenario};
+use crate::config::{ClockKind, ConfigError, Realtime, Scenario};
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::telemetry::{Grant, Latency, RoleReport, StageReport};
 use crate::with_rig;
@@ -143,7 +143,7 @@ pub fn serve<B: Bus + 'static>(
     );
     let mut stages = Vec::new();
     let ended = match begin(scenario, role, &mut node, &mut control, &mut stages)? {
-        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule)?,
+        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, privileges::first_served(&grants))?,
         None => Ended::Stopped,
     };
     if scenario.clock == ClockKind::Realtime {
@@ -231,12 +231,16 @@ fn drive<B: Bus>(
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     schedule: &Schedule,
+    first_served: bool,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
     node.start(grid);
+    // Among equals, a role that spins for a sample holds up the one it waits for.
+    let spin_us = if first_served { scenario.realtime.spin_us } else { 0.0 };
+    let settings = Realtime { spin_us, ..scenario.realtime.clone() };
     let mut drive = Drive::new(control, scenario.last_tick);
     let ended = match scenario.clock {
-        ClockKind::Realtime => drive.realtime(&mut **node, grid, &scenario.realtime),
+        ClockKind::Realtime => drive.realtime(&mut **node, grid, &settings),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
     };
     Ok(ended?)
