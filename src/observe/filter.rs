@@ -17,6 +17,8 @@ pub struct Increment<const N: usize> {
     pub drift: SVector<f64, N>,
     /// ∫ρ G dt: the part of the potential that the drift explains.
     pub drift_moment: SVector<f64, N>,
+    /// Variance of the potential at the end of the step, from the variances of what is measured; 0 without noise.
+    pub variance: SVector<f64, N>,
 }
 
 /// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, at any step size.
@@ -82,6 +84,7 @@ mod tests {
             weight: h,
             drift: Vector1::new(3.0 * h),
             drift_moment: Vector1::new(1.5 * h * h),
+            variance: Vector1::zeros(),
         }
     }
 

@@ -300,6 +300,7 @@ impl HiddenRate {
             weight: dt_s,
             drift: Vector1::new(drift),
             drift_moment: Vector1::new(moment),
+            variance: Vector1::zeros(),
         }
     }
 }
