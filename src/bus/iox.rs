@@ -79,8 +79,8 @@ impl IoxBus {
     /// Only what is scored needs room for the scorer.
     fn deepest(&self, signal: Signal) -> usize {
         match signal {
-            Signal::Truth | Signal::Estimate => self.depths.scorer.max(self.depths.role),
-            Signal::Measurement | Signal::Command => self.depths.role,
+            Signal::Truth | Signal::Estimate | Signal::Command => self.depths.scorer.max(self.depths.role),
+            Signal::Measurement => self.depths.role,
             Signal::Health | Signal::Schedule => 1,
         }
     }

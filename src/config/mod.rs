@@ -16,8 +16,12 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 3] = [
+pub const SHIPPED: [(&str, &str); 7] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
+    ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("inertia", include_str!("../../config/inertia.toml")),
+    ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
+    ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
 ];

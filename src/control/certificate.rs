@@ -39,6 +39,9 @@ pub struct Certificate {
     /// Largest |k|·h: with one tick of delay an axis obeys z² − z + |k|h = 0 and is stable below 1; predicted,
     /// z = 1 − |k|h, stable below 2.
     pub gain_step: Condition,
+    /// What multiplies −e_i² and −ε² in the bound on V̇ of \[D\](18), 1/s.
+    slopes: Vector3<f64>,
+    hidden_slope: f64,
 }
 
 impl Certificate {
@@ -58,6 +61,9 @@ impl Certificate {
         let [i, j, k] = [hidden_axis % 3, (hidden_axis + 1) % 3, (hidden_axis - 1) % 3];
         let m = rate_bound_rad_s;
         let pull = [i, j].map(|axis| coefficients[axis].abs() * m);
+        let mut slopes = Vector3::zeros();
+        (slopes[i], slopes[j]) = (gain_per_s[i] - pull[0], gain_per_s[j] - pull[1]);
+        slopes[k] = gain_per_s[k] / 2.0;
         let schur = [i, j].map(|axis| coefficients[axis] * coefficients[axis] / gain_per_s[axis]);
         Self {
             rate_bound_rad_s: m,
@@ -72,7 +78,18 @@ impl Certificate {
             },
             rate_per_s: gain_per_s.min().min(decay_rate_per_s),
             gain_step: Condition { value: if predict { 2.0 } else { 1.0 }, required: gain_per_s.max() * tick_s },
+            slopes,
+            hidden_slope: decay_rate_per_s - pull[0] - pull[1] - gain_per_s[k] / 2.0,
         }
+    }
+
+    /// V = ½(|e|² + ε²) of \[D\](15), rad²/s², and the bound on V̇ of \[D\](18), rad²/s³, for the errors e = p − ω and
+    /// ε = ω_k − ω̂_k, rad/s.
+    #[inline]
+    pub fn lyapunov(&self, error: &Vector3<f64>, hidden_error: f64) -> (f64, f64) {
+        let square = error.component_mul(error);
+        let hidden = hidden_error * hidden_error;
+        (0.5 * (square.sum() + hidden), -self.slopes.dot(&square) - self.hidden_slope * hidden)
     }
 
     /// Whether the sampled loop is stable at this tick.
@@ -114,6 +131,26 @@ mod tests {
         let needed = Certificate::new(&a, 3, &gain, 1.0, m, 1e-3, false).exact.required;
         assert!(worst_eigenvalue(&a, &gain, needed * 1.001, m) < 0.0);
         assert!(worst_eigenvalue(&a, &gain, needed * 0.999, m) > 0.0);
+    }
+
+    /// The bound of the paper is above V̇ as the error system has it, at every angle of ω and for random errors.
+    #[test]
+    fn the_bound_on_the_rate_of_v_is_one() {
+        let (a, gain, m) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0), 1.5);
+        let certificate = Certificate::new(&a, 3, &gain, 5.0, m, 1e-3, false);
+        for step in 0..360 {
+            let angle = f64::from(step).to_radians();
+            let q = form(&a, &gain, 5.0, m * angle.cos(), m * angle.sin());
+            let x = nalgebra::Vector4::new(
+                (7.0 * angle).sin(),
+                (5.0 * angle).cos(),
+                (3.0 * angle).sin(),
+                (11.0 * angle).cos(),
+            );
+            let (v, bound) = certificate.lyapunov(&x.xyz(), x.w);
+            assert!((v - 0.5 * x.norm_squared()).abs() < 1e-15);
+            assert!((x.transpose() * q * x).x <= bound, "angle {step}");
+        }
     }
 
     #[test]

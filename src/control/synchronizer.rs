@@ -24,22 +24,32 @@ impl Synchronizer {
         Self { body, gain_per_s, lead_s }
     }
 
-    /// The control acceleration, rad/s², from the reference ω or ω̂ and the follower's p, rad/s.
+    /// Goes on with other coefficients a of \[D\](2): those that an observer has learned.
+    pub fn learn(&mut self, coefficients: Vector3<f64>) {
+        self.body = RigidBody::with_coefficients(coefficients);
+    }
+
+    /// Reference and follower, rad/s, when the command will begin to act: predicted over the lead, if there is one.
     ///
-    /// `applied` is the control acceleration acting on the follower now; it matters only for the prediction.
+    /// `applied` is the control acceleration acting on the follower until then, rad/s².
     #[inline]
-    pub fn command(&self, reference: &Vector3<f64>, follower: &Vector3<f64>, applied: &Vector3<f64>) -> Vector3<f64> {
+    pub fn ahead(
+        &self,
+        reference: &Vector3<f64>,
+        follower: &Vector3<f64>,
+        applied: &Vector3<f64>,
+    ) -> (Vector3<f64>, Vector3<f64>) {
         if self.lead_s > 0.0 {
             let reference = self.body.flow(reference, &Vector3::zeros(), self.lead_s);
-            let follower = self.body.flow(follower, applied, self.lead_s);
-            self.law(&reference, &follower)
+            (reference, self.body.flow(follower, applied, self.lead_s))
         } else {
-            self.law(reference, follower)
+            (*reference, *follower)
         }
     }
 
+    /// The control acceleration, rad/s², from the reference ω or ω̂ and the follower's p, rad/s.
     #[inline]
-    fn law(&self, w: &Vector3<f64>, p: &Vector3<f64>) -> Vector3<f64> {
+    pub fn command(&self, w: &Vector3<f64>, p: &Vector3<f64>) -> Vector3<f64> {
         let gyroscopic = Vector3::new(w.y * w.z - p.y * p.z, w.z * w.x - p.z * p.x, w.x * w.y - p.x * p.y);
         self.body.coefficients().component_mul(&gyroscopic) - self.gain_per_s.component_mul(&(p - w))
     }
@@ -59,7 +69,7 @@ mod tests {
     fn the_error_obeys_its_own_linear_equation() {
         let (w, p) = (Vector3::new(0.6, -0.4, 0.8), Vector3::new(-0.3, 0.5, 0.2));
         let law = law(0.0);
-        let u = law.command(&w, &p, &Vector3::zeros());
+        let u = law.command(&w, &p);
         let a = law.body.coefficients();
         let error_rate = euler(a, &p, &u) - euler(a, &w, &Vector3::zeros());
         let expected = -law.gain_per_s.component_mul(&(p - w));
@@ -69,8 +79,9 @@ mod tests {
     #[test]
     fn a_synchronised_follower_needs_no_command() {
         let w = Vector3::new(0.6, -0.4, 0.8);
-        assert_eq!(law(0.0).command(&w, &w, &Vector3::zeros()), Vector3::zeros());
-        assert_eq!(law(0.01).command(&w, &w, &Vector3::zeros()), Vector3::zeros());
+        assert_eq!(law(0.0).command(&w, &w), Vector3::zeros());
+        let (reference, follower) = law(0.01).ahead(&w, &w, &Vector3::zeros());
+        assert_eq!(reference, follower);
     }
 
     /// Held input and one tick of delay: the prediction is worth about one tick of the error's decay.
@@ -82,7 +93,8 @@ mod tests {
             let (mut w, mut p) = (Vector3::new(0.6, -0.4, 0.8), Vector3::new(-0.3, 0.5, 0.2));
             let mut applied = Vector3::zeros();
             for _ in 0..20 {
-                let next = law.command(&w, &p, &applied);
+                let (reference, follower) = law.ahead(&w, &p, &applied);
+                let next = law.command(&reference, &follower);
                 w = law.body.flow(&w, &Vector3::zeros(), h);
                 p = law.body.flow(&p, &applied, h);
                 applied = next;

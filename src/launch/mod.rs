@@ -11,7 +11,7 @@ mod table;
 
 pub use children::janitor;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
-pub use score::{MetricScore, Score, Scorer};
+pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use table::table;
 
 use crate::bus::BusError;

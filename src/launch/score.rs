@@ -4,7 +4,7 @@
 
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::config::{Accept, Scenario};
-use crate::rig::{Estimate, Rig, Truth};
+use crate::rig::{BodyInfo, Command, Estimate, Rig, Truth};
 use crate::runtime::{Input, Seek, topic};
 use crate::with_rig;
 use serde::Serialize;
@@ -18,6 +18,28 @@ pub struct Score {
     pub unscored_ticks: u64,
     /// One entry per metric of the rig.
     pub metrics: Vec<MetricScore>,
+    /// How the live certificate fared, if the rig has one.
+    pub certificate: Option<CertificateScore>,
+}
+
+/// For how many steps of all driven bodies the published bound on V̇ held: V(k+1) ≤ V(k) + h·bound(k).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct CertificateScore {
+    /// It held, or V was at the floor of rounding.
+    pub held: u64,
+    /// It did not.
+    pub broken: u64,
+    /// Nothing can be said: before the first command acts, and around missed ticks.
+    pub unjudged: u64,
+}
+
+/// V from which on its change over one tick is more than rounding, for rates of the order of 1 rad/s.
+///
+/// The reconstruction of ε divides the rounding of a measured increment by h, and the change of V over a tick is a part h
+/// of V: errors count from rounding/h² on.
+fn lyapunov_floor(tick_s: f64) -> f64 {
+    let error = 64.0 * f64::EPSILON / (tick_s * tick_s);
+    error * error
 }
 
 /// The score by one metric.
@@ -64,12 +86,22 @@ pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B) -> Result<Box<dyn Sc
     with_rig!(&scenario.rig, rig => typed(rig, scenario, bus))
 }
 
+/// A driven body's commands, for the live certificate.
+struct DrivenBody<R: Rig, B: Bus> {
+    body: usize,
+    command: Input<B, Command<R>>,
+    /// Tick, V, and the bound on V̇, of the command before.
+    before: Option<(u64, f64, f64)>,
+}
+
 struct RigScorer<R: Rig, B: Bus> {
     rig: R,
     accept: Accept,
     tick_s: f64,
     truths: Vec<Input<B, Truth<R>>>,
     estimate: Input<B, Estimate<R>>,
+    /// Commands of the driven bodies.
+    commands: Vec<DrivenBody<R, B>>,
     next_tick: u64,
     last_tick: u64,
     values: Vec<f64>,
@@ -79,6 +111,11 @@ struct RigScorer<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
         let bodies = rig.bodies().iter();
+        let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven);
+        let command = |(body, info): (usize, &BodyInfo)| {
+            let command = Input::open(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
+            Ok(DrivenBody { body, command, before: None })
+        };
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
@@ -94,10 +131,16 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 .map(|body| Input::open(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
                 .collect::<Result<_, _>>()?,
             estimate: Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
+            commands: driven.map(command).collect::<Result<_, BusError>>()?,
             next_tick: 0,
             last_tick: scenario.last_tick,
             values: vec![f64::NAN; rig.metrics().len()],
-            score: Score { scored_ticks: 0, unscored_ticks: 0, metrics: rig.metrics().iter().map(metric).collect() },
+            score: Score {
+                scored_ticks: 0,
+                unscored_ticks: 0,
+                metrics: rig.metrics().iter().map(metric).collect(),
+                certificate: None,
+            },
         })
     }
 
@@ -106,6 +149,9 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let mut settled = self.estimate.seek(self.next_tick)? != Seek::NotYet;
         for truth in &mut self.truths {
             settled &= truth.seek(self.next_tick)? != Seek::NotYet;
+        }
+        for driven in &mut self.commands {
+            settled &= driven.command.seek(self.next_tick)? != Seek::NotYet;
         }
         Ok(settled)
     }
@@ -120,7 +166,30 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);
         }
+        for driven in &mut self.commands {
+            // A follower that held or was safe did not apply what the certificate is about.
+            let undisturbed = at(&self.truths[driven.body], tick).is_some_and(|truth| R::undisturbed(truth));
+            driven.judge(tick, self.tick_s, undisturbed, &mut self.score.certificate);
+        }
         self.next_tick += 1;
+    }
+}
+
+impl<R: Rig, B: Bus> DrivenBody<R, B> {
+    fn judge(&mut self, tick: u64, tick_s: f64, undisturbed: bool, score: &mut Option<CertificateScore>) {
+        let now = at(&self.command, tick).and_then(R::lyapunov).map(|(v, bound)| (tick, v, bound));
+        if let Some((tick, v, _)) = now {
+            let score = score.get_or_insert_default();
+            match self.before {
+                // The first command acts from tick 1 on: V is under control from there.
+                Some((before, v_before, bound)) if before + 1 == tick && before > 0 && undisturbed => {
+                    let holds = v <= (v_before + tick_s * bound).max(lyapunov_floor(tick_s));
+                    *(if holds { &mut score.held } else { &mut score.broken }) += 1;
+                }
+                _ => score.unjudged += 1,
+            }
+        }
+        self.before = now.filter(|_| undisturbed);
     }
 }
 
@@ -167,7 +236,8 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
             self.poll(u64::MAX)?;
             let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.next_tick);
             let more = newest(self.estimate.report().last_tick)
-                || self.truths.iter().any(|truth| newest(truth.report().last_tick));
+                || self.truths.iter().any(|truth| newest(truth.report().last_tick))
+                || self.commands.iter().any(|driven| newest(driven.command.report().last_tick));
             if !more || self.next_tick > self.last_tick {
                 break;
             }

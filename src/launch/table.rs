@@ -47,6 +47,11 @@ fn results(summary: &Summary, text: &mut String) {
         rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
     }
     let _ = writeln!(text, "\n{rows}");
+    if let Some(score) = summary.score.certificate {
+        let judged = score.held + score.broken;
+        let _ =
+            writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
+    }
 }
 
 fn verdict(holds: Option<bool>) -> String {

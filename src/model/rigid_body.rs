@@ -108,6 +108,11 @@ impl RigidBody {
         Self { coefficients: inertia.coefficients() }
     }
 
+    /// A body of which only the coefficients a of \[D\](2) are known; its motion depends on nothing else.
+    pub fn with_coefficients(coefficients: Vector3<f64>) -> Self {
+        Self { coefficients }
+    }
+
     /// The coefficients a of \[D\](2).
     pub fn coefficients(&self) -> &Vector3<f64> {
         &self.coefficients

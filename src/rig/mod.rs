@@ -58,6 +58,14 @@ pub trait Rig: Clone + Send + Sync + 'static {
     );
     /// What is proven of the closed loop, one entry per driven body.
     fn certificates(&self) -> Vec<CertificateReport>;
+    /// Whether a body applied what it was told to at this tick.
+    fn undisturbed(_truth: &Truth<Self>) -> bool {
+        true
+    }
+    /// V and the bound on V̇ that a controller published with a command, if the rig has such a function.
+    fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
+        None
+    }
 }
 
 /// A certificate as told to people and written to the summary.

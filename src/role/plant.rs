@@ -20,8 +20,8 @@ pub trait Body {
     fn apply_safe(&mut self);
     /// Writes the full state, with the given status bits, everything but the stamp.
     fn truth(&self, status: u64, out: &mut Self::Truth);
-    /// Writes the measurement, with the given status bits, everything but the stamp.
-    fn measure(&self, status: u64, out: &mut Self::Measurement);
+    /// Writes the measurement, with the given status bits, everything but the stamp. Once per executed tick.
+    fn measure(&mut self, status: u64, out: &mut Self::Measurement);
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
 }
@@ -124,8 +124,9 @@ impl<B: Body> Plant<B> {
 
     /// Writes the measurement of the present state under the given stamp.
     #[inline]
-    pub fn measure(&self, stamp: &Stamp, out: &mut B::Measurement) {
-        self.body.measure(self.status(), out);
+    pub fn measure(&mut self, stamp: &Stamp, out: &mut B::Measurement) {
+        let status = self.status();
+        self.body.measure(status, out);
         *out.stamp_mut() = *stamp;
     }
 

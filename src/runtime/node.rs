@@ -29,7 +29,8 @@ impl RoleId {
     /// All roles of a scenario, in the order in which one tick passes through them.
     pub fn all(scenario: &Scenario) -> Vec<Self> {
         let plants = (0..scenario.rig.bodies().len()).map(Self::Plant);
-        plants.chain([Self::Observer, Self::Controller]).collect()
+        let driven = scenario.rig.bodies().iter().any(|body| body.driven);
+        plants.chain([Self::Observer]).chain(driven.then_some(Self::Controller)).collect()
     }
 
     /// The role's name: a body's, `observer` or `controller`.

@@ -138,6 +138,14 @@ pub mod status {
     pub const UNOBSERVABLE: u64 = 1 << 3;
     /// The measurement lacked a component that the observer needs, or was not finite: the estimate is the previous one.
     pub const UNUSABLE: u64 = 1 << 4;
+    /// The observer learns the body's inertia from all components.
+    pub const LEARNING: u64 = 1 << 5;
+    /// A component that used to be measured is supplied by the observer.
+    pub const AXIS_LOST: u64 = 1 << 6;
+    /// The component was lost before the inertia had been learned: bounded, but not to be trusted.
+    pub const DEGRADED: u64 = 1 << 7;
+    /// The motion does not excite the identifier.
+    pub const NOT_EXCITED: u64 = 1 << 8;
 }
 
 #[cfg(test)]

@@ -30,9 +30,17 @@ sample! {
 
 sample! {
     /// What the observer makes of a leader's measurements.
-    RateEstimate = "corotate/rigid-body/estimate/v1" {
-        /// Angular velocity, rad/s: measured components as measured, the hidden one estimated.
+    RateEstimate = "corotate/rigid-body/estimate/v2" {
+        /// Angular velocity, rad/s: measured components as measured, a hidden one estimated.
         omega_rad_s: [f64; 3],
+        /// The hidden component as the last step reconstructs it, less the estimate: the estimate's error, rad/s.
+        innovation_rad_s: f64,
+        /// The coefficients a of \[D\](2) that the observer works with: learned or configured.
+        coefficients: [f64; 3],
+        /// a1 + a2 + a3 + a1·a2·a3: 0 for the coefficients of a body.
+        closure: f64,
+        /// What has excited the identifier, ∫|ω1 ω2 ω3| dt in rad³/s² (asymmetric) or ∫|ω3| dt in rad (axisymmetric).
+        excitation: f64,
         /// Bit i set: component i is measured or observed, not merely guessed.
         valid: u64,
         /// Bits of [`status`](super::status).
@@ -42,8 +50,12 @@ sample! {
 
 sample! {
     /// What a follower's actuators are to apply from the next tick on.
-    RateCommand = "corotate/rigid-body/command/v1" {
-        /// Control acceleration (torque over inertia), rad/s².
+    RateCommand = "corotate/rigid-body/command/v2" {
+        /// Control acceleration (torque over the nominal inertia), rad/s².
         acceleration_rad_s2: [f64; 3],
+        /// V = ½(|e|² + ε²) of \[D\](15) at this tick, rad²/s².
+        lyapunov_rad2_s2: f64,
+        /// The bound on V̇ of \[D\](18) at this tick, rad²/s³.
+        lyapunov_rate_bound_rad2_s3: f64,
     }
 }

@@ -72,7 +72,7 @@ mod tests {
 
     fn sample(tick: u64, value: f64, sent_ns: u64) -> RateCommand {
         let stamp = Stamp { tick, sent_ns, origin_ns: sent_ns / 2, generation: sent_ns };
-        RateCommand { stamp, acceleration_rad_s2: [value, 0.0, 0.0] }
+        RateCommand { stamp, acceleration_rad_s2: [value, 0.0, 0.0], ..RateCommand::default() }
     }
 
     fn hash(samples: &[(u64, f64, u64)]) -> Checkpoints {

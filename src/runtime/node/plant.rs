@@ -66,7 +66,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
             self.book.starved(tick);
         }
         self.book.ticks.safe += u64::from(matches!(event, CommandEvent::Expired | CommandEvent::Safe));
-        let (plant, clock) = (&self.plant, self.clock);
+        let (plant, clock) = (&mut self.plant, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
         self.measurement.send(|sample| {
             stamp.sent_ns = clock.now_ns();

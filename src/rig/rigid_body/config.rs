@@ -1,0 +1,187 @@
+//! The sections of a scenario that belong to this rig: as typed, with their checks.
+
+use crate::config::{Checks, finite_positive};
+use serde::{Deserialize, Serialize};
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Raw {
+    pub leader: RawLeader,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub follower: Vec<RawFollower>,
+    pub observer: RawObserver,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub controller: Option<RawController>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawLeader {
+    pub inertia_kg_m2: [f64; 3],
+    pub initial_rate_rad_s: [f64; 3],
+    pub measured_axes: Vec<usize>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub outage: Vec<RawOutage>,
+}
+
+/// A gyro that is dead from one tick to another.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawOutage {
+    pub axis: usize,
+    pub from_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub until_s: Option<f64>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawFollower {
+    pub name: String,
+    pub initial_rate_rad_s: [f64; 3],
+    #[serde(default = "identical")]
+    pub inertia_factor: [f64; 3],
+}
+
+fn identical() -> [f64; 3] {
+    [1.0; 3]
+}
+
+/// What the observer is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Kind {
+    /// Supplies one component that is never measured.
+    #[default]
+    HiddenRate,
+    /// Learns the inertia while all components are measured, and supplies one that is lost.
+    Inertia,
+    /// The same for a body that is known to be axisymmetric.
+    AxisymmetricInertia,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawObserver {
+    #[serde(default)]
+    pub kind: Kind,
+    pub decay_rate_per_s: f64,
+    #[serde(default)]
+    pub initial_guess_rad_s: f64,
+    #[serde(default = "default_floor")]
+    pub observability_floor_rad_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub identifier_decay: Option<IdentifierDecay>,
+    #[serde(default)]
+    pub initial_coefficients: [f64; 3],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub symmetry_axis: Option<usize>,
+}
+
+/// How fast the identifier's error decays, per unit of excitation: rates per component, or minus a matrix.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "expected three decay rates, or a 3 by 3 Hurwitz matrix, as [5.0, 5.0, 5.0]")]
+pub(super) enum IdentifierDecay {
+    /// One positive rate per component.
+    Rates([f64; 3]),
+    /// The matrix of \[SZ\](8), all eigenvalues left of the imaginary axis.
+    Matrix([[f64; 3]; 3]),
+}
+
+fn default_floor() -> f64 {
+    1e-6
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawController {
+    pub gain_per_s: [f64; 3],
+    #[serde(default)]
+    pub predict: bool,
+    #[serde(default)]
+    pub coefficients: Coefficients,
+    #[serde(default)]
+    pub adaptation_gain: f64,
+}
+
+/// Which mass distribution the law works with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Coefficients {
+    /// The configured one.
+    #[default]
+    Known,
+    /// The one that the observer has learned.
+    Learned,
+}
+
+/// Checks what can be told from the text alone, whatever the observer is for.
+pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
+    check_followers(&raw.follower, checks);
+    check_observer(&raw.observer, checks);
+    match (&raw.controller, raw.follower.is_empty()) {
+        (None, false) => checks.refuse("controller", "is missing; followers need a [controller] with gain_per_s"),
+        (Some(_), true) => checks.refuse("controller", "has no follower to drive; add a [[follower]] or remove it"),
+        (Some(controller), false) => {
+            for gain in controller.gain_per_s {
+                finite_positive(checks, "controller.gain_per_s", gain);
+            }
+            checks.require(controller.adaptation_gain >= 0.0, "controller.adaptation_gain", || {
+                format!("{} is below zero and would unlearn; give 0 or more", controller.adaptation_gain)
+            });
+        }
+        (None, true) => {}
+    }
+}
+
+fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
+    finite_positive(checks, "observer.observability_floor_rad_s", observer.observability_floor_rad_s);
+    finite_positive(checks, "observer.decay_rate_per_s", observer.decay_rate_per_s);
+    let (learns, symmetric) = (observer.kind != Kind::HiddenRate, observer.kind == Kind::AxisymmetricInertia);
+    for (key, given, needed) in [
+        ("observer.identifier_decay", observer.identifier_decay.is_some(), learns),
+        ("observer.symmetry_axis", observer.symmetry_axis.is_some(), symmetric),
+    ] {
+        match (given, needed) {
+            (false, true) => checks.refuse(key, "is missing for this observer.kind; add it"),
+            (true, false) => checks.refuse(key, "has no meaning for this observer.kind; remove it"),
+            _ => {}
+        }
+    }
+    if let Some(IdentifierDecay::Rates(rates)) = &observer.identifier_decay {
+        rates.iter().for_each(|rate| finite_positive(checks, "observer.identifier_decay", *rate));
+    }
+}
+
+fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
+    for (index, follower) in followers.iter().enumerate() {
+        let (key, name) = (format!("follower[{index}].name"), &follower.name);
+        let plain = (1..=32).contains(&name.len())
+            && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+        checks.require(plain, &key, || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
+        let reserved = ["leader", "observer", "controller", "run"].contains(&name.as_str());
+        let taken = followers[..index].iter().any(|other| other.name == *name);
+        checks.require(!reserved && !taken, &key, || format!("`{name}` is taken already; choose another name"));
+        for factor in follower.inertia_factor {
+            finite_positive(checks, &format!("follower[{index}].inertia_factor"), factor);
+        }
+    }
+}
+
+/// The component that the observer supplies, 1 to 3: the one that is not measured, or the one that fails.
+///
+/// An observer that learns needs all three to begin with.
+pub(super) fn hidden_axis(raw: &Raw, checks: &mut Checks<'_>) -> Option<usize> {
+    let measured = &raw.leader.measured_axes;
+    let hidden: Vec<usize> = (1..=3).filter(|axis| !measured.contains(axis)).collect();
+    let expected = if raw.observer.kind == Kind::HiddenRate { 2 } else { 3 };
+    if measured.len() != expected || hidden.len() != 3 - expected {
+        let remedy = match expected {
+            2 => "does not leave exactly one axis hidden; name two different axes of 1, 2 and 3",
+            _ => "is not all axes, which learning needs; give [1, 2, 3] and let one fail with [[leader.outage]]",
+        };
+        checks.refuse("leader.measured_axes", format!("{measured:?} {remedy}"));
+        return None;
+    }
+    hidden.first().or(raw.leader.outage.first().map(|outage| &outage.axis)).copied()
+}

@@ -1,0 +1,81 @@
+//! What learns the coefficients a of \[D\](2) from a body's motion: all three, or the one of an axisymmetric body.
+
+use crate::observe::{Axisymmetric, Identification, InertiaRelation, InvariantFilter, RateSample};
+use crate::sample::status;
+use nalgebra::{Vector1, Vector3};
+
+/// An identifier with its estimate.
+#[derive(Debug, Clone)]
+pub(super) struct Identifier {
+    kind: Kind,
+    /// The slowest decay rate of its error, per unit of excitation.
+    slowest_decay: f64,
+    /// ∫ρ dt so far: rad³/s², or rad for an axisymmetric body.
+    excitation: f64,
+}
+
+#[derive(Debug, Clone)]
+enum Kind {
+    Asymmetric { relation: InertiaRelation, filter: InvariantFilter<3> },
+    Axisymmetric { relation: Axisymmetric, filter: InvariantFilter<1>, axis: usize },
+}
+
+impl Identifier {
+    /// For any body; `filter` is at the initial guess.
+    pub fn asymmetric(relation: InertiaRelation, filter: InvariantFilter<3>, slowest_decay: f64) -> Self {
+        Self { kind: Kind::Asymmetric { relation, filter }, slowest_decay, excitation: 0.0 }
+    }
+
+    /// For a body with the symmetry axis `axis`, 1 to 3, a decay rate per rad, and a guess of a.
+    pub fn axisymmetric(relation: Axisymmetric, axis: usize, decay: f64, guess: f64) -> Self {
+        let filter = InvariantFilter::new(Vector1::new(decay), Vector1::new(guess));
+        Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay: decay, excitation: 0.0 }
+    }
+
+    /// Learns from one step; returns the status bits of what stood against it.
+    pub fn learn(&mut self, from: &RateSample, to: &RateSample, dt_s: f64) -> u64 {
+        match &mut self.kind {
+            Kind::Asymmetric { relation, filter } => {
+                let seen = relation.observe(from, to, dt_s, filter.estimate());
+                take(seen, filter, &mut self.excitation)
+            }
+            Kind::Axisymmetric { relation, filter, .. } => {
+                take(relation.observe(from, to, dt_s), filter, &mut self.excitation)
+            }
+        }
+    }
+
+    /// The coefficients as learned so far.
+    pub fn coefficients(&self) -> Vector3<f64> {
+        match &self.kind {
+            Kind::Asymmetric { filter, .. } => *filter.estimate(),
+            Kind::Axisymmetric { filter, axis, .. } => {
+                let mut a = Vector3::zeros();
+                (a[axis % 3], a[(axis + 1) % 3]) = (filter.estimate().x, -filter.estimate().x);
+                a
+            }
+        }
+    }
+
+    /// ∫ρ dt so far.
+    pub fn excitation(&self) -> f64 {
+        self.excitation
+    }
+
+    /// By how many decay times the initial error has decayed.
+    pub fn decay_times(&self) -> f64 {
+        self.excitation * self.slowest_decay
+    }
+}
+
+fn take<const N: usize>(seen: Identification<N>, filter: &mut InvariantFilter<N>, excitation: &mut f64) -> u64 {
+    *excitation += seen.excitation();
+    match seen {
+        Identification::Excited(increment) => {
+            filter.step(&increment);
+            0
+        }
+        Identification::Unexcited => status::NOT_EXCITED,
+        Identification::Ambiguous => status::UNOBSERVABLE,
+    }
+}

@@ -1,0 +1,40 @@
+//! The synchronising law of one follower, with its certificate computed live.
+
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::role::Law;
+use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
+use nalgebra::Vector3;
+
+/// The synchronising law of one follower.
+#[derive(Debug)]
+pub struct RateLaw {
+    pub(super) law: Synchronizer,
+    pub(super) adaptation: InertiaAdaptation,
+    pub(super) certificate: Certificate,
+    /// The component that the observer supplies, 0 to 2.
+    pub(super) supplied: usize,
+    /// Whether the law works with the coefficients that the observer has learned.
+    pub(super) learned: bool,
+    pub(super) tick_s: f64,
+}
+
+impl Law for RateLaw {
+    type Estimate = RateEstimate;
+    type Measurement = RateMeasurement;
+    type Command = RateCommand;
+
+    fn command(&mut self, estimate: &RateEstimate, measurement: &RateMeasurement, out: &mut RateCommand) {
+        let (reference, follower) = (Vector3::from(estimate.omega_rad_s), Vector3::from(measurement.omega_rad_s));
+        if self.learned {
+            self.law.learn(estimate.coefficients.into());
+        }
+        let (w, p) = self.law.ahead(&reference, &follower, &measurement.applied_rad_s2.into());
+        let correction = self.adaptation.correction(&w, &p, self.tick_s);
+        out.acceleration_rad_s2 = (self.law.command(&w, &p) + correction).into();
+        // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
+        let mut error = follower - reference;
+        error[self.supplied] -= estimate.innovation_rad_s;
+        (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =
+            self.certificate.lyapunov(&error, estimate.innovation_rad_s);
+    }
+}

@@ -1,0 +1,153 @@
+//! The observer for a gyro that fails in flight: learns the body's inertia while all components are measured, and supplies
+//! the one that is lost from the other two and from what it has learned.
+//!
+//! Its modes are explicit and told in the status word. Must not jump when an axis goes or comes back, and must stay bounded
+//! when it goes too early.
+
+use super::identifier::Identifier;
+use super::observer::{ALL, HiddenObserver, filter, seen};
+use crate::observe::{HiddenRate, RateSample};
+use crate::sample::{RateEstimate, RateMeasurement, status};
+use nalgebra::Vector3;
+
+/// The identifier's error counts as gone after so many decay times: e^−25 is 1e-11.
+const SETTLED_DECAYS: f64 = 25.0;
+/// Coefficients of a body close a1 + a2 + a3 + a1·a2·a3 = 0; learned ones do to within this once they are settled.
+const SETTLED_CLOSURE: f64 = 1e-6;
+/// A component that is supplied on poor knowledge is kept within so many times the fastest rate seen.
+const DEGRADED_BOUND: f64 = 2.0;
+
+/// What a [`Learner`] is made of.
+#[derive(Debug, Clone)]
+pub(super) struct Parts {
+    /// The identifier at its initial guess.
+    pub identifier: Identifier,
+    /// Decay rate of a supplied component, 1/s.
+    pub decay_rate_per_s: f64,
+    /// Below this, rad/s, measured components carry no information.
+    pub floor_rad_s: f64,
+}
+
+/// Learns the inertia, and supplies a component that is lost.
+#[derive(Debug)]
+pub struct Learner {
+    parts: Parts,
+    identifier: Identifier,
+    last: RateSample,
+    fastest_rad_s: f64,
+    /// What supplies the lost component, while one is lost.
+    supplier: Option<Supplier>,
+    status: u64,
+}
+
+/// The stand-in for a lost component.
+#[derive(Debug)]
+struct Supplier {
+    component: usize,
+    degraded: bool,
+    /// None if the coefficients learned so far do not tell the component at all: it is held.
+    observer: Option<HiddenObserver>,
+    held: Vector3<f64>,
+}
+
+impl Learner {
+    pub(super) fn new(parts: Parts) -> Self {
+        let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
+        Self {
+            identifier: parts.identifier.clone(),
+            parts,
+            last: nothing,
+            fastest_rad_s: 0.0,
+            supplier: None,
+            status: status::INITIAL,
+        }
+    }
+
+    pub(super) fn start(&mut self, measurement: &RateMeasurement) {
+        *self = Self::new(self.parts.clone());
+        self.last = seen(measurement);
+    }
+
+    pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+        match (0..3).find(|component| measurement.valid >> component & 1 == 0) {
+            None => self.learn(measurement, dt_s),
+            Some(lost) => self.supply(lost, measurement, dt_s),
+        }
+    }
+
+    /// All components are measured.
+    fn learn(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+        let to = seen(measurement);
+        self.status = status::LEARNING;
+        self.fastest_rad_s = self.fastest_rad_s.max(to.rate_rad_s.amax());
+        // Over the step in which an axis comes back there is no increment: only one end of it is complete.
+        if self.supplier.take().is_none() {
+            self.status |= self.identifier.learn(&self.last, &to, dt_s);
+        }
+        self.last = to;
+    }
+
+    /// One component is not measured.
+    fn supply(&mut self, lost: usize, measurement: &RateMeasurement, dt_s: f64) {
+        let rate = self.rate();
+        let (degraded, bound) = (!self.settled(), DEGRADED_BOUND * self.fastest_rad_s);
+        if self.supplier.as_ref().is_none_or(|supplier| supplier.component != lost) {
+            self.supplier = Some(self.supplier(lost, rate, degraded));
+        }
+        let to = seen(measurement);
+        if let Some(supplier) = &mut self.supplier {
+            self.status = status::AXIS_LOST | if supplier.degraded { status::DEGRADED } else { 0 };
+            supplier.held = to.rate_rad_s;
+            supplier.held[lost] = rate[lost];
+            if let Some(observer) = &mut supplier.observer {
+                observer.update(measurement, dt_s);
+                self.status |= observer.status();
+                let supplied = observer.rate()[lost];
+                if supplier.degraded && supplied.abs() > bound {
+                    let within = filter(self.parts.decay_rate_per_s, bound.copysign(supplied));
+                    observer.begin(within, to, self.status);
+                }
+            }
+        }
+        self.last = to;
+    }
+
+    /// A stand-in that goes on from the last good value.
+    fn supplier(&self, component: usize, rate: Vector3<f64>, degraded: bool) -> Supplier {
+        let coefficients = self.identifier.coefficients();
+        let relation = HiddenRate::new(&coefficients, component + 1, self.parts.floor_rad_s).ok();
+        let observer = relation.map(|relation| {
+            let begun = filter(self.parts.decay_rate_per_s, rate[component]);
+            let mut observer = HiddenObserver::new(relation, coefficients, begun, component);
+            observer.begin(begun, self.last, 0);
+            observer
+        });
+        Supplier { component, degraded, observer, held: rate }
+    }
+
+    /// Whether the coefficients can be relied on.
+    fn settled(&self) -> bool {
+        let a = self.identifier.coefficients();
+        self.identifier.decay_times() >= SETTLED_DECAYS && (a.sum() + a.product()).abs() < SETTLED_CLOSURE
+    }
+
+    fn rate(&self) -> Vector3<f64> {
+        match &self.supplier {
+            Some(Supplier { observer: Some(observer), .. }) => observer.rate(),
+            Some(supplier) => supplier.held,
+            None => self.last.rate_rad_s,
+        }
+    }
+
+    pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
+        let a = self.identifier.coefficients();
+        let supplier = self.supplier.as_ref();
+        out.omega_rad_s = self.rate().into();
+        out.innovation_rad_s = supplier.and_then(|s| s.observer.as_ref()).map_or(0.0, HiddenObserver::innovation);
+        out.coefficients = a.into();
+        out.closure = a.sum() + a.product();
+        out.excitation = self.identifier.excitation();
+        out.status = self.status | status;
+        out.valid = supplier.filter(|s| s.degraded).map_or(ALL, |s| ALL & !(1 << s.component));
+    }
+}

@@ -1,0 +1,373 @@
+//! The rig `rigid-body`: a leader with a component of its angular velocity unmeasured or lost, and followers that turn as
+//! it does.
+//!
+//! Parameters, and the glue between samples and vectors; the mathematics is in `model`, `observe` and `control`.
+
+mod config;
+mod identifier;
+mod law;
+mod learner;
+mod observer;
+mod plant;
+
+pub use law::RateLaw;
+pub use learner::Learner;
+pub use observer::{HiddenObserver, RateObserver};
+pub use plant::RatePlant;
+
+use super::{BodyInfo, CertificateReport, ConditionReport, Rig};
+use crate::config::{Checks, ConfigError, Document};
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::model::{Inertia, RigidBody};
+use crate::observe::{Axisymmetric, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
+use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
+use config::{Coefficients, IdentifierDecay, Kind, Raw, RawObserver};
+use identifier::Identifier;
+use nalgebra::{Matrix3, Vector3};
+use observer::ALL;
+use plant::Outage;
+
+/// A leader, its observer, and the followers with their laws.
+#[derive(Debug, Clone)]
+pub struct RigidBodyRig {
+    bodies: Vec<BodyInfo>,
+    inertia: Inertia,
+    /// Per body: initial rate, and inertia over the nominal one.
+    initial_rates: Vec<Vector3<f64>>,
+    inertia_factors: Vec<Vector3<f64>>,
+    /// Bit i set: the leader's component i has a gyro.
+    measured: u64,
+    outages: Vec<Outage>,
+    /// The component that the observer supplies, 1 to 3.
+    supplied_axis: Option<usize>,
+    observer: ObserverDesign,
+    controller: Option<ControllerDesign>,
+    tick_s: f64,
+}
+
+/// The observer's parameters.
+#[derive(Debug, Clone)]
+enum ObserverDesign {
+    Hidden { relation: HiddenRate, decay_rate_per_s: f64, guess_rad_s: f64 },
+    Learner(learner::Parts),
+}
+
+/// The controller's parameters.
+#[derive(Debug, Clone, Copy)]
+struct ControllerDesign {
+    gain_per_s: Vector3<f64>,
+    predict: bool,
+    learned: bool,
+    adaptation_gain: f64,
+}
+
+/// Reads and checks the sections of this rig.
+pub(super) fn resolve(
+    sections: &Document,
+    tick_s: f64,
+    checks: &mut Checks<'_>,
+) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
+    let raw: Raw = sections.read_into()?;
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    config::check(&raw, checks);
+    let supplied_axis = config::hidden_axis(&raw, checks);
+    let outages = resolve_outages(&raw, tick_s, checks);
+    let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
+    let Some(inertia) = inertia else { return Ok((None, table)) };
+    let Some(observer) = design_observer(&raw, &inertia, supplied_axis, checks) else { return Ok((None, table)) };
+    let mut rig = RigidBodyRig {
+        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
+        inertia,
+        initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
+        inertia_factors: vec![Vector3::repeat(1.0)],
+        measured: raw.leader.measured_axes.iter().fold(0, |bits, axis| bits | 1 << (axis - 1)),
+        outages,
+        supplied_axis,
+        observer,
+        controller: raw.controller.as_ref().map(ControllerDesign::from),
+        tick_s,
+    };
+    for (index, follower) in raw.follower.into_iter().enumerate() {
+        let factor = Vector3::from(follower.inertia_factor);
+        let own = inertia.moments_kg_m2().component_mul(&factor);
+        checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
+        rig.bodies.push(BodyInfo { name: follower.name, driven: true });
+        rig.initial_rates.push(follower.initial_rate_rad_s.into());
+        rig.inertia_factors.push(factor);
+    }
+    rig.check_tick(checks);
+    Ok((Some(rig), table))
+}
+
+impl From<&config::RawController> for ControllerDesign {
+    fn from(raw: &config::RawController) -> Self {
+        Self {
+            gain_per_s: raw.gain_per_s.into(),
+            predict: raw.predict,
+            learned: raw.coefficients == Coefficients::Learned,
+            adaptation_gain: raw.adaptation_gain,
+        }
+    }
+}
+
+fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outage> {
+    let mut outages = Vec::new();
+    for (index, outage) in raw.leader.outage.iter().enumerate() {
+        let key = |name: &str| format!("leader.outage[{index}].{name}");
+        let known = raw.leader.measured_axes.contains(&outage.axis) && (1..=3).contains(&outage.axis);
+        checks.require(known, &key("axis"), || {
+            format!("axis {} has no gyro to fail; name one of leader.measured_axes", outage.axis)
+        });
+        checks.require(outage.from_s >= 0.0, &key("from_s"), || format!("{} is before the start", outage.from_s));
+        let until_s = outage.until_s.unwrap_or(f64::INFINITY);
+        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s"));
+        let tick = |time_s: f64| (time_s / tick_s).round() as u64;
+        if known {
+            outages.push(Outage {
+                component: outage.axis - 1,
+                from_tick: tick(outage.from_s),
+                until_tick: tick(until_s),
+            });
+        }
+    }
+    outages
+}
+
+fn design_observer(
+    raw: &Raw,
+    inertia: &Inertia,
+    supplied_axis: Option<usize>,
+    checks: &mut Checks<'_>,
+) -> Option<ObserverDesign> {
+    let (observer, coefficients) = (&raw.observer, inertia.coefficients());
+    let floor_rad_s = observer.observability_floor_rad_s;
+    if let Some(axis) = supplied_axis.filter(|axis| (1..=3).contains(axis)) {
+        // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
+        checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
+    }
+    match observer.kind {
+        Kind::HiddenRate => Some(ObserverDesign::Hidden {
+            relation: HiddenRate::new(&coefficients, supplied_axis?, floor_rad_s).ok()?,
+            decay_rate_per_s: observer.decay_rate_per_s,
+            guess_rad_s: observer.initial_guess_rad_s,
+        }),
+        Kind::Inertia | Kind::AxisymmetricInertia => Some(ObserverDesign::Learner(learner::Parts {
+            identifier: design_identifier(observer, inertia, checks)?,
+            decay_rate_per_s: observer.decay_rate_per_s,
+            floor_rad_s,
+        })),
+    }
+}
+
+fn design_identifier(observer: &RawObserver, inertia: &Inertia, checks: &mut Checks<'_>) -> Option<Identifier> {
+    let floor_rad_s = observer.observability_floor_rad_s;
+    let guess = observer.initial_coefficients;
+    let decay = observer.identifier_decay.as_ref()?;
+    if observer.kind == Kind::AxisymmetricInertia {
+        let axis = observer.symmetry_axis?;
+        let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
+        let moments = inertia.moments_kg_m2();
+        checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
+            format!(
+                "the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body"
+            )
+        });
+        let IdentifierDecay::Rates(rates) = decay else {
+            checks.refuse("observer.identifier_decay", "is a matrix, but there is one unknown; give three equal rates");
+            return None;
+        };
+        return Some(Identifier::axisymmetric(relation, axis, rates[0], guess[axis % 3]));
+    }
+    let matrix = match decay {
+        IdentifierDecay::Rates(rates) => Matrix3::from_diagonal(&-Vector3::from(*rates)),
+        IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
+    };
+    let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
+    let slowest = -matrix.abscissa();
+    let relation = InertiaRelation::new(floor_rad_s * floor_rad_s * floor_rad_s);
+    Some(Identifier::asymmetric(relation, InvariantFilter::with_matrix(matrix, guess.into()), slowest))
+}
+
+impl RigidBodyRig {
+    fn rate_bound_rad_s(&self) -> f64 {
+        self.inertia.rate_bound_rad_s(&self.initial_rates[0])
+    }
+
+    fn check_tick(&self, checks: &mut Checks<'_>) {
+        let (m, tick_s) = (self.rate_bound_rad_s(), self.tick_s);
+        if let ObserverDesign::Hidden { relation, guess_rad_s, .. } = &self.observer {
+            let longest_s = relation.longest_step_s(m);
+            checks.require(tick_s < longest_s, "tick_hz", || {
+                format!(
+                    "the leader may turn at {m:.3} rad/s, so its phase is ambiguous from one tick of {tick_s} s to the \
+                     next; raise tick_hz above {:.3}",
+                    1.0 / longest_s
+                )
+            });
+            checks.require(tick_s < relation.longest_step_s(guess_rad_s.abs()), "observer.initial_guess_rad_s", || {
+                format!("at {guess_rad_s} rad/s the phase would be ambiguous from tick to tick; guess nearer to 0")
+            });
+        }
+        if let Some(certificate) = self.certificate() {
+            checks.require(certificate.stable_when_sampled(), "controller.gain_per_s", || {
+                format!(
+                    "the largest gain times the tick is {:.3}, and the sampled loop is unstable from {} on; lower the gain \
+                     or raise tick_hz",
+                    certificate.gain_step.required, certificate.gain_step.value
+                )
+            });
+        }
+    }
+
+    /// The certificate of any follower: they differ in nothing that it knows of.
+    fn certificate(&self) -> Option<Certificate> {
+        let controller = self.controller?;
+        let decay_rate_per_s = match &self.observer {
+            ObserverDesign::Hidden { decay_rate_per_s, .. } => *decay_rate_per_s,
+            ObserverDesign::Learner(parts) => parts.decay_rate_per_s,
+        };
+        Some(Certificate::new(
+            &self.inertia.coefficients(),
+            self.supplied_axis.unwrap_or(3),
+            &controller.gain_per_s,
+            decay_rate_per_s,
+            self.rate_bound_rad_s(),
+            self.tick_s,
+            controller.predict,
+        ))
+    }
+}
+
+impl Rig for RigidBodyRig {
+    type Body = RatePlant;
+    type Estimator = RateObserver;
+    type Law = RateLaw;
+
+    fn bodies(&self) -> &[BodyInfo] {
+        &self.bodies
+    }
+
+    fn body(&self, index: usize) -> RatePlant {
+        let factor = self.inertia_factors[index];
+        let own = self.inertia.moments_kg_m2().component_mul(&factor);
+        RatePlant {
+            body: Inertia::new(own.into()).map_or(RigidBody::new(&self.inertia), |own| RigidBody::new(&own)),
+            rate: self.initial_rates[index],
+            asked: Vector3::zeros(),
+            inertia_factor: factor,
+            measured: if index == 0 { self.measured } else { ALL },
+            outages: if index == 0 { self.outages.clone() } else { Vec::new() },
+            tick: 0,
+        }
+    }
+
+    fn estimator(&self) -> RateObserver {
+        match &self.observer {
+            ObserverDesign::Hidden { relation, decay_rate_per_s, guess_rad_s } => {
+                let begun = observer::filter(*decay_rate_per_s, *guess_rad_s);
+                let hidden = self.supplied_axis.unwrap_or(3) - 1;
+                RateObserver::Hidden(HiddenObserver::new(*relation, self.inertia.coefficients(), begun, hidden))
+            }
+            ObserverDesign::Learner(parts) => RateObserver::Learner(Learner::new(parts.clone())),
+        }
+    }
+
+    fn law(&self, _index: usize) -> RateLaw {
+        let (Some(controller), Some(certificate)) = (self.controller, self.certificate()) else {
+            unreachable!("a scenario with a follower has a controller: checked when it was resolved")
+        };
+        let lead_s = if controller.predict { self.tick_s } else { 0.0 };
+        RateLaw {
+            law: Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s),
+            adaptation: InertiaAdaptation::new(controller.adaptation_gain),
+            certificate,
+            supplied: self.supplied_axis.unwrap_or(3) - 1,
+            learned: controller.learned,
+            tick_s: self.tick_s,
+        }
+    }
+
+    fn metrics(&self) -> &'static [&'static str] {
+        match (&self.observer, self.controller) {
+            (ObserverDesign::Hidden { .. }, _) => &["sync_error_rad_s", "estimate_error_rad_s"],
+            (_, Some(_)) => &["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"],
+            (_, None) => &["coefficient_error"],
+        }
+    }
+
+    /// |p − ω| of the worst follower, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
+    fn score<'a>(
+        &self,
+        truth: impl Fn(usize) -> Option<&'a RateTruth>,
+        estimate: Option<&RateEstimate>,
+        out: &mut [f64],
+    ) {
+        let rate = |index| truth(index).map(|truth| Vector3::from(truth.omega_rad_s));
+        let distance = |from: Option<Vector3<f64>>, to: Option<Vector3<f64>>| match (from, to) {
+            (Some(from), Some(to)) => (from - to).norm(),
+            _ => f64::NAN,
+        };
+        let leader = rate(0);
+        let followers = (1..self.bodies.len()).map(|index| distance(rate(index), leader));
+        let worst =
+            followers.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst });
+        let estimate_error = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);
+        let coefficients = estimate.map(|estimate| Vector3::from(estimate.coefficients));
+        for (value, metric) in out.iter_mut().zip(self.metrics()) {
+            *value = match *metric {
+                "sync_error_rad_s" => worst,
+                "estimate_error_rad_s" => estimate_error,
+                _ => distance(coefficients, Some(self.inertia.coefficients())),
+            };
+        }
+    }
+
+    fn undisturbed(truth: &RateTruth) -> bool {
+        truth.status & (status::HOLDING | status::SAFE) == 0
+    }
+
+    fn lyapunov(command: &RateCommand) -> Option<(f64, f64)> {
+        Some((command.lyapunov_rad2_s2, command.lyapunov_rate_bound_rad2_s3))
+    }
+
+    fn certificates(&self) -> Vec<CertificateReport> {
+        let Some(certificate) = self.certificate() else { return Vec::new() };
+        let axis = self.supplied_axis.unwrap_or(3);
+        let condition = |name: &str, condition: crate::control::Condition| ConditionReport {
+            name: name.to_owned(),
+            value: condition.value,
+            required: condition.required,
+            holds: condition.holds(),
+        };
+        let (i, j) = (axis % 3 + 1, (axis + 1) % 3 + 1);
+        let conditions = vec![
+            condition(&format!("[D](19) |k{i}| > |a{i}| M, 1/s"), certificate.paper[0]),
+            condition(&format!("[D](19) |k{j}| > |a{j}| M, 1/s"), certificate.paper[1]),
+            condition("[D](19) decay rate > |ai| M + |aj| M + |kk|/2, 1/s", certificate.paper[2]),
+            condition("exact (Schur) decay rate, 1/s", certificate.exact),
+            condition("sampled: limit > |k| h", certificate.gain_step),
+        ];
+        let mut warnings = Vec::new();
+        if certificate.coarse_tick() {
+            warnings.push(format!(
+                "|k| h = {:.3} is above 0.25: the sampled loop will be visibly slower than designed; raise tick_hz",
+                certificate.gain_step.required
+            ));
+        }
+        if !certificate.exact.holds() {
+            warnings.push(
+                "V is not proven to fall everywhere (the error still converges, at the rate below); raise \
+                 observer.decay_rate_per_s or the gains"
+                    .to_owned(),
+            );
+        }
+        let report = |body: &BodyInfo| CertificateReport {
+            body: body.name.clone(),
+            conditions: conditions.clone(),
+            rate_per_s: certificate.rate_per_s,
+            rate_bound_rad_s: certificate.rate_bound_rad_s,
+            warnings: warnings.clone(),
+        };
+        self.bodies.iter().filter(|body| body.driven).map(report).collect()
+    }
+}

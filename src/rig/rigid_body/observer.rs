@@ -1,0 +1,147 @@
+//! The observers of this rig: which components are measured, which one is supplied, and from what.
+
+use super::learner::Learner;
+use crate::observe::{HiddenRate, InvariantFilter, Observation, RateSample};
+use crate::role::Estimator;
+use crate::sample::{RateEstimate, RateMeasurement, status};
+use nalgebra::{Vector1, Vector3};
+
+/// All components of a vector.
+pub(super) const ALL: u64 = 0b111;
+
+/// An observer of this rig.
+#[derive(Debug)]
+pub enum RateObserver {
+    /// One component is never measured.
+    Hidden(HiddenObserver),
+    /// All are measured until one is lost; the inertia is learned meanwhile.
+    Learner(Learner),
+}
+
+impl Estimator for RateObserver {
+    type Measurement = RateMeasurement;
+    type Estimate = RateEstimate;
+
+    fn usable(&self, measurement: &RateMeasurement) -> bool {
+        let finite = |values: &[f64; 3]| values.iter().all(|value| value.is_finite());
+        let needed = match self {
+            Self::Hidden(observer) => measurement.valid & observer.needed() == observer.needed(),
+            Self::Learner(_) => (measurement.valid & ALL).count_ones() >= 2,
+        };
+        needed && finite(&measurement.omega_rad_s) && finite(&measurement.applied_rad_s2)
+    }
+
+    fn start(&mut self, measurement: &RateMeasurement) {
+        match self {
+            Self::Hidden(observer) => observer.start(measurement),
+            Self::Learner(observer) => observer.start(measurement),
+        }
+    }
+
+    fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+        match self {
+            Self::Hidden(observer) => observer.update(measurement, dt_s),
+            Self::Learner(observer) => observer.update(measurement, dt_s),
+        }
+    }
+
+    fn write(&self, status: u64, out: &mut RateEstimate) {
+        match self {
+            Self::Hidden(observer) => observer.write(status, out),
+            Self::Learner(observer) => observer.write(status, out),
+        }
+    }
+}
+
+/// What a measurement tells the relations. Components that are not valid are 0.
+pub(super) fn seen(measurement: &RateMeasurement) -> RateSample {
+    RateSample { rate_rad_s: measurement.omega_rad_s.into(), torque_rad_s2: measurement.applied_rad_s2.into() }
+}
+
+/// Supplies one component from the other two.
+#[derive(Debug, Clone)]
+pub struct HiddenObserver {
+    relation: HiddenRate,
+    coefficients: Vector3<f64>,
+    guess: InvariantFilter<1>,
+    filter: InvariantFilter<1>,
+    hidden: usize,
+    last: RateSample,
+    innovation: f64,
+    status: u64,
+}
+
+impl HiddenObserver {
+    /// An observer of component `hidden` (0 to 2) of a body with the given coefficients, which starts at `guess`.
+    pub(super) fn new(
+        relation: HiddenRate,
+        coefficients: Vector3<f64>,
+        guess: InvariantFilter<1>,
+        hidden: usize,
+    ) -> Self {
+        let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
+        Self { relation, coefficients, guess, filter: guess, hidden, last, innovation: 0.0, status: status::INITIAL }
+    }
+
+    fn needed(&self) -> u64 {
+        ALL & !(1 << self.hidden)
+    }
+
+    fn start(&mut self, measurement: &RateMeasurement) {
+        self.begin(self.guess, seen(measurement), status::INITIAL);
+    }
+
+    /// Begins anew from a known estimate at a known instant.
+    pub(super) fn begin(&mut self, filter: InvariantFilter<1>, at: RateSample, status: u64) {
+        (self.filter, self.last, self.innovation, self.status) = (filter, at, 0.0, status);
+    }
+
+    pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+        let to = seen(measurement);
+        match self.relation.observe(&self.last, &to, dt_s, self.filter.estimate().x) {
+            Observation::Seen(increment) => {
+                self.filter.step(&increment);
+                let start = (increment.potential - increment.drift_moment) / increment.weight;
+                self.innovation = (start + increment.drift - self.filter.estimate()).x;
+                self.status = 0;
+            }
+            Observation::Unobservable { drift } => {
+                self.filter.predict(&drift);
+                self.status |= status::UNOBSERVABLE;
+            }
+        }
+        self.last = to;
+    }
+
+    /// What the last step did: bits of [`status`].
+    pub(super) fn status(&self) -> u64 {
+        self.status
+    }
+
+    /// The hidden component as the last step reconstructs it, less the estimate, rad/s.
+    pub(super) fn innovation(&self) -> f64 {
+        self.innovation
+    }
+
+    /// The angular velocity with the supplied component in its place, rad/s.
+    pub(super) fn rate(&self) -> Vector3<f64> {
+        let mut rate = self.last.rate_rad_s;
+        rate[self.hidden] = self.filter.estimate().x;
+        rate
+    }
+
+    pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
+        out.omega_rad_s = self.rate().into();
+        out.innovation_rad_s = self.innovation;
+        out.coefficients = self.coefficients.into();
+        out.closure = self.coefficients.sum() + self.coefficients.product();
+        out.excitation = 0.0;
+        out.status = self.status | status;
+        out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
+    }
+}
+
+/// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
+pub(super) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> InvariantFilter<1> {
+    InvariantFilter::new(Vector1::new(decay_rate_per_s), Vector1::new(estimate_rad_s))
+}

@@ -1,0 +1,84 @@
+//! A rigid body with its rate gyros and its torquers.
+
+use crate::model::RigidBody;
+use crate::role::Body;
+use crate::sample::{RateCommand, RateMeasurement, RateTruth};
+use nalgebra::Vector3;
+
+/// A gyro that is dead for a while.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Outage {
+    /// The component, 0 to 2.
+    pub component: usize,
+    /// The first tick without it.
+    pub from_tick: u64,
+    /// The first tick with it again.
+    pub until_tick: u64,
+}
+
+/// A rigid body with its rate gyros and torquers.
+#[derive(Debug)]
+pub struct RatePlant {
+    pub(super) body: RigidBody,
+    pub(super) rate: Vector3<f64>,
+    /// What the last command asked for, and what it does to this body.
+    pub(super) asked: Vector3<f64>,
+    /// This body's inertia over the nominal one, per axis: torques are sized by the latter.
+    pub(super) inertia_factor: Vector3<f64>,
+    /// Bit i set: component i has a gyro.
+    pub(super) measured: u64,
+    pub(super) outages: Vec<Outage>,
+    pub(super) tick: u64,
+}
+
+impl RatePlant {
+    fn acceleration(&self) -> Vector3<f64> {
+        self.asked.component_div(&self.inertia_factor)
+    }
+
+    /// Bit i set: component i is measured at this tick.
+    fn valid(&self) -> u64 {
+        let dead = |outage: &&Outage| (outage.from_tick..outage.until_tick).contains(&self.tick);
+        self.outages.iter().filter(dead).fold(self.measured, |valid, outage| valid & !(1 << outage.component))
+    }
+}
+
+impl Body for RatePlant {
+    type Truth = RateTruth;
+    type Measurement = RateMeasurement;
+    type Command = RateCommand;
+
+    fn apply(&mut self, command: &RateCommand) -> bool {
+        let asked = Vector3::from(command.acceleration_rad_s2);
+        let usable = asked.iter().all(|value| value.is_finite());
+        if usable {
+            self.asked = asked;
+        }
+        usable
+    }
+
+    fn apply_safe(&mut self) {
+        self.asked = Vector3::zeros();
+    }
+
+    fn truth(&self, status: u64, out: &mut RateTruth) {
+        out.omega_rad_s = self.rate.into();
+        out.applied_rad_s2 = self.acceleration().into();
+        out.status = status;
+    }
+
+    fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
+        let valid = self.valid();
+        for component in 0..3 {
+            out.omega_rad_s[component] = if valid >> component & 1 == 1 { self.rate[component] } else { 0.0 };
+        }
+        out.applied_rad_s2 = self.asked.into();
+        out.valid = valid;
+        out.status = status;
+    }
+
+    fn flow(&mut self, dt_s: f64) {
+        self.rate = self.body.flow(&self.rate, &self.acceleration(), dt_s);
+        self.tick += 1;
+    }
+}
