@@ -4,6 +4,7 @@
 //! ŵ' = g + λ(ρ ŵ − φ̇) has the error equation (w − ŵ)' = λ ρ (w − ŵ): \[D\](6)-(10), \[SZ\](4)-(8), \[S\](12)-(16) with their
 //! auxiliary variables eliminated, so that ŵ itself is the state and only *increments* of φ are ever needed.
 
+use super::Hurwitz;
 use nalgebra::SVector;
 
 /// What an invariant relation learned about its unknown w over one step from 0 to h.
@@ -21,19 +22,40 @@ pub struct Increment<const N: usize> {
     pub variance: SVector<f64, N>,
 }
 
-/// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, at any step size.
+/// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, or as e^{𝒜W}, at any step size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InvariantFilter<const N: usize> {
-    rate: SVector<f64, N>,
+    decay: Decay<N>,
     estimate: SVector<f64, N>,
-    /// The decay e^{−rate·W} for the weight it was computed for: an equal tick pays for no exponential.
-    decay: (f64, SVector<f64, N>),
+}
+
+/// How the error decays.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Decay<const N: usize> {
+    /// Each component by itself.
+    Diagonal {
+        rate: SVector<f64, N>,
+        /// e^{−rate·W} for the weight it was computed for: an equal tick pays for no exponential.
+        factor: (f64, SVector<f64, N>),
+    },
+    /// All together. Its relation, the identifier's, has another weight at every step: nothing is kept.
+    Matrix(Hurwitz<N>),
 }
 
 impl<const N: usize> InvariantFilter<N> {
     /// A filter with decay rates −λ (positive; per second where ρ = 1) and an initial guess in the unit of w.
     pub fn new(rate: SVector<f64, N>, guess: SVector<f64, N>) -> Self {
-        Self { rate, estimate: guess, decay: (0.0, SVector::repeat(1.0)) }
+        Self { decay: Decay::Diagonal { rate, factor: (0.0, SVector::repeat(1.0)) }, estimate: guess }
+    }
+
+    /// A filter whose error obeys δ̇ = ρ 𝒜 δ, \[SZ\](8), with an initial guess in the unit of w.
+    ///
+    /// A diagonal 𝒜 is the same as [`InvariantFilter::new`] with the rates −𝒜_ii.
+    pub fn with_matrix(matrix: Hurwitz<N>, guess: SVector<f64, N>) -> Self {
+        match matrix.diagonal() {
+            Some(diagonal) => Self::new(-diagonal, guess),
+            None => Self { decay: Decay::Matrix(matrix), estimate: guess },
+        }
     }
 
     /// The estimate ŵ at the end of the last step.
@@ -50,8 +72,8 @@ impl<const N: usize> InvariantFilter<N> {
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
             let start = (increment.potential - increment.drift_moment) / increment.weight;
-            let decay = self.decay(increment.weight);
-            self.estimate = start + increment.drift + decay.component_mul(&(self.estimate - start));
+            let left = self.decay.apply(increment.weight, self.estimate - start);
+            self.estimate = start + increment.drift + left;
         } else {
             self.predict(&increment.drift);
         }
@@ -62,20 +84,28 @@ impl<const N: usize> InvariantFilter<N> {
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
     }
+}
 
+impl<const N: usize> Decay<N> {
+    /// What is left of an error after a step of the given weight.
     #[inline]
-    fn decay(&mut self, weight: f64) -> SVector<f64, N> {
-        if self.decay.0 != weight {
-            self.decay = (weight, self.rate.map(|rate| libm::exp(-rate * weight)));
+    fn apply(&mut self, weight: f64, error: SVector<f64, N>) -> SVector<f64, N> {
+        match self {
+            Self::Diagonal { rate, factor } => {
+                if factor.0 != weight {
+                    *factor = (weight, rate.map(|rate| libm::exp(-rate * weight)));
+                }
+                factor.1.component_mul(&error)
+            }
+            Self::Matrix(matrix) => matrix.exp(weight) * error,
         }
-        self.decay.1
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::{Vector1, Vector2};
+    use nalgebra::{Matrix2, Vector1, Vector2};
 
     /// w = 2 + 3s over a step of `h`, ρ = 1: the increment that a perfect relation reports.
     fn ramp(w0: f64, h: f64) -> Increment<1> {
@@ -120,5 +150,44 @@ mod tests {
             variance: nothing,
         });
         assert_eq!(*filter.estimate(), Vector2::new(1.5, 2.25));
+    }
+    #[test]
+    fn a_diagonal_matrix_gives_the_bits_of_its_rates() {
+        let rate = Vector2::new(5.0, 0.3);
+        let matrix = Hurwitz::new(Matrix2::from_diagonal(&-rate)).unwrap();
+        let guess = Vector2::new(0.1, -0.7);
+        let (mut one, mut other) = (InvariantFilter::new(rate, guess), InvariantFilter::with_matrix(matrix, guess));
+        for step in 1..100 {
+            let w = f64::from(step);
+            let increment = Increment {
+                potential: Vector2::new(w.sin(), w.cos()),
+                weight: 0.01 * (step % 7) as f64,
+                drift: Vector2::new(0.1, 0.2) / w,
+                drift_moment: Vector2::zeros(),
+                variance: Vector2::zeros(),
+            };
+            one.step(&increment);
+            other.step(&increment);
+            assert_eq!(one.estimate(), other.estimate());
+        }
+    }
+
+    /// δ(W) = e^{−W} (cos 2W, −sin 2W): two components that exchange their errors while these decay.
+    #[test]
+    fn a_matrix_turns_the_error_while_it_decays() {
+        let matrix = Hurwitz::new(Matrix2::new(-1.0, 2.0, -2.0, -1.0)).unwrap();
+        let truth = Vector2::new(0.25, -0.5);
+        let mut filter = InvariantFilter::with_matrix(matrix, truth - Vector2::new(1.0, 0.0));
+        let mut total = 0.0_f64;
+        for step in 0..60 {
+            let weight = 0.002 * f64::from(step);
+            total += weight;
+            let nothing = Vector2::zeros();
+            let potential = truth * weight;
+            filter.step(&Increment { potential, weight, drift: nothing, drift_moment: nothing, variance: nothing });
+            let (sin, cos) = (2.0 * total).sin_cos();
+            let error = truth - filter.estimate() - Vector2::new(cos, -sin) * (-total).exp();
+            assert!(error.norm() < 1e-14, "after {total}: {error}");
+        }
     }
 }

@@ -4,6 +4,8 @@
 
 mod filter;
 mod hidden_rate;
+mod hurwitz;
 
 pub use filter::{Increment, InvariantFilter};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
+pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};

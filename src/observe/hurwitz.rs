@@ -1,0 +1,274 @@
+//! A decay matrix for the identifier, checked: every eigenvalue has a negative real part, \[SZ\](7)-(9).
+//!
+//! Must not accept a matrix under which any error would stay or grow, nor allocate. The exponential is our own because
+//! nalgebra has it with `std` only: scaling, a Taylor polynomial, squaring. It needs no eigenvectors, so a defective matrix
+//! is no special case.
+
+use core::fmt;
+use nalgebra::allocator::Allocator;
+use nalgebra::{Complex, Const, DefaultAllocator, DimDiff, DimSub, SMatrix, SVector, Schur, U1};
+
+/// Eigenvalues are known to about this part of the matrix' Frobenius norm; one that is nearer to the imaginary axis may
+/// lie on it.
+const EIGENVALUE_TOLERANCE: f64 = 64.0 * f64::EPSILON;
+
+/// A few QR sweeps per eigenvalue suffice; the bound is there so that a constructor always ends.
+const MAX_SWEEPS: usize = 1000;
+
+/// The Taylor polynomial is used up to this norm, where its remainder is below a rounding: ½^15/15! = 2e-17.
+const TAYLOR_NORM: f64 = 0.5;
+
+/// Degree of the Taylor polynomial.
+const TAYLOR_DEGREE: u32 = 14;
+
+/// The slowest mode's exponent at which all of e^{𝒜W} is below the smallest double, however far from normal 𝒜 is: with the
+/// tolerance above, the powers of W that go with it stay below 1e200 up to N = 10.
+const VANISHED: f64 = 1200.0;
+
+/// The N eigenvalues of a real matrix, printed as a list.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Eigenvalues<const N: usize>(pub SVector<Complex<f64>, N>);
+
+impl<const N: usize> fmt::Display for Eigenvalues<N> {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, value) in self.0.iter().enumerate() {
+            formatter.write_str(if index == 0 { "" } else { ", " })?;
+            match value.im {
+                0.0 => write!(formatter, "{}", value.re)?,
+                im => write!(formatter, "{}{im:+}i", value.re)?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Why a matrix cannot be the decay of an error.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum HurwitzError<const N: usize> {
+    /// An element is infinite or not a number.
+    #[error("element ({row}, {column}) of the decay matrix is {value}; every element must be a finite number")]
+    NotFinite {
+        /// Row, counted from 1.
+        row: usize,
+        /// Column, counted from 1.
+        column: usize,
+        /// The element as given.
+        value: f64,
+    },
+    /// An error would stay or grow along some direction.
+    #[error(
+        "the decay matrix has the eigenvalues {eigenvalues}; all of them must have a negative real part (by more than \
+         {tolerance:e}, to which they are known), or the estimate does not converge"
+    )]
+    NotHurwitz {
+        /// All eigenvalues.
+        eigenvalues: Eigenvalues<N>,
+        /// How accurately they are known; zero for a diagonal matrix.
+        tolerance: f64,
+    },
+    /// The eigenvalues could not be computed.
+    #[error(
+        "the eigenvalues of the decay matrix could not be computed in {} sweeps; choose other elements",
+        MAX_SWEEPS
+    )]
+    NoEigenvalues,
+}
+
+/// A real N×N matrix 𝒜 all of whose eigenvalues have a negative real part.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hurwitz<const N: usize> {
+    matrix: SMatrix<f64, N, N>,
+    eigenvalues: Eigenvalues<N>,
+    /// The greatest real part of an eigenvalue.
+    abscissa: f64,
+    diagonal: bool,
+}
+
+impl<const N: usize> Hurwitz<N> {
+    /// Checks a decay matrix; its unit is that of one over the relation's weight, 1/s where ρ = 1.
+    ///
+    /// A diagonal matrix is judged exactly. Otherwise an eigenvalue whose real part is negative by no more than the
+    /// accuracy of the computation is refused too; note that multiple eigenvalues are known to few digits.
+    ///
+    /// # Errors
+    /// [`HurwitzError`] names the element that is no number, or says all eigenvalues.
+    pub fn new(matrix: SMatrix<f64, N, N>) -> Result<Self, HurwitzError<N>>
+    where
+        Const<N>: DimSub<U1>,
+        DefaultAllocator: Allocator<Const<N>, DimDiff<Const<N>, U1>> + Allocator<DimDiff<Const<N>, U1>>,
+    {
+        for (index, &value) in matrix.iter().enumerate() {
+            if !value.is_finite() {
+                return Err(HurwitzError::NotFinite { row: index % N + 1, column: index / N + 1, value });
+            }
+        }
+        let diagonal = matrix == SMatrix::from_diagonal(&matrix.diagonal());
+        let (eigenvalues, tolerance) = if diagonal {
+            (matrix.diagonal().map(|value| Complex::new(value, 0.0)), 0.0)
+        } else {
+            // Scaled, or the squares in norms and discriminants of extreme matrices leave the range of a double.
+            let scale = matrix.amax();
+            let scaled = matrix / scale;
+            let schur = Schur::try_new(scaled, f64::EPSILON, MAX_SWEEPS).ok_or(HurwitzError::NoEigenvalues)?;
+            (schur.complex_eigenvalues().map(|value| value * scale), EIGENVALUE_TOLERANCE * scaled.norm() * scale)
+        };
+        let abscissa = eigenvalues.iter().map(|value| value.re).fold(f64::NEG_INFINITY, f64::max);
+        let eigenvalues = Eigenvalues(eigenvalues);
+        if eigenvalues.0.iter().all(|value| value.re < -tolerance) {
+            Ok(Self { matrix, eigenvalues, abscissa, diagonal })
+        } else {
+            Err(HurwitzError::NotHurwitz { eigenvalues, tolerance })
+        }
+    }
+
+    /// The matrix 𝒜 as given.
+    pub fn matrix(&self) -> &SMatrix<f64, N, N> {
+        &self.matrix
+    }
+
+    /// Its eigenvalues, in no particular order; multiple ones are known to few digits unless 𝒜 is diagonal.
+    pub fn eigenvalues(&self) -> &Eigenvalues<N> {
+        &self.eigenvalues
+    }
+
+    /// The greatest real part of an eigenvalue, negative: the exponent of the slowest decay.
+    pub fn abscissa(&self) -> f64 {
+        self.abscissa
+    }
+
+    /// The diagonal, if nothing is beside it: the form that the paper finally takes, \[SZ\](10).
+    pub fn diagonal(&self) -> Option<SVector<f64, N>> {
+        self.diagonal.then(|| self.matrix.diagonal())
+    }
+
+    /// e^{𝒜W} for a finite `weight` W ≥ 0; the identity for 0.
+    ///
+    /// Exact to rounding for a diagonal matrix. Otherwise the error is what a rounding of 𝒜's own elements causes: in relation
+    /// to the norm about ε·‖𝒜‖W, more if 𝒜 is far from normal. What lies below the smallest double is zero.
+    pub fn exp(&self, weight: f64) -> SMatrix<f64, N, N> {
+        if self.diagonal {
+            SMatrix::from_diagonal(&self.matrix.diagonal().map(|value| libm::exp(value * weight)))
+        } else if self.abscissa * weight < -VANISHED {
+            SMatrix::zeros()
+        } else {
+            exponential(self.matrix * weight)
+        }
+    }
+}
+
+/// e^X by scaling and squaring. ‖X‖ is bounded by the caller, or the loop would lose all digits before it ends.
+fn exponential<const N: usize>(x: SMatrix<f64, N, N>) -> SMatrix<f64, N, N> {
+    let norm = x.column_iter().map(|column| column.iter().map(|value| value.abs()).sum()).fold(0.0, f64::max);
+    let (mut scaled, mut norm, mut squarings) = (x, norm, 0_u32);
+    while norm > TAYLOR_NORM {
+        // Halving is exact.
+        (scaled, norm, squarings) = (scaled * 0.5, norm * 0.5, squarings + 1);
+    }
+    let mut power = SMatrix::identity();
+    for degree in (1..=TAYLOR_DEGREE).rev() {
+        power = SMatrix::identity() + scaled * power / f64::from(degree);
+    }
+    for _ in 0..squarings {
+        power *= power;
+    }
+    power
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix1, Matrix2, Matrix3};
+
+    /// The greatest difference of two matrices; what is not a number is infinitely wrong.
+    fn distance<const N: usize>(left: &SMatrix<f64, N, N>, right: &SMatrix<f64, N, N>) -> f64 {
+        (left - right).iter().map(|d| if d.is_nan() { f64::INFINITY } else { d.abs() }).fold(0.0, f64::max)
+    }
+
+    /// A rotation with no special angles: what is similar to a matrix by it has the same eigenvalues and no zeros.
+    fn turned(matrix: Matrix3<f64>) -> Matrix3<f64> {
+        let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
+        turn * matrix * turn.transpose()
+    }
+
+    /// e^{λt} (1, t, t²/2; 0, 1, t; 0, 0, 1).
+    fn jordan(t: f64, lambda: f64) -> [Matrix3<f64>; 2] {
+        let block = Matrix3::new(lambda, 1.0, 0.0, 0.0, lambda, 1.0, 0.0, 0.0, lambda);
+        let power = Matrix3::new(1.0, t, t * t / 2.0, 0.0, 1.0, t, 0.0, 0.0, 1.0) * (lambda * t).exp();
+        [block, power]
+    }
+
+    #[test]
+    fn refuses_what_does_not_decay_and_says_the_eigenvalues() {
+        let rotation = turned(Matrix3::new(0.0, 2.0, 0.0, -2.0, 0.0, 0.0, 0.0, 0.0, -1.0));
+        let growing = turned(Matrix3::new(-1.0, 5.0, 1.0, 0.0, 0.5, 2.0, 0.0, 0.0, -3.0));
+        let nilpotent = turned(jordan(0.0, 0.0)[0]);
+        let still = Matrix3::from_diagonal(&nalgebra::Vector3::new(-1.0, 0.0, -1.0));
+        for matrix in [rotation, growing, nilpotent, still, Matrix3::zeros()] {
+            let refusal = Hurwitz::new(matrix).unwrap_err();
+            assert!(matches!(refusal, HurwitzError::NotHurwitz { .. }), "{matrix}: {refusal}");
+        }
+        let message = format!("{}", Hurwitz::new(Matrix2::new(1.0, 2.0, -2.0, 1.0)).unwrap_err());
+        assert!(message.contains("1+2i, 1-2i"), "{message}");
+        let message = format!("{}", Hurwitz::new(still).unwrap_err());
+        assert!(message.contains("-1, 0, -1;"), "{message}");
+    }
+
+    #[test]
+    fn refuses_what_is_no_number() {
+        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let mut matrix = -Matrix3::identity();
+            matrix[(0, 2)] = value;
+            let refusal = Hurwitz::new(matrix).unwrap_err();
+            assert!(matches!(refusal, HurwitzError::NotFinite { row: 1, column: 3, .. }), "{refusal}");
+        }
+    }
+
+    #[test]
+    fn knows_its_eigenvalues() {
+        let spiral = Hurwitz::new(turned(Matrix3::new(-1.0, 2.0, 0.0, -2.0, -1.0, 0.0, 0.0, 0.0, -0.25))).unwrap();
+        let mut found: Vec<_> = spiral.eigenvalues().0.iter().map(|value| (value.re, value.im)).collect();
+        found.sort_by(|left, right| left.partial_cmp(right).unwrap());
+        for (found, expected) in found.iter().zip([(-1.0, -2.0), (-1.0, 2.0), (-0.25, 0.0)]) {
+            assert!((found.0 - expected.0).hypot(found.1 - expected.1) < 1e-14, "{found:?}");
+        }
+        assert!((spiral.abscissa() + 0.25).abs() < 1e-14);
+        assert_eq!(Hurwitz::new(Matrix1::new(-3.0)).unwrap().abscissa(), -3.0);
+    }
+
+    #[test]
+    fn the_exponential_of_a_diagonal_matrix_is_exact() {
+        let rates = nalgebra::Vector3::new(-1e-3, -5.0, -1e6);
+        let hurwitz = Hurwitz::new(Matrix3::from_diagonal(&rates)).unwrap();
+        assert_eq!(hurwitz.diagonal(), Some(rates));
+        for weight in [0.0, 1e-9, 0.3, 40.0, 1e300] {
+            let expected = rates.map(|rate| libm::exp(rate * weight));
+            assert_eq!(hurwitz.exp(weight), Matrix3::from_diagonal(&expected));
+        }
+    }
+
+    #[test]
+    fn the_exponential_of_defective_and_of_turning_matrices_is_known() {
+        for weight in [0.0, 1e-6, 0.02, 0.7, 5.0, 60.0] {
+            let [block, power] = jordan(weight, -1.5);
+            let spiral = Matrix3::new(-1.0, 2.0, 0.0, -2.0, -1.0, 0.0, 0.0, 0.0, -0.25);
+            let (sin, cos) = (2.0 * weight).sin_cos();
+            let spun = Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, (0.75 * weight).exp()) * (-weight).exp();
+            for (matrix, power) in [(block, power), (turned(block), turned(power)), (turned(spiral), turned(spun))] {
+                let error = distance(&Hurwitz::new(matrix).unwrap().exp(weight), &power) / power.norm();
+                // The cube is the block's own sensitivity: a disturbance grows with t² before and after it enters.
+                assert!(error < 1e-15 * (2.0 + 4.0 * weight + weight.powi(3)), "weight {weight}: {error:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn however_long_the_step_the_exponential_vanishes() {
+        let matrix = turned(Matrix3::new(-1e-3, 1e9, 0.0, 0.0, -2.0, 1e6, 0.0, 0.0, -1e4));
+        let hurwitz = Hurwitz::new(matrix).unwrap();
+        assert!(hurwitz.exp(1e5).iter().all(|value| value.is_finite()));
+        for weight in [2e6, 1e12, 1e300, f64::MAX] {
+            assert_eq!(hurwitz.exp(weight), Matrix3::zeros());
+        }
+        assert_eq!(hurwitz.exp(0.0), Matrix3::identity());
+    }
+}
