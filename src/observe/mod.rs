@@ -5,7 +5,9 @@
 mod filter;
 mod hidden_rate;
 mod hurwitz;
+mod inertia;
 
 pub use filter::{Increment, InvariantFilter};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};
+pub use inertia::{Identification, InertiaRatioError, InertiaRatios, InertiaRelation};
