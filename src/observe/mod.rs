@@ -2,11 +2,13 @@
 //!
 //! Pure: no clock, no I/O, no allocation, no logging. Must not see the truth, nor remember more than the filter's state.
 
+mod axisymmetric;
 mod filter;
 mod hidden_rate;
 mod hurwitz;
 mod inertia;
 
+pub use axisymmetric::{Axisymmetric, AxisymmetricError};
 pub use filter::{Increment, InvariantFilter};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};
