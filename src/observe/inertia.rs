@@ -207,11 +207,11 @@ impl Path {
 
     /// The part of the step at which a component with exactly one change of sign is zero.
     fn zero(&self, axis: usize) -> f64 {
-        let negative_first = self.control[0][axis] < 0.0 || self.control[3][axis] > 0.0;
+        let start = self.control.iter().map(|point| point[axis]).find(|value| *value != 0.0).unwrap_or(0.0);
         let (mut low, mut high) = (0.0, 1.0);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (low + high);
-            if (self.at(middle)[axis] < 0.0) == negative_first {
+            if self.at(middle)[axis] * start > 0.0 {
                 low = middle;
             } else {
                 high = middle;
