@@ -4,6 +4,10 @@
 
 mod filter;
 mod hidden_rate;
+mod order;
+mod second_order;
 
 pub use filter::{Increment, InvariantFilter};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
+pub use order::Filter;
+pub use second_order::{KalmanFilter, SecondOrderFilter};
