@@ -3,11 +3,13 @@
 //! Pure: no clock, no I/O, no allocation, no logging. Must not see the truth, nor remember more than the filter's state.
 
 mod filter;
+mod guarded;
 mod hidden_rate;
 mod order;
 mod second_order;
 
 pub use filter::{Increment, InvariantFilter};
+pub use guarded::{GuardedKalman, RateNoise};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use order::Filter;
 pub use second_order::{KalmanFilter, SecondOrderFilter};

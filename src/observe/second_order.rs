@@ -235,3 +235,153 @@ impl Covariance {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Vector1, Vector2};
+
+    const DENSITY: f64 = 1e-4;
+    const VARIANCE: f64 = 1e-6;
+
+    fn increment(potential: f64, weight: f64, variance: f64) -> Increment<1> {
+        let nothing = Vector1::zeros();
+        let exact = Increment::exact(Vector1::new(potential), weight, nothing, nothing);
+        Increment { variance: Vector1::new(variance), ..exact }
+    }
+
+    fn kalman(guess: f64, deviation: f64) -> KalmanFilter<1> {
+        KalmanFilter::new(Vector1::new(DENSITY), Vector1::new(guess), Vector1::new(deviation))
+    }
+
+    fn normals(seed: u64) -> impl FnMut() -> f64 {
+        let mut noise = crate::model::Noise::new(seed, 0, [1.0], [0.0]);
+        move || noise.sample().x
+    }
+
+    #[test]
+    fn the_errors_poles_are_the_designed_ones_at_any_step() {
+        for (damping, bandwidth) in [(0.5, 0.7), (1.0, 0.7), (2.0, 0.7), (0.1, 3.0)] {
+            for weight in [1e-3, 0.1, 3.0] {
+                let mut filter = SecondOrderFilter::new(Vector1::new(bandwidth), damping, Vector1::new(0.5));
+                let mut errors = [0.0; 3];
+                for error in &mut errors {
+                    filter.step(&increment(2.0 * weight, weight, 0.0));
+                    *error = 2.0 - filter.estimate().x;
+                }
+                let x = bandwidth * weight;
+                let middle: f64 = (-damping * x).exp();
+                let root = x * (damping * damping - 1.0).abs().sqrt();
+                let sum = 2.0 * middle * if damping < 1.0 { root.cos() } else { root.cosh() };
+                let expected = sum * errors[1] - middle * middle * errors[0];
+                assert!((errors[2] - expected).abs() < 1e-14, "{damping} {bandwidth} {weight}: {errors:?} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn weights_over_five_decades_do_not_excite_it() {
+        let mut normal = normals(3);
+        for damping in [0.3, core::f64::consts::FRAC_1_SQRT_2, 1.5] {
+            let mut filter = SecondOrderFilter::new(Vector1::new(2.0), damping, Vector1::new(-50.0));
+            let mut kalman = kalman(-50.0, 50.0);
+            let (mut total, mut worst) = (0.0, 0.0_f64);
+            while total < 60.0 {
+                let weight = libm::exp(-5.0 + 3.0 * normal()).min(10.0);
+                total += weight;
+                filter.step(&increment(2.0 * weight, weight, 0.0));
+                kalman.step(&increment(2.0 * weight, weight, VARIANCE));
+                worst = worst.max((2.0 - filter.estimate().x).abs());
+            }
+            assert!(worst <= 60.0, "{damping}: overshoot to {worst}");
+            assert!((2.0 - filter.estimate().x).abs() < 1e-6, "{damping}: {}", filter.estimate().x);
+            assert!((2.0 - kalman.estimate().x).abs() < 1e-3, "{damping}: {}", kalman.estimate().x);
+        }
+    }
+
+    #[test]
+    fn a_blind_step_moves_by_the_drift_and_forgets_the_potential() {
+        let mut filter = SecondOrderFilter::new(Vector2::new(2.0, 1.0), 0.7, Vector2::new(0.5, 0.25));
+        let exact = Increment::exact(Vector2::new(0.3, 0.1), 0.1, Vector2::zeros(), Vector2::zeros());
+        filter.step(&exact);
+        let before = *filter.estimate();
+        filter.step(&Increment { weight: 0.0, drift: Vector2::new(1.0, 2.0), ..exact });
+        assert_eq!(*filter.estimate(), before + Vector2::new(1.0, 2.0));
+        assert_eq!(filter.residual, Vector2::zeros());
+    }
+
+    /// An unknown that wanders with the assumed density, seen through noise, unseen for 5 s: errors over deviations.
+    fn normalised_errors(seed: u64) -> [f64; 3] {
+        let (h, mut normal) = (0.02, normals(seed));
+        let (mut phi, mut w) = (0.0, 3.0 + 0.5 * normal());
+        let mut filter = kalman(3.0, 0.5);
+        let mut seen = phi + VARIANCE.sqrt() * normal();
+        let mut normalised = [0.0; 3];
+        for tick in 1..=800 {
+            let (kick, other) = (normal(), normal());
+            // The exact covariance of (∫w, w) under white noise.
+            phi += h * w + (DENSITY * h * h * h).sqrt() * (0.5 * kick + other / 12.0_f64.sqrt());
+            w += (DENSITY * h).sqrt() * kick;
+            let now = phi + VARIANCE.sqrt() * normal();
+            if (300..550).contains(&tick) {
+                filter.predict(&Vector1::zeros(), h);
+            } else {
+                filter.step(&increment(now - seen, h, VARIANCE));
+            }
+            seen = now;
+            if let Some(slot) = [299, 549, 560].iter().position(|&end| end == tick) {
+                normalised[slot] = (w - filter.estimate().x) / filter.deviation().x;
+            }
+        }
+        normalised
+    }
+
+    #[test]
+    fn it_knows_its_own_error_before_during_and_after_a_blind_gap() {
+        const RUNS: u64 = 2000;
+        let mut squares = [0.0; 3];
+        for seed in 0..RUNS {
+            for (square, value) in squares.iter_mut().zip(normalised_errors(seed)) {
+                *square += value * value / RUNS as f64;
+            }
+        }
+        // One in the mean; its standard error is √(2/2000) = 0.032.
+        assert!(squares.iter().all(|square| (square - 1.0).abs() < 0.12), "{squares:?}");
+    }
+
+    #[test]
+    fn the_covariance_is_that_of_the_textbook() {
+        let (w, q, r) = (0.3, 0.02, 0.5);
+        let mut covariance = Covariance { potential: 0.7, slope: -0.4, rest: 0.2 };
+        let (a, b, c) = (0.7, -0.28, covariance.unknown());
+        covariance.transport(w, q);
+        let a1 = a + 2.0 * w * b + w * w * c + q * w * w * w / 3.0;
+        let (b1, c1) = (b + w * c + q * w * w / 2.0, c + q * w);
+        let gain = covariance.measure(r);
+        let total = a1 + r;
+        assert!((gain - a1 / total).abs() < 1e-15);
+        assert!((gain * covariance.slope - b1 / total).abs() < 1e-15);
+        assert!((covariance.unknown() - (c1 - b1 * b1 / total)).abs() < 1e-15);
+    }
+
+    #[test]
+    fn no_rounding_takes_the_covariances_positivity() {
+        let mut filter = KalmanFilter::new(Vector1::zeros(), Vector1::new(0.0), Vector1::new(1e8));
+        for tick in 0..200_000 {
+            filter.step(&increment(2e-3, 1e-3, 1e-14));
+            let deviation = filter.deviation().x;
+            assert!(deviation > 0.0 && deviation < 1.01e8, "tick {tick}: {deviation}");
+        }
+        assert!((filter.estimate().x - 2.0).abs() < 1e-9, "{}", filter.estimate().x);
+    }
+
+    #[test]
+    fn without_noise_and_without_doubt_nothing_is_divided_by_zero() {
+        let mut filter = KalmanFilter::new(Vector1::zeros(), Vector1::new(0.5), Vector1::zeros());
+        filter.step(&increment(2e-3, 1e-3, 0.0));
+        assert_eq!((filter.estimate().x, filter.deviation().x), (0.5, 0.0));
+        let mut curious = KalmanFilter::new(Vector1::zeros(), Vector1::new(0.5), Vector1::new(1.0));
+        curious.step(&increment(2e-3, 1e-3, 0.0));
+        assert!((curious.estimate().x - 2.0).abs() < 1e-15);
+    }
+}
