@@ -1,7 +1,9 @@
-//! Bodies and their motion. Pure: no clock, no I/O, no allocation, no logging.
+//! Bodies, their motion, and the noise of their sensors. Pure: no clock, no I/O, no allocation, no logging.
 
 mod integrate;
+mod noise;
 mod rigid_body;
 
 pub use integrate::{flow, rk4_step};
+pub use noise::Noise;
 pub use rigid_body::{Inertia, InertiaError, RigidBody, euler};

@@ -112,12 +112,10 @@ impl Axisymmetric {
     fn increment(&self, to: &Spin, potential: f64, weight: f64) -> Increment<1> {
         let [vi, vj, _] = self.axes.map(|index| self.variance_rad2_s2[index]);
         let square = to.i * to.i + to.j * to.j;
+        let nothing = Vector1::zeros();
         Increment {
-            potential: Vector1::new(potential),
-            weight,
-            drift: Vector1::zeros(),
-            drift_moment: Vector1::zeros(),
             variance: Vector1::new((to.j * to.j * vi + to.i * to.i * vj) / (square * square)),
+            ..Increment::exact(Vector1::new(potential), weight, nothing, nothing)
         }
     }
 }

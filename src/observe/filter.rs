@@ -20,6 +20,19 @@ pub struct Increment<const N: usize> {
     pub drift_moment: SVector<f64, N>,
     /// Variance of the potential at the end of the step, from the variances of what is measured; 0 without noise.
     pub variance: SVector<f64, N>,
+    /// Variance of what the measurement at the end of the step adds to the drift of this step and the next; 0 without noise.
+    pub drift_variance: SVector<f64, N>,
+    /// Covariance of the two: both come from one measurement.
+    pub drift_covariance: SVector<f64, N>,
+}
+
+impl<const N: usize> Increment<N> {
+    /// An increment without noise, from its four integrals.
+    #[inline]
+    pub fn exact(potential: SVector<f64, N>, weight: f64, drift: SVector<f64, N>, moment: SVector<f64, N>) -> Self {
+        let [variance, drift_variance, drift_covariance] = [SVector::zeros(); 3];
+        Self { potential, weight, drift, drift_moment: moment, variance, drift_variance, drift_covariance }
+    }
 }
 
 /// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, or as e^{𝒜W}, at any step size.
@@ -109,13 +122,8 @@ mod tests {
 
     /// w = 2 + 3s over a step of `h`, ρ = 1: the increment that a perfect relation reports.
     fn ramp(w0: f64, h: f64) -> Increment<1> {
-        Increment {
-            potential: Vector1::new(w0 * h + 1.5 * h * h),
-            weight: h,
-            drift: Vector1::new(3.0 * h),
-            drift_moment: Vector1::new(1.5 * h * h),
-            variance: Vector1::zeros(),
-        }
+        let moment = Vector1::new(1.5 * h * h);
+        Increment::exact(Vector1::new(w0 * h) + moment, h, Vector1::new(3.0 * h), moment)
     }
 
     #[test]
@@ -142,13 +150,7 @@ mod tests {
     fn a_step_without_weight_moves_by_the_drift_alone() {
         let mut filter = InvariantFilter::new(Vector2::new(5.0, 1.0), Vector2::new(0.5, 0.25));
         let nothing = Vector2::zeros();
-        filter.step(&Increment {
-            potential: nothing,
-            weight: 0.0,
-            drift: Vector2::new(1.0, 2.0),
-            drift_moment: nothing,
-            variance: nothing,
-        });
+        filter.step(&Increment::exact(nothing, 0.0, Vector2::new(1.0, 2.0), nothing));
         assert_eq!(*filter.estimate(), Vector2::new(1.5, 2.25));
     }
     #[test]
@@ -159,13 +161,8 @@ mod tests {
         let (mut one, mut other) = (InvariantFilter::new(rate, guess), InvariantFilter::with_matrix(matrix, guess));
         for step in 1..100 {
             let w = f64::from(step);
-            let increment = Increment {
-                potential: Vector2::new(w.sin(), w.cos()),
-                weight: 0.01 * (step % 7) as f64,
-                drift: Vector2::new(0.1, 0.2) / w,
-                drift_moment: Vector2::zeros(),
-                variance: Vector2::zeros(),
-            };
+            let (potential, drift) = (Vector2::new(w.sin(), w.cos()), Vector2::new(0.1, 0.2) / w);
+            let increment = Increment::exact(potential, 0.01 * (step % 7) as f64, drift, Vector2::zeros());
             one.step(&increment);
             other.step(&increment);
             assert_eq!(one.estimate(), other.estimate());
@@ -184,7 +181,7 @@ mod tests {
             total += weight;
             let nothing = Vector2::zeros();
             let potential = truth * weight;
-            filter.step(&Increment { potential, weight, drift: nothing, drift_moment: nothing, variance: nothing });
+            filter.step(&Increment::exact(potential, weight, nothing, nothing));
             let (sin, cos) = (2.0 * total).sin_cos();
             let error = truth - filter.estimate() - Vector2::new(cos, -sin) * (-total).exp();
             assert!(error.norm() < 1e-14, "after {total}: {error}");

@@ -83,6 +83,8 @@ pub struct HiddenRate {
     a: [f64; 3],
     conic: Conic,
     floor_rad_s: f64,
+    /// Variances of the two measured components, (rad/s)².
+    variance: [f64; 2],
 }
 
 /// The two measured components at one instant, rad/s.
@@ -112,7 +114,18 @@ impl HiddenRate {
             (false, false) if a[0] * a[1] < 0.0 => Conic::Elliptic { omega: libm::sqrt(-a[0] * a[1]) },
             (false, false) => Conic::Hyperbolic { omega: libm::sqrt(a[0] * a[1]) },
         };
-        Ok(Self { axes, a, conic, floor_rad_s })
+        Ok(Self { axes, a, conic, floor_rad_s, variance: [0.0; 2] })
+    }
+
+    /// The same relation, telling with every increment how uncertain white measurement noise makes it.
+    ///
+    /// `sensor_deviation_rad_s` are the standard deviations of one sample's components; the hidden one is not read. An
+    /// increment's potential and drift are the same bits with and without.
+    #[must_use]
+    pub fn with_noise(mut self, sensor_deviation_rad_s: &Vector3<f64>) -> Self {
+        self.variance =
+            [0, 1].map(|index| sensor_deviation_rad_s[self.axes[index]] * sensor_deviation_rad_s[self.axes[index]]);
+        self
     }
 
     /// Which conic the measured components move on.
@@ -144,7 +157,8 @@ impl HiddenRate {
                     let rough = growth - dt_s * self.torque_share(ends.map(|end| self.gradient(&end, share)), &torque);
                     potential = growth - self.torque_growth(&ends, share, &torque, dt_s, rough / dt_s);
                 }
-                Observation::Seen(self.increment(&ends, &torque, dt_s, potential))
+                let exact = self.increment(&ends, &torque, dt_s, potential);
+                Observation::Seen(if self.variance == [0.0; 2] { exact } else { self.noisy(exact, &ends[1], share) })
             }
             None => {
                 let hidden = self.hidden_at_ends(&ends, &torque, dt_s, estimate * dt_s);
@@ -295,12 +309,23 @@ impl HiddenRate {
     fn increment(&self, ends: &[Pair; 2], torque: &[f64; 3], dt_s: f64, potential: f64) -> Increment<1> {
         let hidden = self.hidden_at_ends(ends, torque, dt_s, potential);
         let (drift, moment) = self.drift(ends, torque, dt_s, hidden);
+        Increment::exact(Vector1::new(potential), dt_s, Vector1::new(drift), Vector1::new(moment))
+    }
+
+    /// The same increment with the covariance of its potential φ and its drift, from that of the measured pair.
+    ///
+    /// The drift feels a sample as the end of one step and as the start of the next, half a step's weight each.
+    #[inline]
+    fn noisy(&self, exact: Increment<1>, to: &Pair, share: f64) -> Increment<1> {
+        let step = self.a[2] * exact.weight;
+        let (phi, drift) = (self.gradient(to, share), [step * to.j, step * to.i]);
+        let covariance =
+            |x: [f64; 2], y: [f64; 2]| Vector1::new(x[0] * y[0] * self.variance[0] + x[1] * y[1] * self.variance[1]);
         Increment {
-            potential: Vector1::new(potential),
-            weight: dt_s,
-            drift: Vector1::new(drift),
-            drift_moment: Vector1::new(moment),
-            variance: Vector1::zeros(),
+            variance: covariance(phi, phi),
+            drift_variance: covariance(drift, drift),
+            drift_covariance: covariance(phi, drift),
+            ..exact
         }
     }
 }

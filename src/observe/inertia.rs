@@ -89,12 +89,10 @@ impl InertiaRelation {
 
     #[inline]
     fn increment(&self, piece: &Piece, to: &RateSample) -> Increment<3> {
+        let nothing = Vector3::zeros();
         Increment {
-            potential: piece.potential,
-            weight: piece.weight,
-            drift: Vector3::zeros(),
-            drift_moment: Vector3::zeros(),
             variance: to.rate_rad_s.map(|rate| rate * rate).component_mul(&self.variance_rad2_s2),
+            ..Increment::exact(piece.potential, piece.weight, nothing, nothing)
         }
     }
 }

@@ -4,12 +4,18 @@
 
 mod axisymmetric;
 mod filter;
+mod guarded;
 mod hidden_rate;
 mod hurwitz;
 mod inertia;
+mod order;
+mod second_order;
 
 pub use axisymmetric::{Axisymmetric, AxisymmetricError};
 pub use filter::{Increment, InvariantFilter};
+pub use guarded::{GuardedKalman, RateNoise};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};
 pub use inertia::{Identification, InertiaRatioError, InertiaRatios, InertiaRelation};
+pub use order::Filter;
+pub use second_order::{KalmanFilter, SecondOrderFilter};

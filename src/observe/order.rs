@@ -1,0 +1,58 @@
+//! One type for the filters of either order, so that an estimator holds what its scenario chose.
+//!
+//! Must not compute anything itself: each filter answers for its own mathematics.
+
+use super::{Increment, InvariantFilter, KalmanFilter, SecondOrderFilter};
+use nalgebra::SVector;
+
+/// A filter of an unknown w in R^N.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Filter<const N: usize> {
+    /// The papers' filter: exponential decay, for measurements without noise.
+    First(InvariantFilter<N>),
+    /// Constant poles of second order: little noise passes, the bandwidth is chosen.
+    Second(SecondOrderFilter<N>),
+    /// Gains of the Kalman filter: the noise is known, the bandwidth follows.
+    Kalman(KalmanFilter<N>),
+}
+
+impl<const N: usize> Filter<N> {
+    /// Moves the estimate over one step in which the relation held.
+    #[inline]
+    pub fn step(&mut self, increment: &Increment<N>) {
+        match self {
+            Self::First(filter) => filter.step(increment),
+            Self::Second(filter) => filter.step(increment),
+            Self::Kalman(filter) => filter.step(increment),
+        }
+    }
+
+    /// Moves the estimate by its known drift alone (unit of w), over a step of weight `weight` that tells nothing about w.
+    #[inline]
+    pub fn predict(&mut self, drift: &SVector<f64, N>, weight: f64) {
+        match self {
+            Self::First(filter) => filter.predict(drift),
+            Self::Second(filter) => filter.predict(drift),
+            Self::Kalman(filter) => filter.predict(drift, weight),
+        }
+    }
+
+    /// The estimate ŵ at the end of the last step.
+    #[inline]
+    pub fn estimate(&self) -> &SVector<f64, N> {
+        match self {
+            Self::First(filter) => filter.estimate(),
+            Self::Second(filter) => filter.estimate(),
+            Self::Kalman(filter) => filter.estimate(),
+        }
+    }
+
+    /// Standard deviation of the estimate in the unit of w, where the filter knows it.
+    #[inline]
+    pub fn deviation(&self) -> Option<SVector<f64, N>> {
+        match self {
+            Self::Kalman(filter) => Some(filter.deviation()),
+            Self::First(_) | Self::Second(_) => None,
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! A body's motion and what noisy sensors make of it, for every kind of conic; the hidden axis is 3. No part of the product.
+
+use corotate::model::{Inertia, Noise, RigidBody};
+use corotate::observe::{Filter, HiddenRate, Observation, RateSample};
+use nalgebra::Vector3;
+
+/// A body and its initial rates, rad/s.
+pub struct Case {
+    pub name: &'static str,
+    pub moments: [f64; 3],
+    pub start: [f64; 3],
+}
+
+/// One for every conic, and an ellipse far from a circle.
+pub const CASES: [Case; 5] = [
+    Case { name: "elliptic", moments: [1.0, 2.0, 3.0], start: [0.6, -0.4, 0.8] },
+    Case { name: "hyperbolic", moments: [1.0, 3.0, 2.0], start: [0.9, 0.3, 0.8] },
+    Case { name: "parabolic first", moments: [2.0, 1.5, 2.0], start: [0.5, 0.4, 0.7] },
+    Case { name: "parabolic second", moments: [1.5, 2.0, 2.0], start: [0.4, 0.5, 0.7] },
+    Case { name: "long ellipse", moments: [1.0, 5.0, 5.5], start: [0.6, -0.4, 0.8] },
+];
+
+/// A free motion as truth and as measured at every tick.
+pub struct Recording {
+    pub coefficients: Vector3<f64>,
+    pub tick_s: f64,
+    /// Standard deviation of the measured components, rad/s.
+    pub deviation: f64,
+    pub truth: Vec<Vector3<f64>>,
+    pub measured: Vec<Vector3<f64>>,
+}
+
+impl Recording {
+    pub fn new(case: &Case, tick_s: f64, duration_s: f64, deviation: f64, seed: u64) -> Self {
+        let body = RigidBody::new(&Inertia::new(case.moments).unwrap());
+        let mut noise = Noise::new(seed, 0, [deviation, deviation, 0.0], [0.0, 0.0, f64::NAN]);
+        let mut rate = Vector3::from(case.start);
+        let (mut truth, mut measured) = (vec![rate], vec![rate + noise.sample()]);
+        for _ in 0..(duration_s / tick_s).round() as usize {
+            rate = body.flow(&rate, &Vector3::zeros(), tick_s);
+            truth.push(rate);
+            measured.push(rate + noise.sample());
+        }
+        Self { coefficients: *body.coefficients(), tick_s, deviation, truth, measured }
+    }
+
+    /// Standard deviations of the sensors. Whoever reads the hidden component's gets what is not a number.
+    pub fn sensors(&self) -> Vector3<f64> {
+        Vector3::new(self.deviation, self.deviation, f64::NAN)
+    }
+
+    pub fn sample(&self, index: usize) -> RateSample {
+        RateSample { rate_rad_s: self.measured[index], torque_rad_s2: Vector3::zeros() }
+    }
+
+    pub fn relation(&self) -> HiddenRate {
+        HiddenRate::new(&self.coefficients, 3, 1e-6).unwrap().with_noise(&self.sensors())
+    }
+
+    /// ω_k − ω̂_k at each sample by a filter on the invariant relation.
+    pub fn run(&self, mut filter: Filter<1>) -> Vec<f64> {
+        let relation = self.relation();
+        let mut errors = vec![self.truth[0].z - filter.estimate().x];
+        for index in 1..self.truth.len() {
+            let (from, to) = (self.sample(index - 1), self.sample(index));
+            match relation.observe(&from, &to, self.tick_s, filter.estimate().x) {
+                Observation::Seen(increment) => filter.step(&increment),
+                Observation::Unobservable { drift } => filter.predict(&drift, self.tick_s),
+            }
+            errors.push(self.truth[index].z - filter.estimate().x);
+        }
+        errors
+    }
+}
