@@ -117,6 +117,7 @@ mod tests {
             weight: 0.0,
             drift: Vector2::new(1.0, 2.0),
             drift_moment: nothing,
+            variance: nothing,
         });
         assert_eq!(*filter.estimate(), Vector2::new(1.5, 2.25));
     }
