@@ -1,7 +1,11 @@
 //! Control laws and the conditions under which they are proven. Pure: no clock, no I/O, no allocation, no logging.
 
 mod certificate;
+mod orbit_certificate;
+mod orbit_hold;
 mod synchronizer;
 
 pub use certificate::{Certificate, Condition};
+pub use orbit_certificate::OrbitCertificate;
+pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::Synchronizer;

@@ -4,6 +4,8 @@
 
 mod filter;
 mod hidden_rate;
+mod orbit_velocity;
 
 pub use filter::{Increment, InvariantFilter};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
+pub use orbit_velocity::{OrbitSample, OrbitVelocity, to_inertial, to_polar};
