@@ -16,8 +16,10 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 3] = [
+pub const SHIPPED: [(&str, &str); 5] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
+    ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
+    ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
 ];

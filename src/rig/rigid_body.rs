@@ -2,7 +2,7 @@
 //!
 //! Parameters, and the glue between samples and vectors; the mathematics is in `model`, `observe` and `control`.
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Rig};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, Rig};
 use crate::config::{Checks, ConfigError, Document, finite_positive};
 use crate::control::{Certificate, Synchronizer};
 use crate::model::{Inertia, RigidBody};
@@ -275,7 +275,7 @@ impl Rig for RigidBodyRig {
             body: body.name.clone(),
             conditions: conditions.clone(),
             rate_per_s: certificate.rate_per_s,
-            rate_bound_rad_s: certificate.rate_bound_rad_s,
+            bounds: vec![Figure { name: "M >= |omega|, rad/s".to_owned(), value: certificate.rate_bound_rad_s }],
             warnings: warnings.clone(),
         };
         self.bodies.iter().filter(|body| body.driven).map(report).collect()
