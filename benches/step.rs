@@ -4,12 +4,12 @@
 
 use corotate::bus::memory::MemoryBus;
 use corotate::config::{SHIPPED, Scenario};
-use corotate::rig::{AnyRig, Rig};
+use corotate::rig::{Command, Estimate, Measurement, Rig};
 use corotate::role::{Body, Controller, Observer};
 use corotate::runtime::{RoleId, build, depths, in_turn};
-use corotate::sample::{RateCommand, RateEstimate, RateMeasurement};
+use corotate::sample::Sample;
 use corotate::with_rig;
-use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use criterion::{Bencher, Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
 
 fn scenario(text: &str, overrides: &[&str]) -> Scenario {
@@ -17,16 +17,15 @@ fn scenario(text: &str, overrides: &[&str]) -> Scenario {
     Scenario::parse(text, "bench", &overrides).expect("shipped scenarios are valid")
 }
 
-/// A second of a leader's measurements, and the follower's.
-fn measurements(scenario: &Scenario) -> Vec<[RateMeasurement; 2]> {
-    let AnyRig::RigidBody(rig) = &scenario.rig;
-    let mut bodies = [rig.body(0), rig.body(1)];
+/// A second of the observed body's measurements, and those of the first driven body: the same one in some rigs.
+fn measurements<R: Rig>(rig: &R, driven: usize, scenario: &Scenario) -> Vec<[Measurement<R>; 2]> {
+    let mut bodies = [rig.body(0), rig.body(driven)];
     (0..1000)
         .map(|tick| {
-            let mut pair = [RateMeasurement::default(); 2];
+            let mut pair = [Measurement::<R>::default(); 2];
             for (body, measurement) in bodies.iter_mut().zip(&mut pair) {
                 body.measure(0, measurement);
-                (measurement.stamp.tick, measurement.stamp.generation) = (tick, 1);
+                (measurement.stamp_mut().tick, measurement.stamp_mut().generation) = (tick, 1);
                 body.flow(scenario.tick_s());
             }
             pair
@@ -34,27 +33,29 @@ fn measurements(scenario: &Scenario) -> Vec<[RateMeasurement; 2]> {
         .collect()
 }
 
-/// Measurement in, command out: what stands between the leader's sensor and the follower's actuator.
+/// Measurement in, command out: what stands between the sensor and the actuator.
 fn step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("estimate-and-control step");
     for (name, text) in SHIPPED {
         let scenario = scenario(text, &[]);
-        let samples = measurements(&scenario);
-        let AnyRig::RigidBody(rig) = &scenario.rig;
-        group.throughput(Throughput::Elements(samples.len() as u64));
-        group.bench_function(name, |bencher| {
-            bencher.iter(|| {
-                let mut observer = Observer::new(rig.estimator(), scenario.tick_s());
-                let mut controller = Controller::new(rig.law(1));
-                let (mut estimate, mut command) = (RateEstimate::default(), RateCommand::default());
-                for [leader, follower] in &samples {
-                    observer.step(black_box(leader), &mut estimate);
-                    controller.step(&estimate, black_box(follower), &mut command);
-                    black_box(&command);
-                }
-            });
-        });
+        group.throughput(Throughput::Elements(1000));
+        group.bench_function(name, |bencher| with_rig!(&scenario.rig, rig => step_of(rig, &scenario, bencher)));
     }
+}
+
+fn step_of<R: Rig>(rig: &R, scenario: &Scenario, bencher: &mut Bencher<'_>) {
+    let driven = rig.bodies().iter().position(|body| body.driven).expect("somebody is driven");
+    let samples = measurements(rig, driven, scenario);
+    bencher.iter(|| {
+        let mut observer = Observer::new(rig.estimator(), scenario.tick_s());
+        let mut controller = Controller::new(rig.law(driven));
+        let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
+        for [observed, own] in &samples {
+            observer.step(black_box(observed), &mut estimate);
+            controller.step(&estimate, black_box(own), &mut command);
+            black_box(&command);
+        }
+    });
 }
 
 /// Whole ticks of all roles in one thread: plants, observer, controller, links, books, hash.

@@ -23,6 +23,7 @@ pub fn check(arguments: &Arguments) -> Exit {
         match Scenario::load(path, &arguments.set) {
             Ok(scenario) => {
                 println!("# {}: valid\n{}", path.display(), scenario.to_toml());
+                scenario.rig.notes().iter().for_each(|note| println!("# note: {note}"));
                 scenario.rig.certificates().iter().for_each(print);
             }
             Err(error) => exit = fail(Exit::Usage, &error),
@@ -33,7 +34,10 @@ pub fn check(arguments: &Arguments) -> Exit {
 
 /// As TOML comments, so that the whole output is a scenario file.
 fn print(certificate: &CertificateReport) {
-    println!("# certificate of {}: |omega| <= {:.4} rad/s", certificate.body, certificate.rate_bound_rad_s);
+    println!("# certificate of {}", certificate.body);
+    for bound in &certificate.bounds {
+        println!("#   {}: {:.4}", bound.name, bound.value);
+    }
     for condition in &certificate.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
         let margin = condition.value - condition.required;

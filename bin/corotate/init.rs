@@ -6,7 +6,7 @@ use corotate::config::SHIPPED;
 /// Options of `corotate init`.
 #[derive(clap::Args)]
 pub struct Arguments {
-    /// Name of a shipped scenario: rigid-pair, rigid-pair-hyperbolic, rigid-trio
+    /// Name of a shipped scenario: rigid-pair, rigid-pair-hyperbolic, rigid-trio, orbit-hold, orbit-rendezvous
     name: String,
 }
 

@@ -16,7 +16,7 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 7] = [
+pub const SHIPPED: [(&str, &str); 9] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
@@ -24,4 +24,6 @@ pub const SHIPPED: [(&str, &str); 7] = [
     ("inertia", include_str!("../../config/inertia.toml")),
     ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
     ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
+    ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
+    ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
 ];

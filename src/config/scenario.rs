@@ -14,7 +14,7 @@ const MIN_PERIOD_S: f64 = 1e-5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
 /// The tables whose content belongs to the rig.
-const RIG_SECTIONS: [&str; 4] = ["leader", "follower", "observer", "controller"];
+const RIG_SECTIONS: [&str; 6] = ["central_body", "leader", "spacecraft", "follower", "observer", "controller"];
 
 /// A scenario that can be run.
 #[derive(Debug)]

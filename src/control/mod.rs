@@ -2,8 +2,12 @@
 
 mod adaptation;
 mod certificate;
+mod orbit_certificate;
+mod orbit_hold;
 mod synchronizer;
 
 pub use adaptation::InertiaAdaptation;
 pub use certificate::{Certificate, Condition};
+pub use orbit_certificate::OrbitCertificate;
+pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::Synchronizer;

@@ -57,6 +57,8 @@ pub struct Summary {
     pub criteria: Vec<Criterion>,
     /// The score.
     pub score: Score,
+    /// What a reader of the results must know of the scenario.
+    pub notes: Vec<String>,
     /// What is proven of the loop.
     pub certificates: Vec<CertificateReport>,
     /// The books.
@@ -184,6 +186,7 @@ impl Summary {
             accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
             criteria,
             score: outcome.score.clone(),
+            notes: scenario.rig.notes(),
             certificates: scenario.rig.certificates(),
             state: State::new(&outcome.reports, &books),
             books,
@@ -308,6 +311,10 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
     for (metric, limit) in &accept.metric_max {
         let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
         add(format!("{metric}_max"), *limit, score.and_then(|score| score.settled_max), true);
+    }
+    // Asked for or not: a run that lost a body is not accepted.
+    if outcome.score.faulted_ticks > 0 {
+        add("faulted_ticks_max".to_owned(), 0.0, Some(outcome.score.faulted_ticks as f64), true);
     }
     if let Some(limit) = accept.missed_ticks_max {
         add("missed_ticks_max".to_owned(), limit as f64, Some(books.missed_ticks as f64), true);

@@ -16,6 +16,8 @@ pub struct Score {
     pub scored_ticks: u64,
     /// Ticks at which some sample was missing.
     pub unscored_ticks: u64,
+    /// Ticks at which some body was lost. The metrics are infinite then, which JSON writes as null.
+    pub faulted_ticks: u64,
     /// One entry per metric of the rig.
     pub metrics: Vec<MetricScore>,
     /// How the live certificate fared, if the rig has one.
@@ -138,6 +140,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             score: Score {
                 scored_ticks: 0,
                 unscored_ticks: 0,
+                faulted_ticks: 0,
                 metrics: rig.metrics().iter().map(metric).collect(),
                 certificate: None,
             },
@@ -162,6 +165,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let complete = estimate.is_some() && self.truths.iter().all(|truth| at(truth, tick).is_some());
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
         self.rig.score(|body| at(&self.truths[body], tick), estimate, &mut self.values);
+        self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
         let time_s = tick as f64 * self.tick_s;
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);

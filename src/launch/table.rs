@@ -18,6 +18,9 @@ pub fn table(summary: &Summary) -> String {
         summary.tick_hz,
         summary.last_tick + 1
     );
+    for note in &summary.notes {
+        let _ = writeln!(text, "note: {note}");
+    }
     results(summary, &mut text);
     if !summary.latencies.is_empty() {
         let _ = writeln!(text, "\n{}", latencies(summary));

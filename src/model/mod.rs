@@ -2,8 +2,10 @@
 
 mod integrate;
 mod noise;
+mod orbit;
 mod rigid_body;
 
 pub use integrate::{flow, rk4_step};
 pub use noise::Noise;
+pub use orbit::{CentralField, CentralFieldError, OrbitFault, OrbitState};
 pub use rigid_body::{Inertia, InertiaError, RigidBody, euler};

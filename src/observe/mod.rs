@@ -8,6 +8,7 @@ mod guarded;
 mod hidden_rate;
 mod hurwitz;
 mod inertia;
+mod orbit_velocity;
 mod order;
 mod second_order;
 
@@ -17,5 +18,6 @@ pub use guarded::{GuardedKalman, RateNoise};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};
 pub use inertia::{Identification, InertiaRatioError, InertiaRatios, InertiaRelation};
+pub use orbit_velocity::{OrbitSample, OrbitVelocity, to_inertial, to_polar};
 pub use order::Filter;
 pub use second_order::{KalmanFilter, SecondOrderFilter};

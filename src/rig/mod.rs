@@ -1,10 +1,12 @@
 //! Rigs: which plant, observer and control law belong together, with their parameters.
 //!
-//! A new rig is its mathematics, one file here, one line in each of the three places marked "registry" below, and a
+//! A new rig is its mathematics, one file here, one line in each of the places marked "registry" below, and a
 //! scenario in `config/`. Must not know how roles are driven, nor what carries their samples.
 
+mod orbit;
 mod rigid_body;
 
+pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use rigid_body::RigidBodyRig;
 
 use crate::config::{Checks, ConfigError, Document, nearest};
@@ -48,8 +50,8 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn law(&self, index: usize) -> Self::Law;
     /// What a run is scored by; the unit is the last part of each name.
     fn metrics(&self) -> &'static [&'static str];
-    /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample. `truth` gives the
-    /// truth of a body by its index.
+    /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample, +inf once a body is
+    /// lost. `truth` gives the truth of a body by its index.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
@@ -66,6 +68,10 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None
     }
+    /// What a reader of the results must know of the scenario, such as a declared exception to a rule.
+    fn notes(&self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// A certificate as told to people and written to the summary.
@@ -77,10 +83,19 @@ pub struct CertificateReport {
     pub conditions: Vec<ConditionReport>,
     /// The slowest exponent of the error, 1/s.
     pub rate_per_s: f64,
-    /// The bound M on the leader's motion.
-    pub rate_bound_rad_s: f64,
+    /// What the conditions rest on.
+    pub bounds: Vec<Figure>,
     /// What a careful engineer would change.
     pub warnings: Vec<String>,
+}
+
+/// A number that a certificate rests on.
+#[derive(Debug, Clone, Serialize)]
+pub struct Figure {
+    /// What it is, with its unit.
+    pub name: String,
+    /// Its value.
+    pub value: f64,
 }
 
 /// One condition of a certificate.
@@ -101,6 +116,8 @@ pub struct ConditionReport {
 pub enum AnyRig {
     /// Rigid bodies turning about their centres of mass.
     RigidBody(RigidBodyRig),
+    /// Bodies about a point mass: orbit hold and rendezvous.
+    Orbit(OrbitRig),
 }
 
 /// Registry: runs an expression with the rig at hand, whichever it is.
@@ -109,6 +126,7 @@ macro_rules! with_rig {
     ($any:expr, $rig:ident => $body:expr) => {
         match $any {
             $crate::rig::AnyRig::RigidBody($rig) => $body,
+            $crate::rig::AnyRig::Orbit($rig) => $body,
         }
     };
 }
@@ -128,7 +146,24 @@ impl AnyRig {
     pub fn certificates(&self) -> Vec<CertificateReport> {
         with_rig!(self, rig => rig.certificates())
     }
+
+    /// What a reader of the results must know of the scenario.
+    pub fn notes(&self) -> Vec<String> {
+        with_rig!(self, rig => rig.notes())
+    }
 }
+
+/// Checks that a body's name can name a process and is not `taken` by a role or another body.
+fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut taken: impl Iterator<Item = &'a str>) {
+    let plain = (1..=32).contains(&name.len())
+        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+    checks.require(plain, key, || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
+    let free = !["leader", "observer", "controller", "run"].contains(&name) && taken.all(|other| other != name);
+    checks.require(free, key, || format!("`{name}` is taken already; choose another name"));
+}
+
+/// Registry: the names of the rigs.
+const NAMES: [&str; 3] = ["rigid-body", "orbit-hold", "orbit-rendezvous"];
 
 /// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.
 ///
@@ -146,8 +181,16 @@ pub(crate) fn resolve(
             let (rig, table) = rigid_body::resolve(sections, tick_s, checks)?;
             Ok((rig.map(AnyRig::RigidBody), table))
         }
+        "orbit-hold" => {
+            let (rig, table) = orbit::hold(sections, tick_s, checks)?;
+            Ok((rig.map(AnyRig::Orbit), table))
+        }
+        "orbit-rendezvous" => {
+            let (rig, table) = orbit::rendezvous(sections, tick_s, checks)?;
+            Ok((rig.map(AnyRig::Orbit), table))
+        }
         _ => {
-            checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &["rigid-body"])));
+            checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &NAMES)));
             Ok((None, toml::Table::new()))
         }
     }

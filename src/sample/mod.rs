@@ -4,9 +4,11 @@
 //! type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of layout changes the
 //! version in the name. Must not know how samples travel.
 
+mod orbit;
 mod rigid;
 mod run;
 
+pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
 
@@ -146,6 +148,8 @@ pub mod status {
     pub const DEGRADED: u64 = 1 << 7;
     /// The motion does not excite the identifier.
     pub const NOT_EXCITED: u64 = 1 << 8;
+    /// The body met an end of its model (it hit something, or left for good) and is frozen at its last good state.
+    pub const FAULT: u64 = 1 << 9;
 }
 
 #[cfg(test)]
@@ -168,6 +172,10 @@ mod tests {
         check::<RateMeasurement>();
         check::<RateEstimate>();
         check::<RateCommand>();
+        check::<OrbitTruth>();
+        check::<OrbitMeasurement>();
+        check::<OrbitEstimate>();
+        check::<OrbitCommand>();
         check::<Schedule>();
         check::<Health>();
     }

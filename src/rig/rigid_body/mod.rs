@@ -15,7 +15,7 @@ pub use learner::Learner;
 pub use observer::{HiddenObserver, RateObserver};
 pub use plant::RatePlant;
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Rig};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, Rig};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
 use crate::model::{Inertia, RigidBody};
@@ -365,7 +365,7 @@ impl Rig for RigidBodyRig {
             body: body.name.clone(),
             conditions: conditions.clone(),
             rate_per_s: certificate.rate_per_s,
-            rate_bound_rad_s: certificate.rate_bound_rad_s,
+            bounds: vec![Figure { name: "M >= |omega|, rad/s".to_owned(), value: certificate.rate_bound_rad_s }],
             warnings: warnings.clone(),
         };
         self.bodies.iter().filter(|body| body.driven).map(report).collect()

@@ -1,0 +1,215 @@
+//! The rigs `orbit-hold` and `orbit-rendezvous`: bodies about a point mass of which the first one's velocity is not measured.
+//!
+//! In `orbit-hold` that body, the spacecraft, is itself driven to a circular orbit, \[S\]. In `orbit-rendezvous` it is a free
+//! leader, and followers are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
+//! `resolve`, the mathematics in `model`, `observe` and `control`.
+
+mod resolve;
+mod roles;
+
+pub(super) use resolve::{hold, rendezvous};
+pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
+
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, Rig};
+use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold};
+use crate::model::{CentralField, OrbitFault, OrbitState};
+use crate::observe::OrbitVelocity;
+use crate::sample::{OrbitEstimate, OrbitTruth, status};
+use nalgebra::Vector2;
+use roles::Aim;
+
+/// Bodies in a central field, the observer of the first one's velocity, and the law of the driven ones.
+#[derive(Debug, Clone)]
+pub struct OrbitRig {
+    bodies: Vec<BodyInfo>,
+    field: CentralField,
+    initial: Vec<OrbitState>,
+    decay_rate_per_s: Vector2<f64>,
+    initial_guess: Vector2<f64>,
+    gains: OrbitGains,
+    law: OrbitHold,
+    aim: Aim,
+    tick_s: f64,
+}
+
+impl OrbitRig {
+    /// The radius (du) of the circular orbit about which the loop is linearised: the target, or the leader's pericentre,
+    /// where everything is fastest; where that is no place to be, the leader's present radius.
+    fn certified_radius(&self) -> f64 {
+        match self.aim {
+            Aim::Circle { radius, .. } => radius,
+            Aim::Leader => {
+                let pericentre = self.field.pericentre(&self.initial[0]);
+                if self.field.holds(pericentre) { pericentre } else { self.initial[0].r }
+            }
+        }
+    }
+
+    fn certificate(&self) -> Result<OrbitCertificate, OrbitFault> {
+        // Full-state feedback does not wait for the observer.
+        let full_state = matches!(self.aim, Aim::Circle { full_state: true, .. });
+        let decay = if full_state { Vector2::repeat(f64::INFINITY) } else { self.decay_rate_per_s };
+        OrbitCertificate::new(&self.field, &self.law, &self.gains, &decay, self.certified_radius(), self.tick_s)
+    }
+
+    /// What a body is to be like, at the given state of the leader.
+    fn reference(&self, leader: OrbitState) -> OrbitState {
+        match self.aim {
+            Aim::Circle { radius, .. } => self.field.circular(radius),
+            Aim::Leader => leader,
+        }
+    }
+
+    fn driven(&self) -> impl Iterator<Item = usize> {
+        (0..self.bodies.len()).filter(|index| self.bodies[*index].driven)
+    }
+
+    fn report(&self, index: usize, certificate: &OrbitCertificate) -> CertificateReport {
+        let condition = |name: &str, condition: Condition| ConditionReport {
+            name: name.to_owned(),
+            value: condition.value,
+            required: condition.required,
+            holds: condition.holds(),
+        };
+        let figure = |name: &str, value: f64| Figure { name: name.to_owned(), value };
+        let margin = self.law.margin(&self.reference(self.initial[0]), &self.initial[index]);
+        CertificateReport {
+            body: self.bodies[index].name.clone(),
+            conditions: vec![
+                condition("sampled: 1 > |z| of the slowest mode", certificate.sampled),
+                condition("thrust limit > thrust asked for at the start, du/s^2", margin),
+            ],
+            rate_per_s: certificate.rate_per_s,
+            bounds: vec![
+                figure("radius of the circular orbit it is linearised about, du", self.certified_radius()),
+                figure("rate that sampling and delay leave, 1/s", certificate.sampled_rate_per_s),
+            ],
+            warnings: self.warnings(certificate, &margin),
+        }
+    }
+
+    fn warnings(&self, certificate: &OrbitCertificate, margin: &Condition) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if certificate.sampled_rate_per_s < 0.75 * certificate.rate_per_s {
+            warnings.push(format!(
+                "sampling and delay leave {:.3} of the designed {:.3} 1/s; raise tick_hz, or set controller.predict",
+                certificate.sampled_rate_per_s, certificate.rate_per_s
+            ));
+        }
+        if !margin.holds() {
+            warnings.push(
+                "the thrust limit acts at first: the rate holds from when the law asks for less; watch the radius until then"
+                    .to_owned(),
+            );
+        }
+        if self.aim == Aim::Leader && !self.leader_stays() {
+            warnings.push(
+                "the leader's free orbit leaves the region or meets the central body; a run that gets there ends in a fault"
+                    .to_owned(),
+            );
+        }
+        warnings
+    }
+
+    /// Whether the leader's free orbit keeps between the central body and the escape radius.
+    fn leader_stays(&self) -> bool {
+        let leader = &self.initial[0];
+        let (energy, pericentre) = (self.field.energy(leader), self.field.pericentre(leader));
+        let apocentre = -self.field.mu() / energy - pericentre;
+        energy < 0.0 && self.field.holds(pericentre) && self.field.holds(apocentre)
+    }
+}
+
+impl Rig for OrbitRig {
+    type Body = OrbitPlant;
+    type Estimator = OrbitObserver;
+    type Law = OrbitLaw;
+
+    fn bodies(&self) -> &[BodyInfo] {
+        &self.bodies
+    }
+
+    /// A follower measures its own velocity; the observed body only if full-state feedback is asked for.
+    fn body(&self, index: usize) -> OrbitPlant {
+        let velocity_measured = index != 0 || matches!(self.aim, Aim::Circle { full_state: true, .. });
+        OrbitPlant::new(self.field, self.initial[index], velocity_measured)
+    }
+
+    fn estimator(&self) -> OrbitObserver {
+        OrbitObserver::new(OrbitVelocity::new(self.field.mu()), self.decay_rate_per_s, self.initial_guess)
+    }
+
+    fn law(&self, _index: usize) -> OrbitLaw {
+        OrbitLaw::new(self.law, self.aim)
+    }
+
+    fn metrics(&self) -> &'static [&'static str] {
+        &["radius_error_du", "velocity_error_du_s", "estimate_error_du_s"]
+    }
+
+    /// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)| of the worst driven body, and the length of the velocity estimate's error. All
+    /// of them +inf once any body is lost.
+    fn score<'a>(
+        &self,
+        truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
+        estimate: Option<&OrbitEstimate>,
+        out: &mut [f64],
+    ) {
+        let lost = |index| truth(index).is_some_and(|truth| truth.status & status::FAULT != 0);
+        if (0..self.bodies.len()).any(lost) {
+            out.fill(f64::INFINITY);
+            return;
+        }
+        let state = |index| {
+            truth(index).map(|truth| OrbitState {
+                r: truth.radius_du,
+                vr: truth.velocity_du_s[0],
+                theta: truth.angle_rad,
+                vtheta: truth.velocity_du_s[1],
+            })
+        };
+        let first = state(0);
+        let reference = first.map(|leader| self.reference(leader));
+        let errors = self.driven().map(|index| errors(state(index), reference));
+        let worst = errors.reduce(|a, b| [worse(a[0], b[0]), worse(a[1], b[1])]);
+        [out[0], out[1]] = worst.unwrap_or([f64::NAN; 2]);
+        let estimated = estimate.map(|estimate| Vector2::from(estimate.velocity_du_s));
+        out[2] = match (estimated, first) {
+            (Some(estimated), Some(first)) => (estimated - Vector2::new(first.vr, first.vtheta)).norm(),
+            _ => f64::NAN,
+        };
+    }
+
+    fn certificates(&self) -> Vec<CertificateReport> {
+        // A scenario whose loop could not be certified was refused.
+        self.certificate()
+            .map_or(Vec::new(), |certificate| self.driven().map(|index| self.report(index, &certificate)).collect())
+    }
+
+    fn notes(&self) -> Vec<String> {
+        match self.aim {
+            Aim::Circle { full_state: true, .. } => vec![format!(
+                "controller.feedback = \"full-state\": {} measures its own velocity and the law uses it; the estimate is \
+                 scored and not used",
+                self.bodies[0].name
+            )],
+            _ => Vec::new(),
+        }
+    }
+}
+
+/// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)|; NaN where a sample is missing.
+fn errors(body: Option<OrbitState>, reference: Option<OrbitState>) -> [f64; 2] {
+    match (body, reference) {
+        (Some(body), Some(reference)) => {
+            let velocity = Vector2::new(body.vr - reference.vr, body.vtheta - reference.vtheta);
+            [(body.r - reference.r).abs(), velocity.norm()]
+        }
+        _ => [f64::NAN; 2],
+    }
+}
+
+/// The larger; NaN if either is.
+fn worse(a: f64, b: f64) -> f64 {
+    if b > a || b.is_nan() { b } else { a }
+}

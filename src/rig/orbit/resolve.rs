@@ -1,0 +1,279 @@
+//! Reads and checks the sections of the orbit rigs.
+//!
+//! Must name the key and the remedy of everything it refuses, all at once.
+
+use super::roles::Aim;
+use super::{BodyInfo, OrbitRig};
+use crate::config::{Checks, ConfigError, Document};
+use crate::control::{OrbitGains, OrbitHold};
+use crate::model::{CentralField, CentralFieldError, OrbitState};
+use crate::rig::check_name;
+use serde::{Deserialize, Serialize};
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawHold {
+    central_body: RawCentralBody,
+    spacecraft: RawBody,
+    observer: RawObserver,
+    controller: RawHoldController,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawRendezvous {
+    central_body: RawCentralBody,
+    leader: RawBody,
+    follower: Vec<RawFollower>,
+    observer: RawObserver,
+    controller: RawController,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawCentralBody {
+    gravitational_parameter_du3_s2: f64,
+    radius_du: f64,
+    escape_radius_du: f64,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawBody {
+    initial_radius_du: f64,
+    #[serde(default)]
+    initial_angle_rad: f64,
+    initial_velocity_du_s: [f64; 2],
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawFollower {
+    name: String,
+    initial_radius_du: f64,
+    #[serde(default)]
+    initial_angle_rad: f64,
+    initial_velocity_du_s: [f64; 2],
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawObserver {
+    decay_rate_per_s: [f64; 2],
+    #[serde(default)]
+    initial_guess_du_s: [f64; 2],
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawHoldController {
+    target_radius_du: f64,
+    #[serde(default)]
+    feedback: Feedback,
+    gain: RawGain,
+    thrust_max_du_s2: f64,
+    #[serde(default)]
+    predict: bool,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawController {
+    gain: RawGain,
+    thrust_max_du_s2: f64,
+    #[serde(default)]
+    predict: bool,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawGain {
+    radius_per_s2: f64,
+    radial_per_s: f64,
+    transverse_per_s: f64,
+}
+
+/// Where the law of `orbit-hold` takes the velocity from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Feedback {
+    #[default]
+    Estimate,
+    FullState,
+}
+
+impl From<&RawBody> for OrbitState {
+    fn from(raw: &RawBody) -> Self {
+        let [vr, vtheta] = raw.initial_velocity_du_s;
+        Self { r: raw.initial_radius_du, vr, theta: raw.initial_angle_rad, vtheta }
+    }
+}
+
+impl From<&RawFollower> for OrbitState {
+    fn from(raw: &RawFollower) -> Self {
+        let [vr, vtheta] = raw.initial_velocity_du_s;
+        Self { r: raw.initial_radius_du, vr, theta: raw.initial_angle_rad, vtheta }
+    }
+}
+
+/// Reads and checks a scenario of the rig `orbit-hold`.
+pub(in crate::rig) fn hold(
+    sections: &Document,
+    tick_s: f64,
+    checks: &mut Checks<'_>,
+) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
+    let raw: RawHold = sections.read_into()?;
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    let mut sound = true;
+    let mut review = Review { checks, sound: &mut sound };
+    let field = review.field(&raw.central_body);
+    review.place("spacecraft.initial_radius_du", raw.spacecraft.initial_radius_du, field.as_ref());
+    review.place("controller.target_radius_du", raw.controller.target_radius_du, field.as_ref());
+    review.loops(&raw.observer, &raw.controller.gain, raw.controller.thrust_max_du_s2);
+    let Some(field) = field else { return Ok((None, table)) };
+    let full_state = raw.controller.feedback == Feedback::FullState;
+    let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
+    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { tick_s } else { 0.0 });
+    let rig = OrbitRig {
+        bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true }],
+        field,
+        initial: vec![(&raw.spacecraft).into()],
+        decay_rate_per_s: raw.observer.decay_rate_per_s.into(),
+        initial_guess: raw.observer.initial_guess_du_s.into(),
+        gains,
+        law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
+        aim,
+        tick_s,
+    };
+    if sound {
+        check_loop(&rig, checks);
+    }
+    Ok((Some(rig), table))
+}
+
+/// Reads and checks a scenario of the rig `orbit-rendezvous`.
+pub(in crate::rig) fn rendezvous(
+    sections: &Document,
+    tick_s: f64,
+    checks: &mut Checks<'_>,
+) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
+    let raw: RawRendezvous = sections.read_into()?;
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    let mut sound = true;
+    let mut review = Review { checks, sound: &mut sound };
+    let field = review.field(&raw.central_body);
+    review.place("leader.initial_radius_du", raw.leader.initial_radius_du, field.as_ref());
+    review.followers(&raw.follower, field.as_ref());
+    review.loops(&raw.observer, &raw.controller.gain, raw.controller.thrust_max_du_s2);
+    let Some(field) = field else { return Ok((None, table)) };
+    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { tick_s } else { 0.0 });
+    let mut rig = OrbitRig {
+        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
+        field,
+        initial: vec![(&raw.leader).into()],
+        decay_rate_per_s: raw.observer.decay_rate_per_s.into(),
+        initial_guess: raw.observer.initial_guess_du_s.into(),
+        gains,
+        law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
+        aim: Aim::Leader,
+        tick_s,
+    };
+    for follower in &raw.follower {
+        rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true });
+        rig.initial.push(follower.into());
+    }
+    if sound {
+        check_loop(&rig, checks);
+    }
+    Ok((Some(rig), table))
+}
+
+impl RawGain {
+    fn resolved(&self) -> OrbitGains {
+        OrbitGains {
+            radius_per_s2: self.radius_per_s2,
+            radial_per_s: self.radial_per_s,
+            transverse_per_s: self.transverse_per_s,
+        }
+    }
+}
+
+/// Checks that remember whether one of them failed.
+struct Review<'a, 'd> {
+    checks: &'a mut Checks<'d>,
+    sound: &'a mut bool,
+}
+
+impl Review<'_, '_> {
+    fn require(&mut self, holds: bool, key: &str, reason: impl FnOnce() -> String) {
+        *self.sound &= holds;
+        self.checks.require(holds, key, reason);
+    }
+
+    fn positive(&mut self, key: &str, value: f64) {
+        self.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
+    }
+
+    fn field(&mut self, raw: &RawCentralBody) -> Option<CentralField> {
+        match CentralField::new(raw.gravitational_parameter_du3_s2, raw.radius_du, raw.escape_radius_du) {
+            Ok(field) => Some(field),
+            Err(error) => {
+                let key = match error {
+                    CentralFieldError::NotAttracting { .. } => "central_body.gravitational_parameter_du3_s2",
+                    CentralFieldError::EmptyRegion { inner, .. } if inner <= 0.0 => "central_body.radius_du",
+                    CentralFieldError::EmptyRegion { .. } => "central_body.escape_radius_du",
+                };
+                self.require(false, key, || error.to_string());
+                None
+            }
+        }
+    }
+
+    /// A radius at which a body is to be.
+    fn place(&mut self, key: &str, r: f64, field: Option<&CentralField>) {
+        match field {
+            Some(field) => self.require(field.holds(r), key, || {
+                format!(
+                    "{r} du is not between the central body's radius and the escape radius; move it, or change \
+                     central_body.radius_du or central_body.escape_radius_du"
+                )
+            }),
+            None => self.positive(key, r),
+        }
+    }
+
+    fn followers(&mut self, followers: &[RawFollower], field: Option<&CentralField>) {
+        self.require(!followers.is_empty(), "follower", || "there is none; add a [[follower]]".to_owned());
+        for (index, follower) in followers.iter().enumerate() {
+            let taken = followers[..index].iter().map(|other| other.name.as_str());
+            check_name(self.checks, &format!("follower[{index}].name"), &follower.name, taken);
+            self.place(&format!("follower[{index}].initial_radius_du"), follower.initial_radius_du, field);
+        }
+    }
+
+    fn loops(&mut self, observer: &RawObserver, gain: &RawGain, thrust_max: f64) {
+        for rate in observer.decay_rate_per_s {
+            self.positive("observer.decay_rate_per_s", rate);
+        }
+        self.positive("controller.gain.radius_per_s2", gain.radius_per_s2);
+        self.positive("controller.gain.radial_per_s", gain.radial_per_s);
+        self.positive("controller.gain.transverse_per_s", gain.transverse_per_s);
+        self.positive("controller.thrust_max_du_s2", thrust_max);
+    }
+}
+
+fn check_loop(rig: &OrbitRig, checks: &mut Checks<'_>) {
+    match rig.certificate() {
+        Ok(certificate) => checks.require(certificate.sampled.holds(), "controller.gain", || {
+            format!(
+                "the sampled loop is unstable: its slowest mode is multiplied by {:.4} from tick to tick; lower the gains \
+                 or raise tick_hz",
+                certificate.sampled.required
+            )
+        }),
+        Err(_) => checks.refuse(
+            "tick_hz",
+            format!("in a tick of {} s a body moves further than can be resolved; raise tick_hz", rig.tick_s),
+        ),
+    }
+}

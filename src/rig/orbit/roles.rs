@@ -1,0 +1,282 @@
+//! Body, observer and law of the orbit rigs: the glue between samples and vectors.
+//!
+//! Must not compute what `model`, `observe` and `control` compute.
+
+use crate::control::OrbitHold;
+use crate::model::{CentralField, OrbitState};
+use crate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
+use crate::role::{Body, Estimator, Law};
+use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
+use nalgebra::Vector2;
+
+/// The bits of r and θ in a sample's `valid`.
+const POSITION: u64 = 0b0011;
+/// The bits of Vr and Vθ.
+const VELOCITY: u64 = 0b1100;
+
+/// A body in a central field with its sensors and thrusters.
+#[derive(Debug)]
+pub struct OrbitPlant {
+    field: CentralField,
+    state: OrbitState,
+    applied: Vector2<f64>,
+    /// What its sensors measure, as bits.
+    measured: u64,
+    /// [`status::FAULT`] once the model has ended, or 0.
+    fault: u64,
+}
+
+impl OrbitPlant {
+    /// A body whose sensors measure its position, and its velocity too if `velocity_measured`.
+    pub(super) fn new(field: CentralField, state: OrbitState, velocity_measured: bool) -> Self {
+        let measured = if velocity_measured { POSITION | VELOCITY } else { POSITION };
+        Self { field, state, applied: Vector2::zeros(), measured, fault: 0 }
+    }
+}
+
+impl Body for OrbitPlant {
+    type Truth = OrbitTruth;
+    type Measurement = OrbitMeasurement;
+    type Command = OrbitCommand;
+
+    fn apply(&mut self, command: &OrbitCommand) -> bool {
+        let usable = command.thrust_du_s2.iter().all(|value| value.is_finite());
+        if usable {
+            self.applied = command.thrust_du_s2.into();
+        }
+        usable
+    }
+
+    fn apply_safe(&mut self) {
+        self.applied = Vector2::zeros();
+    }
+
+    fn truth(&self, status: u64, out: &mut OrbitTruth) {
+        out.radius_du = self.state.r;
+        out.angle_rad = self.state.theta;
+        out.velocity_du_s = [self.state.vr, self.state.vtheta];
+        out.applied_du_s2 = self.applied.into();
+        out.status = status | self.fault;
+    }
+
+    fn measure(&mut self, status: u64, out: &mut OrbitMeasurement) {
+        out.radius_du = self.state.r;
+        out.angle_rad = self.state.theta;
+        let velocity = [self.state.vr, self.state.vtheta];
+        out.velocity_du_s = if self.measured & VELOCITY == VELOCITY { velocity } else { [0.0; 2] };
+        out.applied_du_s2 = self.applied.into();
+        out.valid = self.measured;
+        out.status = status | self.fault;
+    }
+
+    /// Freezes for good at the last good state where the model ends.
+    fn flow(&mut self, dt_s: f64) {
+        if self.fault != 0 {
+            return;
+        }
+        match self.field.flow(&self.state, &self.applied, dt_s) {
+            Ok(state) => self.state = state,
+            Err(fault) => (self.state, self.fault) = (fault.last(), status::FAULT),
+        }
+    }
+}
+
+/// The observer of the first body's velocity.
+#[derive(Debug)]
+pub struct OrbitObserver {
+    relation: OrbitVelocity,
+    decay_rate_per_s: Vector2<f64>,
+    /// (Vr, Vθ) before anything is known, du/s.
+    guess: Vector2<f64>,
+    filter: InvariantFilter<2>,
+    last: Option<OrbitSample>,
+    status: u64,
+}
+
+impl OrbitObserver {
+    /// An observer with decay rates −L (1/s) of the two inertial axes, and a guess of (Vr, Vθ) in du/s.
+    pub(super) fn new(relation: OrbitVelocity, decay_rate_per_s: Vector2<f64>, guess: Vector2<f64>) -> Self {
+        let filter = InvariantFilter::new(decay_rate_per_s, guess);
+        Self { relation, decay_rate_per_s, guess, filter, last: None, status: status::INITIAL }
+    }
+
+    fn seen(measurement: &OrbitMeasurement) -> OrbitSample {
+        OrbitSample { r: measurement.radius_du, theta: measurement.angle_rad, thrust: measurement.applied_du_s2.into() }
+    }
+}
+
+impl Estimator for OrbitObserver {
+    type Measurement = OrbitMeasurement;
+    type Estimate = OrbitEstimate;
+
+    /// What a frozen body reports is no motion to learn from.
+    fn usable(&self, measurement: &OrbitMeasurement) -> bool {
+        let OrbitSample { r, theta, thrust } = Self::seen(measurement);
+        measurement.valid & POSITION == POSITION
+            && measurement.status & status::FAULT == 0
+            && r > 0.0
+            && [r, theta, thrust.x, thrust.y].iter().all(|value| value.is_finite())
+    }
+
+    fn start(&mut self, measurement: &OrbitMeasurement) {
+        let guess = to_inertial(measurement.angle_rad, &self.guess);
+        self.filter = InvariantFilter::new(self.decay_rate_per_s, guess);
+        self.last = Some(Self::seen(measurement));
+        self.status = status::INITIAL;
+    }
+
+    fn update(&mut self, measurement: &OrbitMeasurement, dt_s: f64) {
+        let seen = Self::seen(measurement);
+        if let Some(last) = &self.last {
+            self.filter.step(&self.relation.observe(last, &seen, dt_s));
+            self.status = 0;
+        }
+        self.last = Some(seen);
+    }
+
+    fn write(&self, status: u64, out: &mut OrbitEstimate) {
+        // Without any measurement there is nothing that could be said, and no bit says that there was.
+        let at = self.last.unwrap_or(OrbitSample { r: 0.0, theta: 0.0, thrust: Vector2::zeros() });
+        out.radius_du = at.r;
+        out.angle_rad = at.theta;
+        out.velocity_du_s = to_polar(at.theta, self.filter.estimate()).into();
+        out.status = self.status | status;
+        out.valid = match self.last {
+            None => 0,
+            Some(_) if out.status & status::INITIAL != 0 => POSITION,
+            Some(_) => POSITION | VELOCITY,
+        };
+    }
+}
+
+/// What a law takes its body to, and what it knows of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Aim {
+    /// A circular orbit of this radius, du. The body is the observed one; its velocity is the estimate's, unless
+    /// `full_state`: then its own sensors'.
+    Circle { radius: f64, full_state: bool },
+    /// The leader's motion, its velocity as estimated; the body measures its own.
+    Leader,
+}
+
+/// The law of one driven body.
+#[derive(Debug)]
+pub struct OrbitLaw {
+    law: OrbitHold,
+    aim: Aim,
+}
+
+impl OrbitLaw {
+    pub(super) fn new(law: OrbitHold, aim: Aim) -> Self {
+        Self { law, aim }
+    }
+
+    /// The thrust, or none to be asked for: a lost body, or nothing known of the leader yet.
+    fn thrust(&self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement) -> Option<Vector2<f64>> {
+        let sound = measurement.status & status::FAULT == 0 && estimate.valid & POSITION == POSITION;
+        let body = state(measurement.radius_du, measurement.angle_rad, &measurement.velocity_du_s);
+        let applied = measurement.applied_du_s2.into();
+        sound.then(|| match self.aim {
+            Aim::Circle { radius, full_state: true } => self.law.to_circle(radius, &body, &applied),
+            Aim::Circle { radius, full_state: false } => {
+                let [vr, vtheta] = estimate.velocity_du_s;
+                self.law.to_circle(radius, &OrbitState { vr, vtheta, ..body }, &applied)
+            }
+            Aim::Leader => {
+                let leader = state(estimate.radius_du, estimate.angle_rad, &estimate.velocity_du_s);
+                self.law.to_leader(&leader, &body, &applied)
+            }
+        })
+    }
+}
+
+fn state(r: f64, theta: f64, velocity: &[f64; 2]) -> OrbitState {
+    OrbitState { r, vr: velocity[0], theta, vtheta: velocity[1] }
+}
+
+impl Law for OrbitLaw {
+    type Estimate = OrbitEstimate;
+    type Measurement = OrbitMeasurement;
+    type Command = OrbitCommand;
+
+    fn command(&mut self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement, out: &mut OrbitCommand) {
+        out.thrust_du_s2 = self.thrust(estimate, measurement).unwrap_or_default().into();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plant(state: OrbitState) -> OrbitPlant {
+        OrbitPlant::new(CentralField::new(1.0, 0.05, 10.0).unwrap(), state, false)
+    }
+
+    fn measured(plant: &mut OrbitPlant) -> OrbitMeasurement {
+        let mut measurement = OrbitMeasurement::default();
+        plant.measure(0, &mut measurement);
+        measurement
+    }
+
+    fn observer() -> OrbitObserver {
+        OrbitObserver::new(OrbitVelocity::new(1.0), Vector2::repeat(4.0), Vector2::new(0.0, 0.9))
+    }
+
+    #[test]
+    fn a_lost_body_freezes_says_so_and_is_left_alone() {
+        for start in [
+            OrbitState { r: 0.06, vr: -2.0, ..OrbitState::default() },
+            OrbitState { r: 9.9, vr: 3.0, ..OrbitState::default() },
+        ] {
+            let mut plant = plant(start);
+            (0..100).for_each(|_| plant.flow(1e-2));
+            let frozen = measured(&mut plant);
+            plant.flow(1.0);
+            assert_eq!(measured(&mut plant), frozen);
+            assert_eq!(frozen.status, status::FAULT);
+            assert!(frozen.radius_du > 0.05 && frozen.radius_du < 10.0, "{frozen:?}");
+            assert!(!observer().usable(&frozen));
+            let estimate = OrbitEstimate { valid: POSITION, radius_du: 1.0, ..OrbitEstimate::default() };
+            let law = OrbitHold::new(
+                plant.field,
+                crate::control::OrbitGains { radius_per_s2: 1.0, radial_per_s: 1.0, transverse_per_s: 1.0 },
+                0.5,
+                0.0,
+            );
+            for aim in [Aim::Leader, Aim::Circle { radius: 1.3, full_state: true }] {
+                assert_eq!(OrbitLaw::new(law, aim).thrust(&estimate, &frozen), None);
+            }
+        }
+    }
+
+    #[test]
+    fn a_velocity_that_is_not_measured_is_not_published() {
+        let state = OrbitState { r: 1.0, vr: 0.1, theta: 0.3, vtheta: 0.9 };
+        let hidden = measured(&mut plant(state));
+        assert_eq!((hidden.velocity_du_s, hidden.valid), ([0.0; 2], POSITION));
+        let open = measured(&mut OrbitPlant::new(plant(state).field, state, true));
+        assert_eq!((open.velocity_du_s, open.valid), ([0.1, 0.9], POSITION | VELOCITY));
+    }
+
+    #[test]
+    fn an_unusable_command_changes_nothing() {
+        let mut plant = plant(OrbitState { r: 1.0, ..OrbitState::default() });
+        let command = |x| OrbitCommand { thrust_du_s2: [x, 0.1], ..OrbitCommand::default() };
+        assert!(plant.apply(&command(0.2)) && !plant.apply(&command(f64::NAN)));
+        assert_eq!(measured(&mut plant).applied_du_s2, [0.2, 0.1]);
+        plant.apply_safe();
+        assert_eq!(measured(&mut plant).applied_du_s2, [0.0; 2]);
+    }
+
+    #[test]
+    fn the_guess_is_polar_and_nothing_is_said_before_the_first_measurement() {
+        let (mut observer, mut estimate) = (observer(), OrbitEstimate::default());
+        observer.write(status::UNUSABLE, &mut estimate);
+        assert_eq!((estimate.valid, estimate.radius_du), (0, 0.0));
+        let start = OrbitState { r: 1.0, vr: 0.1, theta: 2.0, vtheta: 0.95 };
+        observer.start(&measured(&mut plant(start)));
+        observer.write(0, &mut estimate);
+        assert_eq!((estimate.valid, estimate.status), (POSITION, status::INITIAL));
+        assert!((estimate.velocity_du_s[1] - 0.9).abs() < 1e-15 && estimate.velocity_du_s[0].abs() < 1e-15);
+    }
+}
