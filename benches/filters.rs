@@ -8,7 +8,7 @@ mod ekf;
 mod recording;
 
 use corotate::observe::{
-    Filter, GuardedKalman, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
+    Filter, GuardedKalman, HiddenRate, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
 };
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
 use ekf::Ekf;
@@ -39,16 +39,15 @@ fn filters(criterion: &mut Criterion) {
         for (name, filter) in relation_filters(case.start[2]) {
             let relation = match filter {
                 Filter::Kalman(_) => recording.relation(),
-                _ => corotate::observe::HiddenRate::new(&recording.coefficients, 3, 1e-6)
-                    .expect("the case has a relation"),
+                _ => HiddenRate::new(&recording.coefficients, 3, 1e-6).expect("the case has a relation"),
             };
             group.bench_function(name, |bencher| {
                 let run = |mut filter: Filter<1>| {
                     for index in 1..recording.truth.len() {
                         let (from, to) = (recording.sample(index - 1), black_box(recording.sample(index)));
-                        match relation.observe(&from, &to, TICK_S, filter.estimate().x) {
+                        match relation.observe(&from, &to, recording.tick_s, filter.estimate().x) {
                             Observation::Seen(increment) => filter.step(&increment),
-                            Observation::Unobservable { drift } => filter.predict(&drift, TICK_S),
+                            Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),
                         }
                     }
                     filter
@@ -67,7 +66,7 @@ fn filters(criterion: &mut Criterion) {
                 let mut filter = GuardedKalman::new(&recording.coefficients, 3, 1e-6, noise, &first, case.start[2])
                     .expect("the case has a relation");
                 for index in 1..recording.truth.len() {
-                    filter.step(&recording.sample(index - 1), &black_box(recording.sample(index)), TICK_S);
+                    filter.step(&recording.sample(index - 1), &black_box(recording.sample(index)), recording.tick_s);
                 }
                 filter
             });
@@ -78,7 +77,7 @@ fn filters(criterion: &mut Criterion) {
                 let mut peer =
                     Ekf::new(&recording.coefficients, 3, [DEVIATION, DENSITY], &recording.measured[0], start);
                 for measured in &recording.measured[1..] {
-                    peer.step(TICK_S, black_box(measured));
+                    peer.step(recording.tick_s, black_box(measured));
                 }
                 peer.state
             });

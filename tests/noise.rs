@@ -35,6 +35,23 @@ fn kalman(density: f64, guess: f64, deviation: f64) -> Filter<1> {
     Filter::Kalman(KalmanFilter::new(Vector1::new(density), Vector1::new(guess), Vector1::new(deviation)))
 }
 
+impl Recording {
+    /// ω_k − ω̂_k at each sample by a filter on the invariant relation.
+    pub fn run(&self, mut filter: Filter<1>) -> Vec<f64> {
+        let relation = self.relation();
+        let mut errors = vec![self.truth[0].z - filter.estimate().x];
+        for index in 1..self.truth.len() {
+            let (from, to) = (self.sample(index - 1), self.sample(index));
+            match relation.observe(&from, &to, self.tick_s, filter.estimate().x) {
+                Observation::Seen(increment) => filter.step(&increment),
+                Observation::Unobservable { drift } => filter.predict(&drift, self.tick_s),
+            }
+            errors.push(self.truth[index].z - filter.estimate().x);
+        }
+        errors
+    }
+}
+
 /// ω_k − ω̂_k at each sample by the extended Kalman filter.
 fn by_ekf(recording: &Recording, density: f64, [guess, deviation]: [f64; 2]) -> Vec<f64> {
     let noise = [recording.deviation, density];
@@ -149,7 +166,7 @@ fn the_guarded_kalman_filter_equals_the_extended_one_at_every_noise() {
 
 /// The time after which the error stays below a bound, s; infinite if it does not.
 fn settling_s(recording: &Recording, errors: &[f64], bound: f64) -> f64 {
-    match errors.iter().rposition(|error| !(error.abs() <= bound)) {
+    match errors.iter().rposition(|error| error.is_nan() || error.abs() > bound) {
         Some(last) if last + 1 == errors.len() => f64::INFINITY,
         Some(last) => (last + 1) as f64 * recording.tick_s,
         None => 0.0,

@@ -1,7 +1,7 @@
 //! A body's motion and what noisy sensors make of it, for every kind of conic; the hidden axis is 3. No part of the product.
 
 use corotate::model::{Inertia, Noise, RigidBody};
-use corotate::observe::{Filter, HiddenRate, Observation, RateSample};
+use corotate::observe::{HiddenRate, RateSample};
 use nalgebra::Vector3;
 
 /// A body and its initial rates, rad/s.
@@ -55,20 +55,5 @@ impl Recording {
 
     pub fn relation(&self) -> HiddenRate {
         HiddenRate::new(&self.coefficients, 3, 1e-6).unwrap().with_noise(&self.sensors())
-    }
-
-    /// ω_k − ω̂_k at each sample by a filter on the invariant relation.
-    pub fn run(&self, mut filter: Filter<1>) -> Vec<f64> {
-        let relation = self.relation();
-        let mut errors = vec![self.truth[0].z - filter.estimate().x];
-        for index in 1..self.truth.len() {
-            let (from, to) = (self.sample(index - 1), self.sample(index));
-            match relation.observe(&from, &to, self.tick_s, filter.estimate().x) {
-                Observation::Seen(increment) => filter.step(&increment),
-                Observation::Unobservable { drift } => filter.predict(&drift, self.tick_s),
-            }
-            errors.push(self.truth[index].z - filter.estimate().x);
-        }
-        errors
     }
 }
