@@ -13,7 +13,7 @@ use nalgebra::Vector2;
 pub struct OrbitSample {
     /// Distance from the centre, du; positive.
     pub r: f64,
-    /// Angle, rad.
+    /// Angle, rad. Its rounding is noise of the position: it grows where the angle grows on from turn to turn.
     pub theta: f64,
     /// Known thrust (Ur, Uθ), du/s²: its polar components are held from this instant to the next and turn with the body.
     pub thrust: Vector2<f64>,
