@@ -16,14 +16,15 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 9] = [
+pub const SHIPPED: [(&str, &str); 10] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
-    ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("noisy-pair", include_str!("../../config/noisy-pair.toml")),
+    ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
     ("inertia", include_str!("../../config/inertia.toml")),
     ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
-    ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
+    ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
     ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
     ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
 ];

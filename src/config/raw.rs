@@ -15,6 +15,8 @@ pub(super) struct Raw {
     pub clock: ClockKind,
     pub tick_hz: f64,
     pub duration_s: f64,
+    #[serde(default = "default_seed")]
+    pub seed: u64,
     #[serde(default)]
     pub actuator: Actuator,
     #[serde(default)]
@@ -23,6 +25,10 @@ pub(super) struct Raw {
     pub launch: Launch,
     #[serde(default)]
     pub accept: BTreeMap<String, f64>,
+}
+
+fn default_seed() -> u64 {
+    1
 }
 
 /// What makes the ticks of a run follow one another.

@@ -2,7 +2,7 @@
 
 use super::raw::Raw;
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, nearest};
-use crate::rig::{self, AnyRig};
+use crate::rig::{self, AnyRig, Frame};
 use crate::role::{Actuation, Rearm};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -83,7 +83,7 @@ impl Scenario {
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         let tick_s = period_ns as f64 / 1e9;
-        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, tick_s, &mut checks)?;
+        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let accept =
             resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map_or(&[], AnyRig::metrics), &mut checks);
         let rig = checks.finish(rig)?;

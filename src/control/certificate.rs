@@ -77,7 +77,7 @@ impl Certificate {
                 required: m * m / 4.0 * schur[0].max(schur[1]) + gain_per_s[k] / 4.0,
             },
             rate_per_s: gain_per_s.min().min(decay_rate_per_s),
-            gain_step: Condition { value: if predict { 2.0 } else { 1.0 }, required: gain_per_s.max() * tick_s },
+            gain_step: Self::gain_step(gain_per_s, tick_s, predict),
             slopes,
             hidden_slope: decay_rate_per_s - pull[0] - pull[1] - gain_per_s[k] / 2.0,
         }
@@ -92,9 +92,9 @@ impl Certificate {
         (0.5 * (square.sum() + hidden), -self.slopes.dot(&square) - self.hidden_slope * hidden)
     }
 
-    /// Whether the sampled loop is stable at this tick.
-    pub fn stable_when_sampled(&self) -> bool {
-        self.gain_step.holds()
+    /// The condition of the sampled loop alone, which needs no observer: see the field of this name.
+    pub fn gain_step(gain_per_s: &Vector3<f64>, tick_s: f64, predict: bool) -> Condition {
+        Condition { value: if predict { 2.0 } else { 1.0 }, required: gain_per_s.max() * tick_s }
     }
 
     /// Whether the tick is so coarse that the sampled loop visibly differs from the continuous one.

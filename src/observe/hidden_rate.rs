@@ -128,6 +128,11 @@ impl HiddenRate {
         self
     }
 
+    /// Below this, rad/s, the measured components carry no information.
+    pub fn floor_rad_s(&self) -> f64 {
+        self.floor_rad_s
+    }
+
     /// Which conic the measured components move on.
     pub fn conic(&self) -> Conic {
         self.conic

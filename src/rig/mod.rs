@@ -9,8 +9,10 @@ mod rigid_body;
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use rigid_body::RigidBodyRig;
 
-use crate::config::{Checks, ConfigError, Document, nearest};
+use crate::config::{Checks, ConfigError, Document, finite_positive, nearest};
+use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use crate::role::{Body, Estimator, Law};
+use nalgebra::SVector;
 use serde::Serialize;
 
 /// The samples of a rig, by signal.
@@ -162,6 +164,87 @@ fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut taken: imp
     checks.require(free, key, || format!("`{name}` is taken already; choose another name"));
 }
 
+/// What a rig must know of the scenario around it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Frame {
+    /// The period h, s.
+    pub tick_s: f64,
+    /// The seed of all randomness.
+    pub seed: u64,
+}
+
+/// How a filter is designed: its order, and what follows from that.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum FilterDesign<const N: usize> {
+    /// The papers' filter, by its decay rates, 1/s.
+    First([f64; N]),
+    /// Second order by its bandwidths, rad/s.
+    Second([f64; N]),
+    /// Second order by the noise: density of what drives the unknown, (unit of the unknown)²/s.
+    Kalman(f64),
+}
+
+/// The damping of filters of second order: the flattest pass band (Butterworth).
+const DAMPING: f64 = core::f64::consts::FRAC_1_SQRT_2;
+/// The standard deviation of a guess of which nothing is known, in the unit of the unknown.
+const UNKNOWN_DEVIATION: f64 = 10.0;
+
+impl<const N: usize> FilterDesign<N> {
+    /// Checks the three keys of which one must be given.
+    fn resolve(
+        checks: &mut Checks<'_>,
+        decay: Option<[f64; N]>,
+        bandwidth: Option<[f64; N]>,
+        density: (&str, Option<f64>),
+    ) -> Option<Self> {
+        let keys = ["observer.decay_rate_per_s", "observer.bandwidth_rad_s", &format!("observer.{}", density.0)];
+        for (key, values) in [(keys[0], &decay), (keys[1], &bandwidth)] {
+            values.iter().flatten().for_each(|value| finite_positive(checks, key, *value));
+        }
+        checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], || {
+            "a density below zero is none; give 0 for a perfect model, or more".to_owned()
+        });
+        match (decay, bandwidth, density.1) {
+            (Some(decay), None, None) => Some(Self::First(decay)),
+            (None, Some(bandwidth), None) => Some(Self::Second(bandwidth)),
+            (None, None, Some(density)) => Some(Self::Kalman(density)),
+            (None, None, None) => {
+                checks.refuse(
+                    keys[0],
+                    format!("is missing; give it (first order), or {} or {} (second)", keys[1], keys[2]),
+                );
+                None
+            }
+            _ => {
+                let last = if density.1.is_some() { keys[2] } else { keys[1] };
+                checks.refuse(last, format!("does not go with the other choice; give one of {}", keys.join(", ")));
+                None
+            }
+        }
+    }
+
+    /// A filter of this design at a guess.
+    fn filter(&self, guess: SVector<f64, N>) -> Filter<N> {
+        match self {
+            Self::First(decay) => Filter::First(InvariantFilter::new((*decay).into(), guess)),
+            Self::Second(bandwidth) => Filter::Second(SecondOrderFilter::new((*bandwidth).into(), DAMPING, guess)),
+            Self::Kalman(density) => {
+                let deviation = SVector::repeat(UNKNOWN_DEVIATION);
+                Filter::Kalman(KalmanFilter::new(SVector::repeat(*density), guess, deviation))
+            }
+        }
+    }
+
+    /// The exponents of the error's decay, 1/s, where they are constant.
+    fn decay_rates(&self) -> Option<[f64; N]> {
+        match self {
+            Self::First(decay) => Some(*decay),
+            Self::Second(bandwidth) => Some(bandwidth.map(|bandwidth| DAMPING * bandwidth)),
+            Self::Kalman(_) => None,
+        }
+    }
+}
+
 /// Registry: the names of the rigs.
 const NAMES: [&str; 3] = ["rigid-body", "orbit-hold", "orbit-rendezvous"];
 
@@ -172,21 +255,21 @@ const NAMES: [&str; 3] = ["rigid-body", "orbit-hold", "orbit-rendezvous"];
 pub(crate) fn resolve(
     name: &str,
     sections: &Document,
-    tick_s: f64,
+    frame: Frame,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<AnyRig>, toml::Table), ConfigError> {
     // Registry.
     match name {
         "rigid-body" => {
-            let (rig, table) = rigid_body::resolve(sections, tick_s, checks)?;
+            let (rig, table) = rigid_body::resolve(sections, frame, checks)?;
             Ok((rig.map(AnyRig::RigidBody), table))
         }
         "orbit-hold" => {
-            let (rig, table) = orbit::hold(sections, tick_s, checks)?;
+            let (rig, table) = orbit::hold(sections, frame, checks)?;
             Ok((rig.map(AnyRig::Orbit), table))
         }
         "orbit-rendezvous" => {
-            let (rig, table) = orbit::rendezvous(sections, tick_s, checks)?;
+            let (rig, table) = orbit::rendezvous(sections, frame, checks)?;
             Ok((rig.map(AnyRig::Orbit), table))
         }
         _ => {

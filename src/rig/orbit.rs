@@ -10,9 +10,9 @@ mod roles;
 pub(super) use resolve::{hold, rendezvous};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, Rig};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig};
 use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold};
-use crate::model::{CentralField, OrbitFault, OrbitState};
+use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
 use crate::sample::{OrbitEstimate, OrbitTruth, status};
 use nalgebra::Vector2;
@@ -24,12 +24,20 @@ pub struct OrbitRig {
     bodies: Vec<BodyInfo>,
     field: CentralField,
     initial: Vec<OrbitState>,
-    decay_rate_per_s: Vector2<f64>,
+    sensors: Vec<Sensors>,
+    filter: FilterDesign<2>,
     initial_guess: Vector2<f64>,
     gains: OrbitGains,
     law: OrbitHold,
     aim: Aim,
     tick_s: f64,
+}
+
+/// What a body's sensors add to (r, θ, Vr, Vθ).
+#[derive(Debug, Clone, PartialEq)]
+struct Sensors {
+    noise: Noise<4>,
+    deviation: [f64; 4],
 }
 
 impl OrbitRig {
@@ -46,9 +54,10 @@ impl OrbitRig {
     }
 
     fn certificate(&self) -> Result<OrbitCertificate, OrbitFault> {
-        // Full-state feedback does not wait for the observer.
+        // Full-state feedback does not wait for the observer; a gain that varies has no rate to be certified.
         let full_state = matches!(self.aim, Aim::Circle { full_state: true, .. });
-        let decay = if full_state { Vector2::repeat(f64::INFINITY) } else { self.decay_rate_per_s };
+        let rates = self.filter.decay_rates().filter(|_| !full_state);
+        let decay = rates.map_or(Vector2::repeat(f64::INFINITY), Vector2::from);
         OrbitCertificate::new(&self.field, &self.law, &self.gains, &decay, self.certified_radius(), self.tick_s)
     }
 
@@ -96,6 +105,10 @@ impl OrbitRig {
                 certificate.sampled_rate_per_s, certificate.rate_per_s
             ));
         }
+        if self.filter.decay_rates().is_none() {
+            warnings
+                .push("the observer's gain varies with the noise: its rate is not part of this certificate".to_owned());
+        }
         if !margin.holds() {
             warnings.push(
                 "the thrust limit acts at first: the rate holds from when the law asks for less; watch the radius until then"
@@ -132,11 +145,13 @@ impl Rig for OrbitRig {
     /// A follower measures its own velocity; the observed body only if full-state feedback is asked for.
     fn body(&self, index: usize) -> OrbitPlant {
         let velocity_measured = index != 0 || matches!(self.aim, Aim::Circle { full_state: true, .. });
-        OrbitPlant::new(self.field, self.initial[index], velocity_measured)
+        OrbitPlant::new(self.field, self.initial[index], velocity_measured, self.sensors[index].noise.clone())
     }
 
     fn estimator(&self) -> OrbitObserver {
-        OrbitObserver::new(OrbitVelocity::new(self.field.mu()), self.decay_rate_per_s, self.initial_guess)
+        let [r, theta, ..] = self.sensors[0].deviation;
+        let relation = OrbitVelocity::new(self.field.mu()).with_variance(r * r, theta * theta);
+        OrbitObserver::new(relation, self.filter, self.initial_guess)
     }
 
     fn law(&self, _index: usize) -> OrbitLaw {

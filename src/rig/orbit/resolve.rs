@@ -3,11 +3,11 @@
 //! Must name the key and the remedy of everything it refuses, all at once.
 
 use super::roles::Aim;
-use super::{BodyInfo, OrbitRig};
+use super::{BodyInfo, OrbitRig, Sensors};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
-use crate::model::{CentralField, CentralFieldError, OrbitState};
-use crate::rig::check_name;
+use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
+use crate::rig::{FilterDesign, Frame, check_name};
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -44,6 +44,10 @@ struct RawBody {
     #[serde(default)]
     initial_angle_rad: f64,
     initial_velocity_du_s: [f64; 2],
+    #[serde(default)]
+    noise: RawSensor,
+    #[serde(default)]
+    bias: RawSensor,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -54,14 +58,38 @@ struct RawFollower {
     #[serde(default)]
     initial_angle_rad: f64,
     initial_velocity_du_s: [f64; 2],
+    #[serde(default)]
+    noise: RawSensor,
+    #[serde(default)]
+    bias: RawSensor,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawObserver {
-    decay_rate_per_s: [f64; 2],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    decay_rate_per_s: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    bandwidth_rad_s: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    process_noise_du2_s3: Option<f64>,
     #[serde(default)]
     initial_guess_du_s: [f64; 2],
+}
+
+/// What a body's sensors add to the truth: the standard deviations of white noise, or constant biases.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct RawSensor {
+    radius_du: f64,
+    angle_rad: f64,
+    velocity_du_s: [f64; 2],
+}
+
+impl RawSensor {
+    fn components(&self) -> [f64; 4] {
+        [self.radius_du, self.angle_rad, self.velocity_du_s[0], self.velocity_du_s[1]]
+    }
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -119,7 +147,7 @@ impl From<&RawFollower> for OrbitState {
 /// Reads and checks a scenario of the rig `orbit-hold`.
 pub(in crate::rig) fn hold(
     sections: &Document,
-    tick_s: f64,
+    frame: Frame,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawHold = sections.read_into()?;
@@ -129,21 +157,24 @@ pub(in crate::rig) fn hold(
     let field = review.field(&raw.central_body);
     review.place("spacecraft.initial_radius_du", raw.spacecraft.initial_radius_du, field.as_ref());
     review.place("controller.target_radius_du", raw.controller.target_radius_du, field.as_ref());
-    review.loops(&raw.observer, &raw.controller.gain, raw.controller.thrust_max_du_s2);
-    let Some(field) = field else { return Ok((None, table)) };
+    review.loops(&raw.controller.gain, raw.controller.thrust_max_du_s2);
+    review.sensor("spacecraft", &raw.spacecraft.noise);
+    let sensors = vec![sensor(frame, 0, &raw.spacecraft.noise, &raw.spacecraft.bias)];
+    let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
     let full_state = raw.controller.feedback == Feedback::FullState;
     let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
-    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { tick_s } else { 0.0 });
+    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
     let rig = OrbitRig {
         bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true }],
         field,
         initial: vec![(&raw.spacecraft).into()],
-        decay_rate_per_s: raw.observer.decay_rate_per_s.into(),
+        sensors,
+        filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
         gains,
         law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
         aim,
-        tick_s,
+        tick_s: frame.tick_s,
     };
     if sound {
         check_loop(&rig, checks);
@@ -154,7 +185,7 @@ pub(in crate::rig) fn hold(
 /// Reads and checks a scenario of the rig `orbit-rendezvous`.
 pub(in crate::rig) fn rendezvous(
     sections: &Document,
-    tick_s: f64,
+    frame: Frame,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawRendezvous = sections.read_into()?;
@@ -164,28 +195,39 @@ pub(in crate::rig) fn rendezvous(
     let field = review.field(&raw.central_body);
     review.place("leader.initial_radius_du", raw.leader.initial_radius_du, field.as_ref());
     review.followers(&raw.follower, field.as_ref());
-    review.loops(&raw.observer, &raw.controller.gain, raw.controller.thrust_max_du_s2);
-    let Some(field) = field else { return Ok((None, table)) };
-    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { tick_s } else { 0.0 });
+    review.loops(&raw.controller.gain, raw.controller.thrust_max_du_s2);
+    review.sensor("leader", &raw.leader.noise);
+    let sensors = vec![sensor(frame, 0, &raw.leader.noise, &raw.leader.bias)];
+    let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
+    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
     let mut rig = OrbitRig {
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
         field,
         initial: vec![(&raw.leader).into()],
-        decay_rate_per_s: raw.observer.decay_rate_per_s.into(),
+        sensors,
+        filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
         gains,
         law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
         aim: Aim::Leader,
-        tick_s,
+        tick_s: frame.tick_s,
     };
     for follower in &raw.follower {
         rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true });
         rig.initial.push(follower.into());
+        rig.sensors.push(sensor(frame, rig.sensors.len() as u64, &follower.noise, &follower.bias));
     }
     if sound {
         check_loop(&rig, checks);
     }
     Ok((Some(rig), table))
+}
+
+fn sensor(frame: Frame, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sensors {
+    Sensors {
+        noise: Noise::new(frame.seed, stream, noise.components(), bias.components()),
+        deviation: noise.components(),
+    }
 }
 
 impl RawGain {
@@ -248,13 +290,25 @@ impl Review<'_, '_> {
             let taken = followers[..index].iter().map(|other| other.name.as_str());
             check_name(self.checks, &format!("follower[{index}].name"), &follower.name, taken);
             self.place(&format!("follower[{index}].initial_radius_du"), follower.initial_radius_du, field);
+            self.sensor(&format!("follower[{index}]"), &follower.noise);
         }
     }
 
-    fn loops(&mut self, observer: &RawObserver, gain: &RawGain, thrust_max: f64) {
-        for rate in observer.decay_rate_per_s {
-            self.positive("observer.decay_rate_per_s", rate);
-        }
+    fn sensor(&mut self, body: &str, noise: &RawSensor) {
+        let real = noise.components().iter().all(|deviation| *deviation >= 0.0);
+        self.require(real, &format!("{body}.noise"), || {
+            "a standard deviation is below zero; give 0 or more".to_owned()
+        });
+    }
+
+    fn filter(&mut self, observer: &RawObserver) -> Option<FilterDesign<2>> {
+        let density = ("process_noise_du2_s3", observer.process_noise_du2_s3);
+        let design = FilterDesign::resolve(self.checks, observer.decay_rate_per_s, observer.bandwidth_rad_s, density);
+        *self.sound &= design.is_some();
+        design
+    }
+
+    fn loops(&mut self, gain: &RawGain, thrust_max: f64) {
         self.positive("controller.gain.radius_per_s2", gain.radius_per_s2);
         self.positive("controller.gain.radial_per_s", gain.radial_per_s);
         self.positive("controller.gain.transverse_per_s", gain.transverse_per_s);

@@ -3,8 +3,9 @@
 //! Must not compute what `model`, `observe` and `control` compute.
 
 use crate::control::OrbitHold;
-use crate::model::{CentralField, OrbitState};
-use crate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
+use crate::model::{CentralField, Noise, OrbitState};
+use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
+use crate::rig::FilterDesign;
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use nalgebra::Vector2;
@@ -20,6 +21,8 @@ pub struct OrbitPlant {
     field: CentralField,
     state: OrbitState,
     applied: Vector2<f64>,
+    /// What its sensors add to (r, θ, Vr, Vθ).
+    noise: Noise<4>,
     /// What its sensors measure, as bits.
     measured: u64,
     /// [`status::FAULT`] once the model has ended, or 0.
@@ -28,9 +31,9 @@ pub struct OrbitPlant {
 
 impl OrbitPlant {
     /// A body whose sensors measure its position, and its velocity too if `velocity_measured`.
-    pub(super) fn new(field: CentralField, state: OrbitState, velocity_measured: bool) -> Self {
+    pub(super) fn new(field: CentralField, state: OrbitState, velocity_measured: bool, noise: Noise<4>) -> Self {
         let measured = if velocity_measured { POSITION | VELOCITY } else { POSITION };
-        Self { field, state, applied: Vector2::zeros(), measured, fault: 0 }
+        Self { field, state, applied: Vector2::zeros(), noise, measured, fault: 0 }
     }
 }
 
@@ -60,9 +63,10 @@ impl Body for OrbitPlant {
     }
 
     fn measure(&mut self, status: u64, out: &mut OrbitMeasurement) {
-        out.radius_du = self.state.r;
-        out.angle_rad = self.state.theta;
-        let velocity = [self.state.vr, self.state.vtheta];
+        let noise = self.noise.sample();
+        out.radius_du = self.state.r + noise[0];
+        out.angle_rad = self.state.theta + noise[1];
+        let velocity = [self.state.vr + noise[2], self.state.vtheta + noise[3]];
         out.velocity_du_s = if self.measured & VELOCITY == VELOCITY { velocity } else { [0.0; 2] };
         out.applied_du_s2 = self.applied.into();
         out.valid = self.measured;
@@ -85,19 +89,19 @@ impl Body for OrbitPlant {
 #[derive(Debug)]
 pub struct OrbitObserver {
     relation: OrbitVelocity,
-    decay_rate_per_s: Vector2<f64>,
+    design: FilterDesign<2>,
     /// (Vr, Vθ) before anything is known, du/s.
     guess: Vector2<f64>,
-    filter: InvariantFilter<2>,
+    filter: Filter<2>,
     last: Option<OrbitSample>,
     status: u64,
 }
 
 impl OrbitObserver {
-    /// An observer with decay rates −L (1/s) of the two inertial axes, and a guess of (Vr, Vθ) in du/s.
-    pub(super) fn new(relation: OrbitVelocity, decay_rate_per_s: Vector2<f64>, guess: Vector2<f64>) -> Self {
-        let filter = InvariantFilter::new(decay_rate_per_s, guess);
-        Self { relation, decay_rate_per_s, guess, filter, last: None, status: status::INITIAL }
+    /// An observer of the two inertial components of the velocity, with a guess of (Vr, Vθ) in du/s.
+    pub(super) fn new(relation: OrbitVelocity, design: FilterDesign<2>, guess: Vector2<f64>) -> Self {
+        let filter = design.filter(guess);
+        Self { relation, design, guess, filter, last: None, status: status::INITIAL }
     }
 
     fn seen(measurement: &OrbitMeasurement) -> OrbitSample {
@@ -120,7 +124,7 @@ impl Estimator for OrbitObserver {
 
     fn start(&mut self, measurement: &OrbitMeasurement) {
         let guess = to_inertial(measurement.angle_rad, &self.guess);
-        self.filter = InvariantFilter::new(self.decay_rate_per_s, guess);
+        self.filter = self.design.filter(guess);
         self.last = Some(Self::seen(measurement));
         self.status = status::INITIAL;
     }
@@ -208,8 +212,12 @@ impl Law for OrbitLaw {
 mod tests {
     use super::*;
 
+    fn quiet() -> Noise<4> {
+        Noise::new(1, 0, [0.0; 4], [0.0; 4])
+    }
+
     fn plant(state: OrbitState) -> OrbitPlant {
-        OrbitPlant::new(CentralField::new(1.0, 0.05, 10.0).unwrap(), state, false)
+        OrbitPlant::new(CentralField::new(1.0, 0.05, 10.0).unwrap(), state, false, quiet())
     }
 
     fn measured(plant: &mut OrbitPlant) -> OrbitMeasurement {
@@ -219,7 +227,7 @@ mod tests {
     }
 
     fn observer() -> OrbitObserver {
-        OrbitObserver::new(OrbitVelocity::new(1.0), Vector2::repeat(4.0), Vector2::new(0.0, 0.9))
+        OrbitObserver::new(OrbitVelocity::new(1.0), FilterDesign::First([4.0; 2]), Vector2::new(0.0, 0.9))
     }
 
     #[test]
@@ -254,7 +262,7 @@ mod tests {
         let state = OrbitState { r: 1.0, vr: 0.1, theta: 0.3, vtheta: 0.9 };
         let hidden = measured(&mut plant(state));
         assert_eq!((hidden.velocity_du_s, hidden.valid), ([0.0; 2], POSITION));
-        let open = measured(&mut OrbitPlant::new(plant(state).field, state, true));
+        let open = measured(&mut OrbitPlant::new(plant(state).field, state, true, quiet()));
         assert_eq!((open.velocity_du_s, open.valid), ([0.1, 0.9], POSITION | VELOCITY));
     }
 

@@ -1,6 +1,7 @@
 //! The sections of a scenario that belong to this rig: as typed, with their checks.
 
 use crate::config::{Checks, finite_positive};
+use crate::rig::check_name;
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -20,6 +21,10 @@ pub(super) struct RawLeader {
     pub inertia_kg_m2: [f64; 3],
     pub initial_rate_rad_s: [f64; 3],
     pub measured_axes: Vec<usize>,
+    #[serde(default)]
+    pub noise_rad_s: [f64; 3],
+    #[serde(default)]
+    pub bias_rad_s: [f64; 3],
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outage: Vec<RawOutage>,
 }
@@ -41,6 +46,10 @@ pub(super) struct RawFollower {
     pub initial_rate_rad_s: [f64; 3],
     #[serde(default = "identical")]
     pub inertia_factor: [f64; 3],
+    #[serde(default)]
+    pub noise_rad_s: [f64; 3],
+    #[serde(default)]
+    pub bias_rad_s: [f64; 3],
 }
 
 fn identical() -> [f64; 3] {
@@ -65,7 +74,12 @@ pub(super) enum Kind {
 pub(super) struct RawObserver {
     #[serde(default)]
     pub kind: Kind,
-    pub decay_rate_per_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub decay_rate_per_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bandwidth_rad_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub process_noise_rad2_s3: Option<f64>,
     #[serde(default)]
     pub initial_guess_rad_s: f64,
     #[serde(default = "default_floor")]
@@ -118,6 +132,7 @@ pub(super) enum Coefficients {
 /// Checks what can be told from the text alone, whatever the observer is for.
 pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     check_followers(&raw.follower, checks);
+    check_noise(checks, "leader", &raw.leader.noise_rad_s);
     check_observer(&raw.observer, checks);
     match (&raw.controller, raw.follower.is_empty()) {
         (None, false) => checks.refuse("controller", "is missing; followers need a [controller] with gain_per_s"),
@@ -136,7 +151,6 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
 
 fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     finite_positive(checks, "observer.observability_floor_rad_s", observer.observability_floor_rad_s);
-    finite_positive(checks, "observer.decay_rate_per_s", observer.decay_rate_per_s);
     let (learns, symmetric) = (observer.kind != Kind::HiddenRate, observer.kind == Kind::AxisymmetricInertia);
     for (key, given, needed) in [
         ("observer.identifier_decay", observer.identifier_decay.is_some(), learns),
@@ -153,15 +167,18 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     }
 }
 
+fn check_noise(checks: &mut Checks<'_>, body: &str, deviation: &[f64; 3]) {
+    let real = deviation.iter().all(|deviation| *deviation >= 0.0);
+    checks.require(real, &format!("{body}.noise_rad_s"), || {
+        format!("{deviation:?} has a standard deviation below zero; give 0 or more")
+    });
+}
+
 fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
     for (index, follower) in followers.iter().enumerate() {
         let (key, name) = (format!("follower[{index}].name"), &follower.name);
-        let plain = (1..=32).contains(&name.len())
-            && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-        checks.require(plain, &key, || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
-        let reserved = ["leader", "observer", "controller", "run"].contains(&name.as_str());
-        let taken = followers[..index].iter().any(|other| other.name == *name);
-        checks.require(!reserved && !taken, &key, || format!("`{name}` is taken already; choose another name"));
+        check_name(checks, &key, name, followers[..index].iter().map(|other| other.name.as_str()));
+        check_noise(checks, &format!("follower[{index}]"), &follower.noise_rad_s);
         for factor in follower.inertia_factor {
             finite_positive(checks, &format!("follower[{index}].inertia_factor"), factor);
         }

@@ -10,7 +10,8 @@ use nalgebra::Vector3;
 pub struct RateLaw {
     pub(super) law: Synchronizer,
     pub(super) adaptation: InertiaAdaptation,
-    pub(super) certificate: Certificate,
+    /// None where the observer is not the papers' filter: V is published as 0 then.
+    pub(super) certificate: Option<Certificate>,
     /// The component that the observer supplies, 0 to 2.
     pub(super) supplied: usize,
     /// Whether the law works with the coefficients that the observer has learned.
@@ -35,6 +36,6 @@ impl Law for RateLaw {
         let mut error = follower - reference;
         error[self.supplied] -= estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =
-            self.certificate.lyapunov(&error, estimate.innovation_rad_s);
+            self.certificate.map_or((0.0, 0.0), |certificate| certificate.lyapunov(&error, estimate.innovation_rad_s));
     }
 }

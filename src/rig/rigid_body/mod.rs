@@ -12,18 +12,18 @@ mod plant;
 
 pub use law::RateLaw;
 pub use learner::Learner;
-pub use observer::{HiddenObserver, RateObserver};
+pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, Rig};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Frame, Rig, UNKNOWN_DEVIATION};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
-use crate::model::{Inertia, RigidBody};
-use crate::observe::{Axisymmetric, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
+use crate::model::{Inertia, Noise, RigidBody};
+use crate::observe::{Axisymmetric, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
 use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
 use config::{Coefficients, IdentifierDecay, Kind, Raw, RawObserver};
 use identifier::Identifier;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector1, Vector3};
 use observer::ALL;
 use plant::Outage;
 
@@ -42,13 +42,16 @@ pub struct RigidBodyRig {
     supplied_axis: Option<usize>,
     observer: ObserverDesign,
     controller: Option<ControllerDesign>,
+    /// Per body, what its gyros add; and the standard deviations of the leader's.
+    noise: Vec<Noise<3>>,
+    leader_deviation_rad_s: Vector3<f64>,
     tick_s: f64,
 }
 
 /// The observer's parameters.
 #[derive(Debug, Clone)]
 enum ObserverDesign {
-    Hidden { relation: HiddenRate, decay_rate_per_s: f64, guess_rad_s: f64 },
+    Hidden { relation: HiddenRate, filter: FilterDesign<1>, guess_rad_s: f64 },
     Learner(learner::Parts),
 }
 
@@ -64,14 +67,14 @@ struct ControllerDesign {
 /// Reads and checks the sections of this rig.
 pub(super) fn resolve(
     sections: &Document,
-    tick_s: f64,
+    frame: Frame,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
     let raw: Raw = sections.read_into()?;
     let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
     config::check(&raw, checks);
     let supplied_axis = config::hidden_axis(&raw, checks);
-    let outages = resolve_outages(&raw, tick_s, checks);
+    let outages = resolve_outages(&raw, frame.tick_s, checks);
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
     let Some(inertia) = inertia else { return Ok((None, table)) };
     let Some(observer) = design_observer(&raw, &inertia, supplied_axis, checks) else { return Ok((None, table)) };
@@ -85,7 +88,9 @@ pub(super) fn resolve(
         supplied_axis,
         observer,
         controller: raw.controller.as_ref().map(ControllerDesign::from),
-        tick_s,
+        noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
+        leader_deviation_rad_s: raw.leader.noise_rad_s.into(),
+        tick_s: frame.tick_s,
     };
     for (index, follower) in raw.follower.into_iter().enumerate() {
         let factor = Vector3::from(follower.inertia_factor);
@@ -94,9 +99,14 @@ pub(super) fn resolve(
         rig.bodies.push(BodyInfo { name: follower.name, driven: true });
         rig.initial_rates.push(follower.initial_rate_rad_s.into());
         rig.inertia_factors.push(factor);
+        rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
     }
     rig.check_tick(checks);
     Ok((Some(rig), table))
+}
+
+fn noise(frame: Frame, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
+    Noise::new(frame.seed, stream, deviation, bias)
 }
 
 impl From<&config::RawController> for ControllerDesign {
@@ -145,17 +155,36 @@ fn design_observer(
         // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
         checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
     }
+    let filter = FilterDesign::resolve(
+        checks,
+        observer.decay_rate_per_s.map(|rate| [rate]),
+        observer.bandwidth_rad_s.map(|bandwidth| [bandwidth]),
+        ("process_noise_rad2_s3", observer.process_noise_rad2_s3),
+    )?;
+    if let FilterDesign::Kalman(_) = filter {
+        let noisy = |axis: &usize| raw.leader.noise_rad_s.get(axis.wrapping_sub(1)).is_some_and(|noise| *noise > 0.0);
+        checks.require(raw.leader.measured_axes.iter().all(noisy), "observer.process_noise_rad2_s3", || {
+            "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
+                .to_owned()
+        });
+    }
     match observer.kind {
         Kind::HiddenRate => Some(ObserverDesign::Hidden {
             relation: HiddenRate::new(&coefficients, supplied_axis?, floor_rad_s).ok()?,
-            decay_rate_per_s: observer.decay_rate_per_s,
+            filter,
             guess_rad_s: observer.initial_guess_rad_s,
         }),
-        Kind::Inertia | Kind::AxisymmetricInertia => Some(ObserverDesign::Learner(learner::Parts {
-            identifier: design_identifier(observer, inertia, checks)?,
-            decay_rate_per_s: observer.decay_rate_per_s,
-            floor_rad_s,
-        })),
+        Kind::Inertia | Kind::AxisymmetricInertia => {
+            let FilterDesign::First([decay_rate_per_s]) = filter else {
+                checks.refuse(
+                    "observer.kind",
+                    "learns with a filter of first order; give observer.decay_rate_per_s instead",
+                );
+                return None;
+            };
+            let identifier = design_identifier(observer, inertia, checks)?;
+            Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
+        }
     }
 }
 
@@ -189,6 +218,11 @@ fn design_identifier(observer: &RawObserver, inertia: &Inertia, checks: &mut Che
 }
 
 impl RigidBodyRig {
+    /// The component that the observer supplies, 0 to 2; where there is none, any serves.
+    fn supplied(&self) -> usize {
+        self.supplied_axis.unwrap_or(3) - 1
+    }
+
     fn rate_bound_rad_s(&self) -> f64 {
         self.inertia.rate_bound_rad_s(&self.initial_rates[0])
     }
@@ -208,12 +242,13 @@ impl RigidBodyRig {
                 format!("at {guess_rad_s} rad/s the phase would be ambiguous from tick to tick; guess nearer to 0")
             });
         }
-        if let Some(certificate) = self.certificate() {
-            checks.require(certificate.stable_when_sampled(), "controller.gain_per_s", || {
+        if let Some(controller) = self.controller {
+            let step = Certificate::gain_step(&controller.gain_per_s, tick_s, controller.predict);
+            checks.require(step.holds(), "controller.gain_per_s", || {
                 format!(
                     "the largest gain times the tick is {:.3}, and the sampled loop is unstable from {} on; lower the gain \
                      or raise tick_hz",
-                    certificate.gain_step.required, certificate.gain_step.value
+                    step.required, step.value
                 )
             });
         }
@@ -222,13 +257,15 @@ impl RigidBodyRig {
     /// The certificate of any follower: they differ in nothing that it knows of.
     fn certificate(&self) -> Option<Certificate> {
         let controller = self.controller?;
+        // The papers' conditions are about the papers' filter.
         let decay_rate_per_s = match &self.observer {
-            ObserverDesign::Hidden { decay_rate_per_s, .. } => *decay_rate_per_s,
+            ObserverDesign::Hidden { filter: FilterDesign::First([decay]), .. } => *decay,
+            ObserverDesign::Hidden { .. } => return None,
             ObserverDesign::Learner(parts) => parts.decay_rate_per_s,
         };
         Some(Certificate::new(
             &self.inertia.coefficients(),
-            self.supplied_axis.unwrap_or(3),
+            self.supplied() + 1,
             &controller.gain_per_s,
             decay_rate_per_s,
             self.rate_bound_rad_s(),
@@ -256,6 +293,7 @@ impl Rig for RigidBodyRig {
             asked: Vector3::zeros(),
             inertia_factor: factor,
             measured: if index == 0 { self.measured } else { ALL },
+            noise: self.noise[index].clone(),
             outages: if index == 0 { self.outages.clone() } else { Vec::new() },
             tick: 0,
         }
@@ -263,25 +301,44 @@ impl Rig for RigidBodyRig {
 
     fn estimator(&self) -> RateObserver {
         match &self.observer {
-            ObserverDesign::Hidden { relation, decay_rate_per_s, guess_rad_s } => {
-                let begun = observer::filter(*decay_rate_per_s, *guess_rad_s);
-                let hidden = self.supplied_axis.unwrap_or(3) - 1;
-                RateObserver::Hidden(HiddenObserver::new(*relation, self.inertia.coefficients(), begun, hidden))
+            ObserverDesign::Hidden { relation, filter: FilterDesign::Kalman(density), guess_rad_s } => {
+                let noise = RateNoise {
+                    sensor_deviation_rad_s: self.leader_deviation_rad_s,
+                    density: *density,
+                    guess_deviation_rad_s: UNKNOWN_DEVIATION,
+                };
+                let (coefficients, floor_rad_s) = (self.inertia.coefficients(), relation.floor_rad_s());
+                RateObserver::Kalman(KalmanObserver::new(
+                    coefficients,
+                    noise,
+                    self.supplied(),
+                    floor_rad_s,
+                    *guess_rad_s,
+                ))
+            }
+            ObserverDesign::Hidden { relation, filter, guess_rad_s } => {
+                let begun = filter.filter(Vector1::new(*guess_rad_s));
+                RateObserver::Hidden(HiddenObserver::new(
+                    *relation,
+                    self.inertia.coefficients(),
+                    begun,
+                    self.supplied(),
+                ))
             }
             ObserverDesign::Learner(parts) => RateObserver::Learner(Learner::new(parts.clone())),
         }
     }
 
     fn law(&self, _index: usize) -> RateLaw {
-        let (Some(controller), Some(certificate)) = (self.controller, self.certificate()) else {
+        let Some(controller) = self.controller else {
             unreachable!("a scenario with a follower has a controller: checked when it was resolved")
         };
         let lead_s = if controller.predict { self.tick_s } else { 0.0 };
         RateLaw {
             law: Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s),
             adaptation: InertiaAdaptation::new(controller.adaptation_gain),
-            certificate,
-            supplied: self.supplied_axis.unwrap_or(3) - 1,
+            certificate: self.certificate(),
+            supplied: self.supplied(),
             learned: controller.learned,
             tick_s: self.tick_s,
         }
@@ -327,12 +384,13 @@ impl Rig for RigidBodyRig {
     }
 
     fn lyapunov(command: &RateCommand) -> Option<(f64, f64)> {
-        Some((command.lyapunov_rad2_s2, command.lyapunov_rate_bound_rad2_s3))
+        let (v, bound) = (command.lyapunov_rad2_s2, command.lyapunov_rate_bound_rad2_s3);
+        (v > 0.0).then_some((v, bound))
     }
 
     fn certificates(&self) -> Vec<CertificateReport> {
         let Some(certificate) = self.certificate() else { return Vec::new() };
-        let axis = self.supplied_axis.unwrap_or(3);
+        let axis = self.supplied() + 1;
         let condition = |name: &str, condition: crate::control::Condition| ConditionReport {
             name: name.to_owned(),
             value: condition.value,

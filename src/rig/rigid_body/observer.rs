@@ -1,7 +1,7 @@
 //! The observers of this rig: which components are measured, which one is supplied, and from what.
 
 use super::learner::Learner;
-use crate::observe::{HiddenRate, InvariantFilter, Observation, RateSample};
+use crate::observe::{Filter, GuardedKalman, HiddenRate, InvariantFilter, Observation, RateNoise, RateSample};
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use nalgebra::{Vector1, Vector3};
@@ -14,6 +14,8 @@ pub(super) const ALL: u64 = 0b111;
 pub enum RateObserver {
     /// One component is never measured.
     Hidden(HiddenObserver),
+    /// The same with known noise.
+    Kalman(KalmanObserver),
     /// All are measured until one is lost; the inertia is learned meanwhile.
     Learner(Learner),
 }
@@ -26,6 +28,7 @@ impl Estimator for RateObserver {
         let finite = |values: &[f64; 3]| values.iter().all(|value| value.is_finite());
         let needed = match self {
             Self::Hidden(observer) => measurement.valid & observer.needed() == observer.needed(),
+            Self::Kalman(observer) => measurement.valid & observer.needed() == observer.needed(),
             Self::Learner(_) => (measurement.valid & ALL).count_ones() >= 2,
         };
         needed && finite(&measurement.omega_rad_s) && finite(&measurement.applied_rad_s2)
@@ -34,6 +37,7 @@ impl Estimator for RateObserver {
     fn start(&mut self, measurement: &RateMeasurement) {
         match self {
             Self::Hidden(observer) => observer.start(measurement),
+            Self::Kalman(observer) => observer.start(measurement),
             Self::Learner(observer) => observer.start(measurement),
         }
     }
@@ -41,6 +45,7 @@ impl Estimator for RateObserver {
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         match self {
             Self::Hidden(observer) => observer.update(measurement, dt_s),
+            Self::Kalman(observer) => observer.update(measurement, dt_s),
             Self::Learner(observer) => observer.update(measurement, dt_s),
         }
     }
@@ -48,6 +53,7 @@ impl Estimator for RateObserver {
     fn write(&self, status: u64, out: &mut RateEstimate) {
         match self {
             Self::Hidden(observer) => observer.write(status, out),
+            Self::Kalman(observer) => observer.write(status, out),
             Self::Learner(observer) => observer.write(status, out),
         }
     }
@@ -63,8 +69,8 @@ pub(super) fn seen(measurement: &RateMeasurement) -> RateSample {
 pub struct HiddenObserver {
     relation: HiddenRate,
     coefficients: Vector3<f64>,
-    guess: InvariantFilter<1>,
-    filter: InvariantFilter<1>,
+    guess: Filter<1>,
+    filter: Filter<1>,
     hidden: usize,
     last: RateSample,
     innovation: f64,
@@ -73,12 +79,7 @@ pub struct HiddenObserver {
 
 impl HiddenObserver {
     /// An observer of component `hidden` (0 to 2) of a body with the given coefficients, which starts at `guess`.
-    pub(super) fn new(
-        relation: HiddenRate,
-        coefficients: Vector3<f64>,
-        guess: InvariantFilter<1>,
-        hidden: usize,
-    ) -> Self {
+    pub(super) fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>, hidden: usize) -> Self {
         let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self { relation, coefficients, guess, filter: guess, hidden, last, innovation: 0.0, status: status::INITIAL }
     }
@@ -92,7 +93,7 @@ impl HiddenObserver {
     }
 
     /// Begins anew from a known estimate at a known instant.
-    pub(super) fn begin(&mut self, filter: InvariantFilter<1>, at: RateSample, status: u64) {
+    pub(super) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
         (self.filter, self.last, self.innovation, self.status) = (filter, at, 0.0, status);
     }
 
@@ -106,7 +107,7 @@ impl HiddenObserver {
                 self.status = 0;
             }
             Observation::Unobservable { drift } => {
-                self.filter.predict(&drift);
+                self.filter.predict(&drift, dt_s);
                 self.status |= status::UNOBSERVABLE;
             }
         }
@@ -142,6 +143,67 @@ impl HiddenObserver {
 }
 
 /// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
-pub(super) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> InvariantFilter<1> {
-    InvariantFilter::new(Vector1::new(decay_rate_per_s), Vector1::new(estimate_rad_s))
+pub(super) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> Filter<1> {
+    Filter::First(InvariantFilter::new(Vector1::new(decay_rate_per_s), Vector1::new(estimate_rad_s)))
+}
+
+/// Supplies one component from the other two, all of them filtered: the noise of the sensors is known.
+#[derive(Debug)]
+pub struct KalmanObserver {
+    coefficients: Vector3<f64>,
+    noise: RateNoise,
+    hidden: usize,
+    floor_rad_s: f64,
+    guess_rad_s: f64,
+    /// None before the first measurement.
+    filter: Option<GuardedKalman>,
+    last: RateSample,
+    status: u64,
+}
+
+impl KalmanObserver {
+    /// An observer of component `hidden` (0 to 2) of a body with the given coefficients.
+    pub(super) fn new(
+        coefficients: Vector3<f64>,
+        noise: RateNoise,
+        hidden: usize,
+        floor_rad_s: f64,
+        guess_rad_s: f64,
+    ) -> Self {
+        let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
+        Self { coefficients, noise, hidden, floor_rad_s, guess_rad_s, filter: None, last, status: status::INITIAL }
+    }
+
+    fn needed(&self) -> u64 {
+        ALL & !(1 << self.hidden)
+    }
+
+    fn start(&mut self, measurement: &RateMeasurement) {
+        self.last = seen(measurement);
+        self.status = status::INITIAL;
+        let (axis, first) = (self.hidden + 1, &self.last);
+        // That the component can be observed was checked when the scenario was resolved.
+        self.filter =
+            GuardedKalman::new(&self.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s).ok();
+    }
+
+    fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+        let to = seen(measurement);
+        if let Some(filter) = &mut self.filter {
+            let held = filter.step(&self.last, &to, dt_s);
+            self.status = if held { 0 } else { status::UNOBSERVABLE };
+        }
+        self.last = to;
+    }
+
+    fn write(&self, status: u64, out: &mut RateEstimate) {
+        let rate = self.filter.as_ref().map_or(self.last.rate_rad_s, |filter| *filter.estimate());
+        out.omega_rad_s = rate.into();
+        out.innovation_rad_s = 0.0;
+        out.coefficients = self.coefficients.into();
+        out.closure = self.coefficients.sum() + self.coefficients.product();
+        out.excitation = 0.0;
+        out.status = self.status | status;
+        out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
+    }
 }

@@ -1,6 +1,6 @@
 //! A rigid body with its rate gyros and its torquers.
 
-use crate::model::RigidBody;
+use crate::model::{Noise, RigidBody};
 use crate::role::Body;
 use crate::sample::{RateCommand, RateMeasurement, RateTruth};
 use nalgebra::Vector3;
@@ -27,6 +27,7 @@ pub struct RatePlant {
     pub(super) inertia_factor: Vector3<f64>,
     /// Bit i set: component i has a gyro.
     pub(super) measured: u64,
+    pub(super) noise: Noise<3>,
     pub(super) outages: Vec<Outage>,
     pub(super) tick: u64,
 }
@@ -68,9 +69,9 @@ impl Body for RatePlant {
     }
 
     fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
-        let valid = self.valid();
+        let (valid, seen) = (self.valid(), self.rate + self.noise.sample());
         for component in 0..3 {
-            out.omega_rad_s[component] = if valid >> component & 1 == 1 { self.rate[component] } else { 0.0 };
+            out.omega_rad_s[component] = if valid >> component & 1 == 1 { seen[component] } else { 0.0 };
         }
         out.applied_rad_s2 = self.asked.into();
         out.valid = valid;

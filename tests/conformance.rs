@@ -1,0 +1,91 @@
+//! What every rig and every shipped scenario must fulfil; a new one is picked up from the list by itself.
+
+mod common;
+
+use common::{Bench, shipped};
+use corotate::config::{SHIPPED, Scenario};
+use serde_json::Value;
+
+/// Runs every shipped scenario as processes in lockstep and in one thread: accepted, and the same bits.
+#[test]
+fn every_shipped_scenario_is_accepted_with_the_same_bits_in_process_and_in_lockstep() {
+    for (name, _) in SHIPPED {
+        let bench = Bench::new();
+        let run = |clock: &str| bench.summary(name, &["--clock", clock]);
+        let (one, many) = (run("in-process"), run("lockstep"));
+        assert_eq!(one["state"]["hash"], many["state"]["hash"], "{name}");
+        for summary in [&one, &many] {
+            assert_eq!(summary["accepted"], true, "{name}: {summary:#}");
+            assert!(!summary["criteria"].as_array().unwrap().is_empty(), "{name} judges nothing");
+            assert_eq!(summary["books"]["balanced"], true, "{name}");
+            assert_eq!(summary["books"]["missed_ticks"], 0, "{name}");
+        }
+        println!("{name}: {}", one["score"]["metrics"]);
+        bench.assert_clean(&[]);
+    }
+}
+
+/// The same seed repeats a run, another one does not, where there is noise; without noise the seed is nothing.
+#[test]
+fn noise_comes_from_the_seed_alone() {
+    let bench = Bench::new();
+    let hash = |scenario: &str, seed: u64| -> Value {
+        let seed = format!("seed={seed}");
+        let short = ["--clock", "in-process", "--duration", "0.5", "--set", "accept={}", "--set", &seed];
+        bench.summary(scenario, &short)["state"]["hash"].clone()
+    };
+    assert_eq!(hash("noisy-pair", 7), hash("noisy-pair", 7));
+    assert_ne!(hash("noisy-pair", 7), hash("noisy-pair", 8));
+    assert_eq!(hash("rigid-pair", 7), hash("rigid-pair", 8));
+}
+
+/// The bound of [D](18) that the controller publishes holds at every step that no miss disturbed.
+#[test]
+fn the_live_certificate_holds_at_every_step() {
+    for name in ["rigid-pair", "rigid-pair-hyperbolic", "rigid-trio", "gyro-loss"] {
+        let bench = Bench::new();
+        for clock in ["in-process", "realtime"] {
+            let run = ["--clock", clock, "--duration", "5", "--set", "accept={}", "--set", "leader.outage=[]"];
+            let outage = if name == "gyro-loss" { &run[..] } else { &run[..6] };
+            let certificate = bench.summary(name, outage)["score"]["certificate"].clone();
+            let count = |key: &str| certificate[key].as_u64().unwrap();
+            assert_eq!(count("broken"), 0, "{name} {clock}: {certificate}");
+            assert!(count("held") > 0, "{name} {clock}: {certificate}");
+        }
+    }
+}
+
+/// A follower unlike the leader breaks the theorem's assumption, and the summary says so: the count can fail.
+#[test]
+fn the_live_certificate_breaks_where_its_assumption_does() {
+    let bench = Bench::new();
+    let run = ["--clock", "in-process", "--set", "controller.adaptation_gain=0", "--set", "accept={}"];
+    let summary = bench.summary("mismatched-follower", &run);
+    assert!(summary["score"]["certificate"]["broken"].as_u64().unwrap() > 1000, "{summary:#}");
+}
+
+/// What `check` prints is a scenario, and the same one.
+#[test]
+fn a_resolved_scenario_resolves_to_itself() {
+    for (name, _) in SHIPPED {
+        let first = Scenario::load(&shipped(name), &[]).unwrap().to_toml();
+        assert_eq!(first, Scenario::parse(&first, name, &[]).unwrap().to_toml(), "{name}");
+    }
+}
+
+/// In a mismatched follower the adaptation leaves what the tick leaves, and that falls with the tick.
+#[test]
+fn the_adaptation_removes_a_mismatch_down_to_the_floor_of_the_tick() {
+    let bench = Bench::new();
+    let error = |gain: &str, tick_hz: &str| {
+        let gain = format!("controller.adaptation_gain={gain}");
+        let limit = "accept.sync_error_rad_s_max=10";
+        let run = ["--clock", "in-process", "--tick-hz", tick_hz, "--set", &gain, "--set", limit];
+        let summary = bench.summary("mismatched-follower", &run);
+        summary["score"]["metrics"][0]["settled_max"].as_f64().unwrap()
+    };
+    let (without, coarse, fine) = (error("0", "1000"), error("50", "1000"), error("50", "2000"));
+    println!("without {without:.2e}, with {coarse:.2e} at 1 kHz and {fine:.2e} at 2 kHz");
+    assert!(without > 0.1 && coarse < 1e-3, "{without:e} {coarse:e}");
+    assert!((fine / coarse - 0.5).abs() < 0.05, "{fine:e} {coarse:e}");
+}
