@@ -1,9 +1,10 @@
 //! `corotate check`: validate scenarios and tell what is proven of them.
 
-use crate::{Exit, fail};
+use crate::{Exit, fail, say};
 use corotate::config::Scenario;
 use corotate::rig::CertificateReport;
-use std::path::PathBuf;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
 
 /// Options of `corotate check`.
 #[derive(clap::Args)]
@@ -22,9 +23,9 @@ pub fn check(arguments: &Arguments) -> Exit {
     for path in &arguments.files {
         match Scenario::load(path, &arguments.set) {
             Ok(scenario) => {
-                println!("# {}: valid\n{}", path.display(), scenario.to_toml());
-                scenario.rig.notes().iter().for_each(|note| println!("# note: {note}"));
-                scenario.rig.certificates().iter().for_each(print);
+                if let Err(gone) = say(&tell(path, &scenario)) {
+                    return gone;
+                }
             }
             Err(error) => exit = fail(Exit::Usage, &error),
         }
@@ -32,22 +33,32 @@ pub fn check(arguments: &Arguments) -> Exit {
     exit
 }
 
-/// As TOML comments, so that the whole output is a scenario file.
-fn print(certificate: &CertificateReport) {
-    println!("# certificate of {}", certificate.body);
+/// The scenario as resolved, and what is proven of it as comments, so that the whole is a scenario file.
+fn tell(path: &Path, scenario: &Scenario) -> String {
+    let mut text = format!("# {}: valid\n{}\n", path.display(), scenario.to_toml());
+    tell_proof(scenario, &mut text).expect("a string takes every text");
+    text
+}
+
+fn tell_proof(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
+    scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
+    scenario.rig.certificates().iter().try_for_each(|certificate| tell_certificate(certificate, text))
+}
+
+fn tell_certificate(certificate: &CertificateReport, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "# certificate of {}", certificate.body)?;
     for bound in &certificate.bounds {
-        println!("#   {}: {:.4}", bound.name, bound.value);
+        writeln!(text, "#   {}: {:.4}", bound.name, bound.value)?;
     }
     for condition in &certificate.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
         let margin = condition.value - condition.required;
-        println!(
+        writeln!(
+            text,
             "#   {}: {:.4} > {:.4} {verdict}, margin {margin:.4}",
             condition.name, condition.value, condition.required
-        );
+        )?;
     }
-    println!("#   the error falls at least as exp(-{} t)", certificate.rate_per_s);
-    for warning in &certificate.warnings {
-        println!("#   warning: {warning}");
-    }
+    writeln!(text, "#   the error falls at least as exp(-{} t)", certificate.rate_per_s)?;
+    certificate.warnings.iter().try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
 }

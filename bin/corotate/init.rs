@@ -1,6 +1,6 @@
 //! `corotate init`: print a shipped scenario.
 
-use crate::{Exit, fail};
+use crate::{Exit, fail, say};
 use corotate::config::SHIPPED;
 
 /// Options of `corotate init`.
@@ -13,10 +13,7 @@ pub struct Arguments {
 /// Prints a scenario.
 pub fn init(arguments: &Arguments) -> Exit {
     match SHIPPED.iter().find(|(name, _)| *name == arguments.name) {
-        Some((_, text)) => {
-            print!("{text}");
-            Exit::Ok
-        }
+        Some((_, text)) => say(text).map_or_else(|exit| exit, |()| Exit::Ok),
         None => {
             let known = SHIPPED.map(|(name, _)| name).join(", ");
             fail(Exit::Usage, &format!("there is no scenario `{}`; there are: {known}", arguments.name))

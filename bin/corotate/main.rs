@@ -6,6 +6,7 @@ mod role;
 mod run;
 
 use clap::{Parser, Subcommand};
+use std::io::{self, Write};
 use std::process::ExitCode;
 
 /// Bodies move together although not everything about them can be measured.
@@ -76,9 +77,19 @@ impl From<Exit> for ExitCode {
 /// Prints an error, one paragraph per line of it, and gives the exit code.
 fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
     for line in error.to_string().lines() {
-        eprintln!("corotate: {line}");
+        // Without a stderr the exit code is all there is to say.
+        let _ = writeln!(io::stderr(), "corotate: {line}");
     }
     exit
+}
+
+/// Prints to stdout; a reader that has gone is an error, where `print!` would panic.
+fn say(text: &str) -> Result<(), Exit> {
+    let mut stdout = io::stdout().lock();
+    stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush())
+        .map_err(|error| fail(Exit::Failure, &format!("cannot write to stdout: {error}; give it a reader")))
 }
 
 fn main() -> ExitCode {

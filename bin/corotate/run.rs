@@ -1,7 +1,7 @@
 //! `corotate run`: one scenario from file to verdict.
 
-use crate::{Exit, fail};
-use corotate::config::{SHIPPED, Scenario};
+use crate::{Exit, fail, say};
+use corotate::config::{ClockKind, SHIPPED, Scenario};
 use corotate::launch::{Launch, LaunchError, Progress, Summary, table, write_run};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -54,6 +54,10 @@ impl Arguments {
             None => Scenario::parse(SHIPPED[0].1, &format!("{}.toml", SHIPPED[0].0), &self.overrides()),
         };
         let scenario = loaded.map_err(|error| fail(Exit::Usage, &error))?;
+        if let (Some(role), ClockKind::InProcess) = (self.external.first(), scenario.clock) {
+            let reason = "one process has no room for another's role; give --clock realtime or lockstep";
+            return Err(fail(Exit::Usage, &format!("--external {role}: {reason}")));
+        }
         let roles: Vec<&str> =
             corotate::runtime::RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
         match self.external.iter().find(|role| !roles.contains(&role.as_str())) {
@@ -93,18 +97,19 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
     let outcome = outcome.map_err(|error| fail(exit_of(&error), &error))?;
     let summary = Summary::new(&scenario, &outcome, started);
     let written = write_run(&directory, &scenario, &summary);
-    report(arguments, &summary, &directory);
+    let reported = report(arguments, &summary, &directory);
     written.map_err(|error| fail(Exit::Failure, &format!("cannot write the results: {error}")))?;
+    reported?;
     Ok(verdict(&summary))
 }
 
-fn report(arguments: &Arguments, summary: &Summary, directory: &Path) {
-    let text = format!("{}results in {}", table(summary), directory.display());
+fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), Exit> {
+    let text = format!("{}results in {}\n", table(summary), directory.display());
     if arguments.json {
-        eprintln!("{text}");
-        println!("{}", serde_json::to_string(summary).expect("a summary of plain values is JSON"));
+        eprint!("{text}");
+        say(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
-        println!("{text}");
+        say(&text)
     }
 }
 

@@ -5,9 +5,20 @@
 use super::ConfigError;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
+
+/// The longest text, bytes. What is longer is no scenario, and need not have an end.
+const MAX_BYTES: u64 = 1 << 20;
+/// The most steps in the key of an override. No key lies so deep.
+const MAX_STEPS: usize = 16;
+/// Every number is zero or between these in magnitude, so that neither squares nor their ratios leave the floating point's
+/// range.
+const SMALLEST: f64 = 1e-30;
+const LARGEST: f64 = 1e18;
 
 /// A parsed scenario text: the table, and the place of every key for error messages.
 #[derive(Debug, Clone)]
@@ -16,6 +27,8 @@ pub struct Document {
     /// Key path, as `follower[0].name`, to `file:line` or `--set …`.
     places: BTreeMap<String, String>,
     origin: String,
+    /// Top-level keys that were split off: as good as known.
+    elsewhere: Vec<String>,
 }
 
 impl Document {
@@ -24,9 +37,20 @@ impl Document {
     /// # Errors
     /// [`ConfigError::Read`] and [`ConfigError::Syntax`].
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| ConfigError::Read { path: path.to_owned(), reason: error.to_string() })?;
-        Self::parse(&text, &path.display().to_string())
+        let refuse = |reason: String| ConfigError::Read { path: path.to_owned(), reason };
+        let origin = path.display().to_string();
+        let mut bytes = Vec::new();
+        File::open(path)
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+            .map_err(|error| refuse(error.to_string()))?;
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(refuse(format!("it is longer than {MAX_BYTES} bytes, which no scenario is")));
+        }
+        let text = std::str::from_utf8(&bytes).map_err(|error| ConfigError::Syntax {
+            place: format!("{origin}:{}", position(&bytes, error.valid_up_to())),
+            reason: "this is not UTF-8 text".to_owned(),
+        })?;
+        Self::parse(text, &origin)
     }
 
     /// Parses a text; `origin` stands for the file in error messages.
@@ -34,18 +58,27 @@ impl Document {
     /// # Errors
     /// [`ConfigError::Syntax`], also for a key that appears twice.
     pub fn parse(text: &str, origin: &str) -> Result<Self, ConfigError> {
-        let syntax = |error: toml::de::Error| ConfigError::Syntax {
-            place: error.span().map_or(origin.to_owned(), |span| format!("{origin}:{}", position(text, span.start))),
-            reason: error.message().trim().replace('\n', ", "),
+        let syntax = |error: toml::de::Error| {
+            let at = |offset| format!("{origin}:{}", position(text.as_bytes(), offset));
+            let key = error.span().and_then(|span| text.get(span)).unwrap_or_default();
+            ConfigError::Syntax {
+                place: error.span().map_or(origin.to_owned(), |span| at(span.start)),
+                reason: match error.message().trim() {
+                    "duplicate key" => format!("duplicate key `{key}`"),
+                    message => plain(message),
+                },
+            }
         };
         let spanned = DeTable::parse(text).map_err(syntax)?;
         let table = toml::from_str::<Table>(text).map_err(syntax)?;
+        let ends: Vec<usize> = text.match_indices('\n').map(|(offset, _)| offset).collect();
         let mut places = BTreeMap::new();
         locate_table(spanned.get_ref(), "", &mut |path, offset| {
-            places.insert(path, format!("{origin}:{}", line(text, offset)));
+            let line = 1 + ends.partition_point(|end| *end < offset);
+            places.insert(path, format!("{origin}:{line}"));
         });
-        let document = Self { table, places, origin: origin.to_owned() };
-        document.refuse_non_finite()?;
+        let document = Self { table, places, origin: origin.to_owned(), elsewhere: Vec::new() };
+        document.refuse_absurd()?;
         Ok(document)
     }
 
@@ -57,21 +90,48 @@ impl Document {
         let refuse = |reason: &str| ConfigError::Override { argument: argument.to_owned(), reason: reason.to_owned() };
         let (path, text) = argument.split_once('=').ok_or_else(|| refuse("there is no `=`"))?;
         let value = parse_value(text.trim()).ok_or_else(|| refuse("the value is neither TOML nor a bare word"))?;
-        let steps: Vec<&str> = path.trim().split('.').collect();
+        // Positions in a list also as error messages write them.
+        let path = path.trim().replace('[', ".").replace(']', "");
+        let steps: Vec<&str> = path.split('.').collect();
         if steps.iter().any(|step| step.is_empty()) {
             return Err(refuse("the key is empty"));
+        }
+        if steps.len() > MAX_STEPS {
+            return Err(refuse("no key lies so deep"));
         }
         let key = insert(&mut self.table, &steps, value).map_err(|reason| refuse(&reason))?;
         // Whatever stood below the key is gone, and its places with it.
         self.places.retain(|path, _| !is_below(path, &key));
-        self.places.insert(key, format!("--set {argument}"));
-        self.refuse_non_finite()
+        let place = format!("--set {argument}");
+        // Tables on the way that were not there before are the override's too.
+        for (end, _) in key.match_indices(['.', '[']) {
+            self.places.entry(key[..end].to_owned()).or_insert_with(|| place.clone());
+        }
+        self.places.insert(key, place);
+        self.refuse_absurd()
     }
 
     /// Takes the given top-level keys out into a document of their own.
     pub fn split_off(&mut self, keys: &[&str]) -> Self {
         let table = keys.iter().filter_map(|key| self.table.remove_entry(*key)).collect();
-        Self { table, places: self.places.clone(), origin: self.origin.clone() }
+        self.elsewhere.extend(keys.iter().map(|key| (*key).to_owned()));
+        Self { table, places: self.places.clone(), origin: self.origin.clone(), elsewhere: Vec::new() }
+    }
+
+    /// Refuses a list, as `[[key]]` makes one, at top-level keys that hold one table each: serde would take its elements
+    /// for the table's values.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`].
+    pub fn refuse_lists(&self, keys: &[&str]) -> Result<(), ConfigError> {
+        match keys.iter().find(|key| self.table.get(**key).is_some_and(Value::is_array)) {
+            Some(key) => Err(ConfigError::Value {
+                place: self.place(key),
+                key: (*key).to_owned(),
+                reason: format!("is a list; write [{key}], once"),
+            }),
+            None => Ok(()),
+        }
     }
 
     /// The string at a top-level key, if there is one.
@@ -105,54 +165,106 @@ impl Document {
     }
 
     fn explain(&self, path: String, message: &str) -> ConfigError {
-        // serde names the field and its known alternatives in backquotes; there is no structured way to them.
-        let quoted: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+        // There is no structured way to what serde says.
         let join = |parent: &str, field: &str| {
             if parent.is_empty() { field.to_owned() } else { format!("{parent}.{field}") }
         };
-        if message.starts_with("unknown field") && !quoted.is_empty() {
+        if let Some((field, mut known)) = alternatives(message, "unknown field") {
             // The path ends at the unknown field itself or at its table, by the kind of map.
-            let key = if path.ends_with(quoted[0]) { path } else { join(&path, quoted[0]) };
-            let remedy = nearest(quoted[0], &quoted[1..]);
-            return ConfigError::UnknownKey { place: self.place(&key), key, remedy };
+            let itself = path == field || path.ends_with(&format!(".{field}"));
+            let key = if itself { path } else { join(&path, field) };
+            if key == field {
+                known.extend(self.elsewhere.iter().map(String::as_str));
+            }
+            return ConfigError::UnknownKey { place: self.place(&key), remedy: nearest(field, &known), key };
         }
-        if message.starts_with("missing field") && !quoted.is_empty() {
-            let key = join(&path, quoted[0]);
-            return ConfigError::Value { place: self.place(&path), key, reason: "is missing; add it".to_owned() };
+        if let Some(field) = message.strip_prefix("missing field `").and_then(|rest| rest.strip_suffix('`')) {
+            let key = join(&path, field);
+            return ConfigError::Value { place: self.place(&key), key, reason: "is missing; add it".to_owned() };
         }
-        ConfigError::Value { place: self.place(&path), key: path, reason: message.replace('\n', ", ") }
+        ConfigError::Value { place: self.place(&path), key: path, reason: plain(message) }
     }
 
-    fn refuse_non_finite(&self) -> Result<(), ConfigError> {
-        match non_finite(&Value::Table(self.table.clone()), String::new()) {
+    fn refuse_absurd(&self) -> Result<(), ConfigError> {
+        match absurd(&Value::Table(self.table.clone()), String::new()) {
             Some((key, value)) => Err(ConfigError::Value {
                 place: self.place(&key),
                 key,
-                reason: format!("{value} is not a finite number; no quantity here may be infinite or undefined"),
+                reason: if value.is_finite() {
+                    format!(
+                        "{value:e} is no quantity of any scenario; give 0 or {SMALLEST:e} to {LARGEST:e} in magnitude"
+                    )
+                } else {
+                    format!("{value} is not a finite number; give one")
+                },
             }),
             None => Ok(()),
         }
     }
 }
 
+/// The word and what is known instead of it, from a message as "unknown field `a`, expected `b` or `c`".
+fn alternatives<'a>(message: &'a str, kind: &str) -> Option<(&'a str, Vec<&'a str>)> {
+    // From the end: the word may contain anything.
+    let (word, known) = message.strip_prefix(kind)?.rsplit_once(", expected ")?;
+    let word = word.trim_start().strip_prefix('`')?.strip_suffix('`')?;
+    Some((word, known.split('`').skip(1).step_by(2).collect()))
+}
+
+/// What a deserializer says, in words for somebody who writes a scenario and no Rust.
+fn plain(message: &str) -> String {
+    if let Some((word, known)) = alternatives(message, "unknown variant") {
+        return format!("there is no choice `{word}`; {}", nearest(word, &known));
+    }
+    let as_is = || message.replace("u64 value", "whole number").replace('\n', ", ");
+    let kind =
+        ["invalid type: ", "invalid value: ", "invalid length "].into_iter().find(|kind| message.starts_with(kind));
+    let Some((given, wanted)) = kind.and_then(|kind| message[kind.len()..].rsplit_once(", expected ")) else {
+        return as_is();
+    };
+    let given = match given {
+        "map" => "a table",
+        "sequence" => "a list",
+        "unit variant" => "another kind of value",
+        other => other,
+    };
+    let wanted = match wanted {
+        "f64" => "a number",
+        "i32" => "a whole number",
+        "u64" | "usize" => "a whole number, not below 0",
+        "a boolean" => "true or false",
+        "a string" | "string only" => "a text in quotes",
+        "a sequence" if given == "a table" => "a list of tables, each under its name in double brackets",
+        "a sequence" => "a list",
+        "an array of length 3" => "a list of 3 numbers",
+        "fewer elements in array" => "fewer values",
+        "any valid TOML value" => "a smaller number",
+        table if table == "a map" || table.starts_with("struct ") => "a table",
+        other => other,
+    };
+    match kind {
+        Some("invalid length ") => format!("got {given} values; give {wanted}"),
+        _ => format!("got {given}; give {wanted}"),
+    }
+}
+
 /// "did you mean" for the nearest candidate, or the list of them.
 pub(crate) fn nearest(word: &str, candidates: &[&str]) -> String {
-    let best = candidates.iter().max_by(|a, b| strsim::jaro_winkler(word, a).total_cmp(&strsim::jaro_winkler(word, b)));
-    match best {
-        Some(best) if strsim::jaro_winkler(word, best) > 0.8 => format!("did you mean `{best}`?"),
+    // Nothing so long is a slip of the fingers, and comparing takes its time.
+    let likeness = |known: &str| if word.len() > 64 { 0.0 } else { strsim::jaro_winkler(word, known) };
+    match candidates.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b))) {
+        Some(best) if likeness(best) > 0.8 => format!("did you mean `{best}`?"),
         Some(_) => format!("known here: {}", candidates.join(", ")),
         None => "no key is known here".to_owned(),
     }
 }
 
-fn line(text: &str, offset: usize) -> usize {
-    1 + text.as_bytes()[..offset.min(text.len())].iter().filter(|byte| **byte == b'\n').count()
-}
-
-fn position(text: &str, offset: usize) -> String {
-    let before = &text.as_bytes()[..offset.min(text.len())];
+/// Line and column, both from 1.
+fn position(text: &[u8], offset: usize) -> String {
+    let before = &text[..offset.min(text.len())];
     let column = 1 + before.iter().rev().take_while(|byte| **byte != b'\n').count();
-    format!("{}:{column}", line(text, offset))
+    let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
+    format!("{line}:{column}")
 }
 
 fn locate_table(table: &DeTable<'_>, path: &str, found: &mut impl FnMut(String, usize)) {
@@ -226,14 +338,19 @@ fn descend<'a>(place: &'a mut Value, step: &str, path: &mut String) -> Result<&'
     }
 }
 
-fn non_finite(value: &Value, path: String) -> Option<(String, f64)> {
+fn absurd(value: &Value, path: String) -> Option<(String, f64)> {
+    let number = |number: f64| {
+        let fits = number == 0.0 || (SMALLEST..=LARGEST).contains(&number.abs());
+        (!fits).then_some(number)
+    };
     match value {
-        Value::Float(number) if !number.is_finite() => Some((path, *number)),
+        Value::Float(value) => Some((path, number(*value)?)),
+        Value::Integer(value) => Some((path, number(*value as f64)?)),
         Value::Array(array) => {
-            array.iter().enumerate().find_map(|(index, value)| non_finite(value, format!("{path}[{index}]")))
+            array.iter().enumerate().find_map(|(index, value)| absurd(value, format!("{path}[{index}]")))
         }
         Value::Table(table) => table.iter().find_map(|(key, value)| {
-            non_finite(value, if path.is_empty() { key.clone() } else { format!("{path}.{key}") })
+            absurd(value, if path.is_empty() { key.clone() } else { format!("{path}.{key}") })
         }),
         _ => None,
     }
@@ -294,7 +411,7 @@ mod tests {
     #[test]
     fn refuses_bad_syntax_duplicates_and_non_finite_numbers_with_their_line() {
         for (text, expected) in [
-            ("a = 1\na = 2", "x.toml:2:1: duplicate key"),
+            ("a = 1\na = 2", "x.toml:2:1: duplicate key `a`"),
             ("a = 1\nb = [", "x.toml:2:"),
             ("a = 1\n[b]\nc = nan", "x.toml:3: b.c: NaN is not a finite number"),
             ("a = [1, inf]", "x.toml:1: a[1]: inf is not"),

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or print one with `corotate init rigid-pair`", path.display())]
+    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or print one with `corotate init rigid-pair`", shown(&path.display().to_string()))]
     Read {
         /// The path as given.
         path: PathBuf,
@@ -14,7 +14,7 @@ pub enum ConfigError {
         reason: String,
     },
     /// The text is not TOML, or a key appears twice.
-    #[error("{place}: {reason}; correct the line")]
+    #[error("{}: {}; correct the line", shown(place), shown(reason))]
     Syntax {
         /// File, line and column.
         place: String,
@@ -22,7 +22,7 @@ pub enum ConfigError {
         reason: String,
     },
     /// No key of this name is known.
-    #[error("{place}: {key}: unknown key; {remedy}")]
+    #[error("{}: {}: unknown key; {remedy}", shown(place), shown(key))]
     UnknownKey {
         /// File and line, or the option.
         place: String,
@@ -32,7 +32,7 @@ pub enum ConfigError {
         remedy: String,
     },
     /// A key has a value of the wrong type, or is missing.
-    #[error("{place}: {key}: {reason}")]
+    #[error("{}: {}: {}", shown(place), shown(key), shown(reason))]
     Value {
         /// File and line, or the option.
         place: String,
@@ -43,7 +43,9 @@ pub enum ConfigError {
     },
     /// An override on the command line has not the form key=value, or leads nowhere.
     #[error(
-        "--set {argument}: {reason}; write --set key=value, for example --set leader.initial_rate_rad_s=[0.6,-0.4,0.8] or --set follower.0.name=chaser"
+        "--set {}: {}; write --set key=value, for example --set leader.initial_rate_rad_s=[0.6,-0.4,0.8] or --set follower.0.name=chaser",
+        shown(argument),
+        shown(reason)
     )]
     Override {
         /// The argument as given.
@@ -61,7 +63,7 @@ pub enum ConfigError {
 
 /// One value that makes no sense.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{place}: {key}: {reason}")]
+#[error("{}: {}: {}", shown(place), shown(key), shown(reason))]
 pub struct Problem {
     /// File and line, or the option.
     pub place: String,
@@ -69,4 +71,17 @@ pub struct Problem {
     pub key: String,
     /// Reason and remedy.
     pub reason: String,
+}
+
+/// The most of one part of a message, characters.
+const MAX_SHOWN: usize = 400;
+
+/// Text from outside on one line: nothing that moves a terminal's cursor, and of a long text the beginning and the end.
+fn shown(text: &str) -> String {
+    let clean = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    let text: Vec<char> = text.chars().map(clean).collect();
+    match text.len() {
+        0..=MAX_SHOWN => text.iter().collect(),
+        length => text[..MAX_SHOWN / 2].iter().chain(&[' ', '…', ' ']).chain(&text[length - MAX_SHOWN / 2..]).collect(),
+    }
 }

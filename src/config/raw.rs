@@ -112,7 +112,10 @@ impl Default for Realtime {
 
 /// Where the roles run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "expected \"auto\", \"any\", or a list of core numbers such as [0, 1]")]
+#[serde(
+    untagged,
+    expecting = "there is no such choice; give \"auto\", \"any\", or a list of core numbers such as [0, 1]"
+)]
 pub enum Cores {
     /// `"auto"` or `"any"`.
     Named(NamedCores),

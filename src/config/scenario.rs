@@ -7,14 +7,17 @@ use crate::role::{Actuation, Rearm};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// The longest time a latency histogram holds, s; a tick must be shorter.
-const MAX_PERIOD_S: f64 = 10.0;
-/// The shortest tick: below it the clock reads alone would fill the period.
-const MIN_PERIOD_S: f64 = 1e-5;
+/// The slowest tick: a period must lie well within what a latency histogram holds.
+const MIN_TICK_HZ: f64 = 0.1;
+/// The fastest tick: beyond it the clock reads alone would fill the period.
+const MAX_TICK_HZ: f64 = 1e5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
 /// The tables whose content belongs to the rig.
 const RIG_SECTIONS: [&str; 6] = ["central_body", "leader", "spacecraft", "follower", "observer", "controller"];
+/// The keys that hold one table each.
+const TABLES: [&str; 9] =
+    ["central_body", "leader", "spacecraft", "observer", "controller", "actuator", "realtime", "launch", "accept"];
 
 /// A scenario that can be run.
 #[derive(Debug)]
@@ -77,15 +80,16 @@ impl Scenario {
         for argument in overrides {
             document.set(argument)?;
         }
+        document.refuse_lists(&TABLES)?;
         let sections = document.split_off(&RIG_SECTIONS);
         let raw: Raw = document.read_into()?;
         let mut checks = Checks::new(&document);
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
-        let tick_s = period_ns as f64 / 1e9;
+        // Of a tick that is refused nothing more is said: one of no length reaches no limit of the rig.
+        let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 0.0 };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
-        let accept =
-            resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map_or(&[], AnyRig::metrics), &mut checks);
+        let accept = resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
@@ -167,6 +171,10 @@ pub(crate) fn finite_positive(checks: &mut Checks<'_>, key: &str, value: f64) {
     checks.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
 }
 
+fn tick_possible(tick_hz: f64) -> bool {
+    (MIN_TICK_HZ..=MAX_TICK_HZ).contains(&tick_hz)
+}
+
 fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     let named = !raw.name.is_empty()
         && raw.name.len() <= 32
@@ -174,43 +182,39 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     checks.require(named, "name", || {
         format!("`{}` cannot name services and files; use 1 to 32 of a-z, 0-9 and -", raw.name)
     });
-    let period_s = 1.0 / raw.tick_hz;
-    let period_ok = (MIN_PERIOD_S..=MAX_PERIOD_S).contains(&period_s);
-    checks.require(period_ok, "tick_hz", || {
+    checks.require(tick_possible(raw.tick_hz), "tick_hz", || {
         format!(
-            "a tick of {} Hz is outside what latencies are kept for ({} to {} Hz); choose a rate between",
-            raw.tick_hz,
-            1.0 / MAX_PERIOD_S,
-            1.0 / MIN_PERIOD_S
+            "a tick of {} Hz is outside what latencies are kept for; give a rate from {MIN_TICK_HZ} to {MAX_TICK_HZ} Hz",
+            raw.tick_hz
         )
     });
-    if period_ok {
+    if tick_possible(raw.tick_hz) {
         let ticks = raw.duration_s * raw.tick_hz;
         checks.require((1.0..=MAX_TICKS).contains(&ticks), "duration_s", || {
-            format!("{} s is {ticks} ticks; a run has between 1 and {MAX_TICKS:e}", raw.duration_s)
+            format!("{} s is {ticks} ticks; give a length of 1 to {MAX_TICKS:e} ticks", raw.duration_s)
         });
     }
     checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", || {
         "0 would make every tick unsafe; give at least 1".to_owned()
     });
-    check_realtime(&raw.realtime, period_s, checks);
+    check_realtime(&raw.realtime, checks);
     checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
-        format!("{} is not between 0.1 and 3600", raw.launch.startup_timeout_s)
+        format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
     });
 }
 
-fn check_realtime(realtime: &Realtime, period_s: f64, checks: &mut Checks<'_>) {
+fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     let priority = realtime.priority;
     checks.require(priority == 0 || (4..=99).contains(&priority), "realtime.priority", || {
         format!("{priority} is no SCHED_FIFO priority; give 4 to 99, or 0 not to ask for it")
     });
     for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
         checks.require((0.0..=100_000.0).contains(&value), key, || {
-            format!("{value} is not between 0 and 100000; spinning is for the last moments before a sample")
+            format!("{value} us is no time to spin, which is for the last moments before a sample; give 0 to 100000")
         });
     }
     checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", || {
-        format!("{} is not a part of the period ({period_s} s); give a number above 0, up to 1", realtime.cutoff)
+        format!("{} is no part of the period; give a number above 0, up to 1", realtime.cutoff)
     });
     if let super::Cores::List(cores) = &realtime.cores {
         checks.require(!cores.is_empty() && cores.iter().all(|core| *core < 1024), "realtime.cores", || {
@@ -219,34 +223,50 @@ fn check_realtime(realtime: &Realtime, period_s: f64, checks: &mut Checks<'_>) {
     }
 }
 
-fn resolve_accept(raw: &BTreeMap<String, f64>, duration_s: f64, metrics: &[&str], checks: &mut Checks<'_>) -> Accept {
+/// Without a rig, `metrics` are not known and nothing is said of criteria that may be theirs.
+fn resolve_accept(
+    raw: &BTreeMap<String, f64>,
+    duration_s: f64,
+    metrics: Option<&[&str]>,
+    checks: &mut Checks<'_>,
+) -> Accept {
     let mut accept = Accept::default();
     for (key, &value) in raw {
         let path = format!("accept.{key}");
-        checks.require(value >= 0.0, &path, || format!("{value} is below zero; no result can be"));
+        checks
+            .require(value >= 0.0, &path, || format!("{value} is below zero, which no result can be; give 0 or more"));
         match key.as_str() {
             "settled_by_s" => {
                 accept.settled_by_s = value;
                 checks.require(value < duration_s, &path, || {
-                    format!("{value} s is not before the end of the run at {duration_s} s; nothing would be judged")
+                    format!(
+                        "{value} s is not before the end of the run at {duration_s} s, so nothing would be judged; lower it \
+                         or raise duration_s"
+                    )
                 });
             }
             "missed_ticks_max" => {
                 accept.missed_ticks_max = Some(value as u64);
-                checks.require(value.fract() == 0.0, &path, || format!("{value} is not a whole number of ticks"));
+                checks.require(value.fract() == 0.0, &path, || {
+                    format!("{value} is no count of ticks; give a whole number")
+                });
             }
             "step_latency_p99_us_max" => accept.step_latency_p99_us_max = Some(value),
-            _ => match key.strip_suffix("_max").filter(|metric| metrics.contains(metric)) {
-                Some(metric) => {
-                    accept.metric_max.insert(metric.to_owned(), value);
+            _ => {
+                let Some(metrics) = metrics else { continue };
+                match key.strip_suffix("_max").filter(|metric| metrics.contains(metric)) {
+                    Some(metric) => {
+                        accept.metric_max.insert(metric.to_owned(), value);
+                    }
+                    None => {
+                        let mut known: Vec<String> = metrics.iter().map(|metric| format!("{metric}_max")).collect();
+                        known
+                            .extend(["settled_by_s", "missed_ticks_max", "step_latency_p99_us_max"].map(str::to_owned));
+                        let known: Vec<&str> = known.iter().map(String::as_str).collect();
+                        checks.refuse(&path, format!("unknown criterion; {}", nearest(key, &known)));
+                    }
                 }
-                None => {
-                    let mut known: Vec<String> = metrics.iter().map(|metric| format!("{metric}_max")).collect();
-                    known.extend(["settled_by_s", "missed_ticks_max", "step_latency_p99_us_max"].map(str::to_owned));
-                    let known: Vec<&str> = known.iter().map(String::as_str).collect();
-                    checks.refuse(&path, format!("unknown criterion; {}", nearest(key, &known)));
-                }
-            },
+            }
         }
     }
     accept

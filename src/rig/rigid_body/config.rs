@@ -4,6 +4,9 @@ use crate::config::{Checks, finite_positive};
 use crate::rig::check_name;
 use serde::{Deserialize, Serialize};
 
+/// The most followers: each is a process, and the transport holds 128 of them.
+const MAX_FOLLOWERS: usize = 100;
+
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Raw {
@@ -138,8 +141,8 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
         (None, false) => checks.refuse("controller", "is missing; followers need a [controller] with gain_per_s"),
         (Some(_), true) => checks.refuse("controller", "has no follower to drive; add a [[follower]] or remove it"),
         (Some(controller), false) => {
-            for gain in controller.gain_per_s {
-                finite_positive(checks, "controller.gain_per_s", gain);
+            for (axis, gain) in controller.gain_per_s.into_iter().enumerate() {
+                finite_positive(checks, &format!("controller.gain_per_s[{axis}]"), gain);
             }
             checks.require(controller.adaptation_gain >= 0.0, "controller.adaptation_gain", || {
                 format!("{} is below zero and would unlearn; give 0 or more", controller.adaptation_gain)
@@ -175,6 +178,9 @@ fn check_noise(checks: &mut Checks<'_>, body: &str, deviation: &[f64; 3]) {
 }
 
 fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
+    checks.require(followers.len() <= MAX_FOLLOWERS, "follower", || {
+        format!("{} are more than a run holds; give at most {MAX_FOLLOWERS}", followers.len())
+    });
     for (index, follower) in followers.iter().enumerate() {
         let (key, name) = (format!("follower[{index}].name"), &follower.name);
         check_name(checks, &key, name, followers[..index].iter().map(|other| other.name.as_str()));

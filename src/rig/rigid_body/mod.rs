@@ -27,6 +27,9 @@ use nalgebra::{Matrix3, Vector1, Vector3};
 use observer::ALL;
 use plant::Outage;
 
+/// The farthest that a body may turn in one tick, rad: at half a turn nobody can tell it from its complement.
+const MAX_TURN_RAD: f64 = 3.0;
+
 /// A leader, its observer, and the followers with their laws.
 #[derive(Debug, Clone)]
 pub struct RigidBodyRig {
@@ -229,17 +232,35 @@ impl RigidBodyRig {
 
     fn check_tick(&self, checks: &mut Checks<'_>) {
         let (m, tick_s) = (self.rate_bound_rad_s(), self.tick_s);
-        if let ObserverDesign::Hidden { relation, guess_rad_s, .. } = &self.observer {
-            let longest_s = relation.longest_step_s(m);
-            checks.require(tick_s < longest_s, "tick_hz", || {
+        let limit_rad_s = MAX_TURN_RAD / tick_s;
+        checks.require(m < limit_rad_s, "tick_hz", || {
+            format!(
+                "the leader may turn at {m:.3} rad/s, so its phase is ambiguous from one tick of {tick_s} s to the next; \
+                 raise tick_hz above {:.3}",
+                m / MAX_TURN_RAD
+            )
+        });
+        for (index, rate) in self.initial_rates[1..].iter().enumerate() {
+            let rate_rad_s = rate.norm();
+            checks.require(rate_rad_s < limit_rad_s, &format!("follower[{index}].initial_rate_rad_s"), || {
                 format!(
-                    "the leader may turn at {m:.3} rad/s, so its phase is ambiguous from one tick of {tick_s} s to the \
-                     next; raise tick_hz above {:.3}",
-                    1.0 / longest_s
+                    "at {rate_rad_s:.3} rad/s it turns too far from one tick of {tick_s} s to the next to be driven; lower \
+                     it or raise tick_hz above {:.3}",
+                    rate_rad_s / MAX_TURN_RAD
                 )
             });
-            checks.require(tick_s < relation.longest_step_s(guess_rad_s.abs()), "observer.initial_guess_rad_s", || {
+        }
+        if let ObserverDesign::Hidden { relation, guess_rad_s, .. } = &self.observer {
+            checks.require(guess_rad_s.abs() < limit_rad_s, "observer.initial_guess_rad_s", || {
                 format!("at {guess_rad_s} rad/s the phase would be ambiguous from tick to tick; guess nearer to 0")
+            });
+            // A leader at rest needs no observer and passes.
+            let floor_rad_s = relation.floor_rad_s();
+            checks.require(m == 0.0 || floor_rad_s < m, "observer.observability_floor_rad_s", || {
+                format!(
+                    "{floor_rad_s} is not below the {m:.3} rad/s that the leader may turn at, so it is never observed; \
+                     lower it"
+                )
             });
         }
         if let Some(controller) = self.controller {
