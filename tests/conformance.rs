@@ -89,3 +89,58 @@ fn the_adaptation_removes_a_mismatch_down_to_the_floor_of_the_tick() {
     assert!(without > 0.1 && coarse < 1e-3, "{without:e} {coarse:e}");
     assert!((fine / coarse - 0.5).abs() < 0.05, "{fine:e} {coarse:e}");
 }
+
+/// Every order of the filter settles on noisy sensors, in both families of rigs, and no order is the same as another.
+#[test]
+fn every_filter_works_in_every_rig() {
+    let bench = Bench::new();
+    let noise = "spacecraft.noise={radius_du=1e-4, angle_rad=1e-4}";
+    let orbit = ["accept={}", noise, "observer={decay_rate_per_s=[4.0, 4.0]}"];
+    let cases = [
+        ("noisy-pair", ["accept={}", "seed=3", "observer={decay_rate_per_s=6.0}"]),
+        ("noisy-pair", ["accept={}", "seed=3", "observer={bandwidth_rad_s=1.0}"]),
+        ("noisy-pair", ["accept={}", "seed=3", "observer={process_noise_rad2_s3=1e-8}"]),
+        ("orbit-hold", orbit),
+        ("orbit-hold", [orbit[0], orbit[1], "observer={bandwidth_rad_s=[3.0, 3.0]}"]),
+        ("orbit-hold", [orbit[0], orbit[1], "observer={process_noise_du2_s3=1e-6}"]),
+    ];
+    let mut errors = Vec::new();
+    for (scenario, sets) in cases {
+        let arguments: Vec<&str> =
+            sets.iter().flat_map(|set| ["--set", set]).chain(["--clock", "in-process"]).collect();
+        let summary = bench.summary(scenario, &arguments);
+        let metrics = summary["score"]["metrics"].as_array().unwrap();
+        let estimate = metrics.iter().find(|m| m["name"].as_str().unwrap().starts_with("estimate_error")).unwrap();
+        errors.push(estimate["last"].as_f64().unwrap());
+    }
+    println!("errors of the estimate at the end: {errors:?}");
+    assert!(errors.iter().all(|error| *error < 0.1 && *error > 0.0), "{errors:?}");
+    assert!(errors.windows(2).all(|pair| pair[0] != pair[1]), "{errors:?}");
+}
+
+/// What cannot be learned, or would not converge, is refused before anything starts.
+#[test]
+fn an_identifier_that_cannot_work_is_refused() {
+    for (scenario, set, said) in [
+        (
+            "inertia-axisymmetric",
+            "leader.initial_rate_rad_s=[0.5, 0.2, 0.0]",
+            "does not spin about its symmetry axis 3",
+        ),
+        ("inertia-axisymmetric", "leader.inertia_kg_m2=[1.0, 1.1, 1.6]", "use observer.kind"),
+        ("inertia", "observer.identifier_decay=[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]", "eigenvalue"),
+        ("inertia", "observer.identifier_decay=[5.0, -5.0, 5.0]", "not above zero"),
+        ("inertia", "leader.measured_axes=[1, 2]", "learning needs"),
+        ("gyro-loss", "leader.outage.0.axis=4", "has no gyro to fail"),
+        ("gyro-loss", "leader.outage.0.until_s=1.0", "is not after from_s"),
+        ("noisy-pair", "leader.noise_rad_s=[0.0, 0.0, 0.0]", "weighs noise"),
+        ("noisy-pair", "leader.noise_rad_s=[1e-3, -1e-3, 0.0]", "below zero"),
+        ("noisy-pair", "observer.bandwidth_rad_s=1.0", "does not go with the other choice"),
+        ("mismatched-follower", "follower.0.inertia_factor=[1.0, 1.0, 3.0]", "triangle inequality"),
+        ("mismatched-follower", "controller.adaptation_gain=-1.0", "would unlearn"),
+    ] {
+        let done = Bench::new().run(&["check", shipped(scenario).to_str().unwrap(), "--set", set]);
+        assert_eq!(done.code, Some(2), "{set}: {done:?}");
+        assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+    }
+}

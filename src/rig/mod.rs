@@ -115,6 +115,7 @@ pub struct ConditionReport {
 
 /// Registry: any of the rigs.
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "there is one in a process")]
 pub enum AnyRig {
     /// Rigid bodies turning about their centres of mass.
     RigidBody(RigidBodyRig),
@@ -211,7 +212,7 @@ impl<const N: usize> FilterDesign<N> {
             (None, None, None) => {
                 checks.refuse(
                     keys[0],
-                    format!("is missing; give it (first order), or {} or {} (second)", keys[1], keys[2]),
+                    format!("is missing; add it (first order), or give {} or {} (second)", keys[1], keys[2]),
                 );
                 None
             }

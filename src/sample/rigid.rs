@@ -39,6 +39,8 @@ sample! {
         coefficients: [f64; 3],
         /// a1 + a2 + a3 + a1·a2·a3: 0 for the coefficients of a body.
         closure: f64,
+        /// I2/I1 and I3/I1, all that a free motion tells of the inertia; 0 where the coefficients are no body's.
+        inertia_ratios: [f64; 2],
         /// What has excited the identifier, ∫|ω1 ω2 ω3| dt in rad³/s² (asymmetric) or ∫|ω3| dt in rad (axisymmetric).
         excitation: f64,
         /// Bit i set: component i is measured or observed, not merely guessed.

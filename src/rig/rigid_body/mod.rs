@@ -21,7 +21,7 @@ use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{Axisymmetric, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
 use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
-use config::{Coefficients, IdentifierDecay, Kind, Raw, RawObserver};
+use config::{Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
 use identifier::Identifier;
 use nalgebra::{Matrix3, Vector1, Vector3};
 use observer::ALL;
@@ -48,6 +48,7 @@ pub struct RigidBodyRig {
     /// Per body, what its gyros add; and the standard deviations of the leader's.
     noise: Vec<Noise<3>>,
     leader_deviation_rad_s: Vector3<f64>,
+    notes: Vec<String>,
     tick_s: f64,
 }
 
@@ -80,7 +81,9 @@ pub(super) fn resolve(
     let outages = resolve_outages(&raw, frame.tick_s, checks);
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
     let Some(inertia) = inertia else { return Ok((None, table)) };
-    let Some(observer) = design_observer(&raw, &inertia, supplied_axis, checks) else { return Ok((None, table)) };
+    let mut notes = Vec::new();
+    let observer = design_observer(&raw, &inertia, supplied_axis, &mut notes, checks);
+    let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
         inertia,
@@ -93,6 +96,7 @@ pub(super) fn resolve(
         controller: raw.controller.as_ref().map(ControllerDesign::from),
         noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
         leader_deviation_rad_s: raw.leader.noise_rad_s.into(),
+        notes,
         tick_s: frame.tick_s,
     };
     for (index, follower) in raw.follower.into_iter().enumerate() {
@@ -150,6 +154,7 @@ fn design_observer(
     raw: &Raw,
     inertia: &Inertia,
     supplied_axis: Option<usize>,
+    notes: &mut Vec<String>,
     checks: &mut Checks<'_>,
 ) -> Option<ObserverDesign> {
     let (observer, coefficients) = (&raw.observer, inertia.coefficients());
@@ -185,19 +190,32 @@ fn design_observer(
                 );
                 return None;
             };
-            let identifier = design_identifier(observer, inertia, checks)?;
+            let identifier = design_identifier(&raw.leader, observer, inertia, notes, checks)?;
             Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
         }
     }
 }
 
-fn design_identifier(observer: &RawObserver, inertia: &Inertia, checks: &mut Checks<'_>) -> Option<Identifier> {
+fn design_identifier(
+    leader: &RawLeader,
+    observer: &RawObserver,
+    inertia: &Inertia,
+    notes: &mut Vec<String>,
+    checks: &mut Checks<'_>,
+) -> Option<Identifier> {
     let floor_rad_s = observer.observability_floor_rad_s;
     let guess = observer.initial_coefficients;
     let decay = observer.identifier_decay.as_ref()?;
     if observer.kind == Kind::AxisymmetricInertia {
         let axis = observer.symmetry_axis?;
         let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
+        let spin_rad_s = leader.initial_rate_rad_s[axis - 1];
+        checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
+            format!(
+                "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
+                 nothing of its inertia; give component {axis} a rate"
+            )
+        });
         let moments = inertia.moments_kg_m2();
         checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
             format!(
@@ -215,6 +233,7 @@ fn design_identifier(observer: &RawObserver, inertia: &Inertia, checks: &mut Che
         IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
     };
     let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
+    notes.push(format!("observer.identifier_decay: eigenvalues {}", matrix.eigenvalues()));
     let slowest = -matrix.abscissa();
     let relation = InertiaRelation::new(floor_rad_s * floor_rad_s * floor_rad_s);
     Some(Identifier::asymmetric(relation, InvariantFilter::with_matrix(matrix, guess.into()), slowest))
@@ -398,6 +417,10 @@ impl Rig for RigidBodyRig {
                 _ => distance(coefficients, Some(self.inertia.coefficients())),
             };
         }
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.notes.clone()
     }
 
     fn undisturbed(truth: &RateTruth) -> bool {

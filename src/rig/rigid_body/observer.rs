@@ -1,7 +1,9 @@
 //! The observers of this rig: which components are measured, which one is supplied, and from what.
 
 use super::learner::Learner;
-use crate::observe::{Filter, GuardedKalman, HiddenRate, InvariantFilter, Observation, RateNoise, RateSample};
+use crate::observe::{
+    Filter, GuardedKalman, HiddenRate, InertiaRatios, InvariantFilter, Observation, RateNoise, RateSample,
+};
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use nalgebra::{Vector1, Vector3};
@@ -11,6 +13,7 @@ pub(super) const ALL: u64 = 0b111;
 
 /// An observer of this rig.
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "there is one in a process, and it is used at every tick")]
 pub enum RateObserver {
     /// One component is never measured.
     Hidden(HiddenObserver),
@@ -136,10 +139,16 @@ impl HiddenObserver {
         out.innovation_rad_s = self.innovation;
         out.coefficients = self.coefficients.into();
         out.closure = self.coefficients.sum() + self.coefficients.product();
+        out.inertia_ratios = ratios(&self.coefficients);
         out.excitation = 0.0;
         out.status = self.status | status;
         out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
     }
+}
+
+/// (I2/I1, I3/I1) of a body with these coefficients, or zeros if there is none.
+pub(super) fn ratios(coefficients: &Vector3<f64>) -> [f64; 2] {
+    InertiaRatios::new(coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third])
 }
 
 /// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
@@ -202,6 +211,7 @@ impl KalmanObserver {
         out.innovation_rad_s = 0.0;
         out.coefficients = self.coefficients.into();
         out.closure = self.coefficients.sum() + self.coefficients.product();
+        out.inertia_ratios = ratios(&self.coefficients);
         out.excitation = 0.0;
         out.status = self.status | status;
         out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
