@@ -349,7 +349,7 @@ fn what_makes_no_sense_is_refused_with_key_and_remedy() {
         ("controller.gain.transverse_per_s=0.0", "controller.gain.transverse_per_s"),
         ("controller.gain.transverse_per_s=1001.0", "the sampled loop is unstable"),
         ("controller.gain.transvers_per_s=1.0", "did you mean `transverse_per_s`"),
-        ("controller.feedback=truth", "unknown variant `truth`"),
+        ("controller.feedback=truth", "there is no choice `truth`"),
         ("observer.decay_rate_per_s=[4.0, 0.0]", "observer.decay_rate_per_s: 0 is not above zero"),
         ("accept.sync_error_rad_s_max=1.0", "unknown criterion"),
         ("leader.initial_radius_du=1.0", "leader: unknown key"),
