@@ -6,7 +6,7 @@ use corotate::config::SHIPPED;
 /// Options of `corotate init`.
 #[derive(clap::Args)]
 pub struct Arguments {
-    /// Name of a shipped scenario: rigid-pair, rigid-pair-hyperbolic, rigid-trio, orbit-hold, orbit-rendezvous
+    /// Name of a shipped scenario, for example gyro-loss; a name that is none lists them all
     name: String,
 }
 

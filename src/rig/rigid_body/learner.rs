@@ -5,7 +5,7 @@
 //! when it goes too early.
 
 use super::identifier::Identifier;
-use super::observer::{ALL, HiddenObserver, filter, ratios, seen};
+use super::observer::{ALL, HiddenObserver, filter, seen, write_body};
 use crate::observe::{HiddenRate, RateSample};
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use nalgebra::Vector3;
@@ -142,11 +142,8 @@ impl Learner {
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
         let a = self.identifier.coefficients();
         let supplier = self.supplier.as_ref();
-        out.omega_rad_s = self.rate().into();
+        write_body(&self.rate(), &a, out);
         out.innovation_rad_s = supplier.and_then(|s| s.observer.as_ref()).map_or(0.0, HiddenObserver::innovation);
-        out.coefficients = a.into();
-        out.closure = a.sum() + a.product();
-        out.inertia_ratios = ratios(&a);
         out.excitation = self.identifier.excitation();
         out.status = self.status | status;
         out.valid = supplier.filter(|s| s.degraded).map_or(ALL, |s| ALL & !(1 << s.component));

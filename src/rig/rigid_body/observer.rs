@@ -135,20 +135,20 @@ impl HiddenObserver {
     }
 
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
-        out.omega_rad_s = self.rate().into();
+        write_body(&self.rate(), &self.coefficients, out);
         out.innovation_rad_s = self.innovation;
-        out.coefficients = self.coefficients.into();
-        out.closure = self.coefficients.sum() + self.coefficients.product();
-        out.inertia_ratios = ratios(&self.coefficients);
         out.excitation = 0.0;
         out.status = self.status | status;
         out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
     }
 }
 
-/// (I2/I1, I3/I1) of a body with these coefficients, or zeros if there is none.
-pub(super) fn ratios(coefficients: &Vector3<f64>) -> [f64; 2] {
-    InertiaRatios::new(coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third])
+/// Writes the motion, and what the coefficients that it was found with say of the body.
+pub(super) fn write_body(rate: &Vector3<f64>, coefficients: &Vector3<f64>, out: &mut RateEstimate) {
+    out.omega_rad_s = (*rate).into();
+    out.coefficients = (*coefficients).into();
+    out.closure = coefficients.sum() + coefficients.product();
+    out.inertia_ratios = InertiaRatios::new(coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
 }
 
 /// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
@@ -207,11 +207,8 @@ impl KalmanObserver {
 
     fn write(&self, status: u64, out: &mut RateEstimate) {
         let rate = self.filter.as_ref().map_or(self.last.rate_rad_s, |filter| *filter.estimate());
-        out.omega_rad_s = rate.into();
+        write_body(&rate, &self.coefficients, out);
         out.innovation_rad_s = 0.0;
-        out.coefficients = self.coefficients.into();
-        out.closure = self.coefficients.sum() + self.coefficients.product();
-        out.inertia_ratios = ratios(&self.coefficients);
         out.excitation = 0.0;
         out.status = self.status | status;
         out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
