@@ -118,6 +118,22 @@ fn every_filter_works_in_every_rig() {
     assert!(errors.windows(2).all(|pair| pair[0] != pair[1]), "{errors:?}");
 }
 
+/// The identifiers too may be of second order.
+#[test]
+fn an_identifier_of_second_order_learns_as_well() {
+    let bench = Bench::new();
+    let bandwidth = "observer.identifier_bandwidth=[8.0, 8.0, 8.0]";
+    for (scenario, observer) in [
+        ("inertia", "observer={kind=\"inertia\", decay_rate_per_s=6.0}"),
+        ("inertia-axisymmetric", "observer={kind=\"axisymmetric-inertia\", symmetry_axis=3, decay_rate_per_s=6.0}"),
+    ] {
+        let summary = bench.summary(scenario, &["--clock", "in-process", "--set", observer, "--set", bandwidth]);
+        let error = summary["score"]["metrics"][0]["settled_max"].as_f64().unwrap();
+        println!("{scenario}: {error:e}");
+        assert!(error < 1e-9, "{scenario}: {error:e}");
+    }
+}
+
 /// What cannot be learned, or would not converge, is refused before anything starts.
 #[test]
 fn an_identifier_that_cannot_work_is_refused() {
@@ -131,6 +147,8 @@ fn an_identifier_that_cannot_work_is_refused() {
         ("inertia", "observer.identifier_decay=[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]", "eigenvalue"),
         ("inertia", "observer.identifier_decay=[5.0, -5.0, 5.0]", "not above zero"),
         ("inertia", "leader.measured_axes=[1, 2]", "learning needs"),
+        ("inertia", "observer.identifier_bandwidth=[1.0, 1.0, 1.0]", "give one of them"),
+        ("inertia-axisymmetric", "observer.symmetry_axis=7", "axis 7"),
         ("gyro-loss", "leader.outage.0.axis=4", "has no gyro to fail"),
         ("gyro-loss", "leader.outage.0.until_s=1.0", "is not after from_s"),
         ("noisy-pair", "leader.noise_rad_s=[0.0, 0.0, 0.0]", "weighs noise"),

@@ -15,10 +15,9 @@ use toml::{Table, Value};
 const MAX_BYTES: u64 = 1 << 20;
 /// The most steps in the key of an override. No key lies so deep.
 const MAX_STEPS: usize = 16;
-/// Every number is zero or between these in magnitude, so that neither squares nor their ratios leave the floating point's
-/// range.
+/// Every quantity is zero or between these in magnitude, so that no product of a few leaves the floating point's range.
 const SMALLEST: f64 = 1e-30;
-const LARGEST: f64 = 1e18;
+const LARGEST: f64 = 1e30;
 
 /// A parsed scenario text: the table, and the place of every key for error messages.
 #[derive(Debug, Clone)]
@@ -228,6 +227,7 @@ fn plain(message: &str) -> String {
         "unit variant" => "another kind of value",
         other => other,
     };
+    let numbers = wanted.strip_prefix("an array of length ").map(|length| format!("a list of {length} numbers"));
     let wanted = match wanted {
         "f64" => "a number",
         "i32" => "a whole number",
@@ -236,11 +236,10 @@ fn plain(message: &str) -> String {
         "a string" | "string only" => "a text in quotes",
         "a sequence" if given == "a table" => "a list of tables, each under its name in double brackets",
         "a sequence" => "a list",
-        "an array of length 3" => "a list of 3 numbers",
         "fewer elements in array" => "fewer values",
         "any valid TOML value" => "a smaller number",
         table if table == "a map" || table.starts_with("struct ") => "a table",
-        other => other,
+        other => numbers.as_deref().unwrap_or(other),
     };
     match kind {
         Some("invalid length ") => format!("got {given} values; give {wanted}"),
@@ -339,13 +338,10 @@ fn descend<'a>(place: &'a mut Value, step: &str, path: &mut String) -> Result<&'
 }
 
 fn absurd(value: &Value, path: String) -> Option<(String, f64)> {
-    let number = |number: f64| {
-        let fits = number == 0.0 || (SMALLEST..=LARGEST).contains(&number.abs());
-        (!fits).then_some(number)
-    };
+    let plausible = |number: f64| number == 0.0 || (SMALLEST..=LARGEST).contains(&number.abs());
     match value {
-        Value::Float(value) => Some((path, number(*value)?)),
-        Value::Integer(value) => Some((path, number(*value as f64)?)),
+        // Whole numbers are small enough as they are: a seed may be any.
+        Value::Float(number) if !plausible(*number) => Some((path, *number)),
         Value::Array(array) => {
             array.iter().enumerate().find_map(|(index, value)| absurd(value, format!("{path}[{index}]")))
         }

@@ -86,8 +86,8 @@ impl Scenario {
         let mut checks = Checks::new(&document);
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
-        // Of a tick that is refused nothing more is said: one of no length reaches no limit of the rig.
-        let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 0.0 };
+        // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
+        let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let accept = resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
         let rig = checks.finish(rig)?;

@@ -220,7 +220,7 @@ impl MetricScore {
 impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     fn poll(&mut self, budget: u64) -> Result<u64, BusError> {
         let before = self.next_tick;
-        while self.next_tick <= self.last_tick && self.next_tick < before + budget && self.settled()? {
+        while self.next_tick <= self.last_tick && self.next_tick < before.saturating_add(budget) && self.settled()? {
             self.score_tick();
         }
         Ok(self.next_tick - before)

@@ -26,8 +26,8 @@ const WARM_UP_PAUSE_NS: u64 = 100_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
 const BASELINE_PERIOD_NS: u64 = 1_000_000;
-/// How long a role that is done waits for the launcher's leave, ns.
-const LEAVE_NS: u64 = 10_000_000_000;
+/// How long a role that is done waits for the launcher's leave, ns: longer than any machine keeps a launcher waiting.
+const LEAVE_NS: u64 = 120_000_000_000;
 
 /// Which role to take, where.
 #[derive(Debug, Clone)]

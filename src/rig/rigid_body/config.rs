@@ -89,6 +89,8 @@ pub(super) struct RawObserver {
     pub observability_floor_rad_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub identifier_decay: Option<IdentifierDecay>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub identifier_bandwidth: Option<[f64; 3]>,
     #[serde(default)]
     pub initial_coefficients: [f64; 3],
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -97,7 +99,10 @@ pub(super) struct RawObserver {
 
 /// How fast the identifier's error decays, per unit of excitation: rates per component, or minus a matrix.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "expected three decay rates, or a 3 by 3 Hurwitz matrix, as [5.0, 5.0, 5.0]")]
+#[serde(
+    untagged,
+    expecting = "there is no such choice; give three decay rates, as [5.0, 5.0, 5.0], or a 3 by 3 Hurwitz matrix"
+)]
 pub(super) enum IdentifierDecay {
     /// One positive rate per component.
     Rates([f64; 3]),
@@ -155,8 +160,9 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
 fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     finite_positive(checks, "observer.observability_floor_rad_s", observer.observability_floor_rad_s);
     let (learns, symmetric) = (observer.kind != Kind::HiddenRate, observer.kind == Kind::AxisymmetricInertia);
+    let identifier = observer.identifier_decay.is_some() || observer.identifier_bandwidth.is_some();
     for (key, given, needed) in [
-        ("observer.identifier_decay", observer.identifier_decay.is_some(), learns),
+        ("observer.identifier_decay", identifier, learns),
         ("observer.symmetry_axis", observer.symmetry_axis.is_some(), symmetric),
     ] {
         match (given, needed) {
@@ -167,6 +173,12 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     }
     if let Some(IdentifierDecay::Rates(rates)) = &observer.identifier_decay {
         rates.iter().for_each(|rate| finite_positive(checks, "observer.identifier_decay", *rate));
+    }
+    if let Some(bandwidth) = &observer.identifier_bandwidth {
+        bandwidth.iter().for_each(|value| finite_positive(checks, "observer.identifier_bandwidth", *value));
+        checks.require(observer.identifier_decay.is_none(), "observer.identifier_bandwidth", || {
+            "is of second order, and observer.identifier_decay of first; give one of them".to_owned()
+        });
     }
 }
 
@@ -206,5 +218,7 @@ pub(super) fn hidden_axis(raw: &Raw, checks: &mut Checks<'_>) -> Option<usize> {
         checks.refuse("leader.measured_axes", format!("{measured:?} {remedy}"));
         return None;
     }
-    hidden.first().or(raw.leader.outage.first().map(|outage| &outage.axis)).copied()
+    let supplied = hidden.first().or(raw.leader.outage.first().map(|outage| &outage.axis));
+    // An outage of an axis that no body has is refused elsewhere.
+    supplied.copied().filter(|axis| (1..=3).contains(axis))
 }

@@ -1,8 +1,8 @@
 //! What learns the coefficients a of \[D\](2) from a body's motion: all three, or the one of an axisymmetric body.
 
-use crate::observe::{Axisymmetric, Identification, InertiaRelation, InvariantFilter, RateSample};
+use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
-use nalgebra::{Vector1, Vector3};
+use nalgebra::{SVector, Vector3};
 
 /// An identifier with its estimate.
 #[derive(Debug, Clone)]
@@ -16,20 +16,19 @@ pub(super) struct Identifier {
 
 #[derive(Debug, Clone)]
 enum Kind {
-    Asymmetric { relation: InertiaRelation, filter: InvariantFilter<3> },
-    Axisymmetric { relation: Axisymmetric, filter: InvariantFilter<1>, axis: usize },
+    Asymmetric { relation: InertiaRelation, filter: Filter<3> },
+    Axisymmetric { relation: Axisymmetric, filter: Filter<1>, axis: usize },
 }
 
 impl Identifier {
     /// For any body; `filter` is at the initial guess.
-    pub fn asymmetric(relation: InertiaRelation, filter: InvariantFilter<3>, slowest_decay: f64) -> Self {
+    pub fn asymmetric(relation: InertiaRelation, filter: Filter<3>, slowest_decay: f64) -> Self {
         Self { kind: Kind::Asymmetric { relation, filter }, slowest_decay, excitation: 0.0 }
     }
 
-    /// For a body with the symmetry axis `axis`, 1 to 3, a decay rate per rad, and a guess of a.
-    pub fn axisymmetric(relation: Axisymmetric, axis: usize, decay: f64, guess: f64) -> Self {
-        let filter = InvariantFilter::new(Vector1::new(decay), Vector1::new(guess));
-        Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay: decay, excitation: 0.0 }
+    /// For a body with the symmetry axis `axis`, 1 to 3; `filter` is at the initial guess of a.
+    pub fn axisymmetric(relation: Axisymmetric, axis: usize, filter: Filter<1>, slowest_decay: f64) -> Self {
+        Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay, excitation: 0.0 }
     }
 
     /// Learns from one step; returns the status bits of what stood against it.
@@ -68,14 +67,17 @@ impl Identifier {
     }
 }
 
-fn take<const N: usize>(seen: Identification<N>, filter: &mut InvariantFilter<N>, excitation: &mut f64) -> u64 {
+fn take<const N: usize>(seen: Identification<N>, filter: &mut Filter<N>, excitation: &mut f64) -> u64 {
     *excitation += seen.excitation();
-    match seen {
+    let blind = match seen {
         Identification::Excited(increment) => {
             filter.step(&increment);
-            0
+            return 0;
         }
         Identification::Unexcited => status::NOT_EXCITED,
         Identification::Ambiguous => status::UNOBSERVABLE,
-    }
+    };
+    // Nothing drifts; but a filter of second order must not take up the potential where it left it.
+    filter.predict(&SVector::zeros(), 0.0);
+    blind
 }

@@ -19,7 +19,7 @@ use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, 
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
-use crate::observe::{Axisymmetric, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
+use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
 use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
 use config::{Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
 use identifier::Identifier;
@@ -89,7 +89,7 @@ pub(super) fn resolve(
         inertia,
         initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
         inertia_factors: vec![Vector3::repeat(1.0)],
-        measured: raw.leader.measured_axes.iter().fold(0, |bits, axis| bits | 1 << (axis - 1)),
+        measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
         outages,
         supplied_axis,
         observer,
@@ -135,9 +135,11 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
         checks.require(known, &key("axis"), || {
             format!("axis {} has no gyro to fail; name one of leader.measured_axes", outage.axis)
         });
-        checks.require(outage.from_s >= 0.0, &key("from_s"), || format!("{} is before the start", outage.from_s));
+        checks.require(outage.from_s >= 0.0, &key("from_s"), || {
+            format!("{} is before the start; give 0 or more", outage.from_s)
+        });
         let until_s = outage.until_s.unwrap_or(f64::INFINITY);
-        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s"));
+        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s; raise it"));
         let tick = |time_s: f64| (time_s / tick_s).round() as u64;
         if known {
             outages.push(Outage {
@@ -159,7 +161,7 @@ fn design_observer(
 ) -> Option<ObserverDesign> {
     let (observer, coefficients) = (&raw.observer, inertia.coefficients());
     let floor_rad_s = observer.observability_floor_rad_s;
-    if let Some(axis) = supplied_axis.filter(|axis| (1..=3).contains(axis)) {
+    if let Some(axis) = supplied_axis {
         // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
         checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
     }
@@ -205,38 +207,58 @@ fn design_identifier(
 ) -> Option<Identifier> {
     let floor_rad_s = observer.observability_floor_rad_s;
     let guess = observer.initial_coefficients;
-    let decay = observer.identifier_decay.as_ref()?;
     if observer.kind == Kind::AxisymmetricInertia {
         let axis = observer.symmetry_axis?;
+        check_symmetry(leader, inertia, axis, floor_rad_s, checks);
         let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
-        let spin_rad_s = leader.initial_rate_rad_s[axis - 1];
-        checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
-            format!(
-                "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
-                 nothing of its inertia; give component {axis} a rate"
-            )
-        });
-        let moments = inertia.moments_kg_m2();
-        checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
-            format!(
-                "the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body"
-            )
-        });
-        let IdentifierDecay::Rates(rates) = decay else {
-            checks.refuse("observer.identifier_decay", "is a matrix, but there is one unknown; give three equal rates");
-            return None;
+        let design = match (&observer.identifier_decay, observer.identifier_bandwidth) {
+            (Some(IdentifierDecay::Rates(rates)), _) => FilterDesign::First([rates[0]]),
+            (_, Some(bandwidth)) => FilterDesign::Second([bandwidth[0]]),
+            _ => {
+                let key = "observer.identifier_decay";
+                checks.refuse(key, "is a matrix, but there is one unknown; give three equal rates");
+                return None;
+            }
         };
-        return Some(Identifier::axisymmetric(relation, axis, rates[0], guess[axis % 3]));
+        let [slowest] = design.decay_rates()?;
+        let filter = design.filter(Vector1::new(guess[axis % 3]));
+        return Some(Identifier::axisymmetric(relation, axis, filter, slowest));
     }
-    let matrix = match decay {
-        IdentifierDecay::Rates(rates) => Matrix3::from_diagonal(&-Vector3::from(*rates)),
-        IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
+    let (filter, slowest) = match (&observer.identifier_decay, observer.identifier_bandwidth) {
+        (Some(decay), _) => {
+            let matrix = match decay {
+                IdentifierDecay::Rates(rates) => Matrix3::from_diagonal(&-Vector3::from(*rates)),
+                IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
+            };
+            let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
+            notes.push(format!("observer.identifier_decay: eigenvalues {}", matrix.eigenvalues()));
+            (Filter::First(InvariantFilter::with_matrix(matrix, guess.into())), -matrix.abscissa())
+        }
+        (None, bandwidth) => {
+            let design = FilterDesign::Second(bandwidth?);
+            let slowest = design.decay_rates()?.into_iter().fold(f64::INFINITY, f64::min);
+            (design.filter(guess.into()), slowest)
+        }
     };
-    let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
-    notes.push(format!("observer.identifier_decay: eigenvalues {}", matrix.eigenvalues()));
-    let slowest = -matrix.abscissa();
     let relation = InertiaRelation::new(floor_rad_s * floor_rad_s * floor_rad_s);
-    Some(Identifier::asymmetric(relation, InvariantFilter::with_matrix(matrix, guess.into()), slowest))
+    Some(Identifier::asymmetric(relation, filter, slowest))
+}
+
+/// A body that is said to be axisymmetric is, and spins.
+fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_s: f64, checks: &mut Checks<'_>) {
+    if !(1..=3).contains(&axis) {
+        return;
+    }
+    let (spin_rad_s, moments) = (leader.initial_rate_rad_s[axis - 1], inertia.moments_kg_m2());
+    checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
+        format!(
+            "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
+             nothing of its inertia; give component {axis} a rate"
+        )
+    });
+    checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
+        format!("the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body")
+    });
 }
 
 impl RigidBodyRig {
