@@ -38,6 +38,9 @@ fn step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("estimate-and-control step");
     for (name, text) in SHIPPED {
         let scenario = scenario(text, &[]);
+        if !scenario.rig.bodies().iter().any(|body| body.driven) {
+            continue;
+        }
         group.throughput(Throughput::Elements(1000));
         group.bench_function(name, |bencher| with_rig!(&scenario.rig, rig => step_of(rig, &scenario, bencher)));
     }

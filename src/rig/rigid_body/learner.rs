@@ -5,7 +5,7 @@
 //! when it goes too early.
 
 use super::identifier::Identifier;
-use super::observer::{ALL, HiddenObserver, filter, seen, write_body};
+use super::observer::{ALL, HiddenObserver, Knowledge, filter, seen};
 use crate::observe::{HiddenRate, RateSample};
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use nalgebra::Vector3;
@@ -142,7 +142,7 @@ impl Learner {
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
         let a = self.identifier.coefficients();
         let supplier = self.supplier.as_ref();
-        write_body(&self.rate(), &a, out);
+        Knowledge::new(a).write(&self.rate(), out);
         out.innovation_rad_s = supplier.and_then(|s| s.observer.as_ref()).map_or(0.0, HiddenObserver::innovation);
         out.excitation = self.identifier.excitation();
         out.status = self.status | status;

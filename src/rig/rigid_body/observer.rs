@@ -71,7 +71,7 @@ pub(super) fn seen(measurement: &RateMeasurement) -> RateSample {
 #[derive(Debug, Clone)]
 pub struct HiddenObserver {
     relation: HiddenRate,
-    coefficients: Vector3<f64>,
+    body: Knowledge,
     guess: Filter<1>,
     filter: Filter<1>,
     hidden: usize,
@@ -84,7 +84,16 @@ impl HiddenObserver {
     /// An observer of component `hidden` (0 to 2) of a body with the given coefficients, which starts at `guess`.
     pub(super) fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>, hidden: usize) -> Self {
         let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
-        Self { relation, coefficients, guess, filter: guess, hidden, last, innovation: 0.0, status: status::INITIAL }
+        Self {
+            relation,
+            body: Knowledge::new(coefficients),
+            guess,
+            filter: guess,
+            hidden,
+            last,
+            innovation: 0.0,
+            status: status::INITIAL,
+        }
     }
 
     fn needed(&self) -> u64 {
@@ -135,7 +144,7 @@ impl HiddenObserver {
     }
 
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
-        write_body(&self.rate(), &self.coefficients, out);
+        self.body.write(&self.rate(), out);
         out.innovation_rad_s = self.innovation;
         out.excitation = 0.0;
         out.status = self.status | status;
@@ -143,12 +152,29 @@ impl HiddenObserver {
     }
 }
 
-/// Writes the motion, and what the coefficients that it was found with say of the body.
-pub(super) fn write_body(rate: &Vector3<f64>, coefficients: &Vector3<f64>, out: &mut RateEstimate) {
-    out.omega_rad_s = (*rate).into();
-    out.coefficients = (*coefficients).into();
-    out.closure = coefficients.sum() + coefficients.product();
-    out.inertia_ratios = InertiaRatios::new(coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
+/// What coefficients say of a body. Where they are known it is computed once.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Knowledge {
+    coefficients: Vector3<f64>,
+    closure: f64,
+    inertia_ratios: [f64; 2],
+}
+
+impl Knowledge {
+    /// What these coefficients say.
+    pub fn new(coefficients: Vector3<f64>) -> Self {
+        let closure = coefficients.sum() + coefficients.product();
+        let ratios = InertiaRatios::new(&coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
+        Self { coefficients, closure, inertia_ratios: ratios }
+    }
+
+    /// Writes it beside a motion.
+    pub fn write(&self, rate: &Vector3<f64>, out: &mut RateEstimate) {
+        out.omega_rad_s = (*rate).into();
+        out.coefficients = self.coefficients.into();
+        out.closure = self.closure;
+        out.inertia_ratios = self.inertia_ratios;
+    }
 }
 
 /// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
@@ -159,7 +185,7 @@ pub(super) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> Filter<1> {
 /// Supplies one component from the other two, all of them filtered: the noise of the sensors is known.
 #[derive(Debug)]
 pub struct KalmanObserver {
-    coefficients: Vector3<f64>,
+    body: Knowledge,
     noise: RateNoise,
     hidden: usize,
     floor_rad_s: f64,
@@ -180,7 +206,8 @@ impl KalmanObserver {
         guess_rad_s: f64,
     ) -> Self {
         let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
-        Self { coefficients, noise, hidden, floor_rad_s, guess_rad_s, filter: None, last, status: status::INITIAL }
+        let body = Knowledge::new(coefficients);
+        Self { body, noise, hidden, floor_rad_s, guess_rad_s, filter: None, last, status: status::INITIAL }
     }
 
     fn needed(&self) -> u64 {
@@ -193,7 +220,8 @@ impl KalmanObserver {
         let (axis, first) = (self.hidden + 1, &self.last);
         // That the component can be observed was checked when the scenario was resolved.
         self.filter =
-            GuardedKalman::new(&self.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s).ok();
+            GuardedKalman::new(&self.body.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s)
+                .ok();
     }
 
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
@@ -207,7 +235,7 @@ impl KalmanObserver {
 
     fn write(&self, status: u64, out: &mut RateEstimate) {
         let rate = self.filter.as_ref().map_or(self.last.rate_rad_s, |filter| *filter.estimate());
-        write_body(&rate, &self.coefficients, out);
+        self.body.write(&rate, out);
         out.innovation_rad_s = 0.0;
         out.excitation = 0.0;
         out.status = self.status | status;
