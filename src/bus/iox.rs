@@ -33,6 +33,7 @@ struct Wire<S>(S);
 // SAFETY: `S` is `Pod`: plain bytes of a fixed layout without pointers, valid in every process, and `Wire` is transparent.
 #[allow(unsafe_code)]
 unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
+    // SAFETY: unsafe by the trait's declaration only; a constant asks nothing of its caller.
     unsafe fn type_name() -> &'static str {
         S::TYPE_NAME
     }
