@@ -183,10 +183,10 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);
         }
-        if !self.within() {
-            if let Some((_, last)) = self.incidents.iter_mut().rfind(|(from, _)| *from <= tick) {
-                *last = tick;
-            }
+        if !self.within()
+            && let Some((_, last)) = self.incidents.iter_mut().rfind(|(from, _)| *from <= tick)
+        {
+            *last = tick;
         }
         let generations = self.generations();
         let continued = generations == self.generations;

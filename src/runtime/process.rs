@@ -3,6 +3,7 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::drive::{Control, Drive, Ended};
+use super::hooks::{self, Place};
 use super::node::{self, ReadyNode, RoleId, ledger_words, report, topic};
 use super::{depths, privileges};
 use crate::bus::domain::{Domain, DomainError};
@@ -103,6 +104,8 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     let realtime = scenario.clock == ClockKind::Realtime;
     let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
     let ledger = open_ledger(&domain, &scenario, role)?;
+    hooks::enter(&seat.role, ledger.generation() + 1);
+    hooks::at(Place::Opening);
     let bus = IoxBus::enter(&domain, &seat.role, depths(&scenario))?;
     serve(&scenario, role, &bus, &ledger, terminated, grants, |report| write_report(&domain, report))
 }
@@ -192,6 +195,7 @@ fn begin<B: Bus>(
     if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) && control.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
+    hooks::at(Place::Ready);
     await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
 }
 
