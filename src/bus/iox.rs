@@ -24,7 +24,18 @@ const MAX_READERS: usize = 8;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
+/// An upper bound on the size of a sample with the transport's header, bytes.
+const CHUNK_BYTES: usize = 256;
+/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
+const SIGNAL_BYTES: usize = 64 << 10;
+
 type Ipc = ipc::Service;
+
+/// An upper bound on the shared memory that one signal takes, bytes.
+pub fn footprint(depths: Depths, signal: Signal) -> usize {
+    let chunks = MAX_READERS * (depths.deepest(signal) + MAX_BORROWED) + depths.history + 2;
+    chunks * CHUNK_BYTES + SIGNAL_BYTES
+}
 
 /// A sample as iceoryx2 sees it.
 #[repr(transparent)]
@@ -71,7 +82,7 @@ impl IoxBus {
             .max_subscribers(readers)
             .max_nodes(MAX_NODES)
             .history_size(self.history(topic.signal))
-            .subscriber_max_buffer_size(self.deepest(topic.signal))
+            .subscriber_max_buffer_size(self.depths.deepest(topic.signal))
             .subscriber_max_borrowed_samples(MAX_BORROWED)
             .enable_safe_overflow(true)
             .open_or_create()
@@ -89,15 +100,6 @@ impl IoxBus {
         match signal {
             Signal::Health | Signal::Schedule => 0,
             Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => self.depths.history,
-        }
-    }
-
-    /// Only what is scored needs room for the scorer.
-    fn deepest(&self, signal: Signal) -> usize {
-        match signal {
-            Signal::Truth | Signal::Estimate | Signal::Command => self.depths.scorer.max(self.depths.role),
-            Signal::Measurement => self.depths.role,
-            Signal::Health | Signal::Schedule => 1,
         }
     }
 }
@@ -136,7 +138,7 @@ impl Bus for IoxBus {
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
-        let depth = self.depths.of(reader).min(self.deepest(topic.signal));
+        let depth = self.depths.of(reader).min(self.depths.deepest(topic.signal));
         let subscriber =
             self.service::<S>(topic, "reader")?.subscriber_builder().buffer_size(depth).create().map_err(|error| {
                 BusError::Open { service: topic.to_string(), end: "reader", reason: format!("{error:?}") }
@@ -231,7 +233,7 @@ mod tests {
 
     #[test]
     fn a_deep_reader_gets_every_sample_and_a_shallow_one_the_newest() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
@@ -253,7 +255,7 @@ mod tests {
 
     #[test]
     fn refuses_a_second_writer_and_another_type() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let _writer = bus.writer::<RateTruth>(&topic()).unwrap();
         assert!(matches!(bus.writer::<RateTruth>(&topic()), Err(BusError::Open { .. })));
@@ -263,7 +265,7 @@ mod tests {
 
     #[test]
     fn two_domains_never_meet() {
-        let (one, other) = (OwnedDomain::create().unwrap(), OwnedDomain::create().unwrap());
+        let (one, other) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
         let mut writer = bus(&one).writer::<RateTruth>(&topic()).unwrap();
         let mut reader = bus(&other).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         reader.advance().unwrap();
