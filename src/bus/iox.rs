@@ -23,7 +23,58 @@ const MAX_READERS: usize = 8;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
+/// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
+pub const VERSION: &str = "0.10.0";
+
 type Ipc = ipc::Service;
+
+/// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Qos {
+    /// One writer per signal.
+    pub max_publishers: usize,
+    /// The most readers.
+    pub max_subscribers: usize,
+    /// The most processes.
+    pub max_nodes: usize,
+    /// Samples for readers that come later.
+    pub history_size: usize,
+    /// The most samples that may wait for one reader.
+    pub subscriber_max_buffer_size: usize,
+    /// The most samples that one reader may hold.
+    pub subscriber_max_borrowed_samples: usize,
+    /// Whether the oldest waiting sample gives way to a new one.
+    pub enable_safe_overflow: bool,
+}
+
+impl Qos {
+    /// That of a signal on links of these depths.
+    pub fn of(signal: Signal, depths: Depths) -> Self {
+        Self {
+            max_publishers: 1,
+            max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
+            max_nodes: MAX_NODES,
+            history_size: 0,
+            subscriber_max_buffer_size: deepest(signal, depths),
+            subscriber_max_borrowed_samples: MAX_BORROWED,
+            enable_safe_overflow: true,
+        }
+    }
+}
+
+/// How many samples of a signal may wait for a reader.
+pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
+    depths.of(reader).min(deepest(signal, depths))
+}
+
+/// Only what is scored needs room for the scorer.
+fn deepest(signal: Signal, depths: Depths) -> usize {
+    match signal {
+        Signal::Truth | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
+        Signal::Measurement => depths.role,
+        Signal::Health | Signal::Schedule => 1,
+    }
+}
 
 /// A sample as iceoryx2 sees it.
 #[repr(transparent)]
@@ -59,40 +110,37 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        let readers = if topic.signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS };
+        let qos = Qos::of(topic.signal, self.depths);
         let name = topic.to_string();
         let open = |reason: String| BusError::Open { service: topic.to_string(), end, reason };
         let name: ServiceName = name.as_str().try_into().map_err(|error| open(format!("{error:?}")))?;
         self.node
             .service_builder(&name)
             .publish_subscribe::<Wire<S>>()
-            .max_publishers(1)
-            .max_subscribers(readers)
-            .max_nodes(MAX_NODES)
-            .history_size(0)
-            .subscriber_max_buffer_size(self.deepest(topic.signal))
-            .subscriber_max_borrowed_samples(MAX_BORROWED)
-            .enable_safe_overflow(true)
+            .max_publishers(qos.max_publishers)
+            .max_subscribers(qos.max_subscribers)
+            .max_nodes(qos.max_nodes)
+            .history_size(qos.history_size)
+            .subscriber_max_buffer_size(qos.subscriber_max_buffer_size)
+            .subscriber_max_borrowed_samples(qos.subscriber_max_borrowed_samples)
+            .enable_safe_overflow(qos.enable_safe_overflow)
             .open_or_create()
             .map_err(|error| open(format!("{error:?}")))
     }
-
-    /// Only what is scored needs room for the scorer.
-    fn deepest(&self, signal: Signal) -> usize {
-        match signal {
-            Signal::Truth | Signal::Estimate | Signal::Command => self.depths.scorer.max(self.depths.role),
-            Signal::Measurement => self.depths.role,
-            Signal::Health | Signal::Schedule => 1,
-        }
-    }
 }
 
-fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+/// The transport's configuration by which a process enters a domain.
+fn config(domain: &Domain) -> Result<Config, String> {
     let mut config = Config::default();
     let root = domain.root().to_string_lossy();
     let root = Path::new(root.as_bytes()).map_err(|error| format!("{error:?}"))?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|error| format!("{error:?}"))?;
+    Ok(config)
+}
+
+fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+    let config = config(domain)?;
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
         .config(&config)
@@ -121,7 +169,7 @@ impl Bus for IoxBus {
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
-        let depth = self.depths.of(reader).min(self.deepest(topic.signal));
+        let depth = buffer_size(topic.signal, reader, self.depths);
         let subscriber =
             self.service::<S>(topic, "reader")?.subscriber_builder().buffer_size(depth).create().map_err(|error| {
                 BusError::Open { service: topic.to_string(), end: "reader", reason: format!("{error:?}") }
@@ -240,6 +288,20 @@ mod tests {
         assert!(matches!(bus.writer::<RateTruth>(&topic()), Err(BusError::Open { .. })));
         let error = bus.reader::<RateCommand>(&topic(), Reader::Role).err().unwrap();
         assert!(error.to_string().contains("IncompatibleTypes"), "{error}");
+    }
+
+    /// A foreign program is told this version: it must be the one that is linked.
+    #[test]
+    fn the_version_is_the_transport_s_own() {
+        let domain = OwnedDomain::create().unwrap();
+        let _reader = bus(&domain).reader::<RateTruth>(&topic(), Reader::Role).unwrap();
+        let mut versions = Vec::new();
+        Ipc::list(&config(domain.domain()).unwrap(), |service| {
+            versions.push(service.static_details.iceoryx2_version().to_string());
+            CallbackProgression::Continue
+        })
+        .unwrap();
+        assert_eq!(versions, [VERSION]);
     }
 
     #[test]

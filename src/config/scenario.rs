@@ -38,6 +38,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// Roles that somebody else starts: hardware, or a foreign program.
+    pub external: Vec<String>,
     /// What the run is judged by.
     pub accept: Accept,
     /// Bodies, observer and laws.
@@ -90,6 +92,7 @@ impl Scenario {
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let accept = resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
@@ -102,6 +105,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            external: raw.launch.external,
             accept,
             rig,
             resolved,
@@ -201,6 +205,23 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
         format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
     });
+}
+
+/// Without a rig, its roles are not known and nothing is said of them.
+fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) {
+    let external = &raw.launch.external;
+    checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", || {
+        "one process has no room for another's role; give clock = \"realtime\" or \"lockstep\", or leave it empty"
+            .to_owned()
+    });
+    let Some(roles) = roles else { return };
+    for (index, role) in external.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
+        let known = roles.join(", ");
+        checks.refuse(
+            &format!("launch.external[{index}]"),
+            format!("there is no role `{role}`; this scenario has: {known}"),
+        );
+    }
 }
 
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {

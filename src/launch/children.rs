@@ -34,13 +34,8 @@ impl RoleProcess {
     /// Starts a role of a scenario in a domain.
     pub fn start(program: &Path, scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
         let name = role.name(scenario).to_owned();
-        let kind = match role {
-            RoleId::Plant(_) => "plant",
-            RoleId::Observer => "observer",
-            RoleId::Controller => "controller",
-        };
         let mut command = Command::new(program);
-        command.arg(kind).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
+        command.arg(role.kind()).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
         if let RoleId::Plant(_) = role {
             command.arg("--body").arg(&name);
         }

@@ -36,8 +36,8 @@ pub struct Outcome {
 #[derive(Debug, Serialize)]
 pub struct Summary {
     schema: &'static str,
-    version: &'static str,
-    revision: &'static str,
+    pub(super) version: &'static str,
+    pub(super) revision: &'static str,
     /// The scenario's name.
     pub scenario: String,
     /// The clock's name.
@@ -46,7 +46,7 @@ pub struct Summary {
     pub tick_hz: f64,
     /// The last tick of the scenario.
     pub last_tick: u64,
-    started_utc: String,
+    pub(super) started_utc: String,
     host: Host,
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.

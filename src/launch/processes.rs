@@ -5,12 +5,15 @@
 use super::children::{Janitor, RoleProcess, await_end};
 use super::score::{self, Scorer};
 use super::{Launch, LaunchError, Outcome, Progress};
-use crate::bus::domain::OwnedDomain;
+use crate::bus::domain::{Domain, OwnedDomain};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
-use crate::runtime::{Backoff, RoleId, depths, hold_low_latency_idle, report_path, scenario_path, topic, write_whole};
+use crate::runtime::{
+    Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report_path, scenario_path, seat_path, topic,
+    write_whole,
+};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::{Grant, RoleReport};
 use std::sync::atomic::Ordering;
@@ -32,6 +35,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let owned = OwnedDomain::create()?;
     let path = scenario_path(owned.domain());
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    describe_seats(scenario, launch, owned.domain())?;
     // Declared before the roles, so that it is dropped, and cleans up, after them.
     let _janitor = Janitor::start(&launch.program)?;
     let (_low_latency, grants) = match scenario.clock {
@@ -44,6 +48,21 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;
     let reports = crew.dismiss()?;
     Ok(Outcome { reports, score: scorer.finish()?, grants, domain: Some(owned.domain().root().to_owned()), signal })
+}
+
+fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
+    launch.external.iter().chain(&scenario.external).any(|external| external == role)
+}
+
+/// Leaves the seat of every external role in the domain, for the program that is to take it.
+fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
+    let roles = RoleId::all(scenario).into_iter();
+    for role in roles.filter(|role| is_external(scenario, launch, role.name(scenario))) {
+        let path = seat_path(domain.root(), role.name(scenario));
+        let seat = describe_seat(scenario, role, Some(domain)).to_json();
+        write_whole(&path, seat.as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    }
+    Ok(())
 }
 
 /// One role, seen from the launcher.
@@ -81,7 +100,7 @@ impl<'a> Crew<'a> {
         let (mut members, mut processes) = (Vec::new(), Vec::new());
         for role in RoleId::all(scenario) {
             let name = role.name(scenario).to_owned();
-            let external = launch.external.contains(&name);
+            let external = is_external(scenario, launch, &name);
             if !external {
                 processes.push(RoleProcess::start(&launch.program, scenario, role, owned.domain())?);
             }

@@ -8,12 +8,15 @@ mod link;
 mod node;
 mod privileges;
 mod process;
+mod seat;
 
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Input, Output, Seek};
-pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, topic};
+pub use node::{Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, build, ports, topic};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
+pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
+
 pub(crate) use process::{report_path, scenario_path, write_whole};
 
 use crate::bus::Depths;

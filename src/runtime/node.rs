@@ -5,6 +5,9 @@
 mod controller;
 mod observer;
 mod plant;
+mod ports;
+
+pub use ports::{Port, Ports, ports};
 
 use super::link::{Input, Output};
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
@@ -37,6 +40,20 @@ impl RoleId {
     pub fn name(self, scenario: &Scenario) -> &str {
         match self {
             Self::Plant(index) => &scenario.rig.bodies()[index].name,
+            Self::Observer => "observer",
+            Self::Controller => "controller",
+        }
+    }
+
+    /// The role of this name, if the scenario has one.
+    pub fn named(scenario: &Scenario, name: &str) -> Option<Self> {
+        Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
+    }
+
+    /// What kind of role it is, as the command line calls it.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Plant(_) => "plant",
             Self::Observer => "observer",
             Self::Controller => "controller",
         }
@@ -194,4 +211,19 @@ pub fn build<R: Rig, B: Bus + 'static>(
         RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
         RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+
+    #[test]
+    fn every_role_of_a_scenario_has_the_name_that_the_rig_gives_it() {
+        for (name, text) in SHIPPED {
+            let scenario = Scenario::parse(text, name, &[]).unwrap();
+            let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
+            assert_eq!(names, scenario.rig.roles(), "{name}");
+        }
+    }
 }

@@ -1,0 +1,110 @@
+//! Which signals a role writes and reads, with the layout of each: the one list for whoever is not a node of ours.
+//!
+//! In the order in which the nodes open them. Must not open anything.
+
+use super::{RoleId, topic};
+use crate::bus::{Signal, Topic};
+use crate::config::Scenario;
+use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
+use crate::sample::{Field, Health, Sample, Schedule};
+use crate::with_rig;
+
+/// One signal as it travels: where, and what its bytes mean.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Port {
+    /// The signal and its service.
+    pub topic: Topic,
+    /// Name and version of the layout.
+    pub type_name: &'static str,
+    /// The length of a sample, bytes.
+    pub size: usize,
+    /// The fields after the stamp, in order.
+    pub fields: &'static [Field],
+}
+
+/// The signals of a role.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Ports {
+    /// What it writes for the loop.
+    pub writes: Vec<Port>,
+    /// What it reads of the loop.
+    pub reads: Vec<Port>,
+    /// Its word to the launcher.
+    pub health: Port,
+    /// The launcher's word to it.
+    pub schedule: Port,
+}
+
+/// The signals of a role of a scenario.
+pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
+    let (writes, reads) = with_rig!(&scenario.rig, rig => of_the_loop(rig, scenario, role));
+    let health = port::<Health>(scenario, role.name(scenario), Signal::Health);
+    Ports { writes, reads, health, schedule: port::<Schedule>(scenario, "run", Signal::Schedule) }
+}
+
+fn of_the_loop<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
+    let bodies = rig.bodies();
+    let observed = &bodies[0].name;
+    let measurement = |body: &str| port::<Measurement<R>>(scenario, body, Signal::Measurement);
+    let command = |body: &str| port::<Command<R>>(scenario, body, Signal::Command);
+    let estimate = || port::<Estimate<R>>(scenario, observed, Signal::Estimate);
+    match role {
+        RoleId::Plant(index) => {
+            let body = &bodies[index];
+            let truth = port::<Truth<R>>(scenario, &body.name, Signal::Truth);
+            let reads = body.driven.then(|| command(&body.name)).into_iter().collect();
+            (vec![measurement(&body.name), truth], reads)
+        }
+        RoleId::Observer => (vec![estimate()], vec![measurement(observed)]),
+        RoleId::Controller => {
+            let driven = bodies.iter().filter(|body| body.driven);
+            let reads = [estimate()].into_iter().chain(driven.clone().map(|body| measurement(&body.name)));
+            (driven.map(|body| command(&body.name)).collect(), reads.collect())
+        }
+    }
+}
+
+fn port<S: Sample>(scenario: &Scenario, body: &str, signal: Signal) -> Port {
+    Port { topic: topic(scenario, body, signal), type_name: S::TYPE_NAME, size: size_of::<S>(), fields: S::FIELDS }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::memory::MemoryBus;
+    use crate::config::SHIPPED;
+    use crate::runtime::{build, depths};
+
+    /// The list is the nodes' own: their books name every signal that they opened, in order.
+    #[test]
+    fn the_list_is_what_the_nodes_open() {
+        for (name, text) in SHIPPED {
+            let scenario = Scenario::parse(text, name, &[]).unwrap();
+            let bus = MemoryBus::new(depths(&scenario));
+            for role in RoleId::all(&scenario) {
+                let node = with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, 1)).unwrap();
+                let ports = ports(&scenario, role);
+                let services = |ports: &[Port]| ports.iter().map(|port| port.topic.to_string()).collect::<Vec<_>>();
+                let written: Vec<String> = node.written().into_iter().map(|link| link.service).collect();
+                let read: Vec<String> = node.read().into_iter().map(|link| link.service).collect();
+                assert_eq!((services(&ports.writes), services(&ports.reads)), (written, read), "{name} {role:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_is_the_nodes_and_the_layout_the_samples() {
+        let scenario = Scenario::parse(SHIPPED[2].1, "rigid-trio", &[]).unwrap();
+        let signals = |ports: &[Port]| ports.iter().map(|port| port.topic.to_string()).collect::<Vec<_>>();
+        let controller = ports(&scenario, RoleId::Controller);
+        let of = |name: &str| format!("corotate/rigid-trio/{name}");
+        assert_eq!(signals(&controller.writes), [of("follower-a/command"), of("follower-b/command")]);
+        let reads = ["leader/estimate", "follower-a/measurement", "follower-b/measurement"];
+        assert_eq!(signals(&controller.reads), reads.map(of));
+        let plant = ports(&scenario, RoleId::Plant(1));
+        assert_eq!(plant.writes[0].type_name, "corotate/rigid-body/measurement/v1");
+        assert_eq!(plant.writes[0].size, 32 + 8 * 8);
+        assert_eq!((plant.writes[0].fields[0].name, plant.writes[0].fields[0].offset), ("omega_rad_s", 32));
+        assert!(ports(&scenario, RoleId::Plant(0)).reads.is_empty(), "a leader takes no command");
+    }
+}
