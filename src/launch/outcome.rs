@@ -263,18 +263,19 @@ impl LinkBook {
 
 impl State {
     fn new(reports: &[RoleReport], books: &Books) -> Self {
-        let mut links: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
-        links.sort_by(|a, b| a.service.cmp(&b.service));
-        let stride = links.iter().map(|link| link.hash.stride).max().unwrap_or(1);
-        let count = links.iter().map(|link| link.hash.hashes.len()).min().unwrap_or(0);
+        let written = reports.iter().flat_map(|report| &report.written);
+        let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
+        links.sort_by_key(|(service, _)| *service);
+        let stride = links.iter().map(|(_, hash)| hash.stride).max().unwrap_or(1);
+        let count = links.iter().map(|(_, hash)| hash.hashes.len()).min().unwrap_or(0);
         let checkpoints: Vec<(u64, u64)> = (0..count)
-            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|link| link.hash.hashes[index]))))
+            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|(_, hash)| hash.hashes[index]))))
             .collect();
         let first_disturbed_tick = books.roles.values().filter_map(|ticks| ticks.first_disturbed).min();
         let clean =
             checkpoints.iter().rev().find(|(ticks, _)| first_disturbed_tick.is_none_or(|first| *ticks <= first));
         let (clean_ticks, clean_hash) = clean.copied().unwrap_or((0, 0));
-        let hash = combine(links.iter().map(|link| link.hash.last));
+        let hash = combine(links.iter().map(|(_, hash)| hash.last));
         Self {
             hash: format!("{hash:016x}"),
             first_disturbed_tick,

@@ -81,7 +81,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
             published: self.published,
             skipped: self.skipped,
             last_tick: self.last_tick,
-            hash: self.hash.checkpoints(),
+            hash: Some(self.hash.checkpoints()),
         }
     }
 }
