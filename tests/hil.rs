@@ -9,7 +9,9 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::config::Scenario;
-use corotate::runtime::{Gate, Input, Poll, RoleId, build, depths, describe_seat, in_turn, seat_path, topic};
+use corotate::runtime::{
+    Gate, Input, Poll, RoleId, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
+};
 use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
 };
@@ -126,9 +128,11 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
     let overrides = ["launch.external=[]", "clock=in-process"].map(str::to_owned);
     let scenario = Scenario::load(&file("pair.toml"), &overrides).unwrap();
     let bus = MemoryBus::new(depths(&scenario));
-    let roles = RoleId::all(&scenario);
-    let node = |role: RoleId| with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, 1)).unwrap();
-    let mut nodes: Vec<_> = roles.into_iter().map(node).collect();
+    let node = |role: RoleId| {
+        let ledger = private_ledger(&scenario, role);
+        with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+    };
+    let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
     let mut measurement = reader(&bus, &scenario, Signal::Measurement);
     let mut truth = reader(&bus, &scenario, Signal::Truth);
     let mut command = reader(&bus, &scenario, Signal::Command);
@@ -144,7 +148,7 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
 }
 
 fn reader<S: Sample>(bus: &MemoryBus, scenario: &Scenario, signal: Signal) -> Input<MemoryBus, S> {
-    Input::open(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
+    Input::watch(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
 }
 
 fn next<S: Sample>(input: &mut Input<MemoryBus, S>) -> S {
@@ -209,7 +213,8 @@ fn commands() -> Vec<RateCommand> {
 fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let bus = MemoryBus::new(depths(scenario));
     let follower = RoleId::named(scenario, "follower").unwrap();
-    let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, 1)).unwrap();
+    let ledger = private_ledger(scenario, follower);
+    let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, &ledger)).unwrap();
     let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
     commands().iter().for_each(|command| writer.send(|sample| *sample = *command).unwrap());
@@ -264,6 +269,14 @@ fn the_foreign_follower_treats_its_commands_as_ours_does() {
     }
 }
 
+/// Waits until a signal carries a sample of this kind, as a watcher in the domain of a run.
+fn await_sample<S: Sample>(domain: &Path, body: &str, signal: Signal, wanted: impl Fn(&S) -> bool) {
+    let scenario = Scenario::load(&domain.join("scenario.toml"), &[]).unwrap();
+    let bus = IoxBus::enter(&Domain::join(domain).unwrap(), "watcher", depths(&scenario)).unwrap();
+    let mut reader = bus.reader::<S>(&topic(&scenario, body, signal), Reader::Role).unwrap();
+    await_some(|| (reader.advance().unwrap() && reader.current().is_some_and(&wanted)).then_some(()));
+}
+
 /// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
 fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
     let scenario = file("pair.toml");
@@ -278,7 +291,8 @@ fn a_waiting_run_leaves_the_seat_that_the_command_prints_and_ends_in_order() {
     let bench = Bench::new();
     let (running, seat) = start_waiting(&bench, &["--clock", "lockstep", "--set", "controller.predict=false"]);
     let (domains, domain) = (bench.domains(), seat.parent().unwrap().to_str().unwrap());
-    bench.await_role("controller");
+    // The launcher says who is missing before it looks at its roles a second time.
+    await_sample(&domains[0], "run", Signal::Schedule, |word: &Schedule| word.stamp.tick > 2);
     let own = format!("{domain}/scenario.toml");
     let printed = bench.run(&["seat", &own, "follower", "--domain", domain]);
     assert_eq!(printed.stdout, std::fs::read_to_string(&seat).unwrap(), "{printed:?}");
@@ -310,16 +324,6 @@ fn the_foreign_follower_takes_only_a_seat_of_its_kind() {
     }
 }
 
-/// Waits until the foreign follower's ticks run, as a watcher in the domain of its run.
-fn await_ticks(domain: &Path) {
-    let scenario = Scenario::load(&domain.join("scenario.toml"), &[]).unwrap();
-    let bus = IoxBus::enter(&Domain::join(domain).unwrap(), "watcher", depths(&scenario)).unwrap();
-    let mut measurement =
-        Input::<IoxBus, RateMeasurement>::open(&bus, &topic(&scenario, "follower", Signal::Measurement), Reader::Role)
-            .unwrap();
-    await_some(|| measurement.advance().unwrap().then_some(()));
-}
-
 /// The launcher is killed: the foreign program notices that its run is gone, and leaves.
 #[test]
 fn the_foreign_follower_does_not_outlive_its_run() {
@@ -328,7 +332,9 @@ fn the_foreign_follower_does_not_outlive_its_run() {
         let (running, seat) = start_waiting(&bench, &["--clock", clock, "--duration", "100000", "--set", "accept={}"]);
         let domains = bench.domains();
         let follower = start_follower(&bench, &seat, "record");
-        await_ticks(&domains[0]);
+        await_sample(&domains[0], "follower", Signal::Measurement, |sample: &RateMeasurement| {
+            sample.stamp.generation > 0
+        });
         running.signal(9);
         running.wait();
         let follower = follower.wait();

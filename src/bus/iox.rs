@@ -9,6 +9,7 @@ use crate::sample::Sample;
 use iceoryx2::config::Config;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
@@ -54,7 +55,7 @@ impl Qos {
             max_publishers: 1,
             max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
             max_nodes: MAX_NODES,
-            history_size: 0,
+            history_size: history(signal, depths),
             subscriber_max_buffer_size: deepest(signal, depths),
             subscriber_max_borrowed_samples: MAX_BORROWED,
             enable_safe_overflow: true,
@@ -65,6 +66,14 @@ impl Qos {
 /// How many samples of a signal may wait for a reader.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
     depths.of(reader).min(deepest(signal, depths))
+}
+
+/// What roles say of themselves and hear from the launcher is said again and again.
+fn history(signal: Signal, depths: Depths) -> usize {
+    match signal {
+        Signal::Health | Signal::Schedule => 0,
+        Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.history,
+    }
 }
 
 /// Only what is scored needs room for the scorer.
@@ -126,6 +135,12 @@ impl IoxBus {
             .enable_safe_overflow(qos.enable_safe_overflow)
             .open_or_create()
             .map_err(|error| open(format!("{error:?}")))
+    }
+
+    /// Puts away what processes of this domain left behind when they died, so that others can take their seats.
+    pub fn clear_dead(&self) {
+        // What cannot be put away now is so when the successor enters.
+        let _ = self.node.try_cleanup_dead_nodes();
     }
 }
 
@@ -216,6 +231,10 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
         }
         Ok(())
     }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+    }
 }
 
 /// The reading end.
@@ -255,7 +274,7 @@ mod tests {
     }
 
     fn bus(domain: &OwnedDomain) -> IoxBus {
-        IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8 }).unwrap()
+        IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8, history: 0 }).unwrap()
     }
 
     #[test]

@@ -265,6 +265,7 @@ class Follower:
         # Samples may still wait to be read: the links stay open until everybody is done.
         while self.next_tick > self.last_tick and not self.stopped():
             self.announce("done")
+            self.refresh()
             time.sleep(LOOK_S)
 
     def await_phase(self, state, phase):
@@ -314,7 +315,13 @@ class Follower:
             return False
         self.next_turn_ns = time.monotonic_ns() + TURN_NS
         self.announce("running")
+        self.refresh()
         return self.stopped()
+
+    def refresh(self):
+        """Lets roles that were started anew have what they still lack: in lockstep the loop waits for them."""
+        for writer in (self.measurement, self.truth):
+            writer.publisher.update_connections()
 
     def lockstep(self):
         """Ticks by the inputs alone, at most the window ahead of the slowest consumer."""

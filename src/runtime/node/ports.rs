@@ -1,6 +1,6 @@
-//! Which signals a role writes and reads, with the layout of each: the one list for whoever is not a node of ours.
+//! Which signals a role writes and reads, with the layout of each: the one list, for books and for foreign programs.
 //!
-//! In the order in which the nodes open them. Must not open anything.
+//! In the order in which the nodes open them, which is that of their books. Must not open anything.
 
 use super::{RoleId, topic};
 use crate::bus::{Signal, Topic};
@@ -72,22 +72,50 @@ fn port<S: Sample>(scenario: &Scenario, body: &str, signal: Signal) -> Port {
 mod tests {
     use super::*;
     use crate::bus::memory::MemoryBus;
+    use crate::bus::{Bus, BusError, Reader};
     use crate::config::SHIPPED;
-    use crate::runtime::{build, depths};
+    use crate::runtime::{build, depths, private_ledger};
+    use std::cell::RefCell;
 
-    /// The list is the nodes' own: their books name every signal that they opened, in order.
+    type Opened = RefCell<Vec<(Topic, &'static str)>>;
+
+    /// A bus that remembers what was opened.
+    struct Watched {
+        bus: MemoryBus,
+        written: Opened,
+        read: Opened,
+    }
+
+    impl Bus for Watched {
+        type Writer<S: Sample> = <MemoryBus as Bus>::Writer<S>;
+        type Reader<S: Sample> = <MemoryBus as Bus>::Reader<S>;
+
+        fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
+            self.written.borrow_mut().push((topic.clone(), S::TYPE_NAME));
+            self.bus.writer(topic)
+        }
+
+        fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
+            self.read.borrow_mut().push((topic.clone(), S::TYPE_NAME));
+            self.bus.reader(topic, reader)
+        }
+    }
+
     #[test]
     fn the_list_is_what_the_nodes_open() {
         for (name, text) in SHIPPED {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
-            let bus = MemoryBus::new(depths(&scenario));
             for role in RoleId::all(&scenario) {
-                let node = with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, 1)).unwrap();
+                let bus = MemoryBus::new(depths(&scenario));
+                let bus = Watched { bus, written: Opened::default(), read: Opened::default() };
+                let ledger = private_ledger(&scenario, role);
+                with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap();
                 let ports = ports(&scenario, role);
-                let services = |ports: &[Port]| ports.iter().map(|port| port.topic.to_string()).collect::<Vec<_>>();
-                let written: Vec<String> = node.written().into_iter().map(|link| link.service).collect();
-                let read: Vec<String> = node.read().into_iter().map(|link| link.service).collect();
-                assert_eq!((services(&ports.writes), services(&ports.reads)), (written, read), "{name} {role:?}");
+                let listed = |ports: &[Port]| -> Vec<_> {
+                    ports.iter().map(|port| (port.topic.clone(), port.type_name)).collect()
+                };
+                let opened = (bus.written.into_inner(), bus.read.into_inner());
+                assert_eq!((listed(&ports.writes), listed(&ports.reads)), opened, "{name} {role:?}");
             }
         }
     }
