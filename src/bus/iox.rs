@@ -13,6 +13,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
@@ -185,11 +186,13 @@ impl Bus for IoxBus {
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
         let depth = buffer_size(topic.signal, reader, self.depths);
-        let subscriber =
-            self.service::<S>(topic, "reader")?.subscriber_builder().buffer_size(depth).create().map_err(|error| {
-                BusError::Open { service: topic.to_string(), end: "reader", reason: format!("{error:?}") }
-            })?;
-        Ok(IoxReader { subscriber, current: None, topic: topic.clone() })
+        let service = self.service::<S>(topic, "reader")?;
+        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
+            service: topic.to_string(),
+            end: "reader",
+            reason: format!("{error:?}"),
+        })?;
+        Ok(IoxReader { service, subscriber, current: None, topic: topic.clone() })
     }
 }
 
@@ -239,9 +242,17 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
 
 /// The reading end.
 pub struct IoxReader<S: Sample> {
+    service: PortFactory<Ipc, Wire<S>, ()>,
     subscriber: Subscriber<Ipc, Wire<S>, ()>,
     current: Option<Received<Ipc, Wire<S>, ()>>,
     topic: Topic,
+}
+
+impl<S: Sample> IoxReader<S> {
+    /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
+    pub fn written(&self) -> bool {
+        self.service.dynamic_config().number_of_publishers() > 0
+    }
 }
 
 impl<S: Sample> Read<S> for IoxReader<S> {
@@ -283,7 +294,9 @@ mod tests {
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
+        assert!(!newest.written());
         let mut writer = ours.writer::<RateTruth>(&topic()).unwrap();
+        assert!(newest.written());
         assert!(!newest.advance().unwrap() && !every.advance().unwrap());
         for tick in 0..5 {
             writer.prepare().unwrap();

@@ -12,7 +12,9 @@ mod seat;
 
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Input, Output, Seek};
-pub use node::{Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, build, ports, private_ledger, report, topic};
+pub use node::{
+    Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic, visit_writes,
+};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};

@@ -7,7 +7,7 @@ mod observer;
 mod plant;
 mod ports;
 
-pub use ports::{Port, Ports, ports};
+pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
 use super::link::{Input, Output};
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};

@@ -147,10 +147,12 @@ pub fn serve<B: Bus + 'static>(
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let name = role.name(scenario);
+    // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
+    let health = bus.writer(&topic(scenario, name, Signal::Health))?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
-        bus.writer(&topic(scenario, name, Signal::Health))?,
+        health,
         ledger.generation(),
         grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,

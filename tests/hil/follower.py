@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """A follower that shares no code with corotate: a rigid body with perfect gyros, in a seat of a run.
 
 Everything it knows of the run comes from the seat's description, `<domain>/<role>.seat.json`. It keeps logical execution
@@ -90,7 +89,8 @@ class Writer:
         factory = transport.service(described, type(self.sample)).publisher_builder()
         self.publisher = factory.backpressure_strategy(iox2.BackpressureStrategy.DiscardData).create()
         self.published, self.skipped, self.last_tick = 0, 0, None
-        self.record = bytearray()
+        #: Every sample, byte for byte, where somebody asks for it.
+        self.record = None
 
     def warm_up(self):
         self.publisher.send_copy(type(self.sample)())
@@ -101,7 +101,8 @@ class Writer:
         self.published += 1
         self.skipped += self.sample.tick - (0 if self.last_tick is None else self.last_tick + 1)
         self.last_tick = self.sample.tick
-        self.record += bytes(self.sample)
+        if self.record is not None:
+            self.record += bytes(self.sample)
 
     def books(self):
         keys = ("service", "published", "skipped", "last_tick")
@@ -119,7 +120,8 @@ class Reader:
         self.sample = None
         self.received, self.gaps, self.stale = 0, 0, 0
         self.last_tick, self.last_generation = None, None
-        self.record = bytearray()
+        #: Every sample, byte for byte, where somebody asks for it.
+        self.record = None
 
     def receive(self):
         """The next sample as it comes, or none."""
@@ -156,7 +158,8 @@ class Reader:
         self.received += 1
         self.gaps += sample.tick - expected
         self.last_tick, self.last_generation = sample.tick, sample.generation
-        self.record += bytes(sample)
+        if self.record is not None:
+            self.record += bytes(sample)
         return True
 
     def books(self):
@@ -236,18 +239,18 @@ class Actuator:
 class Follower:
     """The role: its links, its ticks, its books."""
 
-    def __init__(self, seat, terminated):
-        self.seat, self.terminated = seat, terminated
+    def __init__(self, seat, terminated, silent):
+        self.seat, self.terminated, self.silent = seat, terminated, silent
         if seat["schema"] != "corotate/seat/v1" or seat["kind"] != "plant" or not seat["reads"]:
             raise SeatError(f"{seat['role']} is no driven body described by corotate/seat/v1")
         if seat["scenario"]["rig"] != "rigid-body":
             raise SeatError(f"this program is a rigid body, and the rig is {seat['scenario']['rig']}")
-        self.transport = Transport(seat["transport"], seat["role"])
         self.domain = seat["transport"]["domain"]
-        self.measurement, self.truth = (Writer(self.transport, described) for described in seat["writes"])
-        (self.command,) = (Reader(self.transport, described) for described in seat["reads"])
-        self.health = Writer(self.transport, seat["health"])
-        self.schedule = Reader(self.transport, seat["schedule"])
+        self.transport = Transport(seat["transport"], seat["role"])
+        try:
+            self.open_links()
+        except Exception as error:  # iceoryx2's errors have no ancestor of their own
+            raise SeatError(f"cannot open the links of {seat['role']}: {error!r}; is the seat taken?") from error
         self.body = Body(seat["scenario"], seat["role"])
         self.actuator = Actuator(self.body, seat)
         self.period_ns, self.last_tick = seat["period_ns"], seat["last_tick"]
@@ -256,12 +259,20 @@ class Follower:
         self.ticks = {"executed": 0, "missed": 0, "starved": 0, "safe": 0, "first_disturbed": None}
         self.grants = []
 
+    def open_links(self):
+        # Before the signals of the loop: whoever has those open and not this one is judged by its samples alone.
+        self.health = None if self.silent else Writer(self.transport, self.seat["health"])
+        self.measurement, self.truth = (Writer(self.transport, described) for described in self.seat["writes"])
+        (self.command,) = (Reader(self.transport, described) for described in self.seat["reads"])
+        self.schedule = Reader(self.transport, self.seat["schedule"])
+
     def run(self):
         """From open links to the end of the run."""
         if self.await_phase("open", "warm_up") and self.warm_up() and self.await_phase("ready", "run"):
             self.epoch_ns = self.schedule.newest().epoch_ns
             self.realtime() if self.timed else self.lockstep()
-        self.report()
+        if not self.silent:
+            self.report()
         # Samples may still wait to be read: the links stay open until everybody is done.
         while self.next_tick > self.last_tick and not self.stopped():
             self.announce("done")
@@ -380,6 +391,9 @@ class Follower:
             self.ticks["first_disturbed"] = tick
 
     def announce(self, state):
+        """Tells the launcher how this role is, if it does so at all."""
+        if self.silent:
+            return
         sample = self.health.sample
         sample.tick, sample.generation = self.next_tick, 1
         sample.origin_ns = sample.sent_ns = time.monotonic_ns()
@@ -422,10 +436,18 @@ class Follower:
             json.dump(books, file)
         os.replace(part, self.seat["report"])
 
-    def keep_record(self, directory):
-        """Leaves every sample that was published or applied, byte for byte, one file per signal."""
+    def loop_ends(self):
+        return {"measurement": self.measurement, "truth": self.truth, "command": self.command}
+
+    def record(self):
+        """Keeps every sample that is published or received from now on."""
+        for end in self.loop_ends().values():
+            end.record = bytearray()
+
+    def leave_record(self, directory):
+        """Leaves what was kept, one file per signal."""
         os.makedirs(directory, exist_ok=True)
-        for name, end in (("measurement", self.measurement), ("truth", self.truth), ("command", self.command)):
+        for name, end in self.loop_ends().items():
             with open(os.path.join(directory, f"{name}.bin"), "wb") as file:
                 file.write(end.record)
 
@@ -434,19 +456,22 @@ def main():
     parser = argparse.ArgumentParser(description="A follower in a seat of a corotate run.")
     parser.add_argument("seat", help="the seat's description, as the waiting run prints its path")
     parser.add_argument("--record", metavar="DIR", help="leave every sample published and received there")
+    parser.add_argument("--silent", action="store_true", help="say nothing of itself, as hardware may: samples only")
     arguments = parser.parse_args()
     terminated = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _frame: terminated.append(number))
     try:
         with open(arguments.seat, encoding="utf-8") as file:
-            follower = Follower(json.load(file), terminated)
+            follower = Follower(json.load(file), terminated, arguments.silent)
+        if arguments.record:
+            follower.record()
         # What is made from now on is freed by reference counts; a collection would cost ticks.
         gc.freeze()
         gc.disable()
         follower.run()
         if arguments.record:
-            follower.keep_record(arguments.record)
+            follower.leave_record(arguments.record)
     except (SeatError, OSError, ValueError, KeyError) as error:
         print(f"follower: {error}", file=sys.stderr)
         return 2

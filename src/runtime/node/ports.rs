@@ -5,7 +5,7 @@
 use super::{RoleId, topic};
 use crate::bus::{Signal, Topic};
 use crate::config::Scenario;
-use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
+use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig, Truth};
 use crate::sample::{Field, Health, Sample, Schedule};
 use crate::with_rig;
 
@@ -35,37 +35,73 @@ pub struct Ports {
     pub schedule: Port,
 }
 
-/// The signals of a role of a scenario.
-pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
-    let (writes, reads) = with_rig!(&scenario.rig, rig => of_the_loop(rig, scenario, role));
-    let health = port::<Health>(scenario, role.name(scenario), Signal::Health);
-    Ports { writes, reads, health, schedule: port::<Schedule>(scenario, "run", Signal::Schedule) }
+/// Does something with a signal whose type is known.
+pub trait Visit {
+    /// What comes of it.
+    type Made;
+    /// Does it.
+    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made;
 }
 
-fn of_the_loop<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
+/// The signals of a role of a scenario.
+pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
+    let describe = &mut Describe;
+    Ports {
+        writes: visit_writes(scenario, role, describe),
+        reads: with_rig!(&scenario.rig, rig => reads(rig, scenario, role, describe)),
+        health: describe.visit::<Health>(topic(scenario, role.name(scenario), Signal::Health)),
+        schedule: describe.visit::<Schedule>(topic(scenario, "run", Signal::Schedule)),
+    }
+}
+
+/// Visits the signals that a role writes for the loop, in their order.
+pub fn visit_writes<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    with_rig!(&scenario.rig, rig => writes(rig, scenario, role, visit))
+}
+
+fn writes<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    let of = |body: &BodyInfo, signal| topic(scenario, &body.name, signal);
     let bodies = rig.bodies();
-    let observed = &bodies[0].name;
-    let measurement = |body: &str| port::<Measurement<R>>(scenario, body, Signal::Measurement);
-    let command = |body: &str| port::<Command<R>>(scenario, body, Signal::Command);
-    let estimate = || port::<Estimate<R>>(scenario, observed, Signal::Estimate);
     match role {
-        RoleId::Plant(index) => {
-            let body = &bodies[index];
-            let truth = port::<Truth<R>>(scenario, &body.name, Signal::Truth);
-            let reads = body.driven.then(|| command(&body.name)).into_iter().collect();
-            (vec![measurement(&body.name), truth], reads)
-        }
-        RoleId::Observer => (vec![estimate()], vec![measurement(observed)]),
+        RoleId::Plant(index) => vec![
+            visit.visit::<Measurement<R>>(of(&bodies[index], Signal::Measurement)),
+            visit.visit::<Truth<R>>(of(&bodies[index], Signal::Truth)),
+        ],
+        RoleId::Observer => vec![visit.visit::<Estimate<R>>(of(&bodies[0], Signal::Estimate))],
         RoleId::Controller => {
             let driven = bodies.iter().filter(|body| body.driven);
-            let reads = [estimate()].into_iter().chain(driven.clone().map(|body| measurement(&body.name)));
-            (driven.map(|body| command(&body.name)).collect(), reads.collect())
+            driven.map(|body| visit.visit::<Command<R>>(of(body, Signal::Command))).collect()
         }
     }
 }
 
-fn port<S: Sample>(scenario: &Scenario, body: &str, signal: Signal) -> Port {
-    Port { topic: topic(scenario, body, signal), type_name: S::TYPE_NAME, size: size_of::<S>(), fields: S::FIELDS }
+fn reads<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    let of = |body: &BodyInfo, signal| topic(scenario, &body.name, signal);
+    let bodies = rig.bodies();
+    match role {
+        RoleId::Plant(index) => {
+            let driven = Some(&bodies[index]).filter(|body| body.driven);
+            driven.map(|body| visit.visit::<Command<R>>(of(body, Signal::Command))).into_iter().collect()
+        }
+        RoleId::Observer => vec![visit.visit::<Measurement<R>>(of(&bodies[0], Signal::Measurement))],
+        RoleId::Controller => {
+            let estimate = visit.visit::<Estimate<R>>(of(&bodies[0], Signal::Estimate));
+            let driven = bodies.iter().filter(|body| body.driven);
+            let measurements = driven.map(|body| visit.visit::<Measurement<R>>(of(body, Signal::Measurement)));
+            std::iter::once(estimate).chain(measurements).collect()
+        }
+    }
+}
+
+/// Tells the layout.
+struct Describe;
+
+impl Visit for Describe {
+    type Made = Port;
+
+    fn visit<S: Sample>(&mut self, topic: Topic) -> Port {
+        Port { topic, type_name: S::TYPE_NAME, size: size_of::<S>(), fields: S::FIELDS }
+    }
 }
 
 #[cfg(test)]
