@@ -16,15 +16,20 @@ use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
 };
 use corotate::with_rig;
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
+use std::time::Duration;
 
 /// By how much a value that the foreign follower published, or that our controller made of it, may differ from the run
 /// with the built-in one, rad/s and rad/s². Both integrate by Runge-Kutta steps whose error is far below a rounding, the
 /// foreign one in twice as many; so they differ by a rounding of 1e-16 per step, which the closed loop forgets within a
 /// second, times the gain of 6/s in a command. Ten times what that comes to.
 const TOLERANCE: f64 = 1e-14;
+
+const SIGINT: i32 = 2;
+const SIGKILL: i32 = 9;
 
 fn file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil").join(name)
@@ -40,26 +45,34 @@ fn python() -> &'static Path {
     })
 }
 
-/// Starts the foreign follower in a seat; it leaves what it published and received in `record`.
-fn start_follower(bench: &Bench, seat: &Path, record: &str) -> Running {
-    let (program, record) = (file("follower.py"), bench.path(record));
-    let arguments = [program.to_str().unwrap(), seat.to_str().unwrap(), "--record", record.to_str().unwrap()];
-    bench.start_program(python(), &arguments)
+/// Starts the foreign follower in a seat.
+fn start_follower(bench: &Bench, seat: &Path, options: &[&str]) -> Running {
+    let program = file("follower.py");
+    bench.start_program(python(), &[&[program.to_str().unwrap(), seat.to_str().unwrap()], options].concat())
 }
+
+/// Makes the foreign follower leave what it published and received.
+const RECORD: [&str; 2] = ["--record", "record"];
 
 /// The seat that a run of this bench leaves while it waits.
 fn await_seat(bench: &Bench, role: &str) -> PathBuf {
     await_some(|| bench.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
 }
 
-/// A run with the foreign follower in its seat, which both must end well.
-fn run_with_follower(bench: &Bench, arguments: &[&str]) -> Done {
+/// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
+fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
     let scenario = file("pair.toml");
     let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out"];
     let running = bench.start(&[&common[..], arguments].concat());
     let seat = await_seat(bench, "follower");
+    (running, seat)
+}
+
+/// A run with the foreign follower in its seat, which both must end well.
+fn run_with_follower(bench: &Bench, clock: &str, options: &[&str]) -> Done {
+    let (running, seat) = start_waiting(bench, &["--clock", clock]);
     let domains = bench.domains();
-    let follower = start_follower(bench, &seat, "record");
+    let follower = start_follower(bench, &seat, options);
     let (run, follower) = (running.wait(), follower.wait());
     assert_eq!((run.code, follower.code), (Some(0), Some(0)), "{run:?} {follower:?}");
     bench.assert_clean(&domains);
@@ -86,22 +99,27 @@ fn assert_accepted(bench: &Bench) {
     assert_eq!(cases(bench), expected.map(|name| (name.to_owned(), None)));
 }
 
-fn tell(clock: &str, run: &Done) {
-    let summary: serde_json::Value = serde_json::from_str(&run.stdout).unwrap();
+fn tell(clock: &str, run: &Done) -> Value {
+    let summary: Value = serde_json::from_str(&run.stdout).unwrap();
     let (metrics, missed) = (&summary["score"]["metrics"], &summary["books"]["missed_ticks"]);
     println!("{clock}: {metrics}, {missed} ticks missed or starved");
+    summary
+}
+
+/// The books of the foreign follower are whole, and the launcher takes them for what they are.
+fn assert_booked(summary: &Value) {
     let follower = &summary["books"]["roles"]["follower"];
     let ticks = |key: &str| follower[key].as_u64().unwrap();
     assert_eq!(ticks("executed") + ticks("missed"), 10_001, "the books of the foreign follower: {follower}");
-    let link = |link: &serde_json::Value| link["service"] == "corotate/hil-pair/follower/command";
+    let link = |link: &Value| link["service"] == "corotate/hil-pair/follower/command";
     assert!(summary["books"]["links"].as_array().unwrap().iter().any(link), "its commands are in the books");
 }
 
 #[test]
 fn the_foreign_follower_synchronises_in_real_time() {
     let bench = Bench::new();
-    let run = run_with_follower(&bench, &["--clock", "realtime"]);
-    tell("realtime", &run);
+    let run = run_with_follower(&bench, "realtime", &[]);
+    assert_booked(&tell("realtime", &run));
     assert_accepted(&bench);
 }
 
@@ -109,8 +127,8 @@ fn the_foreign_follower_synchronises_in_real_time() {
 #[test]
 fn in_lockstep_the_foreign_follower_does_what_the_built_in_one_does() {
     let bench = Bench::new();
-    let run = run_with_follower(&bench, &["--clock", "lockstep"]);
-    tell("lockstep", &run);
+    let run = run_with_follower(&bench, "lockstep", &RECORD);
+    assert_booked(&tell("lockstep", &run));
     assert_accepted(&bench);
     let expected = built_in();
     let worst = [
@@ -255,7 +273,7 @@ fn the_foreign_follower_treats_its_commands_as_ours_does() {
         let role = RoleId::named(&scenario, "follower").unwrap();
         let seat = bench.path("seat.json");
         std::fs::write(&seat, describe_seat(&scenario, role, Some(domain.domain())).to_json()).unwrap();
-        let follower = start_follower(&bench, &seat, "record");
+        let follower = start_follower(&bench, &seat, &RECORD);
         conduct(&scenario, &domain);
         let follower = follower.wait();
         assert_eq!(follower.code, Some(0), "{follower:?}");
@@ -277,13 +295,9 @@ fn await_sample<S: Sample>(domain: &Path, body: &str, signal: Signal, wanted: im
     await_some(|| (reader.advance().unwrap() && reader.current().is_some_and(&wanted)).then_some(()));
 }
 
-/// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
-fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
-    let scenario = file("pair.toml");
-    let common = ["run", scenario.to_str().unwrap(), "--junit", "verdict.xml", "--out", "out"];
-    let running = bench.start(&[&common[..], arguments].concat());
-    let seat = await_seat(bench, "follower");
-    (running, seat)
+/// Waits until the follower's ticks run.
+fn await_ticks(domain: &Path) {
+    await_sample(domain, "follower", Signal::Measurement, |sample: &RateMeasurement| sample.stamp.generation > 0);
 }
 
 #[test]
@@ -300,12 +314,99 @@ fn a_waiting_run_leaves_the_seat_that_the_command_prints_and_ends_in_order() {
     let other = bench.run(&["seat", file("pair.toml").to_str().unwrap(), "follower", "--domain", domain]);
     assert_eq!((other.code, other.stdout.as_str()), (Some(2), ""), "{other:?}");
     assert!(other.stderr.contains(&format!("give its own file, {own}")), "{other:?}");
-    running.signal(2);
+    running.signal(SIGINT);
     let done = running.wait();
-    assert_eq!(done.code, Some(130), "{done:?}");
+    assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");
     assert!(done.stderr.contains("waiting for follower") && done.stderr.contains(seat.to_str().unwrap()), "{done:?}");
-    assert_eq!(cases(&bench)[0], ("run".into(), Some("error: ended by signal 2 before its last tick".into())));
+    assert_eq!(cases(&bench)[0], ("run".to_owned(), Some("error: ended by signal 2 before its last tick".into())));
     bench.assert_clean(&domains);
+}
+
+/// However far the roles have come: each hears that the run is over.
+#[test]
+fn a_signal_while_the_roles_come_up_ends_the_run_in_order() {
+    for pause_ms in [0, 3, 6, 10, 20, 40, 80] {
+        let bench = Bench::new();
+        let (running, _) = start_waiting(&bench, &["--clock", "lockstep"]);
+        let domains = bench.domains();
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        running.signal(SIGINT);
+        let done = running.wait();
+        assert_eq!(done.code, Some(128 + SIGINT), "after {pause_ms} ms: {done:?}");
+        bench.assert_clean(&domains);
+    }
+}
+
+/// Hardware need not know of health, nor keep books: it is there, runs and is done by its samples.
+#[test]
+fn a_follower_that_says_nothing_of_itself_is_seen_by_its_samples() {
+    for clock in ["lockstep", "realtime"] {
+        let bench = Bench::new();
+        let summary = tell(clock, &run_with_follower(&bench, clock, &["--silent"]));
+        assert_accepted(&bench);
+        assert_eq!(summary["books"]["unbooked"], serde_json::json!(["follower"]));
+        assert!(summary["books"]["roles"]["follower"].is_null());
+        assert!(summary["score"]["scored_ticks"].as_u64().unwrap() > 1_000, "{summary:#}");
+    }
+}
+
+/// Whether it told of itself or not: the run ends in order, by name and cause.
+#[test]
+fn a_follower_that_is_killed_ends_the_run() {
+    for (clock, options, cause) in [
+        ("realtime", &[][..], "it said nothing for 0.5 s"),
+        ("lockstep", &[], "it said nothing for 0.5 s"),
+        ("realtime", &["--silent"], "it sent nothing for 0.5 s"),
+        ("lockstep", &["--silent"], "it left before its last tick"),
+    ] {
+        let bench = Bench::new();
+        let endless = ["--duration", "100000", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=0.5"];
+        let (running, seat) = start_waiting(&bench, &[&["--clock", clock], &endless[..]].concat());
+        let domains = bench.domains();
+        let follower = start_follower(&bench, &seat, options);
+        await_ticks(&domains[0]);
+        follower.signal(SIGKILL);
+        let (done, _) = (running.wait(), follower.wait());
+        assert_eq!(done.code, Some(4), "{clock} {options:?}: {done:?}");
+        let died = done.stderr.lines().find(|line| line.contains("follower died at tick ")).unwrap();
+        assert!(died.contains(cause) && died.contains("the run ends"), "{clock} {options:?}: {died}");
+        let (name, trouble) = cases(&bench).remove(0);
+        assert!(name == "run" && trouble.is_some_and(|trouble| trouble.contains(cause)), "{clock} {options:?}");
+        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+        bench.assert_clean(&domains);
+    }
+}
+
+/// A program that leaves before the ticks run is waited for again.
+#[test]
+fn a_seat_that_was_left_before_the_run_can_be_taken_again() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep", "--external", "observer"]);
+    let domains = bench.domains();
+    let first = start_follower(&bench, &seat, &[]);
+    await_sample(&domains[0], "follower", Signal::Health, |health: &Health| health.state == RoleState::Open as u64);
+    first.signal(SIGINT);
+    assert_eq!(first.wait().code, Some(128 + SIGINT));
+    let second = start_follower(&bench, &seat, &[]);
+    let observer = bench.start(&["observer", "--domain", domains[0].to_str().unwrap()]);
+    let ended = [running, second, observer].map(Running::wait);
+    assert!(ended.iter().all(|done| done.code == Some(0)), "{ended:?}");
+    assert_accepted(&bench);
+    bench.assert_clean(&domains);
+}
+
+/// What a foreign program leaves as its books is looked at, not believed.
+#[test]
+fn a_report_that_is_none_is_told() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep"]);
+    std::fs::write(seat.with_file_name("follower.report.json"), "{}").unwrap();
+    let follower = start_follower(&bench, &seat, &["--silent"]);
+    let (done, follower) = (running.wait(), follower.wait());
+    assert_eq!((done.code, follower.code), (Some(1), Some(0)), "{done:?} {follower:?}");
+    let books = cases(&bench).into_iter().find(|(name, _)| name == "books").unwrap().1.unwrap();
+    assert!(books.starts_with("failure: ") && books.contains("follower: its report is none: missing field"), "{books}");
 }
 
 /// A seat that is no driven body's, or that is in no run, is refused before anything is opened.
@@ -318,7 +419,7 @@ fn the_foreign_follower_takes_only_a_seat_of_its_kind() {
         let printed = bench.run(&["seat", file("pair.toml").to_str().unwrap(), role]);
         assert!(printed.stderr.contains("a domain exists while a run does"), "{printed:?}");
         std::fs::write(bench.path("seat.json"), printed.stdout).unwrap();
-        let refused = start_follower(&bench, &bench.path("seat.json"), "record").wait();
+        let refused = start_follower(&bench, &bench.path("seat.json"), &[]).wait();
         assert_eq!(refused.code, Some(2), "{refused:?}");
         assert!(refused.stderr.contains(reason), "{refused:?}");
     }
@@ -331,11 +432,11 @@ fn the_foreign_follower_does_not_outlive_its_run() {
         let bench = Bench::new();
         let (running, seat) = start_waiting(&bench, &["--clock", clock, "--duration", "100000", "--set", "accept={}"]);
         let domains = bench.domains();
-        let follower = start_follower(&bench, &seat, "record");
+        let follower = start_follower(&bench, &seat, &RECORD);
         await_sample(&domains[0], "follower", Signal::Measurement, |sample: &RateMeasurement| {
             sample.stamp.generation > 0
         });
-        running.signal(9);
+        running.signal(SIGKILL);
         running.wait();
         let follower = follower.wait();
         assert_eq!(follower.code, Some(1), "{follower:?}");

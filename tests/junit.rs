@@ -3,10 +3,11 @@
 
 mod common;
 
-use common::{Bench, Done, shipped};
+use common::{Bench, Done, Running, send_signal, shipped};
 use roxmltree::{Document, Node};
 
 const SIGINT: i32 = 2;
+const SIGKILL: i32 = 9;
 
 fn run(bench: &Bench, arguments: &[&str]) -> Done {
     bench.run(&[&["run", shipped("rigid-pair").to_str().unwrap(), "--junit", "verdict.xml"], arguments].concat())
@@ -107,19 +108,33 @@ fn a_run_without_an_end_is_an_error() {
     bench.assert_clean(&[]);
 }
 
+/// Starts a run that lasts until it is stopped, and waits until its roles are up.
+fn start_endless(bench: &Bench) -> Running {
+    let file = shipped("rigid-pair");
+    let endless = ["--clock", "lockstep", "--duration", "100000", "--set", "accept={}", "--junit", "verdict.xml"];
+    let stop = ["--set", "supervision.on_failure=stop"];
+    let running = bench.start(&[&["run", file.to_str().unwrap()][..], &endless, &stop].concat());
+    bench.await_role("controller");
+    // As in tests/processes.rs: ticks are certain a little later.
+    std::thread::sleep(std::time::Duration::from_millis(1000));
+    running
+}
+
 #[test]
-fn an_interrupted_run_is_an_error_and_a_killed_one_too() {
-    for (signal, reason) in [(SIGINT, "ended by signal 2"), (9, "did not come to an end")] {
+fn a_run_that_was_cut_short_is_an_error() {
+    type Cut = fn(&Bench, &Running);
+    let cuts: [(Cut, Option<i32>, &str); 3] = [
+        (|_, running| running.signal(SIGINT), Some(128 + SIGINT), "ended by signal 2"),
+        (|bench, _| send_signal(bench.await_role("observer"), SIGKILL), Some(4), "observer died at tick"),
+        (|_, running| running.signal(SIGKILL), None, "did not come to an end"),
+    ];
+    for (cut, code, reason) in cuts {
         let bench = Bench::new();
-        let file = shipped("rigid-pair");
-        let endless = ["--clock", "lockstep", "--duration", "100000", "--set", "accept={}", "--junit", "verdict.xml"];
-        let running = bench.start(&[&["run", file.to_str().unwrap()][..], &endless].concat());
-        bench.await_role("controller");
+        let running = start_endless(&bench);
         let domains = bench.domains();
-        // As in tests/processes.rs: the roles are up a little later.
-        std::thread::sleep(std::time::Duration::from_millis(1000));
-        running.signal(signal);
-        running.wait();
+        cut(&bench, &running);
+        let done = running.wait();
+        assert_eq!(done.code, code, "{done:?}");
         let text = verdict(&bench);
         let document = Document::parse(&text).unwrap();
         let troubles = troubles(suite(&document));

@@ -38,7 +38,10 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
             .zip(&ledgers)
             .map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()))
             .collect(),
+        unbooked: Vec::new(),
+        problems: Vec::new(),
         score: scorer.finish()?,
+        incidents: Vec::new(),
         grants: Vec::new(),
         domain: None,
         signal: if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 },

@@ -2,7 +2,7 @@
 //!
 //! Must not be more lenient than the exit code, nor ever be without a case: what did not run is an error.
 
-use super::{Criterion, Summary};
+use super::{Action, Criterion, Summary};
 use quick_xml::Writer;
 use std::io;
 
@@ -59,11 +59,12 @@ fn write(xml: &mut Xml, scenario: &str, run: Result<&Summary, &str>) -> io::Resu
 
 /// What tells this run from another one of the same scenario.
 fn properties(xml: &mut Xml, summary: &Summary) -> io::Result<()> {
-    let tick_hz = summary.tick_hz.to_string();
+    let (tick_hz, incidents) = (summary.tick_hz.to_string(), summary.incidents.len().to_string());
     let properties = [
         ("clock", summary.clock),
         ("tick_hz", &tick_hz),
         ("state_hash", &summary.state.hash),
+        ("incidents", &incidents),
         ("version", summary.version),
         ("revision", summary.revision),
     ];
@@ -77,9 +78,11 @@ fn properties(xml: &mut Xml, summary: &Summary) -> io::Result<()> {
 
 /// The run, its books, and the criteria in their order.
 fn cases(summary: &Summary) -> Vec<Case> {
-    let run = match summary.signal {
-        0 => Verdict::Passed,
-        signal => Verdict::Error(format!("ended by signal {signal} before its last tick")),
+    let stopped = summary.incidents.iter().find(|incident| incident.action == Action::Stopped);
+    let run = match (stopped, summary.signal) {
+        (Some(incident), _) => Verdict::Error(incident.to_string()),
+        (None, 0) => Verdict::Passed,
+        (None, signal) => Verdict::Error(format!("ended by signal {signal} before its last tick")),
     };
     let books = match summary.books.balanced {
         true => Verdict::Passed,

@@ -2,7 +2,7 @@
 //!
 //! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
 
-use super::Score;
+use super::{Action, Incident, Score};
 use crate::config::Scenario;
 use crate::rig::CertificateReport;
 use crate::telemetry::{
@@ -22,8 +22,14 @@ const SCHEMA: &str = "corotate/summary/v1";
 pub struct Outcome {
     /// The roles' own accounts, in the order of a tick.
     pub reports: Vec<RoleReport>,
+    /// External roles that keep no books.
+    pub unbooked: Vec<String>,
+    /// What is wrong with accounts that were left.
+    pub problems: Vec<String>,
     /// The score.
     pub score: Score,
+    /// Roles that failed while the ticks ran.
+    pub incidents: Vec<Incident>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
     /// The domain that was used, if there was one.
@@ -57,6 +63,8 @@ pub struct Summary {
     pub criteria: Vec<Criterion>,
     /// The score.
     pub score: Score,
+    /// Roles that failed while the ticks ran, and what became of them.
+    pub incidents: Vec<Incident>,
     /// What a reader of the results must know of the scenario.
     pub notes: Vec<String>,
     /// What is proven of the loop.
@@ -91,6 +99,8 @@ pub struct Books {
     pub balanced: bool,
     /// Where they do not.
     pub problems: Vec<String>,
+    /// External roles that keep no books: nothing is known of their ticks, nor of the links that they write and read.
+    pub unbooked: Vec<String>,
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
@@ -168,8 +178,10 @@ struct Host {
 impl Summary {
     /// Draws up the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
-        let latencies = latencies(&outcome.reports);
-        let books = Books::new(scenario, &outcome.reports, outcome.signal != 0);
+        let mut latencies = latencies(&outcome.reports);
+        latencies.extend(incident_figures(&outcome.incidents));
+        let stopped = outcome.incidents.iter().any(|incident| incident.action == Action::Stopped);
+        let books = Books::new(scenario, outcome, outcome.signal != 0 || stopped);
         let criteria = judge(scenario, outcome, &books, &latencies);
         Self {
             schema: SCHEMA,
@@ -186,6 +198,7 @@ impl Summary {
             accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
             criteria,
             score: outcome.score.clone(),
+            incidents: outcome.incidents.clone(),
             notes: scenario.rig.notes(),
             certificates: scenario.rig.certificates(),
             state: State::new(&outcome.reports, &books),
@@ -197,8 +210,8 @@ impl Summary {
 }
 
 impl Books {
-    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool) -> Self {
-        let mut problems = Vec::new();
+    fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool) -> Self {
+        let (reports, mut problems) = (&outcome.reports, outcome.problems.clone());
         let written: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
         for report in reports {
             let Ticks { elapsed, executed, missed, .. } = report.ticks;
@@ -220,6 +233,7 @@ impl Books {
         Self {
             balanced: problems.is_empty(),
             problems,
+            unbooked: outcome.unbooked.clone(),
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
             roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
             links,
@@ -284,6 +298,25 @@ impl State {
             checkpoints,
         }
     }
+}
+
+/// How long roles that failed were out, and how long the loop took to recover from it, by role.
+fn incident_figures(incidents: &[Incident]) -> Vec<StageFigures> {
+    let mut stages: BTreeMap<(&str, &str), Latency> = BTreeMap::new();
+    for incident in incidents {
+        for (stage, seconds) in [("outage", incident.outage_s), ("recovery", incident.recovery_s)] {
+            if let Some(seconds) = seconds {
+                stages.entry((&incident.role, stage)).or_default().record(0, (seconds * 1e9) as u64);
+            }
+        }
+    }
+    let figures = |((role, stage), latency): ((&str, &str), Latency)| StageFigures {
+        role: role.to_owned(),
+        stage: stage.to_owned(),
+        figures: latency.percentiles(),
+        latency,
+    };
+    stages.into_iter().map(figures).collect()
 }
 
 fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {

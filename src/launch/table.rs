@@ -1,6 +1,6 @@
 //! The end of a run on the screen.
 
-use super::Summary;
+use super::{Incident, Summary};
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -22,6 +22,9 @@ pub fn table(summary: &Summary) -> String {
         let _ = writeln!(text, "note: {note}");
     }
     results(summary, &mut text);
+    for incident in &summary.incidents {
+        let _ = writeln!(text, "{incident}{}", times(incident));
+    }
     if !summary.latencies.is_empty() {
         let _ = writeln!(text, "\n{}", latencies(summary));
     }
@@ -55,6 +58,11 @@ fn results(summary: &Summary, text: &mut String) {
         let _ =
             writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
     }
+}
+
+fn times(incident: &Incident) -> String {
+    let told = |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {s:.3} s"));
+    told("back", incident.outage_s) + &told("recovered", incident.recovery_s)
 }
 
 fn verdict(holds: Option<bool>) -> String {
@@ -91,6 +99,9 @@ fn books(summary: &Summary, text: &mut String) {
     );
     for problem in &books.problems {
         let _ = writeln!(text, "  {problem}");
+    }
+    if !books.unbooked.is_empty() {
+        let _ = writeln!(text, "no books of {}, nor of the signals there", books.unbooked.join(", "));
     }
     let _ = match state.first_disturbed_tick {
         None => writeln!(text, "state hash {} (every tick undisturbed)", state.hash),

@@ -403,11 +403,14 @@ class Follower:
         self.health.publisher.send_copy(sample)
 
     def stopped(self):
-        """Whether the run is over for this role."""
-        if not os.path.isdir(self.domain):
-            raise RunLost(f"{self.domain} is gone: the run was killed")
+        """Whether the run is over for this role. The launcher says so before it removes the domain."""
+        gone = not os.path.isdir(self.domain)
         word = self.schedule.newest()
-        return bool(self.terminated) or (word is not None and word.phase >= self.seat["phases"]["stop"])
+        if self.terminated or (word is not None and word.phase >= self.seat["phases"]["stop"]):
+            return True
+        if gone:
+            raise RunLost(f"{self.domain} is gone: the run was killed")
+        return False
 
     def ask_for_priority(self):
         """Runs before all ordinary processes where that is granted; what is not is reported, and done without."""
@@ -472,8 +475,11 @@ def main():
         follower.run()
         if arguments.record:
             follower.leave_record(arguments.record)
-    except (SeatError, OSError, ValueError, KeyError) as error:
-        print(f"follower: {error}", file=sys.stderr)
+    except KeyError as error:
+        print(f"follower: {arguments.seat} is no seat: it lacks {error}", file=sys.stderr)
+        return 2
+    except (SeatError, OSError, ValueError) as error:
+        print(f"follower: {arguments.seat}: {error}", file=sys.stderr)
         return 2
     except RunLost as error:
         print(f"follower: {error}", file=sys.stderr)
