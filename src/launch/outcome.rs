@@ -180,8 +180,10 @@ impl Summary {
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
         let mut latencies = latencies(&outcome.reports);
         latencies.extend(incident_figures(&outcome.incidents));
-        let stopped = outcome.incidents.iter().any(|incident| incident.action == Action::Stopped);
-        let books = Books::new(scenario, outcome, outcome.signal != 0 || stopped);
+        let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
+        let lost: Vec<&str> = lost.map(|incident| incident.role.as_str()).collect();
+        let interrupted = outcome.signal != 0 || !lost.is_empty();
+        let books = Books::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies);
         Self {
             schema: SCHEMA,
@@ -210,24 +212,27 @@ impl Summary {
 }
 
 impl Books {
-    fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool) -> Self {
+    fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool, lost: &[&str]) -> Self {
         let (reports, mut problems) = (&outcome.reports, outcome.problems.clone());
-        let written: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
+        let written = reports.iter().flat_map(|report| report.written.iter().map(move |link| (&*report.role, link)));
+        let written: Vec<(&str, &LinkWritten)> = written.collect();
         for report in reports {
             let Ticks { elapsed, executed, missed, .. } = report.ticks;
             if executed + missed != elapsed || (!interrupted && elapsed != scenario.last_tick + 1) {
                 problems.push(format!("{}: {executed} executed + {missed} missed of {elapsed} ticks", report.role));
             }
         }
-        for link in &written {
+        for (_, link) in &written {
             if link.published + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
         }
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
-            if let Some(written) = written.iter().find(|written| written.service == read.service) {
-                links.push(LinkBook::new(&report.role, written, read, scenario, &mut problems));
+            if let Some((writer, written)) = written.iter().find(|(_, written)| written.service == read.service) {
+                // A role that died may have sent a sample that it had no time to book: whoever received it knows.
+                let in_flight = lost.contains(writer) && read.last_tick > written.last_tick;
+                links.push(LinkBook::new(&report.role, written, in_flight, read, scenario, &mut problems));
             }
         }
         Self {
@@ -245,23 +250,25 @@ impl LinkBook {
     fn new(
         reader: &str,
         written: &LinkWritten,
+        in_flight: bool,
         read: &LinkRead,
         scenario: &Scenario,
         problems: &mut Vec<String>,
     ) -> Self {
         let covered = read.last_tick.map_or(0, |tick| tick + 1);
+        let sent = written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
         let book = Self {
             service: read.service.clone(),
             reader: reader.to_owned(),
-            published: written.published,
+            published: written.published + u64::from(in_flight),
             received: read.received,
             skipped: written.skipped,
             gaps: read.gaps,
-            unread: written.last_tick.map_or(0, |tick| tick + 1).saturating_sub(covered),
+            unread: sent.saturating_sub(covered),
         };
         let lossless = scenario.clock != crate::config::ClockKind::Realtime;
         let balanced = read.received + read.gaps == covered
-            && read.last_tick <= written.last_tick
+            && covered <= sent
             && read.stale == 0
             && book.published + book.skipped == book.received + book.gaps + book.unread
             && (!lossless || read.gaps == 0);

@@ -47,6 +47,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         _ => (None, Vec::new()),
     };
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?;
+    domain.seal()?;
     let mut crew = Crew::start(scenario, launch, domain, &bus)?;
     let mut scorer = score::open(scenario, &bus)?;
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;

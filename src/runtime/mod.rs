@@ -4,6 +4,7 @@
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
 mod drive;
+mod hooks;
 mod link;
 mod node;
 mod privileges;
