@@ -141,7 +141,7 @@ impl WriteBook {
             published: self.published(),
             skipped: self.words.get(Self::SKIPPED),
             last_tick: self.words.get(Self::COVERED).checked_sub(1),
-            hash: self.hash.checkpoints(),
+            hash: Some(self.hash.checkpoints()),
         }
     }
 }

@@ -15,8 +15,10 @@ pub struct RoleReport {
     /// What it read, by signal.
     pub read: Vec<LinkRead>,
     /// Its latencies, by stage.
+    #[serde(default)]
     pub stages: Vec<StageReport>,
     /// What it asked of the machine, and what it got.
+    #[serde(default)]
     pub grants: Vec<Grant>,
 }
 
@@ -30,8 +32,10 @@ pub struct Ticks {
     /// Ticks that it did not execute.
     pub missed: u64,
     /// Ticks at which an input that was due was absent: a plant's command, a controller's measurement.
+    #[serde(default)]
     pub starved: u64,
     /// Ticks at which a plant applied its safe command.
+    #[serde(default)]
     pub safe: u64,
     /// The first tick whose result differs from an undisturbed run's, if any does.
     pub first_disturbed: Option<u64>,
@@ -48,8 +52,9 @@ pub struct LinkWritten {
     pub skipped: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
-    /// The hash of what was sent.
-    pub hash: Checkpoints,
+    /// The hash of what was sent; a program that is not ours need not keep one.
+    #[serde(default)]
+    pub hash: Option<Checkpoints>,
 }
 
 /// The books of a signal's reading end: `received` + `gaps` = `last_tick` + 1.

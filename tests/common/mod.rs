@@ -63,10 +63,15 @@ impl Bench {
     }
 
     pub fn command(&self) -> Command {
-        let mut command = Command::new(match self.user {
+        self.command_of(&match self.user {
             Some(_) => self.path("corotate"),
             None => env!("CARGO_BIN_EXE_corotate").into(),
-        });
+        })
+    }
+
+    /// A command in this bench by another program than ours.
+    pub fn command_of(&self, program: &Path) -> Command {
+        let mut command = Command::new(program);
         if let Some(user) = self.user {
             command.uid(user).gid(user);
         }
@@ -76,6 +81,10 @@ impl Bench {
 
     pub fn start(&self, arguments: &[&str]) -> Running {
         Running::new(self.command().args(arguments))
+    }
+
+    pub fn start_program(&self, program: &Path, arguments: &[&str]) -> Running {
+        Running::new(self.command_of(program).args(arguments))
     }
 
     pub fn run(&self, arguments: &[&str]) -> Done {
