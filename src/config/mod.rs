@@ -2,15 +2,20 @@
 //!
 //! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
 
+mod accept;
 mod document;
 mod error;
+mod fault;
 mod raw;
 mod scenario;
+mod watchdog;
 
+pub use accept::Accept;
 pub use document::Document;
 pub use error::{ConfigError, Problem};
+pub use fault::ScriptedFault;
 pub use raw::{ClockKind, Cores, NamedCores, Realtime};
-pub use scenario::{Accept, Scenario};
+pub use scenario::Scenario;
 
 pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};

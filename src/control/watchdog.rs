@@ -87,6 +87,17 @@ impl Watchdog {
         }
     }
 
+    /// Goes on with what a predecessor counted, and with its latch. The references are taken anew.
+    pub fn resume(bounds: WatchBounds, breaches: [Breaches; 4], latched_at: Option<u64>) -> Self {
+        Self { breaches, latched_at, ..Self::new(bounds) }
+    }
+
+    /// Whether anything is watched.
+    #[inline]
+    pub fn active(&self) -> bool {
+        self.bounds.max.iter().any(|max| *max < f64::INFINITY)
+    }
+
     /// Looks at the energy and the momentum of the observed body, in any unit.
     #[inline]
     pub fn invariants(&mut self, tick: u64, values: [f64; 2]) {
@@ -114,11 +125,9 @@ impl Watchdog {
         let (max, breaches) = (self.bounds.max[watched as usize], &mut self.breaches[watched as usize]);
         breaches.judged += 1;
         // What is not a number is beyond every bound.
-        let within = value <= max;
-        if !(value <= breaches.largest) {
-            breaches.largest = if value.is_nan() { f64::INFINITY } else { value };
-        }
-        if !within {
+        let value = if value.is_nan() { f64::INFINITY } else { value };
+        breaches.largest = breaches.largest.max(value);
+        if value > max {
             breaches.count += 1;
             breaches.first_tick.get_or_insert(tick);
             self.broken(tick);
@@ -186,7 +195,10 @@ mod tests {
     fn the_reference_is_the_median_of_the_first_values_from_its_tick_on() {
         let mut watchdog = watchdog(None);
         (0..10).for_each(|tick| watchdog.invariants(tick, [99.0, 99.0]));
-        [2.0, 1e300, 2.0, 2.0, f64::NAN].iter().zip(10..).for_each(|(value, tick)| watchdog.invariants(tick, [*value, 4.0]));
+        [2.0, 1e300, 2.0, 2.0, f64::NAN]
+            .iter()
+            .zip(10..)
+            .for_each(|(value, tick)| watchdog.invariants(tick, [*value, 4.0]));
         assert_eq!(watchdog.breaches()[0], Breaches::default(), "nothing is judged while the reference is taken");
         watchdog.invariants(15, [2.01, 4.1]);
         let [energy, momentum, ..] = *watchdog.breaches();

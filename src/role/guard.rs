@@ -86,7 +86,11 @@ mod tests {
     use crate::sample::{RateMeasurement, Stamp};
 
     fn guard() -> Plausible<3> {
-        Plausible::new(Bounds { magnitude: [2.0; 3], slew_per_tick: [0.01, 0.01, f64::INFINITY], allowance: [0.001; 3] })
+        Plausible::new(Bounds {
+            magnitude: [2.0; 3],
+            slew_per_tick: [0.01, 0.01, f64::INFINITY],
+            allowance: [0.001; 3],
+        })
     }
 
     fn accepts(guard: &mut Plausible<3>, tick: u64, values: [f64; 3], valid: u64) -> bool {

@@ -7,22 +7,26 @@ mod config;
 mod identifier;
 mod law;
 mod learner;
+mod limits;
 mod observer;
 mod plant;
 
 pub use law::RateLaw;
 pub use learner::Learner;
+pub(in crate::rig) use limits::SURE_DEVIATIONS;
+pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 
 use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Frame, Rig, UNKNOWN_DEVIATION};
 use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
 use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
 use config::{Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
 use identifier::Identifier;
+use limits::{Limits, Sensed};
 use nalgebra::{Matrix3, Vector1, Vector3};
 use observer::ALL;
 use plant::Outage;
@@ -45,9 +49,11 @@ pub struct RigidBodyRig {
     supplied_axis: Option<usize>,
     observer: ObserverDesign,
     controller: Option<ControllerDesign>,
-    /// Per body, what its gyros add; and the standard deviations of the leader's.
+    /// Per body, what its gyros add, and of which standard deviation and bias that is.
     noise: Vec<Noise<3>>,
-    leader_deviation_rad_s: Vector3<f64>,
+    deviations_rad_s: Vec<Vector3<f64>>,
+    biases_rad_s: Vec<Vector3<f64>>,
+    limits: Limits,
     notes: Vec<String>,
     tick_s: f64,
 }
@@ -95,7 +101,9 @@ pub(super) fn resolve(
         observer,
         controller: raw.controller.as_ref().map(ControllerDesign::from),
         noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
-        leader_deviation_rad_s: raw.leader.noise_rad_s.into(),
+        deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
+        biases_rad_s: vec![raw.leader.bias_rad_s.into()],
+        limits: design_limits(&raw, &inertia, checks),
         notes,
         tick_s: frame.tick_s,
     };
@@ -107,6 +115,8 @@ pub(super) fn resolve(
         rig.initial_rates.push(follower.initial_rate_rad_s.into());
         rig.inertia_factors.push(factor);
         rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
+        rig.deviations_rad_s.push(follower.noise_rad_s.into());
+        rig.biases_rad_s.push(follower.bias_rad_s.into());
     }
     rig.check_tick(checks);
     Ok((Some(rig), table))
@@ -150,6 +160,21 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
         }
     }
     outages
+}
+
+fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limits {
+    let fastest =
+        |rates: &mut dyn Iterator<Item = [f64; 3]>| rates.map(|rate| Vector3::from(rate).norm()).fold(0.0, f64::max);
+    let noisy = raw.leader.noise_rad_s != [0.0; 3] || raw.observer.decay_rate_per_s.is_none();
+    let gain_per_s = raw.controller.as_ref().map_or(0.0, |controller| Vector3::from(controller.gain_per_s).amax());
+    let about = limits::Circumstances {
+        leader_rad_s: inertia.rate_bound_rad_s(&raw.leader.initial_rate_rad_s.into()),
+        follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.initial_rate_rad_s)),
+        transient_rad_s: raw.observer.initial_guess_rad_s.abs()
+            + if noisy { limits::SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
+        gain_per_s,
+    };
+    Limits::resolve(&raw.limits, &about, checks)
 }
 
 fn design_observer(
@@ -341,6 +366,10 @@ impl Rig for RigidBodyRig {
     type Body = RatePlant;
     type Estimator = RateObserver;
     type Law = RateLaw;
+    type MeasurementGuard = MeasurementGuard;
+    type EstimateGuard = EstimateGuard;
+    type CommandGuard = CommandGuard;
+    const AXES: usize = 3;
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies
@@ -365,7 +394,7 @@ impl Rig for RigidBodyRig {
         match &self.observer {
             ObserverDesign::Hidden { relation, filter: FilterDesign::Kalman(density), guess_rad_s } => {
                 let noise = RateNoise {
-                    sensor_deviation_rad_s: self.leader_deviation_rad_s,
+                    sensor_deviation_rad_s: self.deviations_rad_s[0],
                     density: *density,
                     guess_deviation_rad_s: UNKNOWN_DEVIATION,
                 };
@@ -402,7 +431,61 @@ impl Rig for RigidBodyRig {
             certificate: self.certificate(),
             supplied: self.supplied(),
             learned: controller.learned,
+            acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
             tick_s: self.tick_s,
+        }
+    }
+
+    /// A law acts on all components; an observer says itself which it needs.
+    fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
+        // What is not known of the leader is not used here either; a follower may have another inertia.
+        let known = index == 0 && matches!(self.observer, ObserverDesign::Hidden { .. });
+        let body = Sensed {
+            coefficients: if known { self.inertia.coefficients().abs() } else { Vector3::repeat(1.0) },
+            factor: self.inertia_factors[index],
+            driven: self.bodies[index].driven,
+            deviation: self.deviations_rad_s[index],
+            bias: self.biases_rad_s[index],
+        };
+        self.limits.measurement(&body, self.tick_s, if acts { ALL } else { 0 })
+    }
+
+    fn estimate_guard(&self) -> EstimateGuard {
+        self.limits.estimate()
+    }
+
+    fn command_guard(&self, _index: usize) -> CommandGuard {
+        self.limits.command()
+    }
+
+    fn limits(&self) -> Vec<Figure> {
+        self.limits.figures()
+    }
+
+    /// Both per I1, which is what a free motion tells of the inertia: [kinetic energy, rad²/s²; momentum, rad/s].
+    fn invariants(&self, estimate: &RateEstimate) -> Option<[f64; 2]> {
+        let ([second, third], rate) = (estimate.inertia_ratios, Vector3::from(estimate.omega_rad_s));
+        let momentum = rate.component_mul(&Vector3::new(1.0, second, third));
+        Some([0.5 * rate.dot(&momentum), momentum.norm()])
+    }
+
+    fn innovation(estimate: &RateEstimate) -> f64 {
+        estimate.innovation_rad_s
+    }
+
+    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        let silent = match &self.observer {
+            ObserverDesign::Hidden { filter: FilterDesign::Kalman(_), .. } => watched == Watched::Innovation,
+            _ => false,
+        };
+        if self.controller.is_none() {
+            Some("is watched by the controller, and this scenario has none")
+        } else if silent {
+            Some("is not published by the Kalman filter")
+        } else if watched == Watched::Lyapunov && self.certificate().is_none() {
+            Some("is published with the first-order filter only")
+        } else {
+            None
         }
     }
 
