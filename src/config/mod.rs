@@ -21,7 +21,7 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 10] = [
+pub const SHIPPED: [(&str, &str); 11] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
@@ -30,6 +30,7 @@ pub const SHIPPED: [(&str, &str); 10] = [
     ("inertia", include_str!("../../config/inertia.toml")),
     ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
     ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("faults", include_str!("../../config/faults.toml")),
     ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
     ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
 ];

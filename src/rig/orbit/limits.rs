@@ -6,7 +6,7 @@ use super::roles::{POSITION, VELOCITY};
 use crate::config::{Checks, finite_positive};
 use crate::model::{CentralField, OrbitState};
 use crate::rig::{Figure, rigid_body::SURE_DEVIATIONS};
-use crate::role::Guard;
+use crate::role::{Bounds, Guard, Plausible};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
 use nalgebra::Vector4;
 use serde::{Deserialize, Serialize};
@@ -22,23 +22,27 @@ const ROUNDING: f64 = 1e-12;
 pub(super) struct RawLimits {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub speed_du_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repeats: Option<u64>,
 }
 
 impl RawLimits {
     pub fn is_default(&self) -> bool {
-        self.speed_du_s.is_none()
+        self.speed_du_s.is_none() && self.repeats.is_none()
     }
 }
 
 /// The limits as resolved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Limits {
-    field: CentralField,
+    pub field: CentralField,
     pub speed_du_s: f64,
     /// How far a velocity estimate may err before it settles, du/s.
     pub transient_du_s: f64,
     pub thrust_du_s2: f64,
-    tick_s: f64,
+    pub tick_s: f64,
+    /// So often a measurement may repeat the one before to the last bit.
+    pub repeats: u64,
 }
 
 impl Limits {
@@ -71,10 +75,6 @@ impl Limits {
         raw.speed_du_s.unwrap_or(SPEED_MARGIN * fastest)
     }
 
-    pub fn new(field: CentralField, speed_du_s: f64, transient_du_s: f64, thrust_du_s2: f64, tick_s: f64) -> Self {
-        Self { field, speed_du_s, transient_du_s, thrust_du_s2, tick_s }
-    }
-
     /// For people.
     pub fn figures(&self) -> Vec<Figure> {
         let figure = |name: &str, value| Figure { name: name.to_owned(), value };
@@ -88,14 +88,16 @@ impl Limits {
     /// A guard for measurements with sensors of these standard deviations and biases of (r, θ, Vr, Vθ).
     pub fn measurement(&self, deviation: [f64; 4], bias: [f64; 4], needed: u64) -> MeasurementGuard {
         let spread = Vector4::from(deviation) * SURE_DEVIATIONS;
-        MeasurementGuard {
-            limits: *self,
-            spread,
-            offset: Vector4::from(bias).abs() + spread,
-            needed,
-            generation: 0,
-            last: None,
-        }
+        let offset = Vector4::from(bias).abs() + spread;
+        let (far, fast) = (f64::MAX, self.speed_du_s);
+        let bounds = Bounds {
+            magnitude: [far, far, fast + offset[2], fast + offset[3]],
+            slew_per_tick: [f64::INFINITY; 4],
+            // A noisy radius also blurs what follows from it.
+            allowance: (spread * 2.0 + Vector4::repeat(ROUNDING)).into(),
+            repeats: self.repeats,
+        };
+        MeasurementGuard { limits: *self, radius_offset: offset[0], state: Plausible::new(bounds), needed }
     }
 
     /// A guard for estimates, whose radius is as measured with this standard deviation and bias.
@@ -118,63 +120,38 @@ impl Limits {
 #[derive(Debug)]
 pub struct MeasurementGuard {
     limits: Limits,
-    spread: Vector4<f64>,
-    offset: Vector4<f64>,
+    radius_offset: f64,
+    state: Plausible<4>,
     needed: u64,
-    generation: u64,
-    /// The last measurement that was believed, its tick, and whether it has a velocity.
-    last: Option<(Vector4<f64>, u64, bool)>,
 }
 
-impl MeasurementGuard {
+impl Limits {
+    /// How far a component of (r, θ, Vr, Vθ) can have changed after so many ticks from `from`.
     #[inline]
-    fn in_range(&self, x: &Vector4<f64>, moving: bool) -> bool {
-        let speed = self.limits.speed_du_s;
-        let velocity = |i: usize| !moving || x[i].abs() <= speed + self.offset[i];
-        self.limits.radius_possible(x[0], self.offset[0]) && x[1].is_finite() && velocity(2) && velocity(3)
-    }
-
-    /// Whether a body that was at `from` can be at `to` after `ticks` ticks.
-    #[inline]
-    fn reachable(&self, from: &Vector4<f64>, to: &Vector4<f64>, ticks: u64, moving: bool) -> bool {
-        let Limits { field, speed_du_s: speed, thrust_du_s2: thrust, tick_s, .. } = &self.limits;
-        let time = ticks as f64 * tick_s;
+    fn change(&self, i: usize, from: &[f64; 4], ticks: f64) -> f64 {
+        let (time, speed) = (ticks * self.tick_s, self.speed_du_s);
         // The nearest that it can have come to the centre meanwhile.
-        let r = (from[0] - self.offset[0] - speed * time).max(field.inner());
-        let acceleration = field.mu() / (r * r) + 2.0 * speed * speed / r + thrust;
-        let change = [speed * time, speed * time / r, acceleration * time, acceleration * time];
-        let allowed = |i: usize| {
-            let slack = 2.0 * self.spread[i] + ROUNDING * (1.0 + to[i].abs());
-            (to[i] - from[i]).abs() <= change[i] + slack
-        };
-        (0..if moving { 4 } else { 2 }).all(allowed)
+        let r = (from[0] - speed * time).max(self.field.inner());
+        match i {
+            0 => speed * time,
+            1 => speed * time / r,
+            _ => (self.field.mu() / (r * r) + 2.0 * speed * speed / r + self.thrust_du_s2) * time,
+        }
     }
 }
 
 impl Guard<OrbitMeasurement> for MeasurementGuard {
     #[inline]
     fn accepts(&mut self, sample: &OrbitMeasurement) -> bool {
-        if sample.stamp.generation != self.generation {
-            (self.generation, self.last) = (sample.stamp.generation, None);
-        }
-        let [vr, vtheta] = sample.velocity_du_s;
-        let (x, moving) =
-            (Vector4::new(sample.radius_du, sample.angle_rad, vr, vtheta), sample.valid & VELOCITY == VELOCITY);
-        let complete = sample.valid & self.needed == self.needed;
-        // Without a position there is nothing to check: the observer says itself that it cannot use it.
-        if complete && sample.valid & POSITION != POSITION {
-            return true;
-        }
-        let believed = complete
-            && sample.applied_du_s2.iter().all(|thrust| thrust.abs() <= self.limits.thrust_du_s2 * (1.0 + ROUNDING))
-            && self.in_range(&x, moving)
-            && self.last.is_none_or(|(last, tick, moved)| {
-                self.reachable(&last, &x, sample.stamp.tick.saturating_sub(tick), moving && moved)
-            });
-        if believed {
-            self.last = Some((x, sample.stamp.tick, moving));
-        }
-        believed
+        let ([vr, vtheta], limits) = (sample.velocity_du_s, self.limits);
+        let state = [sample.radius_du, sample.angle_rad, vr, vtheta];
+        let placed = sample.valid & 1 == 0 || limits.radius_possible(sample.radius_du, self.radius_offset);
+        sample.valid & self.needed == self.needed
+            && sample.applied_du_s2.iter().all(|thrust| thrust.abs() <= limits.thrust_du_s2 * (1.0 + ROUNDING))
+            && placed
+            && self
+                .state
+                .accepts_within(&sample.stamp, &state, sample.valid, |i, from, ticks| limits.change(i, from, ticks))
     }
 }
 
@@ -217,7 +194,14 @@ mod tests {
     use crate::sample::Stamp;
 
     fn limits() -> Limits {
-        Limits::new(CentralField::new(1.0, 0.05, 10.0).unwrap(), 2.0, 1.0, 0.5, 1e-3)
+        Limits {
+            field: CentralField::new(1.0, 0.05, 10.0).unwrap(),
+            speed_du_s: 2.0,
+            transient_du_s: 1.0,
+            thrust_du_s2: 0.5,
+            tick_s: 1e-3,
+            repeats: u64::MAX,
+        }
     }
 
     fn at(tick: u64, radius_du: f64, angle_rad: f64, velocity: f64) -> OrbitMeasurement {

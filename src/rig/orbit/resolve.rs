@@ -176,7 +176,7 @@ pub(in crate::rig) fn hold(
         bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true }],
         field,
         initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, frame.tick_s),
+        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
@@ -216,7 +216,7 @@ pub(in crate::rig) fn rendezvous(
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
         field,
         initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, frame.tick_s),
+        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
@@ -246,16 +246,23 @@ fn sensor(frame: Frame, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sen
 /// An estimate errs by its guess until it settles; one that weighs noise may err by more.
 fn limits(
     field: CentralField,
-    speed: f64,
+    speed_du_s: f64,
     observer: &RawObserver,
     sensors: &Sensors,
-    thrust_max: f64,
-    tick_s: f64,
+    thrust_du_s2: f64,
+    raw: &RawLimits,
+    frame: Frame,
 ) -> Limits {
     let guess = observer.initial_guess_du_s.iter().fold(0.0, |largest: f64, guess| largest.max(guess.abs()));
     let noisy = sensors.deviation != [0.0; 4] || observer.decay_rate_per_s.is_none();
-    let transient = speed + guess + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 };
-    Limits::new(field, speed, transient, thrust_max, tick_s)
+    Limits {
+        field,
+        speed_du_s,
+        transient_du_s: speed_du_s + guess + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
+        thrust_du_s2,
+        tick_s: frame.tick_s,
+        repeats: raw.repeats.unwrap_or(u64::MAX),
+    }
 }
 
 impl RawGain {

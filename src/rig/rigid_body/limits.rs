@@ -24,11 +24,13 @@ pub(super) struct RawLimits {
     pub rate_rad_s: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub acceleration_rad_s2: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repeats: Option<u64>,
 }
 
 impl RawLimits {
     pub fn is_default(&self) -> bool {
-        self.rate_rad_s.is_none() && self.acceleration_rad_s2.is_none()
+        self.rate_rad_s.is_none() && self.acceleration_rad_s2.is_none() && self.repeats.is_none()
     }
 }
 
@@ -41,6 +43,8 @@ pub(super) struct Circumstances {
     pub follower_rad_s: f64,
     /// How far an estimate may err before it settles, rad/s.
     pub transient_rad_s: f64,
+    /// How fast the observer moves an estimate that errs, 1/s; +inf where nothing bounds that.
+    pub correction_per_s: f64,
     /// The largest gain of the law, 1/s.
     pub gain_per_s: f64,
 }
@@ -51,6 +55,8 @@ pub(super) struct Limits {
     pub rate_rad_s: f64,
     pub estimate_rad_s: f64,
     pub acceleration_rad_s2: f64,
+    correction_per_s: f64,
+    repeats: u64,
 }
 
 impl Limits {
@@ -76,7 +82,13 @@ impl Limits {
         let demand = about.gain_per_s * (estimate_rad_s + rate_rad_s)
             + estimate_rad_s * estimate_rad_s
             + rate_rad_s * rate_rad_s;
-        Self { rate_rad_s, estimate_rad_s, acceleration_rad_s2: raw.acceleration_rad_s2.unwrap_or(demand) }
+        Self {
+            rate_rad_s,
+            estimate_rad_s,
+            acceleration_rad_s2: raw.acceleration_rad_s2.unwrap_or(demand),
+            correction_per_s: about.correction_per_s,
+            repeats: raw.repeats.unwrap_or(u64::MAX),
+        }
     }
 
     /// For people.
@@ -101,13 +113,22 @@ impl Limits {
             magnitude: (Vector3::repeat(self.rate_rad_s) + body.bias.abs() + spread).into(),
             slew_per_tick: ((free + driven) * tick_s).into(),
             allowance: (spread * 2.0 + rounding).into(),
+            repeats: self.repeats,
         };
         MeasurementGuard { rate: Plausible::new(bounds), acceleration_rad_s2: self.acceleration_rad_s2, needed }
     }
 
-    /// A guard for estimates.
-    pub fn estimate(&self) -> EstimateGuard {
-        EstimateGuard { rate_rad_s: self.estimate_rad_s }
+    /// A guard for estimates of a body whose |a| are at most `coefficients`.
+    pub fn estimate(&self, coefficients: &Vector3<f64>, tick_s: f64) -> EstimateGuard {
+        let free = coefficients * (self.estimate_rad_s * self.estimate_rad_s);
+        let corrected = Vector3::repeat(self.correction_per_s * 2.0 * self.estimate_rad_s);
+        let bounds = Bounds {
+            magnitude: [self.estimate_rad_s; 3],
+            slew_per_tick: ((free + corrected) * tick_s).into(),
+            allowance: [0.0; 3],
+            repeats: self.repeats,
+        };
+        EstimateGuard { rate: Plausible::new(bounds) }
     }
 
     /// A guard for commands.
@@ -142,25 +163,24 @@ impl Guard<RateMeasurement> for MeasurementGuard {
     fn accepts(&mut self, sample: &RateMeasurement) -> bool {
         sample.valid & self.needed == self.needed
             && within(&sample.applied_rad_s2, self.acceleration_rad_s2)
-            && self.rate.accepts(sample, &sample.omega_rad_s, sample.valid)
+            && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid)
     }
 }
 
-/// Guards estimates: their range, and that a component which is not valid is said to be a guess.
-///
-/// An estimate may jump where a measured body cannot, so its slew is not bounded.
+/// Guards estimates: their range, how fast the body and the observer's correction let them change, and that a component
+/// which is not valid is said to be a guess. Without a filter of first order on quiet sensors their slew is not bounded.
 #[derive(Debug)]
 pub struct EstimateGuard {
-    rate_rad_s: f64,
+    rate: Plausible<3>,
 }
 
 impl Guard<RateEstimate> for EstimateGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateEstimate) -> bool {
         let told = sample.valid & ALL == ALL || sample.status & (status::INITIAL | status::DEGRADED) != 0;
-        told && within(&sample.omega_rad_s, self.rate_rad_s)
-            && within(&sample.coefficients, f64::MAX)
+        told && within(&sample.coefficients, f64::MAX)
             && sample.innovation_rad_s.is_finite()
+            && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, ALL)
     }
 }
 
@@ -188,7 +208,13 @@ mod tests {
     use super::*;
     use crate::sample::Stamp;
 
-    const LIMITS: Limits = Limits { rate_rad_s: 2.0, estimate_rad_s: 3.0, acceleration_rad_s2: 8.0 };
+    const LIMITS: Limits = Limits {
+        rate_rad_s: 2.0,
+        estimate_rad_s: 3.0,
+        acceleration_rad_s2: 8.0,
+        correction_per_s: f64::INFINITY,
+        repeats: u64::MAX,
+    };
 
     fn sensed(driven: bool) -> Sensed {
         let zero = Vector3::zeros();
@@ -220,11 +246,26 @@ mod tests {
     #[test]
     fn an_estimate_that_lacks_a_component_says_why_or_is_not_believed() {
         let estimate = |valid, status| RateEstimate { valid, status, ..RateEstimate::default() };
-        let mut guard = LIMITS.estimate();
+        let mut guard = LIMITS.estimate(&Vector3::repeat(1.0), 1e-3);
         assert!(guard.accepts(&estimate(ALL, 0)) && guard.accepts(&estimate(0b011, status::INITIAL)));
         assert!(!guard.accepts(&estimate(0b011, 0)));
         assert!(!guard.accepts(&RateEstimate { omega_rad_s: [0.0, 3.1, 0.0], ..estimate(ALL, 0) }));
         assert!(!guard.accepts(&RateEstimate { coefficients: [0.0, f64::NAN, 0.0], ..estimate(ALL, 0) }));
+    }
+
+    #[test]
+    fn a_quiet_estimate_moves_with_the_body_and_the_correction() {
+        let limits = Limits { correction_per_s: 6.0, ..LIMITS };
+        let slew = 0.5 * 9.0 + 6.0 * 6.0;
+        let estimate = |tick, rate| {
+            let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+            RateEstimate { stamp, omega_rad_s: [rate; 3], valid: ALL, ..RateEstimate::default() }
+        };
+        let mut guard = limits.estimate(&Vector3::repeat(0.5), 1e-3);
+        assert!(guard.accepts(&estimate(0, 0.0)) && !guard.accepts(&estimate(1, 1.01e-3 * slew)));
+        assert!(guard.accepts(&estimate(1, 0.99e-3 * slew)));
+        let mut loose = LIMITS.estimate(&Vector3::repeat(0.5), 1e-3);
+        assert!(loose.accepts(&estimate(0, 0.0)) && loose.accepts(&estimate(1, 3.0)));
     }
 
     #[test]

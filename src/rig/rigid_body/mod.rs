@@ -172,6 +172,11 @@ fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limit
         follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.initial_rate_rad_s)),
         transient_rad_s: raw.observer.initial_guess_rad_s.abs()
             + if noisy { limits::SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
+        // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.
+        correction_per_s: match raw.observer.decay_rate_per_s {
+            Some(decay) if !noisy && raw.observer.kind == Kind::HiddenRate => decay,
+            _ => f64::INFINITY,
+        },
         gain_per_s,
     };
     Limits::resolve(&raw.limits, &about, checks)
@@ -290,6 +295,14 @@ impl RigidBodyRig {
     /// The component that the observer supplies, 0 to 2; where there is none, any serves.
     fn supplied(&self) -> usize {
         self.supplied_axis.unwrap_or(3) - 1
+    }
+
+    /// Bounds on the leader's |a|: what an observer has to learn is not used in guarding it either.
+    fn leader_coefficients(&self) -> Vector3<f64> {
+        match &self.observer {
+            ObserverDesign::Hidden { .. } => self.inertia.coefficients().abs(),
+            ObserverDesign::Learner(_) => Vector3::repeat(1.0),
+        }
     }
 
     fn rate_bound_rad_s(&self) -> f64 {
@@ -438,10 +451,9 @@ impl Rig for RigidBodyRig {
 
     /// A law acts on all components; an observer says itself which it needs.
     fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
-        // What is not known of the leader is not used here either; a follower may have another inertia.
-        let known = index == 0 && matches!(self.observer, ObserverDesign::Hidden { .. });
         let body = Sensed {
-            coefficients: if known { self.inertia.coefficients().abs() } else { Vector3::repeat(1.0) },
+            // A follower may have another inertia.
+            coefficients: if index == 0 { self.leader_coefficients() } else { Vector3::repeat(1.0) },
             factor: self.inertia_factors[index],
             driven: self.bodies[index].driven,
             deviation: self.deviations_rad_s[index],
@@ -451,7 +463,7 @@ impl Rig for RigidBodyRig {
     }
 
     fn estimate_guard(&self) -> EstimateGuard {
-        self.limits.estimate()
+        self.limits.estimate(&self.leader_coefficients(), self.tick_s)
     }
 
     fn command_guard(&self, _index: usize) -> CommandGuard {

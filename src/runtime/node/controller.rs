@@ -104,7 +104,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     fn pass_over(&mut self) -> Result<(), BusError> {
         let next = self.book.next();
         for tick in next..=self.estimate.last_tick().unwrap_or(next) {
-            self.channels.iter_mut().try_for_each(|channel| channel.command.pass_over(tick))?;
+            for channel in &mut self.channels {
+                // What is not used now will never be, and must not fill the link.
+                channel.measurement.seek(tick)?;
+                channel.command.pass_over(tick)?;
+            }
             self.skip_to(tick + 1);
         }
         Ok(())
