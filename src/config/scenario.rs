@@ -1,8 +1,8 @@
 //! A scenario as resolved: every value checked, every default filled in, ready to run.
 
 use super::fault::{self, ScriptedFault};
-use super::raw::Raw;
-use super::{ClockKind, ConfigError, Document, Problem, Realtime, accept, watchdog};
+use super::raw::{Policy, Raw};
+use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, accept, nearest, watchdog};
 use crate::control::WatchBounds;
 use crate::rig::{self, AnyRig, Frame};
 use crate::role::{Actuation, Rearm};
@@ -18,7 +18,7 @@ const MAX_TICKS: f64 = 3.2e11;
 const RIG_SECTIONS: [&str; 7] =
     ["central_body", "leader", "spacecraft", "follower", "observer", "controller", "limits"];
 /// The keys that hold one table each.
-const TABLES: [&str; 11] = [
+const TABLES: [&str; 12] = [
     "central_body",
     "leader",
     "spacecraft",
@@ -28,6 +28,7 @@ const TABLES: [&str; 11] = [
     "actuator",
     "realtime",
     "launch",
+    "supervision",
     "watchdog",
     "accept",
 ];
@@ -51,6 +52,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// What the launcher does about roles that fail.
+    pub supervision: Supervision,
     /// What is to go wrong.
     pub faults: Vec<ScriptedFault>,
     /// What the controller watches.
@@ -97,6 +100,7 @@ impl Scenario {
         let accept = accept::resolve(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
+            check_roles(&raw.supervision.on_failure, rig, &mut checks);
             let setting = fault::Setting { rig, clock: raw.clock, last_tick, seed: raw.seed };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             watch = watchdog::resolve(&raw.watchdog, rig, tick_s, raw.duration_s, &mut checks);
@@ -113,6 +117,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            supervision: raw.supervision,
             faults,
             watch,
             accept,
@@ -211,9 +216,36 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
         "0 would make every tick unsafe; give at least 1".to_owned()
     });
     check_realtime(&raw.realtime, checks);
+    check_supervision(&raw.supervision, checks);
     checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
         format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
     });
+}
+
+fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
+    let (heartbeat_s, interval_s) = (supervision.heartbeat_timeout_s, supervision.restart_interval_s);
+    checks.require((0.1..=3600.0).contains(&heartbeat_s), "supervision.heartbeat_timeout_s", || {
+        format!("{heartbeat_s} s is no time to wait for a word that is due every 0.02 s; give 0.1 to 3600")
+    });
+    checks.require((0.0..=3600.0).contains(&interval_s), "supervision.restart_interval_s", || {
+        format!("{interval_s} s is no time between two starts; give 0 to 3600")
+    });
+    checks.require(supervision.restarts_max <= 1000, "supervision.restarts_max", || {
+        format!("{} starts of one role will not mend it; give 0 to 1000", supervision.restarts_max)
+    });
+}
+
+/// Roles that a policy names must exist.
+fn check_roles(policy: &Policy, rig: &AnyRig, checks: &mut Checks<'_>) {
+    let Policy::ByRole(roles) = policy else { return };
+    let bodies = rig.bodies().iter().map(|body| body.name.as_str());
+    let known: Vec<&str> = bodies.chain(["observer", "controller"]).collect();
+    for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
+        checks.refuse(
+            &format!("supervision.on_failure.{role}"),
+            format!("there is no such role; {}", nearest(role, &known)),
+        );
+    }
 }
 
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {

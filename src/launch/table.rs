@@ -1,7 +1,7 @@
 //! The end of a run on the screen.
 
-use super::Summary;
 use super::outcome::LinkBook;
+use super::{Incident, Summary};
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -23,6 +23,9 @@ pub fn table(summary: &Summary) -> String {
         let _ = writeln!(text, "note: {note}");
     }
     results(summary, &mut text);
+    for incident in &summary.incidents {
+        let _ = writeln!(text, "{incident}{}", times(incident));
+    }
     if !summary.latencies.is_empty() {
         let _ = writeln!(text, "\n{}", latencies(summary));
     }
@@ -71,6 +74,11 @@ fn watchdog(summary: &Summary, text: &mut String) {
     if let Some(tick) = report.latched_at_tick {
         let _ = writeln!(text, "watchdog: safe command latched at tick {tick}");
     }
+}
+
+fn times(incident: &Incident) -> String {
+    let told = |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {s:.3} s"));
+    told("back", incident.outage_s) + &told("recovered", incident.recovery_s)
 }
 
 fn verdict(holds: Option<bool>) -> String {

@@ -224,6 +224,8 @@ enum FilterDesign<const N: usize> {
 const DAMPING: f64 = core::f64::consts::FRAC_1_SQRT_2;
 /// The standard deviation of a guess of which nothing is known, in the unit of the unknown.
 const UNKNOWN_DEVIATION: f64 = 10.0;
+/// Of white noise, so many standard deviations never occur: once in 10¹⁸ samples.
+const SURE_DEVIATIONS: f64 = 9.0;
 
 impl<const N: usize> FilterDesign<N> {
     /// Checks the three keys of which one must be given.

@@ -194,7 +194,7 @@ mod tests {
     fn noise_is_not_believed_because_it_has_lasted() {
         let mut guard = guard();
         assert!(accepts(&mut guard, 0, [0.0; 3], 7));
-        let wild = |tick: u64| if tick % 2 == 0 { 0.2 } else { -0.2 };
+        let wild = |tick: u64| if tick.is_multiple_of(2) { 0.2 } else { -0.2 };
         let believed = (1..500).filter(|tick| accepts(&mut guard, *tick, [wild(*tick), 0.0, 0.0], 7)).count();
         assert_eq!(believed, 0, "it could have been reached, but no body moves so");
         let good = (500..510).find(|tick| accepts(&mut guard, *tick, [0.1, 0.0, 0.0], 7));

@@ -4,6 +4,7 @@
 //! not exist, where everybody waits for inputs. Must not let a sample that its guard does not believe be seen.
 
 use super::disturb::Disturbance;
+use super::hooks::{self, Place};
 use crate::bus::{Bus, BusError, Read, Reader, Topic, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::fault::Transport;
@@ -63,7 +64,10 @@ impl<B: Bus, S: Sample> Output<B, S> {
             fill(sample);
             sample.stamp_mut().generation = generation;
             *sent = *sample;
-        })
+            hooks::at(Place::Loaned);
+        })?;
+        hooks::at(Place::Sent);
+        Ok(())
     }
 
     /// Sends a sample as the scripted faults have it.
@@ -91,7 +95,10 @@ impl<B: Bus, S: Sample> Output<B, S> {
             None => 1,
         };
         for _ in 0..copies {
-            self.port.send(|slot| *slot = sample)?;
+            self.port.send(|slot| {
+                *slot = sample;
+                hooks::at(Place::Loaned);
+            })?;
         }
         (self.delivered as u64..copies).for_each(|_| self.book.extra());
         if injected {
@@ -99,7 +106,11 @@ impl<B: Bus, S: Sample> Output<B, S> {
         }
         self.sent = sample;
         *self.sent.stamp_mut() = stamp;
-        if self.delivered { Ok(()) } else { self.send_void(&stamp) }
+        if !self.delivered {
+            self.send_void(&stamp)?;
+        }
+        hooks::at(Place::Sent);
+        Ok(())
     }
 
     /// Says that there is no sample for this tick, where readers wait for one. Without its having been made, if it never

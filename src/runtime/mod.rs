@@ -5,6 +5,7 @@
 
 mod disturb;
 mod drive;
+mod hooks;
 mod link;
 mod node;
 mod privileges;
@@ -13,11 +14,11 @@ mod process;
 pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Horizon, Input, Output, Seek};
-pub(crate) use node::horizon;
 pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
+pub(crate) use node::{horizon, next_tick};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
-pub(crate) use process::{report_path, scenario_path, write_whole};
+pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Scenario};

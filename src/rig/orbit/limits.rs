@@ -5,7 +5,7 @@
 use super::roles::{POSITION, VELOCITY};
 use crate::config::{Checks, finite_positive};
 use crate::model::{CentralField, OrbitState};
-use crate::rig::{Figure, rigid_body::SURE_DEVIATIONS};
+use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
 use nalgebra::Vector4;

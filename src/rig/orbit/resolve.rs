@@ -8,8 +8,7 @@ use super::{BodyInfo, OrbitRig, Sensors};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
-use crate::rig::rigid_body::SURE_DEVIATIONS;
-use crate::rig::{FilterDesign, Frame, UNKNOWN_DEVIATION, check_name};
+use crate::rig::{FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, Serialize, Deserialize)]

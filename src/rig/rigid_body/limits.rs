@@ -2,19 +2,16 @@
 //!
 //! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
 
+use super::observer::ALL;
 use crate::config::{Checks, finite_positive};
-use crate::rig::Figure;
+use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::observer::ALL;
-
 /// A default rate limit lies so far above what the initial rates allow.
 const RATE_MARGIN: f64 = 2.0;
-/// Of white noise, so many standard deviations never occur.
-pub(in crate::rig) const SURE_DEVIATIONS: f64 = 9.0;
 
 /// The table `[limits]` as typed.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
