@@ -9,14 +9,16 @@ mod ports;
 
 pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
-use super::link::{Input, Output};
+use super::disturb::{Disturbance, Interruptions};
+use super::link::{Horizon, Input, Output};
 use crate::bus::iox::footprint;
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
 use crate::rig::{Rig, Truth};
+use crate::role::Guard;
 use crate::sample::Sample;
-use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WriteBook};
+use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
 use crate::with_rig;
 
 /// Which role of a scenario.
@@ -88,7 +90,7 @@ pub enum Gate {
 pub enum Poll {
     /// It did; [`Node::settle`] is due.
     Executed,
-    /// It waits for inputs.
+    /// It waits for inputs, or has passed over a tick of which there are none.
     Waiting,
 }
 
@@ -101,6 +103,8 @@ pub trait Node {
     /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor left undone
     /// before that counts as missed.
     fn start(&mut self, grid: Grid, first_tick: u64);
+    /// Lets scripted interruptions of this role act: before every tick, once.
+    fn before_tick(&mut self);
     /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
     ///
     /// # Errors
@@ -136,19 +140,42 @@ pub type ReadyNode = Box<dyn Node>;
 pub struct Seat<'a, B> {
     bus: &'a B,
     scenario: &'a Scenario,
+    role: RoleId,
     generation: u64,
     ledger: &'a Ledger,
     clock: Clock,
 }
 
 impl<B: Bus> Seat<'_, B> {
-    fn input<S: Sample>(&self, body: &str, signal: Signal) -> Result<Input<B, S>, BusError> {
-        Input::open(self.bus, &topic(self.scenario, body, signal), Reader::Role, self.ledger)
+    fn input<S: Sample, G: Guard<S>>(&self, body: &str, signal: Signal, guard: G) -> Result<Input<B, S, G>, BusError> {
+        let topic = topic(self.scenario, body, signal);
+        let mut input = Input::open(self.bus, &topic, Reader::Role, self.ledger)?.guarded(guard);
+        input.expect(horizon(self.scenario, None));
+        Ok(input)
     }
 
     fn output<S: Sample>(&self, body: &str, signal: Signal) -> Result<Output<B, S>, BusError> {
         let topic = topic(self.scenario, body, signal);
-        Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)
+        let output = Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)?;
+        // Nobody in the loop reads the truth, and the score is to tell what really happened.
+        let disturbance = match signal {
+            Signal::Truth => None,
+            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), body),
+        };
+        Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+    }
+
+    fn interruptions(&self) -> Interruptions {
+        Interruptions::of(self.scenario, self.role.name(self.scenario), self.generation)
+    }
+}
+
+/// Which ticks samples can have; in real time only once the grid is known.
+pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
+    match (scenario.clock, grid) {
+        (ClockKind::Realtime, None) => Horizon::Unknown,
+        (ClockKind::Realtime, Some(grid)) => Horizon::Due(grid),
+        (ClockKind::Lockstep | ClockKind::InProcess, _) => Horizon::Next,
     }
 }
 
@@ -160,7 +187,8 @@ pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
     let ports = ports(scenario, role);
     let state = match role {
         RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
-        RoleId::Observer | RoleId::Controller => 0,
+        RoleId::Observer => 0,
+        RoleId::Controller => WatchBook::WORDS,
     };
     TickBook::WORDS
         + ports.writes.len() * WriteBook::words(scenario.last_tick)
@@ -199,6 +227,7 @@ pub fn report(
 ) -> RoleReport {
     let ports = ports(scenario, role);
     let ledger = ledger.reopened();
+    let watches = role == RoleId::Controller;
     RoleReport {
         role: role.name(scenario).to_owned(),
         ticks: TickBook::open(&ledger).report(),
@@ -208,6 +237,7 @@ pub fn report(
             .map(|port| WriteBook::open(&ledger, scenario.last_tick).report(&port.topic.to_string()))
             .collect(),
         read: ports.reads.iter().map(|port| ReadBook::open(&ledger).report(&port.topic.to_string())).collect(),
+        watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
         stages,
         grants,
     }
@@ -232,7 +262,7 @@ pub fn build<R: Rig, B: Bus + 'static>(
     let generation = ledger.enter();
     let ledger = &ledger.reopened();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let seat = Seat { bus, scenario, generation, ledger, clock };
+    let seat = Seat { bus, scenario, role, generation, ledger, clock };
     Ok(match role {
         RoleId::Plant(index) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
         RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),

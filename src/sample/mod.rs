@@ -40,6 +40,12 @@ impl Stamp {
     }
 }
 
+/// Set in a stamp's generation: of this tick there is no sample, and there will be none. A void.
+///
+/// Where everybody waits for inputs (lockstep, one thread), a sample that is missing would stop the loop; a void stands in
+/// its place. Readers count it and treat the tick as they treat a sample that was lost. Real time needs none.
+pub const VOID: u64 = 1 << 63;
+
 /// The type of one field's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FieldKind {
@@ -152,7 +158,8 @@ pub mod status {
     pub const INITIAL: u64 = 1 << 2;
     /// The motion did not reveal the unknown since the last sample: the estimate moved by the model alone.
     pub const UNOBSERVABLE: u64 = 1 << 3;
-    /// The measurement lacked a component that the observer needs, or was not finite: the estimate is the previous one.
+    /// The measurement lacked a component that the observer needs, or was not finite: the estimate went on by the model
+    /// alone, or is the previous one where the model is being learned.
     pub const UNUSABLE: u64 = 1 << 4;
     /// The observer learns the body's inertia from all components.
     pub const LEARNING: u64 = 1 << 5;
@@ -164,9 +171,12 @@ pub mod status {
     pub const NOT_EXCITED: u64 = 1 << 8;
     /// The body met an end of its model (it hit something, or left for good) and is frozen at its last good state.
     pub const FAULT: u64 = 1 << 9;
+    /// The input of this tick was there and was not believed: not finite, of a wrong life of its sender, or physically
+    /// impossible. It is treated as missing.
+    pub const REJECTED: u64 = 1 << 10;
 
     /// Every bit with its name.
-    pub const NAMES: [(&str, u64); 10] = [
+    pub const NAMES: [(&str, u64); 11] = [
         ("holding", HOLDING),
         ("safe", SAFE),
         ("initial", INITIAL),
@@ -177,6 +187,7 @@ pub mod status {
         ("degraded", DEGRADED),
         ("not_excited", NOT_EXCITED),
         ("fault", FAULT),
+        ("rejected", REJECTED),
     ];
 }
 
