@@ -93,14 +93,14 @@ impl<const N: usize> Plausible<N> {
         }
         let counts = self.bounds.repeats != u64::MAX;
         let mut believed = true;
-        for i in 0..N {
+        for (i, &value) in values.iter().enumerate() {
             if counts {
-                self.repeated[i] = if values[i] == self.before[i] { self.repeated[i] + 1 } else { 0 };
+                self.repeated[i] = if value == self.before[i] { self.repeated[i] + 1 } else { 0 };
             }
             believed &= valid >> i & 1 == 0
-                || (self.in_range(i, values[i])
+                || (self.in_range(i, value)
                     && self.repeated[i] <= self.bounds.repeats
-                    && self.reached(i, values[i], stamp.tick, &change));
+                    && self.reached(i, value, stamp.tick, &change));
         }
         if believed {
             for i in (0..N).filter(|i| valid >> i & 1 == 1) {
