@@ -144,11 +144,13 @@ pub enum NamedCores {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Launch {
     pub startup_timeout_s: f64,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub external: Vec<String>,
 }
 
 impl Default for Launch {
     fn default() -> Self {
-        Self { startup_timeout_s: 30.0 }
+        Self { startup_timeout_s: 30.0, external: Vec::new() }
     }
 }
 

@@ -52,6 +52,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// Roles that somebody else starts: hardware, or a foreign program.
+    pub external: Vec<String>,
     /// What the launcher does about roles that fail.
     pub supervision: Supervision,
     /// What is to go wrong.
@@ -98,6 +100,7 @@ impl Scenario {
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         let accept = accept::resolve(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
@@ -117,6 +120,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            external: raw.launch.external,
             supervision: raw.supervision,
             faults,
             watch,
@@ -235,11 +239,27 @@ fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
     });
 }
 
+/// Without a rig, its roles are not known and nothing is said of them.
+fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) {
+    let external = &raw.launch.external;
+    checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", || {
+        "one process has no room for another's role; give clock = \"realtime\" or \"lockstep\", or leave it empty"
+            .to_owned()
+    });
+    let Some(roles) = roles else { return };
+    for (index, role) in external.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
+        let known = roles.join(", ");
+        checks.refuse(
+            &format!("launch.external[{index}]"),
+            format!("there is no role `{role}`; this scenario has: {known}"),
+        );
+    }
+}
+
 /// Roles that a policy names must exist.
 fn check_roles(policy: &Policy, rig: &AnyRig, checks: &mut Checks<'_>) {
     let Policy::ByRole(roles) = policy else { return };
-    let bodies = rig.bodies().iter().map(|body| body.name.as_str());
-    let known: Vec<&str> = bodies.chain(["observer", "controller"]).collect();
+    let known = rig.roles();
     for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
         checks.refuse(
             &format!("supervision.on_failure.{role}"),

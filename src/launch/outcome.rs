@@ -22,6 +22,10 @@ const SCHEMA: &str = "corotate/summary/v1";
 pub struct Outcome {
     /// The roles' own accounts, in the order of a tick.
     pub reports: Vec<RoleReport>,
+    /// External roles that keep no books.
+    pub unbooked: Vec<String>,
+    /// What is wrong with accounts that were left.
+    pub problems: Vec<String>,
     /// The score.
     pub score: Score,
     /// Roles that failed while the ticks ran.
@@ -38,8 +42,8 @@ pub struct Outcome {
 #[derive(Debug, Serialize)]
 pub struct Summary {
     schema: &'static str,
-    version: &'static str,
-    revision: &'static str,
+    pub(super) version: &'static str,
+    pub(super) revision: &'static str,
     /// The scenario's name.
     pub scenario: String,
     /// The clock's name.
@@ -48,7 +52,7 @@ pub struct Summary {
     pub tick_hz: f64,
     /// The last tick of the scenario.
     pub last_tick: u64,
-    started_utc: String,
+    pub(super) started_utc: String,
     host: Host,
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
@@ -99,6 +103,8 @@ pub struct Books {
     pub balanced: bool,
     /// Where they do not.
     pub problems: Vec<String>,
+    /// External roles that keep no books: nothing is known of their ticks, nor of the links that they write and read.
+    pub unbooked: Vec<String>,
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
@@ -193,7 +199,7 @@ impl Summary {
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
         let lost: Vec<&str> = lost.map(|incident| incident.role.as_str()).collect();
         let interrupted = outcome.signal != 0 || !lost.is_empty();
-        let books = Books::new(scenario, &outcome.reports, interrupted, &lost);
+        let books = Books::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies);
         Self {
             schema: SCHEMA,
@@ -224,8 +230,8 @@ impl Summary {
 }
 
 impl Books {
-    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool, lost: &[&str]) -> Self {
-        let mut problems = Vec::new();
+    fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool, lost: &[&str]) -> Self {
+        let (reports, mut problems) = (&outcome.reports, outcome.problems.clone());
         let written = reports.iter().flat_map(|report| report.written.iter().map(move |link| (&*report.role, link)));
         let written: Vec<(&str, &LinkWritten)> = written.collect();
         for report in reports {
@@ -250,6 +256,7 @@ impl Books {
         Self {
             balanced: problems.is_empty(),
             problems,
+            unbooked: outcome.unbooked.clone(),
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
             rejected_samples: links.iter().map(|link| link.rejected).sum(),
             injected_faults: written.iter().map(|(_, link)| link.injected).sum::<u64>()
@@ -310,18 +317,19 @@ impl LinkBook {
 
 impl State {
     fn new(reports: &[RoleReport], books: &Books) -> Self {
-        let mut links: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
-        links.sort_by(|a, b| a.service.cmp(&b.service));
-        let stride = links.iter().map(|link| link.hash.stride).max().unwrap_or(1);
-        let count = links.iter().map(|link| link.hash.hashes.len()).min().unwrap_or(0);
+        let written = reports.iter().flat_map(|report| &report.written);
+        let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
+        links.sort_by_key(|(service, _)| *service);
+        let stride = links.iter().map(|(_, hash)| hash.stride).max().unwrap_or(1);
+        let count = links.iter().map(|(_, hash)| hash.hashes.len()).min().unwrap_or(0);
         let checkpoints: Vec<(u64, u64)> = (0..count)
-            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|link| link.hash.hashes[index]))))
+            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|(_, hash)| hash.hashes[index]))))
             .collect();
         let first_disturbed_tick = books.roles.values().filter_map(|ticks| ticks.first_disturbed).min();
         let clean =
             checkpoints.iter().rev().find(|(ticks, _)| first_disturbed_tick.is_none_or(|first| *ticks <= first));
         let (clean_ticks, clean_hash) = clean.copied().unwrap_or((0, 0));
-        let hash = combine(links.iter().map(|link| link.hash.last));
+        let hash = combine(links.iter().map(|(_, hash)| hash.last));
         Self {
             hash: format!("{hash:016x}"),
             first_disturbed_tick,

@@ -127,6 +127,9 @@ fn books(summary: &Summary, text: &mut String) {
     for problem in &books.problems {
         let _ = writeln!(text, "  {problem}");
     }
+    if !books.unbooked.is_empty() {
+        let _ = writeln!(text, "no books of {}, nor of the signals there", books.unbooked.join(", "));
+    }
     let _ = match state.first_disturbed_tick {
         None => writeln!(text, "state hash {} (every tick undisturbed)", state.hash),
         Some(tick) => writeln!(

@@ -165,6 +165,13 @@ impl AnyRig {
         with_rig!(self, rig => rig.bodies())
     }
 
+    /// The names of all roles, in the order in which one tick passes through them.
+    pub fn roles(&self) -> Vec<&str> {
+        let controller = self.bodies().iter().any(|body| body.driven).then_some("controller");
+        let bodies = self.bodies().iter().map(|body| body.name.as_str());
+        bodies.chain(["observer"]).chain(controller).collect()
+    }
+
     /// What a run is scored by.
     pub fn metrics(&self) -> &'static [&'static str] {
         with_rig!(self, rig => rig.metrics())

@@ -10,15 +10,19 @@ mod link;
 mod node;
 mod privileges;
 mod process;
+mod seat;
 
 pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Horizon, Input, Output, Seek};
-pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
-pub(crate) use node::{horizon, next_tick};
+pub use node::{
+    Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic, visit_writes,
+};
+pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};
+pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Scenario};

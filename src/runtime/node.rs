@@ -5,9 +5,13 @@
 mod controller;
 mod observer;
 mod plant;
+mod ports;
+
+pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
 use super::disturb::{Disturbance, Interruptions};
 use super::link::{Horizon, Input, Output};
+use crate::bus::iox::footprint;
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
@@ -40,6 +44,20 @@ impl RoleId {
     pub fn name(self, scenario: &Scenario) -> &str {
         match self {
             Self::Plant(index) => &scenario.rig.bodies()[index].name,
+            Self::Observer => "observer",
+            Self::Controller => "controller",
+        }
+    }
+
+    /// The role of this name, if the scenario has one.
+    pub fn named(scenario: &Scenario, name: &str) -> Option<Self> {
+        Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
+    }
+
+    /// What kind of role it is, as the command line calls it.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Plant(_) => "plant",
             Self::Observer => "observer",
             Self::Controller => "controller",
         }
@@ -161,47 +179,37 @@ pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
     }
 }
 
-/// The signals that a role writes and reads, in the order of its books.
-fn signals(scenario: &Scenario, role: RoleId) -> (Vec<Topic>, Vec<Topic>) {
-    let bodies = scenario.rig.bodies();
-    let driven = || bodies.iter().filter(|body| body.driven);
-    let of = |body: &str, signal| topic(scenario, body, signal);
-    match role {
-        RoleId::Plant(index) => {
-            let body = &bodies[index];
-            let command = body.driven.then(|| of(&body.name, Signal::Command));
-            (vec![of(&body.name, Signal::Measurement), of(&body.name, Signal::Truth)], command.into_iter().collect())
-        }
-        RoleId::Observer => {
-            (vec![of(&bodies[0].name, Signal::Estimate)], vec![of(&bodies[0].name, Signal::Measurement)])
-        }
-        RoleId::Controller => {
-            let measurements = driven().map(|body| of(&body.name, Signal::Measurement));
-            (
-                driven().map(|body| of(&body.name, Signal::Command)).collect(),
-                std::iter::once(of(&bodies[0].name, Signal::Estimate)).chain(measurements).collect(),
-            )
-        }
-    }
-}
-
 /// How large the ledger of a role is, words.
 pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
     fn state_words<R: Rig>(_: &R) -> usize {
         plant::StateBook::<Truth<R>>::WORDS
     }
-    let (written, read) = signals(scenario, role);
+    let ports = ports(scenario, role);
     let state = match role {
         RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
         RoleId::Observer => 0,
         RoleId::Controller => WatchBook::WORDS,
     };
-    TickBook::WORDS + written.len() * WriteBook::words(scenario.last_tick) + read.len() * ReadBook::WORDS + state
+    TickBook::WORDS
+        + ports.writes.len() * WriteBook::words(scenario.last_tick)
+        + ports.reads.len() * ReadBook::WORDS
+        + state
 }
 
 /// A ledger for a role that no successor will need.
 pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
+}
+
+/// An upper bound on the shared memory that a run takes, bytes.
+pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
+    let depths = super::depths(scenario);
+    let port = |port: &Port| footprint(depths, port.topic.signal, port.size);
+    let role = |role: RoleId| {
+        let Ports { writes, health, .. } = ports(scenario, role);
+        writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
+    };
+    port(&ports(scenario, RoleId::Observer).schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.
@@ -217,17 +225,18 @@ pub fn report(
     stages: Vec<StageReport>,
     grants: Vec<Grant>,
 ) -> RoleReport {
-    let (written, read) = signals(scenario, role);
+    let ports = ports(scenario, role);
     let ledger = ledger.reopened();
     let watches = role == RoleId::Controller;
     RoleReport {
         role: role.name(scenario).to_owned(),
         ticks: TickBook::open(&ledger).report(),
-        written: written
+        written: ports
+            .writes
             .iter()
-            .map(|topic| WriteBook::open(&ledger, scenario.last_tick).report(&topic.to_string()))
+            .map(|port| WriteBook::open(&ledger, scenario.last_tick).report(&port.topic.to_string()))
             .collect(),
-        read: read.iter().map(|topic| ReadBook::open(&ledger).report(&topic.to_string())).collect(),
+        read: ports.reads.iter().map(|port| ReadBook::open(&ledger).report(&port.topic.to_string())).collect(),
         watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
         stages,
         grants,
@@ -259,4 +268,19 @@ pub fn build<R: Rig, B: Bus + 'static>(
         RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
         RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+
+    #[test]
+    fn every_role_of_a_scenario_has_the_name_that_the_rig_gives_it() {
+        for (name, text) in SHIPPED {
+            let scenario = Scenario::parse(text, name, &[]).unwrap();
+            let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
+            assert_eq!(names, scenario.rig.roles(), "{name}");
+        }
+    }
 }

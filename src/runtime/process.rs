@@ -21,9 +21,9 @@ use std::sync::atomic::AtomicBool;
 /// How often a role looks for the next phase before its ticks, ns.
 const LOOK_NS: u64 = 1_000_000;
 /// Samples that every link carries before the first tick.
-const WARM_UP_SAMPLES: usize = 200;
+pub(super) const WARM_UP_SAMPLES: usize = 200;
 /// The pause between them, ns.
-const WARM_UP_PAUSE_NS: u64 = 100_000;
+pub(super) const WARM_UP_PAUSE_NS: u64 = 100_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
 const BASELINE_PERIOD_NS: u64 = 1_000_000;
@@ -55,6 +55,14 @@ pub enum RoleError {
         role: String,
         /// The roles there are.
         known: String,
+    },
+    /// The domain's run is one of another scenario.
+    #[error("the run in {} is not one of this scenario with these overrides; give its own file, {}", domain.display(), scenario.display())]
+    OtherScenario {
+        /// The domain's directory.
+        domain: PathBuf,
+        /// The scenario of its run.
+        scenario: PathBuf,
     },
     /// A link failed.
     #[error(transparent)]
@@ -95,11 +103,8 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
 pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleError> {
     let domain = Domain::join(&seat.domain)?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
-    let roles = RoleId::all(&scenario);
-    let role = *roles.iter().find(|role| role.name(&scenario) == seat.role).ok_or_else(|| RoleError::NoSuchRole {
-        role: seat.role.clone(),
-        known: roles.iter().map(|role| role.name(&scenario)).collect::<Vec<_>>().join(", "),
-    })?;
+    let role = RoleId::named(&scenario, &seat.role)
+        .ok_or_else(|| RoleError::NoSuchRole { role: seat.role.clone(), known: scenario.rig.roles().join(", ") })?;
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
@@ -148,10 +153,12 @@ pub fn serve<B: Bus + 'static>(
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let name = role.name(scenario);
+    // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
+    let health = bus.writer(&topic(scenario, name, Signal::Health))?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
-        bus.writer(&topic(scenario, name, Signal::Health))?,
+        health,
         ledger.generation(),
         grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,

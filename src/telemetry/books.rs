@@ -185,7 +185,7 @@ impl WriteBook {
             extra: self.words.get(Self::EXTRA),
             injected: self.words.get(Self::INJECTED),
             last_tick: self.words.get(Self::COVERED).checked_sub(1),
-            hash: self.hash.checkpoints(),
+            hash: Some(self.hash.checkpoints()),
         }
     }
 }

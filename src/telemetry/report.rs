@@ -15,10 +15,13 @@ pub struct RoleReport {
     /// What it read, by signal.
     pub read: Vec<LinkRead>,
     /// What its watchdog saw, if it has one that watches anything.
+    #[serde(default)]
     pub watchdog: Option<WatchReport>,
     /// Its latencies, by stage.
+    #[serde(default)]
     pub stages: Vec<StageReport>,
     /// What it asked of the machine, and what it got.
+    #[serde(default)]
     pub grants: Vec<Grant>,
 }
 
@@ -58,10 +61,13 @@ pub struct Ticks {
     /// Ticks that it did not execute.
     pub missed: u64,
     /// Ticks at which an input that was due was absent: a plant's command, a controller's measurement.
+    #[serde(default)]
     pub starved: u64,
     /// Ticks at which a plant applied its safe command.
+    #[serde(default)]
     pub safe: u64,
     /// Scripted stalls.
+    #[serde(default)]
     pub stalled: u64,
     /// The first tick whose result differs from an undisturbed run's, if any does.
     pub first_disturbed: Option<u64>,
@@ -77,15 +83,19 @@ pub struct LinkWritten {
     /// Ticks without a sample.
     pub skipped: u64,
     /// Ticks without a sample for which a void was sent: in lockstep and in one thread.
+    #[serde(default)]
     pub void: u64,
     /// Samples sent beyond the one of each tick: second, late and broken ones, by scripted faults.
+    #[serde(default)]
     pub extra: u64,
     /// Samples that a scripted fault touched.
+    #[serde(default)]
     pub injected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
-    /// The hash of what was sent.
-    pub hash: Checkpoints,
+    /// The hash of what was sent; a program that is not ours need not keep one.
+    #[serde(default)]
+    pub hash: Option<Checkpoints>,
 }
 
 /// The books of a signal's reading end: `received` + `void` + `gaps` = `last_tick` + 1.
@@ -100,8 +110,10 @@ pub struct LinkRead {
     /// Samples that were not newer than the one before.
     pub stale: u64,
     /// Voids received in the place of samples.
+    #[serde(default)]
     pub void: u64,
     /// Samples that were received and not believed; they count as received where they were of the tick that was due.
+    #[serde(default)]
     pub rejected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
