@@ -68,6 +68,8 @@ pub struct Breaches {
 #[derive(Debug, Clone)]
 pub struct Watchdog {
     bounds: WatchBounds,
+    /// Whether anything is watched.
+    active: bool,
     references: [Reference; 2],
     breaches: [Breaches; 4],
     /// The last tick with a breach, and how many there were in a row.
@@ -79,6 +81,7 @@ impl Watchdog {
     /// A watchdog that has seen nothing.
     pub fn new(bounds: WatchBounds) -> Self {
         Self {
+            active: bounds.max.iter().any(|max| *max < f64::INFINITY),
             bounds,
             references: [Reference::default(); 2],
             breaches: [Breaches::default(); 4],
@@ -95,7 +98,7 @@ impl Watchdog {
     /// Whether anything is watched.
     #[inline]
     pub fn active(&self) -> bool {
-        self.bounds.max.iter().any(|max| *max < f64::INFINITY)
+        self.active
     }
 
     /// Looks at the energy and the momentum of the observed body, in any unit.

@@ -91,15 +91,17 @@ impl<const N: usize> Plausible<N> {
         if stamp.generation != self.generation {
             *self = Self { generation: stamp.generation, ..Self::new(self.bounds) };
         }
-        for ((repeated, value), before) in self.repeated.iter_mut().zip(values).zip(&self.before) {
-            *repeated = if value == before { *repeated + 1 } else { 0 };
+        let counts = self.bounds.repeats != u64::MAX;
+        let mut believed = true;
+        for (i, &value) in values.iter().enumerate() {
+            if counts {
+                self.repeated[i] = if value == self.before[i] { self.repeated[i] + 1 } else { 0 };
+            }
+            believed &= valid >> i & 1 == 0
+                || (self.in_range(i, value)
+                    && self.repeated[i] <= self.bounds.repeats
+                    && self.reached(i, value, stamp.tick, &change));
         }
-        let mut components = (0..N).filter(|i| valid >> i & 1 == 1);
-        let believed = components.all(|i| {
-            self.in_range(i, values[i])
-                && self.repeated[i] <= self.bounds.repeats
-                && self.reached(i, values[i], stamp.tick, &change)
-        });
         if believed {
             for i in (0..N).filter(|i| valid >> i & 1 == 1) {
                 (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));

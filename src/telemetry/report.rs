@@ -15,6 +15,7 @@ pub struct RoleReport {
     /// What it read, by signal.
     pub read: Vec<LinkRead>,
     /// What its watchdog saw, if it has one that watches anything.
+    #[serde(default)]
     pub watchdog: Option<WatchReport>,
     /// Its latencies, by stage.
     #[serde(default)]
@@ -66,6 +67,7 @@ pub struct Ticks {
     #[serde(default)]
     pub safe: u64,
     /// Scripted stalls.
+    #[serde(default)]
     pub stalled: u64,
     /// The first tick whose result differs from an undisturbed run's, if any does.
     pub first_disturbed: Option<u64>,
@@ -81,10 +83,13 @@ pub struct LinkWritten {
     /// Ticks without a sample.
     pub skipped: u64,
     /// Ticks without a sample for which a void was sent: in lockstep and in one thread.
+    #[serde(default)]
     pub void: u64,
     /// Samples sent beyond the one of each tick: second, late and broken ones, by scripted faults.
+    #[serde(default)]
     pub extra: u64,
     /// Samples that a scripted fault touched.
+    #[serde(default)]
     pub injected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
@@ -105,8 +110,10 @@ pub struct LinkRead {
     /// Samples that were not newer than the one before.
     pub stale: u64,
     /// Voids received in the place of samples.
+    #[serde(default)]
     pub void: u64,
     /// Samples that were received and not believed; they count as received where they were of the tick that was due.
+    #[serde(default)]
     pub rejected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
