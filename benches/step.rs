@@ -6,7 +6,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Command, Estimate, Measurement, Rig};
 use corotate::role::{Body, Controller, Observer};
-use corotate::runtime::{RoleId, build, depths, in_turn};
+use corotate::runtime::{RoleId, build, depths, in_turn, private_ledger};
 use corotate::sample::Sample;
 use corotate::with_rig;
 use criterion::{Bencher, Criterion, Throughput, criterion_group, criterion_main};
@@ -72,7 +72,7 @@ fn in_process(criterion: &mut Criterion) {
                 let bus = MemoryBus::new(depths(&scenario));
                 let mut nodes: Vec<_> = RoleId::all(&scenario)
                     .into_iter()
-                    .map(|role| with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, 1)))
+                    .map(|role| with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &private_ledger(&scenario, role))))
                     .collect::<Result<_, _>>()
                     .expect("links in memory open");
                 in_turn(&mut nodes, scenario.last_tick, |_| true)

@@ -5,7 +5,7 @@ use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
-use corotate::runtime::{RoleId, depths, serve, topic};
+use corotate::runtime::{RoleId, depths, private_ledger, serve, topic};
 use corotate::sample::{Health, Phase, RoleState, Sample, Schedule};
 use corotate::telemetry::RoleReport;
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -108,6 +108,10 @@ impl<S: Sample, W: Write<S>> Write<S> for CountedWriter<W> {
         update(|count| count.in_prepare = false);
         prepared
     }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.0.refresh()
+    }
 }
 
 /// Serves one role in this thread and gives its report and what it allocated.
@@ -115,7 +119,8 @@ fn count_role(scenario: &Scenario, role: RoleId, domain: &OwnedDomain) -> (RoleR
     let bus = CountedBus(IoxBus::enter(domain.domain(), role.name(scenario), depths(scenario)).unwrap());
     let terminated = AtomicBool::new(false);
     let mut result = None;
-    serve(scenario, role, &bus, 1, &terminated, Vec::new(), |report| {
+    let ledger = private_ledger(scenario, role);
+    serve(scenario, role, &bus, &ledger, &terminated, Vec::new(), |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })

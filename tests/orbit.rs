@@ -10,7 +10,7 @@ use corotate::config::Scenario;
 use corotate::control::{OrbitGains, OrbitHold};
 use corotate::model::{CentralField, OrbitState};
 use corotate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, topic};
+use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{OrbitEstimate, OrbitTruth};
 use corotate::with_rig;
 use nalgebra::{Vector2, Vector4};
@@ -147,15 +147,17 @@ fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> 
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
         .into_iter()
-        .map(|role| with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, 1)).unwrap())
+        .map(|role| {
+            with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &private_ledger(scenario, role))).unwrap()
+        })
         .collect();
     let bodies = scenario.rig.bodies();
     let mut truths: Vec<Input<MemoryBus, OrbitTruth>> = bodies
         .iter()
-        .map(|body| Input::open(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
+        .map(|body| Input::watch(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
         .collect();
     let mut estimate: Input<MemoryBus, OrbitEstimate> =
-        Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+        Input::watch(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
     in_turn(&mut nodes, scenario.last_tick, |_| {
         let mut take = |truth: &mut Input<MemoryBus, OrbitTruth>| {

@@ -6,7 +6,7 @@ use common::{Bench, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, topic};
+use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth};
 use corotate::with_rig;
 use serde_json::Value;
@@ -35,14 +35,16 @@ fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
         .into_iter()
-        .map(|role| with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, 1)).unwrap())
+        .map(|role| {
+            with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &private_ledger(scenario, role))).unwrap()
+        })
         .collect();
     let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
-        Input::open(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()
+        Input::watch(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()
     };
     let (mut leader, mut follower) = (truth("leader"), truth("follower"));
     let mut estimate: Input<MemoryBus, RateEstimate> =
-        Input::open(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
+        Input::watch(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
     in_turn(&mut nodes, scenario.last_tick, |tick| {
         assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());

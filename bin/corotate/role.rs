@@ -13,9 +13,6 @@ pub struct Arguments {
     /// The run's domain, as `corotate run --external ROLE` prints it
     #[arg(long, value_name = "DIR")]
     domain: PathBuf,
-    /// How often this role has been started in this run, from 1
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
-    generation: u64,
     /// Die with this process (the launcher gives its own id)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
@@ -42,7 +39,7 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
             return fail(Exit::Failure, &error);
         }
     }
-    let seat = RoleSeat { domain: arguments.domain.clone(), role: name.to_owned(), generation: arguments.generation };
+    let seat = RoleSeat { domain: arguments.domain.clone(), role: name.to_owned() };
     match run_role(&seat, &terminated) {
         Ok(()) => Exit::Ok,
         Err(error) => {

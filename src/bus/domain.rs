@@ -122,6 +122,11 @@ impl Domain {
         format!("{PREFIX}{}_", self.root.file_name().unwrap_or_default().to_string_lossy())
     }
 
+    /// Where a file lies in shared memory that goes with the domain.
+    pub fn shared(&self, name: &str) -> PathBuf {
+        Path::new(SHARED_MEMORY).join(self.prefix() + name)
+    }
+
     /// Removes every trace of the domain. What is gone already is no error.
     fn remove(&self) {
         let prefix = self.prefix();

@@ -9,6 +9,7 @@ use crate::sample::Sample;
 use iceoryx2::config::Config;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
@@ -69,12 +70,26 @@ impl IoxBus {
             .max_publishers(1)
             .max_subscribers(readers)
             .max_nodes(MAX_NODES)
-            .history_size(0)
+            .history_size(self.history(topic.signal))
             .subscriber_max_buffer_size(self.deepest(topic.signal))
             .subscriber_max_borrowed_samples(MAX_BORROWED)
             .enable_safe_overflow(true)
             .open_or_create()
             .map_err(|error| open(format!("{error:?}")))
+    }
+
+    /// Puts away what processes of this domain left behind when they died, so that others can take their seats.
+    pub fn clear_dead(&self) {
+        // What cannot be put away now is so when the successor enters.
+        let _ = self.node.try_cleanup_dead_nodes();
+    }
+
+    /// What roles say of themselves and hear from the launcher is said again and again.
+    fn history(&self, signal: Signal) -> usize {
+        match signal {
+            Signal::Health | Signal::Schedule => 0,
+            Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => self.depths.history,
+        }
     }
 
     /// Only what is scored needs room for the scorer.
@@ -168,6 +183,10 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
         }
         Ok(())
     }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+    }
 }
 
 /// The reading end.
@@ -207,7 +226,7 @@ mod tests {
     }
 
     fn bus(domain: &OwnedDomain) -> IoxBus {
-        IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8 }).unwrap()
+        IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8, history: 0 }).unwrap()
     }
 
     #[test]

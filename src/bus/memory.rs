@@ -14,7 +14,8 @@ struct Waiting<S> {
 }
 
 type Queue<S> = Rc<RefCell<Waiting<S>>>;
-/// The queues of a signal's readers.
+/// The queues of a signal's readers. One whose reader is gone goes to the next reader, with what waits in it: a role that
+/// is built anew takes its predecessor's place.
 type Queues<S> = Rc<RefCell<Vec<Queue<S>>>>;
 
 /// A bus that lives in one thread.
@@ -51,8 +52,14 @@ impl Bus for MemoryBus {
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<MemoryReader<S>, BusError> {
         let depth = self.depths.of(reader);
-        let queue: Queue<S> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
-        self.queues(topic, "reader")?.borrow_mut().push(queue.clone());
+        let queues = self.queues(topic, "reader")?;
+        let orphan = |queue: &&Queue<S>| Rc::strong_count(queue) == 1 && queue.borrow().depth == depth;
+        let found = queues.borrow().iter().find(orphan).cloned();
+        let queue = found.unwrap_or_else(|| {
+            let queue: Queue<S> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
+            queues.borrow_mut().push(queue.clone());
+            queue
+        });
         Ok(MemoryReader { queue, current: None })
     }
 }
@@ -78,6 +85,10 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
     }
 
     fn prepare(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
         Ok(())
     }
 }
@@ -117,7 +128,7 @@ mod tests {
 
     #[test]
     fn a_deep_reader_gets_every_sample_in_order_and_a_shallow_one_the_newest() {
-        let bus = MemoryBus::new(Depths { role: 1, scorer: 8 });
+        let bus = MemoryBus::new(Depths { role: 1, scorer: 8, history: 0 });
         let mut newest = bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
         let mut every = bus.reader::<RateCommand>(&topic(), Reader::Scorer).unwrap();
         let mut writer = bus.writer::<RateCommand>(&topic()).unwrap();
@@ -136,8 +147,25 @@ mod tests {
     }
 
     #[test]
+    fn a_reader_that_is_opened_anew_finds_what_its_predecessor_left() {
+        let bus = MemoryBus::new(Depths { role: 4, scorer: 8, history: 0 });
+        let open = || bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
+        let mut writer = bus.writer::<RateCommand>(&topic()).unwrap();
+        let mut first = open();
+        for tick in 0..3 {
+            writer.send(|sample| sample.stamp.tick = tick).unwrap();
+        }
+        first.advance().unwrap();
+        drop(first);
+        let mut second = open();
+        assert!(second.advance().unwrap());
+        assert_eq!(second.current().unwrap().stamp.tick, 1);
+        assert!(!open().advance().unwrap(), "a further reader begins with nothing");
+    }
+
+    #[test]
     fn refuses_a_signal_of_another_type() {
-        let bus = MemoryBus::new(Depths { role: 1, scorer: 8 });
+        let bus = MemoryBus::new(Depths { role: 1, scorer: 8, history: 0 });
         bus.writer::<RateCommand>(&topic()).unwrap();
         assert!(matches!(bus.reader::<RateTruth>(&topic(), Reader::Role), Err(BusError::Open { .. })));
     }

@@ -70,6 +70,9 @@ pub struct Depths {
     pub role: usize,
     /// For [`Reader::Scorer`].
     pub scorer: usize,
+    /// For a reader that comes late: how many of the last samples it still gets. In lockstep, where nobody goes on without
+    /// its inputs, a role that is started anew would otherwise wait for ever for what its predecessor had been sent.
+    pub history: usize,
 }
 
 impl Depths {
@@ -113,6 +116,11 @@ pub trait Write<S> {
     /// # Errors
     /// [`BusError::Send`].
     fn prepare(&mut self) -> Result<(), BusError>;
+    /// Lets readers that have come later know of this end; [`send`](Self::send) does so too.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn refresh(&mut self) -> Result<(), BusError>;
 }
 
 /// The reading end of a link.

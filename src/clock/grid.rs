@@ -21,6 +21,11 @@ impl Grid {
     pub fn tick_at(&self, now_ns: u64) -> u64 {
         now_ns.saturating_sub(self.epoch_ns) / self.period_ns
     }
+
+    /// The first tick that is not due before `now_ns`.
+    pub fn next_at(&self, now_ns: u64) -> u64 {
+        now_ns.saturating_sub(self.epoch_ns).div_ceil(self.period_ns)
+    }
 }
 
 #[cfg(test)]
@@ -34,6 +39,7 @@ mod tests {
             assert_eq!(grid.tick_at(grid.due_ns(tick)), tick);
             assert_eq!(grid.tick_at(grid.due_ns(tick + 1) - 1), tick);
         }
-        assert_eq!(grid.tick_at(0), 0, "before the epoch");
+        assert_eq!((grid.tick_at(0), grid.next_at(0)), (0, 0), "before the epoch");
+        assert_eq!((grid.next_at(grid.due_ns(7)), grid.next_at(grid.due_ns(7) + 1)), (7, 8));
     }
 }

@@ -4,8 +4,8 @@ use super::score::{self, Scorer};
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::config::Scenario;
-use crate::runtime::{Ended, RoleId, build, depths, in_turn};
-use crate::telemetry::RoleReport;
+use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
+use crate::telemetry::Ledger;
 use crate::with_rig;
 use std::sync::atomic::Ordering;
 
@@ -17,8 +17,10 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let bus = MemoryBus::new(depths(scenario));
     let mut scorer = score::open(scenario, &bus)?;
     let roles = RoleId::all(scenario);
-    let node = |role: &RoleId| with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, 1));
-    let mut nodes = roles.iter().map(node).collect::<Result<Vec<_>, _>>()?;
+    let ledgers: Vec<Ledger> = roles.iter().map(|role| private_ledger(scenario, *role)).collect();
+    let node =
+        |(role, ledger): (&RoleId, &Ledger)| with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, ledger));
+    let mut nodes = roles.iter().zip(&ledgers).map(node).collect::<Result<Vec<_>, _>>()?;
     let mut failure = None;
     let ended = in_turn(&mut nodes, scenario.last_tick, |tick| match scorer.poll(1) {
         Ok(_) => proceed(&*scorer, scenario, launch, tick),
@@ -30,16 +32,12 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     if let Some(error) = failure {
         return Err(error.into());
     }
-    let report = |(role, node): (&RoleId, &crate::runtime::ReadyNode)| RoleReport {
-        role: role.name(scenario).to_owned(),
-        ticks: node.ticks(),
-        written: node.written(),
-        read: node.read(),
-        stages: Vec::new(),
-        grants: Vec::new(),
-    };
     Ok(Outcome {
-        reports: roles.iter().zip(&nodes).map(report).collect(),
+        reports: roles
+            .iter()
+            .zip(&ledgers)
+            .map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()))
+            .collect(),
         score: scorer.finish()?,
         grants: Vec::new(),
         domain: None,

@@ -115,7 +115,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let bodies = rig.bodies().iter();
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven);
         let command = |(body, info): (usize, &BodyInfo)| {
-            let command = Input::open(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
+            let command = Input::watch(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
             Ok(DrivenBody { body, command, before: None })
         };
         let metric = |name: &&str| MetricScore {
@@ -130,9 +130,9 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
             truths: bodies
-                .map(|body| Input::open(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
+                .map(|body| Input::watch(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
                 .collect::<Result<_, _>>()?,
-            estimate: Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
+            estimate: Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
             commands: driven.map(command).collect::<Result<_, BusError>>()?,
             next_tick: 0,
             last_tick: scenario.last_tick,
@@ -239,9 +239,9 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         loop {
             self.poll(u64::MAX)?;
             let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.next_tick);
-            let more = newest(self.estimate.report().last_tick)
-                || self.truths.iter().any(|truth| newest(truth.report().last_tick))
-                || self.commands.iter().any(|driven| newest(driven.command.report().last_tick));
+            let more = newest(self.estimate.last_tick())
+                || self.truths.iter().any(|truth| newest(truth.last_tick()))
+                || self.commands.iter().any(|driven| newest(driven.command.last_tick()));
             if !more || self.next_tick > self.last_tick {
                 break;
             }

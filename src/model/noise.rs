@@ -36,6 +36,14 @@ impl<const N: usize> Noise<N> {
         if self.white { self.draw() } else { self.bias }
     }
 
+    /// Leaves out `samples` samples.
+    pub fn skip(&mut self, samples: u64) {
+        if self.white {
+            // Each pair of components takes one draw for its radius and one for its angle.
+            self.generator.advance(u128::from(samples) * 2 * N.div_ceil(2) as u128);
+        }
+    }
+
     /// Every component draws, also one without deviation: setting one sensor's noise leaves the others' as they are.
     fn draw(&mut self) -> SVector<f64, N> {
         let mut sample = self.bias;
@@ -104,6 +112,17 @@ mod tests {
         assert_eq!(first(1, 1), first(1, 1));
         assert_ne!(first(1, 1), first(1, 2));
         assert_ne!(first(1, 1), first(2, 1));
+    }
+
+    #[test]
+    fn skipping_is_sampling_without_looking() {
+        let noise = Noise::new(5, 1, [1.0, 2.0, 3.0], [0.5; 3]);
+        let (mut sampled, mut skipped) = (noise.clone(), noise);
+        for _ in 0..1000 {
+            sampled.sample();
+        }
+        skipped.skip(1000);
+        assert_eq!(sampled.sample(), skipped.sample());
     }
 
     #[test]

@@ -20,8 +20,12 @@ pub trait Body {
     fn apply_safe(&mut self);
     /// Writes the full state, with the given status bits, everything but the stamp.
     fn truth(&self, status: u64, out: &mut Self::Truth);
+    /// The status bits of a truth.
+    fn status_of(truth: &Self::Truth) -> u64;
     /// Writes the measurement, with the given status bits, everything but the stamp. Once per executed tick.
     fn measure(&mut self, status: u64, out: &mut Self::Measurement);
+    /// Goes on from a state that was reported before, after which its sensors had reported `measured` times.
+    fn resume(&mut self, truth: &Self::Truth, measured: u64);
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
 }
@@ -155,6 +159,14 @@ impl<B: Body> Plant<B> {
         for _ in 0..ticks {
             self.body.flow(self.tick_s);
         }
+    }
+
+    /// Goes on from a truth that was reported before, after which `measured` measurements had been reported.
+    pub fn resume(&mut self, truth: &B::Truth, measured: u64) {
+        let was = B::status_of(truth);
+        self.safe = was & status::SAFE != 0;
+        self.silent_ticks = u64::from(was & (status::SAFE | status::HOLDING) != 0);
+        self.body.resume(truth, measured);
     }
 
     fn status(&self) -> u64 {

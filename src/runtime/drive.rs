@@ -18,7 +18,7 @@ const NAP_NS: u64 = 50_000;
 /// How long after its last tick a role still waits for inputs, ns and periods.
 const GRACE_NS: u64 = 1_000_000_000;
 const GRACE_PERIODS: u64 = 5;
-/// Lockstep turns between two looks at the schedule.
+/// Lockstep ticks between two looks at the schedule and the time.
 const TURN_TICKS: u64 = 256;
 
 /// How a drive ended.
@@ -50,6 +50,11 @@ impl<'a, B: Bus> Control<'a, B> {
         terminated: &'a AtomicBool,
     ) -> Self {
         Self { schedule, health, generation, denied, terminated }
+    }
+
+    /// Whether nobody has had this role's seat before.
+    pub fn first(&self) -> bool {
+        self.generation == 1
     }
 
     /// Tells the launcher how the role is.
@@ -173,13 +178,20 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
 
     /// Now and then: how this role is, and whether the run is over.
     fn turn(&mut self, node: &dyn Node) -> Result<bool, BusError> {
-        let now_ns = monotonic_ns();
-        if now_ns < self.next_turn_ns {
+        if !self.turn_is_due() {
             return Ok(false);
         }
-        self.next_turn_ns = now_ns + TURN_NS;
         self.control.announce(RoleState::Running, node)?;
         self.control.stopped()
+    }
+
+    fn turn_is_due(&mut self) -> bool {
+        let now_ns = monotonic_ns();
+        let due = now_ns >= self.next_turn_ns;
+        if due {
+            self.next_turn_ns = now_ns + TURN_NS;
+        }
+        due
     }
 
     /// Drives a node by its inputs alone, at most [`WINDOW_TICKS`] ahead of the slowest consumer.
@@ -196,9 +208,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 if !node.next_tick().is_multiple_of(TURN_TICKS) {
                     continue;
                 }
-                self.control.announce(RoleState::Running, node)?;
             } else {
                 backoff.wait();
+            }
+            if self.turn_is_due() {
+                self.control.announce(RoleState::Running, node)?;
+                node.refresh()?;
             }
             if self.control.stopped()? {
                 return Ok(Ended::Stopped);

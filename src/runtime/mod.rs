@@ -11,7 +11,7 @@ mod process;
 
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Input, Output, Seek};
-pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, topic};
+pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{report_path, scenario_path, write_whole};
@@ -27,10 +27,11 @@ pub fn depths(scenario: &Scenario) -> Depths {
     // The scorer looks about every 20 ms; a quarter of a second is slack for a loaded machine.
     let quarter_second = (250_000_000 / scenario.period_ns).next_power_of_two() as usize;
     match scenario.clock {
-        ClockKind::Realtime => Depths { role: 1, scorer: quarter_second.clamp(64, 8192) },
+        ClockKind::Realtime => Depths { role: 1, scorer: quarter_second.clamp(64, 8192), history: 0 },
         // Nobody is more than the window ahead of anybody: twice that never overflows.
         ClockKind::Lockstep | ClockKind::InProcess => {
-            Depths { role: 2 * WINDOW_TICKS as usize, scorer: 2 * WINDOW_TICKS as usize }
+            let twice = 2 * WINDOW_TICKS as usize;
+            Depths { role: twice, scorer: twice, history: twice }
         }
     }
 }

@@ -10,9 +10,10 @@ use super::link::{Input, Output};
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
-use crate::rig::Rig;
+use crate::rig::{Rig, Truth};
 use crate::sample::Sample;
-use crate::telemetry::{LinkRead, LinkWritten, StageReport, Ticks};
+use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WriteBook};
+use crate::with_rig;
 
 /// Which role of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,8 +80,9 @@ pub trait Node {
     fn time_triggered(&self) -> bool;
     /// The next tick to execute.
     fn next_tick(&self) -> u64;
-    /// Hands over the time grid, once the epoch is known.
-    fn start(&mut self, grid: Grid);
+    /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor left undone
+    /// before that counts as missed.
+    fn start(&mut self, grid: Grid, first_tick: u64);
     /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
     ///
     /// # Errors
@@ -98,12 +100,13 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn warm_up(&mut self) -> Result<(), BusError>;
+    /// Lets readers that have come later know of this role's signals. Off the critical path.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn refresh(&mut self) -> Result<(), BusError>;
     /// The tick books.
     fn ticks(&self) -> Ticks;
-    /// The books of all written signals.
-    fn written(&self) -> Vec<LinkWritten>;
-    /// The books of all read signals.
-    fn read(&self) -> Vec<LinkRead>;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
 }
@@ -116,58 +119,83 @@ pub struct Seat<'a, B> {
     bus: &'a B,
     scenario: &'a Scenario,
     generation: u64,
+    ledger: &'a Ledger,
     clock: Clock,
 }
 
 impl<B: Bus> Seat<'_, B> {
     fn input<S: Sample>(&self, body: &str, signal: Signal) -> Result<Input<B, S>, BusError> {
-        Input::open(self.bus, &topic(self.scenario, body, signal), Reader::Role)
+        Input::open(self.bus, &topic(self.scenario, body, signal), Reader::Role, self.ledger)
     }
 
     fn output<S: Sample>(&self, body: &str, signal: Signal) -> Result<Output<B, S>, BusError> {
-        Output::open(self.bus, &topic(self.scenario, body, signal), self.generation, self.scenario.last_tick)
+        let topic = topic(self.scenario, body, signal);
+        Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)
     }
 }
 
-/// The books of a role's ticks while it runs.
-#[derive(Debug, Default)]
-struct TickBook {
-    next: u64,
-    ticks: Ticks,
-}
-
-impl TickBook {
-    /// Counts the ticks before `tick` that were not executed as missed, and tells how many.
-    #[inline]
-    fn skip_to(&mut self, tick: u64) -> u64 {
-        let missed = tick.saturating_sub(self.next);
-        if missed > 0 {
-            self.disturbed(self.next);
-            self.ticks.missed += missed;
-            self.next = tick;
+/// The signals that a role writes and reads, in the order of its books.
+fn signals(scenario: &Scenario, role: RoleId) -> (Vec<Topic>, Vec<Topic>) {
+    let bodies = scenario.rig.bodies();
+    let driven = || bodies.iter().filter(|body| body.driven);
+    let of = |body: &str, signal| topic(scenario, body, signal);
+    match role {
+        RoleId::Plant(index) => {
+            let body = &bodies[index];
+            let command = body.driven.then(|| of(&body.name, Signal::Command));
+            (vec![of(&body.name, Signal::Measurement), of(&body.name, Signal::Truth)], command.into_iter().collect())
         }
-        missed
+        RoleId::Observer => {
+            (vec![of(&bodies[0].name, Signal::Estimate)], vec![of(&bodies[0].name, Signal::Measurement)])
+        }
+        RoleId::Controller => {
+            let measurements = driven().map(|body| of(&body.name, Signal::Measurement));
+            (
+                driven().map(|body| of(&body.name, Signal::Command)).collect(),
+                std::iter::once(of(&bodies[0].name, Signal::Estimate)).chain(measurements).collect(),
+            )
+        }
     }
+}
 
-    #[inline]
-    fn executed(&mut self) {
-        self.ticks.executed += 1;
-        self.next += 1;
+/// How large the ledger of a role is, words.
+pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
+    fn state_words<R: Rig>(_: &R) -> usize {
+        plant::StateBook::<Truth<R>>::WORDS
     }
+    let (written, read) = signals(scenario, role);
+    let state = match role {
+        RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
+        RoleId::Observer | RoleId::Controller => 0,
+    };
+    TickBook::WORDS + written.len() * WriteBook::words(scenario.last_tick) + read.len() * ReadBook::WORDS + state
+}
 
-    /// Counts a tick at which an input was absent.
-    #[inline]
-    fn starved(&mut self, tick: u64) {
-        self.ticks.starved += 1;
-        self.disturbed(tick);
-    }
+/// A ledger for a role that no successor will need.
+pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
+    Ledger::private(ledger_words(scenario, role))
+}
 
-    fn disturbed(&mut self, tick: u64) {
-        self.ticks.first_disturbed.get_or_insert(tick);
-    }
-
-    fn report(&self) -> Ticks {
-        Ticks { elapsed: self.next, ..self.ticks }
+/// What a role's ledger says, with what the role itself has to add.
+pub fn report(
+    scenario: &Scenario,
+    role: RoleId,
+    ledger: &Ledger,
+    stages: Vec<StageReport>,
+    grants: Vec<Grant>,
+) -> RoleReport {
+    let (written, read) = signals(scenario, role);
+    let ledger = ledger.reopened();
+    RoleReport {
+        role: role.name(scenario).to_owned(),
+        ticks: TickBook::open(&ledger).report(),
+        written: written
+            .iter()
+            .map(|topic| WriteBook::open(&ledger, scenario.last_tick).report(&topic.to_string()))
+            .collect(),
+        read: read.iter().map(|topic| ReadBook::open(&ledger).report(&topic.to_string())).collect(),
+        stages,
+        grants,
     }
 }
 
@@ -176,7 +204,7 @@ pub fn topic(scenario: &Scenario, body: &str, signal: Signal) -> Topic {
     Topic { scenario: scenario.name.clone(), body: body.to_owned(), signal }
 }
 
-/// Opens a role's links and builds its node.
+/// Opens a role's links and builds its node, with its books in the ledger: new, or a predecessor's.
 ///
 /// # Errors
 /// [`BusError::Open`].
@@ -185,10 +213,12 @@ pub fn build<R: Rig, B: Bus + 'static>(
     scenario: &Scenario,
     role: RoleId,
     bus: &B,
-    generation: u64,
+    ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
+    let generation = ledger.enter();
+    let ledger = &ledger.reopened();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let seat = Seat { bus, scenario, generation, clock };
+    let seat = Seat { bus, scenario, generation, ledger, clock };
     Ok(match role {
         RoleId::Plant(index) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
         RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),

@@ -3,7 +3,7 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::drive::{Control, Drive, Ended};
-use super::node::{self, ReadyNode, RoleId, topic};
+use super::node::{self, ReadyNode, RoleId, ledger_words, report, topic};
 use super::{depths, privileges};
 use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
@@ -11,7 +11,7 @@ use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario};
 use crate::sample::{Phase, RoleState, Schedule};
-use crate::telemetry::{Grant, Latency, RoleReport, StageReport};
+use crate::telemetry::{Grant, Latency, Ledger, LedgerError, RoleReport, StageReport};
 use crate::with_rig;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -36,8 +36,6 @@ pub struct RoleSeat {
     pub domain: PathBuf,
     /// The role's name.
     pub role: String,
-    /// How often the role has been started in this run, from 1.
-    pub generation: u64,
 }
 
 /// Why a role ended without a report.
@@ -60,6 +58,9 @@ pub enum RoleError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// The books could not be opened.
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
     /// The launcher did not give the word in time.
     #[error("no word from the launcher for {waited_s} s; is `corotate run` alive in this domain?")]
     NoLauncher {
@@ -101,8 +102,15 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
+    let ledger = open_ledger(&domain, &scenario, role)?;
     let bus = IoxBus::enter(&domain, &seat.role, depths(&scenario))?;
-    serve(&scenario, role, &bus, seat.generation, terminated, grants, |report| write_report(&domain, report))
+    serve(&scenario, role, &bus, &ledger, terminated, grants, |report| write_report(&domain, report))
+}
+
+/// A role's ledger in a domain.
+pub(crate) fn open_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
+    let path = domain.shared(&format!("{}.books", role.name(scenario)));
+    Ledger::shared(&path, ledger_words(scenario, role))
 }
 
 fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
@@ -119,7 +127,8 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a role on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken.
+/// Serves a role on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken, and
+/// `ledger` the books, new or a predecessor's.
 ///
 /// # Errors
 /// [`RoleError`].
@@ -127,17 +136,17 @@ pub fn serve<B: Bus + 'static>(
     scenario: &Scenario,
     role: RoleId,
     bus: &B,
-    generation: u64,
+    ledger: &Ledger,
     terminated: &AtomicBool,
     grants: Vec<Grant>,
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let name = role.name(scenario);
-    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, generation))?;
+    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         bus.writer(&topic(scenario, name, Signal::Health))?,
-        generation,
+        ledger.generation(),
         grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,
     );
@@ -150,27 +159,20 @@ pub fn serve<B: Bus + 'static>(
         privileges::release();
     }
     stages.extend(node.stages());
-    let report = RoleReport {
-        role: name.to_owned(),
-        ticks: node.ticks(),
-        written: node.written(),
-        read: node.read(),
-        stages,
-        grants,
-    };
-    deliver(&report)?;
+    deliver(&report(scenario, role, ledger, stages, grants))?;
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
         let leave_ns = monotonic_ns() + LEAVE_NS;
         while monotonic_ns() < leave_ns && !control.stopped()? {
             control.announce(RoleState::Done, &*node)?;
+            node.refresh()?;
             sleep_until(monotonic_ns() + LOOK_NS);
         }
     }
     Ok(())
 }
 
-/// From open links to the word to run; `None` if the run was stopped before.
+/// From open links to the word to run. The links of a successor carry samples already. `None` if the run was stopped before.
 fn begin<B: Bus>(
     scenario: &Scenario,
     role: RoleId,
@@ -181,11 +183,13 @@ fn begin<B: Bus>(
     if await_phase(scenario, node, control, RoleState::Open, Phase::WarmUp)?.is_none() {
         return Ok(None);
     }
-    for _ in 0..WARM_UP_SAMPLES {
-        node.warm_up()?;
-        sleep_until(monotonic_ns() + WARM_UP_PAUSE_NS);
+    if control.first() {
+        for _ in 0..WARM_UP_SAMPLES {
+            node.warm_up()?;
+            sleep_until(monotonic_ns() + WARM_UP_PAUSE_NS);
+        }
     }
-    if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) {
+    if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) && control.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
     await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
@@ -234,7 +238,10 @@ fn drive<B: Bus>(
     first_served: bool,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
-    node.start(grid);
+    // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
+    let late = scenario.clock == ClockKind::Realtime && !control.first();
+    let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
+    node.start(grid, first_tick.min(scenario.last_tick + 1));
     // Among equals, a role that spins for a sample holds up the one it waits for.
     let spin_us = if first_served { scenario.realtime.spin_us } else { 0.0 };
     let settings = Realtime { spin_us, ..scenario.realtime.clone() };

@@ -2,6 +2,7 @@
 //!
 //! It covers ticks and values, no generation and no time. Checkpoints make it comparable up to any tick.
 
+use super::ledger::{Ledger, Words};
 use crate::sample::Sample;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
@@ -11,9 +12,9 @@ const MAX_CHECKPOINTS: u64 = 16_384;
 /// The hash of one signal, chained over its samples (XXH3-64, each sample's hash seeded by the last).
 #[derive(Debug)]
 pub struct StateHash {
-    value: u64,
+    words: Words,
     stride: u64,
-    checkpoints: Vec<u64>,
+    capacity: u64,
 }
 
 /// The hashes of one signal after ticks stride − 1, 2·stride − 1, …
@@ -28,10 +29,29 @@ pub struct Checkpoints {
 }
 
 impl StateHash {
-    /// An empty hash for a run whose last tick is `last_tick`. All memory is taken now.
-    pub fn new(last_tick: u64) -> Self {
-        let stride = (last_tick + 1).div_ceil(MAX_CHECKPOINTS).max(1);
-        Self { value: 0, stride, checkpoints: Vec::with_capacity(((last_tick + 1) / stride) as usize) }
+    const VALUE: usize = 0;
+    /// How many checkpoints there are; they follow.
+    const COUNT: usize = 1;
+    const FIRST: usize = 2;
+
+    /// Words of the ledger for a run whose last tick is `last_tick`.
+    pub fn words(last_tick: u64) -> usize {
+        Self::FIRST + Self::capacity(last_tick) as usize
+    }
+
+    /// Ticks per checkpoint.
+    fn stride(last_tick: u64) -> u64 {
+        (last_tick + 1).div_ceil(MAX_CHECKPOINTS).max(1)
+    }
+
+    fn capacity(last_tick: u64) -> u64 {
+        (last_tick + 1) / Self::stride(last_tick)
+    }
+
+    /// Opens the hash of a run whose last tick is `last_tick`, as it was left.
+    pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
+        let words = ledger.take(Self::words(last_tick));
+        Self { words, stride: Self::stride(last_tick), capacity: Self::capacity(last_tick) }
     }
 
     /// Takes in a sample. Ticks rise.
@@ -39,23 +59,30 @@ impl StateHash {
     pub fn absorb(&mut self, sample: &impl Sample) {
         let tick = sample.stamp().tick;
         self.checkpoint(tick);
-        self.value = xxh3_64_with_seed(sample.content(), self.value ^ tick.rotate_left(32));
+        let value = self.words.get(Self::VALUE) ^ tick.rotate_left(32);
+        self.words.set(Self::VALUE, xxh3_64_with_seed(sample.content(), value));
         self.checkpoint(tick + 1);
     }
 
     /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
     #[inline]
     fn checkpoint(&mut self, ticks: u64) {
-        while (self.checkpoints.len() as u64 + 1) * self.stride <= ticks
-            && self.checkpoints.len() < self.checkpoints.capacity()
-        {
-            self.checkpoints.push(self.value);
+        let mut count = self.words.get(Self::COUNT);
+        while (count + 1) * self.stride <= ticks && count < self.capacity {
+            self.words.set(Self::FIRST + count as usize, self.words.get(Self::VALUE));
+            count += 1;
+            self.words.set(Self::COUNT, count);
         }
     }
 
     /// What has been gathered.
     pub fn checkpoints(&self) -> Checkpoints {
-        Checkpoints { stride: self.stride, hashes: self.checkpoints.clone(), last: self.value }
+        let count = self.words.get(Self::COUNT).min(self.capacity) as usize;
+        Checkpoints {
+            stride: self.stride,
+            hashes: (0..count).map(|index| self.words.get(Self::FIRST + index)).collect(),
+            last: self.words.get(Self::VALUE),
+        }
     }
 }
 
@@ -75,8 +102,12 @@ mod tests {
         RateCommand { stamp, acceleration_rad_s2: [value, 0.0, 0.0], ..RateCommand::default() }
     }
 
+    fn open(last_tick: u64) -> StateHash {
+        StateHash::open(&Ledger::private(StateHash::words(last_tick)), last_tick)
+    }
+
     fn hash(samples: &[(u64, f64, u64)]) -> Checkpoints {
-        let mut hash = StateHash::new(9);
+        let mut hash = open(9);
         samples.iter().for_each(|&(tick, value, sent)| hash.absorb(&sample(tick, value, sent)));
         hash.checkpoints()
     }
@@ -105,10 +136,23 @@ mod tests {
 
     #[test]
     fn a_long_run_keeps_a_bounded_number_of_checkpoints() {
-        let mut hash = StateHash::new(MAX_CHECKPOINTS * 5);
-        let capacity = hash.checkpoints.capacity();
+        let mut hash = open(MAX_CHECKPOINTS * 5);
         (0..=MAX_CHECKPOINTS * 5).for_each(|tick| hash.absorb(&sample(tick, 0.5, 0)));
-        assert_eq!(hash.checkpoints.capacity(), capacity, "nothing was allocated on the way");
-        assert!(capacity as u64 <= MAX_CHECKPOINTS && hash.stride == 6);
+        let count = hash.checkpoints().hashes.len() as u64;
+        assert_eq!(count, hash.capacity);
+        assert!(count <= MAX_CHECKPOINTS && hash.stride == 6);
+    }
+
+    #[test]
+    fn a_successor_continues_the_chain() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("books");
+        for tick in 0..4 {
+            let ledger = Ledger::shared(&path, StateHash::words(9)).unwrap();
+            StateHash::open(&ledger, 9).absorb(&sample(tick, tick as f64, 0));
+        }
+        let ledger = Ledger::shared(&path, StateHash::words(9)).unwrap();
+        let whole = hash(&[(0, 0.0, 0), (1, 1.0, 0), (2, 2.0, 0), (3, 3.0, 0)]);
+        assert_eq!(StateHash::open(&ledger, 9).checkpoints(), whole);
     }
 }

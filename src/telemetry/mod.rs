@@ -2,12 +2,16 @@
 //!
 //! Everything is allocated before the loop and only counted in it; export and arithmetic come after. Must not log.
 
+mod books;
 mod export;
 mod hash;
 mod latency;
+mod ledger;
 mod report;
 
+pub use books::{ReadBook, TickBook, WriteBook};
 pub use export::{write_hgrm, write_hlog};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};
+pub use ledger::{Ledger, LedgerError, Words};
 pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks};

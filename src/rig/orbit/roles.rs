@@ -73,6 +73,18 @@ impl Body for OrbitPlant {
         out.status = status | self.fault;
     }
 
+    fn status_of(truth: &OrbitTruth) -> u64 {
+        truth.status
+    }
+
+    fn resume(&mut self, truth: &OrbitTruth, measured: u64) {
+        let [vr, vtheta] = truth.velocity_du_s;
+        self.state = OrbitState { r: truth.radius_du, theta: truth.angle_rad, vr, vtheta };
+        self.applied = truth.applied_du_s2.into();
+        self.fault = truth.status & status::FAULT;
+        self.noise.skip(measured);
+    }
+
     /// Freezes for good at the last good state where the model ends.
     fn flow(&mut self, dt_s: f64) {
         if self.fault != 0 {

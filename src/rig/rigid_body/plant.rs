@@ -78,6 +78,17 @@ impl Body for RatePlant {
         out.status = status;
     }
 
+    fn status_of(truth: &RateTruth) -> u64 {
+        truth.status
+    }
+
+    fn resume(&mut self, truth: &RateTruth, measured: u64) {
+        self.rate = truth.omega_rad_s.into();
+        self.asked = Vector3::from(truth.applied_rad_s2).component_mul(&self.inertia_factor);
+        self.tick = truth.stamp.tick;
+        self.noise.skip(measured);
+    }
+
     fn flow(&mut self, dt_s: f64) {
         self.rate = self.body.flow(&self.rate, &self.acceleration(), dt_s);
         self.tick += 1;

@@ -1,13 +1,13 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
-use super::{Gate, Node, Poll, Seat, TickBook};
+use super::{Gate, Node, Poll, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
-use crate::rig::{Command, Estimate, Measurement, Rig};
+use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
 use crate::role::Controller;
 use crate::runtime::link::{Input, Output, Seek};
 use crate::sample::Sample;
-use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 
 /// One driven body, seen from the controller.
 struct Channel<R: Rig, B: Bus> {
@@ -38,22 +38,27 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
-        let channel = |(index, body): (usize, &crate::rig::BodyInfo)| {
+        let book = TickBook::open(seat.ledger);
+        let driven = || rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+        // In the order of the books: everything written, then everything read.
+        let commands: Vec<Output<B, Command<R>>> =
+            driven().map(|(_, body)| seat.output(&body.name, Signal::Command)).collect::<Result<_, _>>()?;
+        let estimate = seat.input(&rig.bodies()[0].name, Signal::Estimate)?;
+        let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             Ok(Channel {
                 controller: Controller::new(rig.law(index)),
                 measurement: seat.input(&body.name, Signal::Measurement)?,
-                command: seat.output(&body.name, Signal::Command)?,
+                command,
                 ready: false,
                 began_ns: 0,
                 sent_ns: 0,
             })
         };
         Ok(Self {
-            estimate: seat.input(&rig.bodies()[0].name, Signal::Estimate)?,
-            channels: driven.map(channel).collect::<Result<_, BusError>>()?,
+            estimate,
+            channels: driven().zip(commands).map(channel).collect::<Result<_, BusError>>()?,
             clock: seat.clock,
-            book: TickBook::default(),
+            book,
             origin_ns: 0,
             estimate_sent_ns: 0,
             received_ns: 0,
@@ -66,7 +71,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
-        if self.estimate.seek(self.book.next)? == Seek::NotYet {
+        if self.estimate.seek(self.book.next())? == Seek::NotYet {
             return Ok(false);
         }
         let Some(estimate) = self.estimate.sample() else { return Ok(false) };
@@ -116,14 +121,16 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next
+        self.book.next()
     }
 
-    fn start(&mut self, _grid: Grid) {}
+    fn start(&mut self, _grid: Grid, first_tick: u64) {
+        self.skip_to(first_tick);
+    }
 
     #[inline]
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next > up_to);
+        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
         if allowed && self.gather(gate == Gate::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
     }
 
@@ -157,17 +164,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         Ok(())
     }
 
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.channels.iter_mut().try_for_each(|channel| channel.command.refresh())
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
-    }
-
-    fn written(&self) -> Vec<LinkWritten> {
-        self.channels.iter().map(|channel| channel.command.report()).collect()
-    }
-
-    fn read(&self) -> Vec<LinkRead> {
-        let measurements = self.channels.iter().map(|channel| channel.measurement.report());
-        std::iter::once(self.estimate.report()).chain(measurements).collect()
     }
 
     fn stages(&self) -> Vec<StageReport> {

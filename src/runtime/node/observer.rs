@@ -1,13 +1,13 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Gate, Node, Poll, Seat, TickBook};
+use super::{Gate, Node, Poll, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
-use crate::runtime::link::{Input, Output};
+use crate::runtime::link::{Input, Output, Seek};
 use crate::sample::Sample;
-use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -34,12 +34,14 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0].name;
+        let book = TickBook::open(seat.ledger);
+        let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
             observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),
             measurement: seat.input(leader, Signal::Measurement)?,
-            estimate: seat.output(leader, Signal::Estimate)?,
+            estimate,
             clock: seat.clock,
-            book: TickBook::default(),
+            book,
             instants: Instants::default(),
             hop: Latency::default(),
             step: Latency::default(),
@@ -71,15 +73,18 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next
+        self.book.next()
     }
 
-    fn start(&mut self, _grid: Grid) {}
+    fn start(&mut self, _grid: Grid, first_tick: u64) {
+        self.skip_to(first_tick);
+    }
 
     #[inline]
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next > up_to);
-        if allowed && self.measurement.advance()? { self.execute() } else { Ok(Poll::Waiting) }
+        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
+        let there = allowed && self.measurement.seek(self.book.next())? != Seek::NotYet;
+        if there { self.execute() } else { Ok(Poll::Waiting) }
     }
 
     #[inline]
@@ -104,16 +109,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.estimate.warm_up()
     }
 
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.estimate.refresh()
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
-    }
-
-    fn written(&self) -> Vec<LinkWritten> {
-        vec![self.estimate.report()]
-    }
-
-    fn read(&self) -> Vec<LinkRead> {
-        vec![self.measurement.report()]
     }
 
     fn stages(&self) -> Vec<StageReport> {

@@ -1,13 +1,14 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Gate, Node, Poll, Seat, TickBook};
+use super::{Gate, Node, Poll, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::{CommandEvent, Plant};
 use crate::runtime::link::{Input, Output, Seek};
 use crate::sample::{Sample, Stamp};
-use crate::telemetry::{Latency, LinkRead, LinkWritten, StageReport, Ticks};
+use crate::telemetry::{Latency, Ledger, StageReport, TickBook, Ticks, Words};
+use std::marker::PhantomData;
 
 /// A plant with its links and books.
 pub struct PlantNode<R: Rig, B: Bus> {
@@ -19,6 +20,7 @@ pub struct PlantNode<R: Rig, B: Bus> {
     grid: Grid,
     last_tick: u64,
     book: TickBook,
+    state: StateBook<Truth<R>>,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -27,16 +29,20 @@ pub struct PlantNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> PlantNode<R, B> {
     pub fn open(rig: &R, index: usize, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
+        let book = TickBook::open(seat.ledger);
+        let measurement = seat.output(&body.name, Signal::Measurement)?;
+        let truth = seat.output(&body.name, Signal::Truth)?;
         let command = body.driven.then(|| seat.input(&body.name, Signal::Command)).transpose()?;
         Ok(Self {
             plant: Plant::new(rig.body(index), scenario.actuation(body.driven), scenario.tick_s()),
             command,
-            measurement: seat.output(&body.name, Signal::Measurement)?,
-            truth: seat.output(&body.name, Signal::Truth)?,
+            measurement,
+            truth,
             clock: seat.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            book: TickBook::default(),
+            book,
+            state: StateBook::open(seat.ledger),
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -45,27 +51,41 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
 
     fn inputs_ready(&mut self) -> Result<bool, BusError> {
         match &mut self.command {
-            Some(command) if self.book.next > 0 => Ok(command.seek(self.book.next - 1)? != Seek::NotYet),
+            Some(command) if self.book.next() > 0 => Ok(command.seek(self.book.next() - 1)? != Seek::NotYet),
             _ => Ok(true),
         }
     }
 
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
-        for missed in self.book.next..tick {
+        for missed in self.book.next()..tick {
             self.lateness.record(self.grid.due_ns(missed), now_ns);
         }
         self.skip_to(tick);
     }
 
+    /// Takes over a body from a predecessor that died: it has moved on by itself, and its actuators have protected it.
+    fn resume(&mut self, truth: &Truth<R>, first_tick: u64) {
+        self.plant.resume(truth, self.measurement.published());
+        let first_tick = first_tick.max(truth.stamp().tick + 1);
+        self.plant.advance(1);
+        for tick in truth.stamp().tick + 1..first_tick {
+            self.plant.command(tick, None);
+            self.plant.advance(1);
+        }
+        self.book.skip_to(first_tick);
+    }
+
     #[inline]
     fn execute(&mut self, now_ns: u64) -> Result<Poll, BusError> {
-        let tick = self.book.next;
+        let tick = self.book.next();
         let event = self.take_command(tick, now_ns)?;
         if event.missed() {
             self.book.starved(tick);
         }
-        self.book.ticks.safe += u64::from(matches!(event, CommandEvent::Expired | CommandEvent::Safe));
+        if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
+            self.book.safe();
+        }
         let (plant, clock) = (&mut self.plant, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
         self.measurement.send(|sample| {
@@ -94,20 +114,25 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next
+        self.book.next()
     }
 
-    fn start(&mut self, grid: Grid) {
+    fn start(&mut self, grid: Grid, first_tick: u64) {
         self.grid = grid;
+        if let Some(truth) = self.state.load() {
+            self.resume(&truth, first_tick);
+        } else {
+            self.skip_to(first_tick);
+        }
     }
 
     #[inline]
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
         match gate {
-            Gate::Inputs { up_to } if self.book.next <= up_to && self.inputs_ready()? => self.execute(0),
+            Gate::Inputs { up_to } if self.book.next() <= up_to && self.inputs_ready()? => self.execute(0),
             Gate::Now { tick, now_ns } => {
                 self.catch_up(tick.min(self.last_tick + 1), now_ns);
-                if self.book.next > self.last_tick {
+                if self.book.next() > self.last_tick {
                     return Ok(Poll::Waiting);
                 }
                 self.lateness.record(self.grid.due_ns(tick), now_ns);
@@ -120,7 +145,7 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         let (plant, clock) = (&self.plant, self.clock);
-        let (tick, origin_ns) = (self.book.next, self.grid.due_ns(self.book.next));
+        let (tick, origin_ns) = (self.book.next(), self.grid.due_ns(self.book.next()));
         self.truth.send(|sample| {
             plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
         })?;
@@ -131,6 +156,7 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
         }
         self.measurement.settle()?;
         self.truth.settle()?;
+        self.state.store(self.truth.sent());
         self.book.executed();
         Ok(())
     }
@@ -148,19 +174,60 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
         self.truth.warm_up()
     }
 
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh()?;
+        self.truth.refresh()
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
     }
 
-    fn written(&self) -> Vec<LinkWritten> {
-        vec![self.measurement.report(), self.truth.report()]
-    }
-
-    fn read(&self) -> Vec<LinkRead> {
-        self.command.iter().map(Input::report).collect()
-    }
-
     fn stages(&self) -> Vec<StageReport> {
         StageReport::all(&[("lateness", &self.lateness), ("age", &self.age), ("step", &self.step)])
+    }
+}
+
+/// The last state of a body, kept in the ledger so that whoever simulates it next can go on from there: a body does not
+/// vanish with the process that simulates it.
+pub struct StateBook<S> {
+    words: Words,
+    sample: PhantomData<S>,
+}
+
+impl<S: Sample> StateBook<S> {
+    const SAMPLE_WORDS: usize = size_of::<S>() / size_of::<u64>();
+    /// Words of the ledger: which of the two copies holds, from 1, and the copies. One of them is always whole.
+    pub const WORDS: usize = 1 + 2 * Self::SAMPLE_WORDS;
+
+    fn open(ledger: &Ledger) -> Self {
+        Self { words: ledger.take(Self::WORDS), sample: PhantomData }
+    }
+
+    fn begin(copy: u64) -> usize {
+        1 + (copy as usize - 1) * Self::SAMPLE_WORDS
+    }
+
+    #[inline]
+    fn store(&mut self, sample: &S) {
+        let copy = if self.words.get(0) == 1 { 2 } else { 1 };
+        let words: &[u64] = bytemuck::cast_slice(std::slice::from_ref(sample));
+        for (index, word) in words.iter().enumerate() {
+            self.words.set(Self::begin(copy) + index, *word);
+        }
+        self.words.set(0, copy);
+    }
+
+    fn load(&self) -> Option<S> {
+        let copy = self.words.get(0);
+        if !(1..=2).contains(&copy) {
+            return None;
+        }
+        let mut sample = S::default();
+        let words: &mut [u64] = bytemuck::cast_slice_mut(std::slice::from_mut(&mut sample));
+        for (index, word) in words.iter_mut().enumerate() {
+            *word = self.words.get(Self::begin(copy) + index);
+        }
+        Some(sample)
     }
 }

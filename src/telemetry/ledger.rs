@@ -1,0 +1,180 @@
+//! Memory for a role's books that survives the role: a process that takes a dead one's seat goes on with its counters.
+//!
+//! Words are written one by one and never locked: whoever dies in between leaves each of them whole. Must not know what
+//! is counted.
+
+use memmap2::MmapRaw;
+use rustix::fs::{FallocateFlags, fallocate};
+use std::cell::Cell;
+use std::fs::OpenOptions;
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Why a ledger could not be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum LedgerError {
+    /// The memory could not be had.
+    #[error("cannot keep the books in {}: {source}; is there room in /dev/shm?", path.display())]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The file is there and has another size.
+    #[error("{} holds {found} bytes, not {expected}: it was written by another version of this program", path.display())]
+    Size {
+        /// The file.
+        path: PathBuf,
+        /// Its size.
+        found: u64,
+        /// The size of this version's books.
+        expected: u64,
+    },
+}
+
+/// A fixed number of words, handed out in order, and the count of those who have come to write in them.
+#[derive(Debug)]
+pub struct Ledger {
+    memory: Rc<Memory>,
+    taken: Cell<usize>,
+}
+
+#[derive(Debug)]
+enum Memory {
+    Private(Box<[AtomicU64]>),
+    Shared(MmapRaw),
+}
+
+impl Memory {
+    #[inline]
+    #[allow(unsafe_code)]
+    fn words(&self) -> &[AtomicU64] {
+        match self {
+            Self::Private(words) => words,
+            // SAFETY: the mapping is writable, page-aligned, at least `len` bytes long (the file was allocated so, and no
+            // process of a run shortens it), and lives as long as `self`; every access to it, in any process, is atomic.
+            Self::Shared(map) => unsafe {
+                std::slice::from_raw_parts(map.as_ptr().cast::<AtomicU64>(), map.len() / size_of::<u64>())
+            },
+        }
+    }
+}
+
+impl Ledger {
+    const GENERATION: usize = 0;
+    const FIRST: usize = 1;
+
+    /// A ledger that dies with this process: for runs in one thread.
+    pub fn private(words: usize) -> Self {
+        Self::over(Memory::Private((0..Self::FIRST + words).map(|_| AtomicU64::new(0)).collect()))
+    }
+
+    /// The ledger in a file of shared memory, as it was left, or new and all zero.
+    ///
+    /// # Errors
+    /// [`LedgerError`].
+    pub fn shared(path: &Path, words: usize) -> Result<Self, LedgerError> {
+        let expected = ((Self::FIRST + words) * size_of::<u64>()) as u64;
+        let open = || {
+            let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
+            if file.metadata()?.len() == 0 {
+                // Really allocated, not merely promised: a page that is missing later would kill the process.
+                fallocate(&file, FallocateFlags::empty(), 0, expected)?;
+            }
+            let found = file.metadata()?.len();
+            Ok((found, MmapRaw::map_raw(&file)?))
+        };
+        let (found, map) = open().map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
+        if found != expected {
+            return Err(LedgerError::Size { path: path.to_owned(), found, expected });
+        }
+        Ok(Self::over(Memory::Shared(map)))
+    }
+
+    fn over(memory: Memory) -> Self {
+        Self { memory: Rc::new(memory), taken: Cell::new(Self::FIRST) }
+    }
+
+    /// Enters as the next generation of writers, and tells which: 1 for the first.
+    pub fn enter(&self) -> u64 {
+        self.memory.words()[Self::GENERATION].fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// The generation that has entered last; 0 if none has.
+    pub fn generation(&self) -> u64 {
+        self.memory.words()[Self::GENERATION].load(Ordering::Relaxed)
+    }
+
+    /// The same memory, to be taken anew from its beginning.
+    pub fn reopened(&self) -> Self {
+        Self { memory: self.memory.clone(), taken: Cell::new(Self::FIRST) }
+    }
+
+    /// The next `count` words. Whoever takes in the same order finds the same words again.
+    ///
+    /// # Panics
+    /// If the ledger has no more: its size is computed from the same list of books that are opened in it.
+    pub fn take(&self, count: usize) -> Words {
+        let begin = self.taken.replace(self.taken.get() + count);
+        assert!(begin + count <= self.memory.words().len(), "the ledger is sized for all of its books");
+        Words { memory: self.memory.clone(), begin }
+    }
+}
+
+/// Some words of a ledger.
+#[derive(Debug)]
+pub struct Words {
+    memory: Rc<Memory>,
+    begin: usize,
+}
+
+impl Words {
+    #[inline]
+    fn word(&self, index: usize) -> &AtomicU64 {
+        &self.memory.words()[self.begin + index]
+    }
+
+    /// One word.
+    #[inline]
+    pub fn get(&self, index: usize) -> u64 {
+        self.word(index).load(Ordering::Relaxed)
+    }
+
+    /// Writes one word; what was written before is seen before, by whoever outlives this process.
+    #[inline]
+    pub fn set(&self, index: usize, value: u64) {
+        self.word(index).store(value, Ordering::Release);
+    }
+
+    /// Adds to one word. There is one writer.
+    #[inline]
+    pub fn add(&self, index: usize, amount: u64) {
+        self.set(index, self.get(index).wrapping_add(amount));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whoever_opens_it_again_finds_what_was_written() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("books");
+        let (first, second) = (Ledger::shared(&path, 5).unwrap(), Ledger::shared(&path, 5).unwrap());
+        assert_eq!((first.enter(), second.enter(), first.generation()), (1, 2, 2));
+        let (_, ours) = (first.take(2), first.take(3));
+        let (_, theirs) = (second.take(2), second.take(3));
+        ours.set(2, 7);
+        ours.add(2, 1);
+        assert_eq!((theirs.get(2), theirs.get(0)), (8, 0));
+        drop((first, ours));
+        assert_eq!(theirs.get(2), 8);
+        assert!(matches!(Ledger::shared(&path, 6), Err(LedgerError::Size { found: 48, expected: 56, .. })));
+        assert!(matches!(Ledger::shared(directory.path(), 6), Err(LedgerError::Open { .. })));
+    }
+}
