@@ -1,5 +1,6 @@
 //! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
 
+mod bridge;
 mod check;
 mod init;
 mod role;
@@ -27,7 +28,9 @@ Examples:
   corotate                                       the shipped scenario rigid-pair
   corotate init rigid-trio > trio.toml           a commented scenario to start from
   corotate check trio.toml                       validate it, print what is proven of it
-  corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits";
+  corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
+                                                 a device as the follower of a run --external follower";
 
 #[derive(Subcommand)]
 enum Command {
@@ -43,6 +46,8 @@ enum Command {
     Observer(role::Arguments),
     /// Take the controller's seat in a run
     Controller(role::Arguments),
+    /// Put a device behind a serial line into a driven body's seat in a run
+    Bridge(bridge::Arguments),
     /// Clean up after a launcher that was killed
     #[command(hide = true)]
     Janitor,
@@ -101,6 +106,7 @@ fn main() -> ExitCode {
         Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
+        Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
         Some(Command::Janitor) => {
             corotate::launch::janitor(std::io::stdin());
             Exit::Ok

@@ -12,7 +12,7 @@ mod table;
 pub use children::janitor;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
-pub use table::table;
+pub use table::{line_words, table};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

@@ -3,15 +3,19 @@
 //! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
+mod bridge;
 mod drive;
+mod line;
 mod link;
 mod node;
 mod privileges;
 mod process;
 
+pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use line::{Line, LineError};
 pub use link::{Input, Output, Seek};
-pub use node::{Gate, Node, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
+pub use node::{Gate, Node, Occupant, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{report_path, scenario_path, write_whole};

@@ -15,7 +15,7 @@ const SILENT_REQUESTS: u32 = 8;
 const SHORTEST_REPEAT_NS: u64 = 5_000_000;
 const LONGEST_REPEAT_NS: u64 = 1_000_000_000;
 /// A request is repeated after so many round trips; the smoothing of that figure, as a shift.
-const PATIENT_ROUND_TRIPS: u64 = 3;
+const PATIENT_ROUND_TRIPS: u64 = 2;
 const SMOOTHING: u32 = 3;
 
 /// The books of a line.
@@ -269,6 +269,11 @@ impl Host {
     /// For how long the device has not answered, ns; 0 if nothing is waited for.
     pub fn silent_ns(&self, now_ns: u64) -> u64 {
         self.silent_since_ns.map_or(0, |since_ns| now_ns.saturating_sub(since_ns))
+    }
+
+    /// Something is waited for, at the latest since now.
+    pub fn wait_since(&mut self, now_ns: u64) {
+        self.silent_since_ns.get_or_insert(now_ns);
     }
 
     /// Begins to wait anew.

@@ -59,7 +59,7 @@
 //! ## What the host does
 //!
 //! It sends Hello every 100 ms until the device says Welcome; asks for each tick once its command is there or, in real time,
-//! when the tick is due; repeats a request after a quarter of the period and three round trips at least, twice as late each
+//! when the tick is due; repeats a request after a quarter of the period and two round trips at least, twice as late each
 //! time; gives it up at the cutoff of the period (never in lockstep); greets anew after 8 requests without any answer, or
 //! when the line was cut. Answers to what is no longer asked are counted and dropped.
 
