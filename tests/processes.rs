@@ -63,11 +63,15 @@ fn an_in_process_run_ends_in_order_too() {
 fn a_killed_role_ends_the_run_by_name_and_cause() {
     for role in ["leader", "follower", "observer", "controller"] {
         let bench = Bench::new();
-        let (running, domains) = start_endless(&bench, &[]);
+        let (running, domains) = start_endless(&bench, &["--set", "supervision.on_failure=\"stop\""]);
         send_signal(bench.await_role(role), SIGKILL);
         let done = running.wait();
         assert_eq!(done.code, Some(4), "{done:?}");
-        assert!(done.stderr.contains(&format!("{role} died: it was killed by SIGKILL")), "{done:?}");
+        assert!(done.stderr.contains(&format!("{role} died at tick ")), "{done:?}");
+        assert!(done.stderr.contains("it was killed by SIGKILL; the run ends"), "{done:?}");
+        let summary: Value = serde_json::from_slice(&std::fs::read(bench.path("out/summary.json")).unwrap()).unwrap();
+        assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+        assert_eq!(summary["incidents"][0]["role"], role);
         bench.assert_clean(&domains);
     }
 }

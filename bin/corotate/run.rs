@@ -2,7 +2,7 @@
 
 use crate::{Exit, fail, say};
 use corotate::config::{ClockKind, SHIPPED, Scenario};
-use corotate::launch::{Launch, LaunchError, Progress, Summary, table, write_run};
+use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, table, write_run};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
@@ -117,6 +117,9 @@ fn verdict(summary: &Summary) -> Exit {
     if !summary.books.balanced {
         return fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
     }
+    if summary.incidents.iter().any(|incident| incident.action == Action::Stopped) {
+        return Exit::ProcessLost;
+    }
     if summary.signal != 0 {
         eprintln!("corotate: ended in order by signal {}", summary.signal);
         return Exit::Signal(summary.signal);
@@ -132,9 +135,11 @@ fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
-        LaunchError::Domain(_) | LaunchError::Bus(_) | LaunchError::Write { .. } | LaunchError::Spawn { .. } => {
-            Exit::Failure
-        }
+        LaunchError::Domain(_)
+        | LaunchError::Bus(_)
+        | LaunchError::Ledger(_)
+        | LaunchError::Write { .. }
+        | LaunchError::Spawn { .. } => Exit::Failure,
     }
 }
 

@@ -6,7 +6,7 @@
 use rustix::fs::{FlockOperation, flock, fstat};
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 /// Where the transport's shared memory appears as files.
@@ -127,14 +127,30 @@ impl Domain {
         Path::new(SHARED_MEMORY).join(self.prefix() + name)
     }
 
+    /// Takes from other users what the transport has left open to them in shared memory so far.
+    ///
+    /// iceoryx2 0.10 makes one file, its count of nodes, writable for everybody. It is there once somebody has entered.
+    ///
+    /// # Errors
+    /// [`DomainError::Create`].
+    pub fn seal(&self) -> Result<(), DomainError> {
+        for path in self.in_shared_memory() {
+            let private = fs::Permissions::from_mode(0o600);
+            fs::set_permissions(&path, private).map_err(|source| DomainError::Create { path, source })?;
+        }
+        Ok(())
+    }
+
+    /// The domain's files in shared memory.
+    fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
+        let prefix = self.prefix();
+        let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+        entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(&prefix)).map(|entry| entry.path())
+    }
+
     /// Removes every trace of the domain. What is gone already is no error.
     fn remove(&self) {
-        let prefix = self.prefix();
-        for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
-            if entry.file_name().to_string_lossy().starts_with(&prefix) {
-                let _ = fs::remove_file(entry.path());
-            }
-        }
+        self.in_shared_memory().for_each(|path| drop(fs::remove_file(path)));
         let _ = fs::remove_dir_all(&self.root);
         let _ = fs::remove_file(lock_path(&self.root));
         // The directory of all domains goes with the last; it is not empty while another run lives.

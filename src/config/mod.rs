@@ -9,7 +9,7 @@ mod scenario;
 
 pub use document::Document;
 pub use error::{ConfigError, Problem};
-pub use raw::{ClockKind, Cores, NamedCores, Realtime};
+pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision};
 pub use scenario::{Accept, Scenario};
 
 pub(crate) use document::nearest;

@@ -24,6 +24,8 @@ pub(super) struct Raw {
     #[serde(default)]
     pub launch: Launch,
     #[serde(default)]
+    pub supervision: Supervision,
+    #[serde(default)]
     pub accept: BTreeMap<String, f64>,
 }
 
@@ -142,5 +144,63 @@ pub(super) struct Launch {
 impl Default for Launch {
     fn default() -> Self {
         Self { startup_timeout_s: 30.0 }
+    }
+}
+
+/// What the launcher does about roles that die or hang while the ticks run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Supervision {
+    /// What is done about a role that failed.
+    pub on_failure: Policy,
+    /// A role that says nothing for so long counts as hung and is killed, s. Roles speak every 20 ms.
+    pub heartbeat_timeout_s: f64,
+    /// How often one role is started anew in a run.
+    pub restarts_max: u64,
+    /// The least time between two starts of one role, s.
+    pub restart_interval_s: f64,
+}
+
+/// What is done about a role that failed, by role.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "there is no such choice; give \"restart\", \"stop\", or a table such as { observer = \"restart\", leader = \"stop\" }"
+)]
+pub enum Policy {
+    /// The same for all.
+    All(OnFailure),
+    /// By role; those not named are started anew.
+    ByRole(BTreeMap<String, OnFailure>),
+}
+
+/// What is done about a role that failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnFailure {
+    /// Start it anew.
+    Restart,
+    /// End the run in order; exit code 4.
+    Stop,
+}
+
+impl Default for Supervision {
+    fn default() -> Self {
+        Self {
+            on_failure: Policy::All(OnFailure::Restart),
+            heartbeat_timeout_s: 2.0,
+            restarts_max: 5,
+            restart_interval_s: 0.1,
+        }
+    }
+}
+
+impl Supervision {
+    /// What is done about a role that failed.
+    pub fn of(&self, role: &str) -> OnFailure {
+        match &self.on_failure {
+            Policy::All(policy) => *policy,
+            Policy::ByRole(roles) => roles.get(role).copied().unwrap_or(OnFailure::Restart),
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! A scenario as resolved: every value checked, every default filled in, ready to run.
 
-use super::raw::Raw;
-use super::{ClockKind, ConfigError, Document, Problem, Realtime, nearest};
+use super::raw::{Policy, Raw};
+use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, nearest};
 use crate::rig::{self, AnyRig, Frame};
 use crate::role::{Actuation, Rearm};
 use std::collections::BTreeMap;
@@ -16,8 +16,18 @@ const MAX_TICKS: f64 = 3.2e11;
 /// The tables whose content belongs to the rig.
 const RIG_SECTIONS: [&str; 6] = ["central_body", "leader", "spacecraft", "follower", "observer", "controller"];
 /// The keys that hold one table each.
-const TABLES: [&str; 9] =
-    ["central_body", "leader", "spacecraft", "observer", "controller", "actuator", "realtime", "launch", "accept"];
+const TABLES: [&str; 10] = [
+    "central_body",
+    "leader",
+    "spacecraft",
+    "observer",
+    "controller",
+    "actuator",
+    "realtime",
+    "launch",
+    "supervision",
+    "accept",
+];
 
 /// A scenario that can be run.
 #[derive(Debug)]
@@ -38,6 +48,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// What the launcher does about roles that fail.
+    pub supervision: Supervision,
     /// What the run is judged by.
     pub accept: Accept,
     /// Bodies, observer and laws.
@@ -90,6 +102,9 @@ impl Scenario {
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let accept = resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        if let Some(rig) = &rig {
+            check_roles(&raw.supervision.on_failure, rig, &mut checks);
+        }
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
@@ -102,6 +117,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            supervision: raw.supervision,
             accept,
             rig,
             resolved,
@@ -198,9 +214,36 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
         "0 would make every tick unsafe; give at least 1".to_owned()
     });
     check_realtime(&raw.realtime, checks);
+    check_supervision(&raw.supervision, checks);
     checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
         format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
     });
+}
+
+fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
+    let (heartbeat_s, interval_s) = (supervision.heartbeat_timeout_s, supervision.restart_interval_s);
+    checks.require((0.1..=3600.0).contains(&heartbeat_s), "supervision.heartbeat_timeout_s", || {
+        format!("{heartbeat_s} s is no time to wait for a word that is due every 0.02 s; give 0.1 to 3600")
+    });
+    checks.require((0.0..=3600.0).contains(&interval_s), "supervision.restart_interval_s", || {
+        format!("{interval_s} s is no time between two starts; give 0 to 3600")
+    });
+    checks.require(supervision.restarts_max <= 1000, "supervision.restarts_max", || {
+        format!("{} starts of one role will not mend it; give 0 to 1000", supervision.restarts_max)
+    });
+}
+
+/// Roles that a policy names must exist.
+fn check_roles(policy: &Policy, rig: &AnyRig, checks: &mut Checks<'_>) {
+    let Policy::ByRole(roles) = policy else { return };
+    let bodies = rig.bodies().iter().map(|body| body.name.as_str());
+    let known: Vec<&str> = bodies.chain(["observer", "controller"]).collect();
+    for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
+        checks.refuse(
+            &format!("supervision.on_failure.{role}"),
+            format!("there is no such role; {}", nearest(role, &known)),
+        );
+    }
 }
 
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {

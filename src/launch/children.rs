@@ -4,11 +4,14 @@
 //! shared memory. Must not leave a zombie.
 
 use super::LaunchError;
+use super::supervision::Failure;
 use crate::bus::domain::{self, Domain};
 use crate::config::Scenario;
 use crate::runtime::RoleId;
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read, Write};
+use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
@@ -17,15 +20,16 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// How long a role may take to end once it has been told to.
-const END_LIMIT: Duration = Duration::from_secs(5);
+pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
 /// How much of a role's error output is kept.
 const LAST_LINES: usize = 8;
 
 /// A role's process.
 pub(super) struct RoleProcess {
-    pub name: String,
     child: Child,
     status: Option<ExitStatus>,
+    /// Readable once the process has ended; none on a kernel without.
+    handle: Option<OwnedFd>,
     last_words: Arc<Mutex<VecDeque<String>>>,
     listener: Option<JoinHandle<()>>,
 }
@@ -48,8 +52,9 @@ impl RoleProcess {
         command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|source| LaunchError::Spawn { role: name.clone(), source })?;
         let last_words = Arc::new(Mutex::new(VecDeque::new()));
-        let listener = child.stderr.take().map(|stderr| listen(name.clone(), stderr, last_words.clone()));
-        Ok(Self { name, child, status: None, last_words, listener })
+        let listener = child.stderr.take().map(|stderr| listen(name, stderr, last_words.clone()));
+        let handle = Pid::from_raw(child.id() as i32).and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
+        Ok(Self { child, status: None, handle, last_words, listener })
     }
 
     /// How the process ended, if it has.
@@ -60,16 +65,34 @@ impl RoleProcess {
         self.status
     }
 
-    /// The error for a role that ended before its time.
-    pub fn died(&mut self, status: ExitStatus) -> LaunchError {
-        self.stop_listening();
+    /// What there is to wait on for the end of a process that has not ended.
+    pub fn handle(&self) -> Option<&OwnedFd> {
+        self.handle.as_ref().filter(|_| self.status.is_none())
+    }
+
+    /// How a role failed that ended before its time.
+    pub fn failure(&mut self, status: ExitStatus) -> Failure {
         let cause = match (status.code(), status.signal()) {
             (Some(code), _) => format!("it exited with code {code}"),
             (None, Some(signal)) => format!("it was killed by {}", signal_name(signal)),
             (None, None) => "it ended".to_owned(),
         };
+        Failure { cause, last_words: self.last_words() }
+    }
+
+    /// The end of the error output of a process that has ended.
+    pub fn last_words(&mut self) -> String {
+        self.stop_listening();
         let words = self.last_words.lock().map(|lines| lines.iter().cloned().collect::<Vec<_>>()).unwrap_or_default();
-        LaunchError::Died { role: self.name.clone(), cause, last_words: words.join(" | ") }
+        words.join(" | ")
+    }
+
+    /// Ends the process at once and reaps it.
+    pub fn kill(&mut self) {
+        if self.ended().is_none() {
+            let _ = self.child.kill();
+            self.status = self.child.wait().ok();
+        }
     }
 
     fn stop_listening(&mut self) {
@@ -81,19 +104,18 @@ impl RoleProcess {
 
 impl Drop for RoleProcess {
     fn drop(&mut self) {
-        if self.ended().is_none() {
-            let _ = self.child.kill();
-            let _ = self.child.wait();
-        }
+        self.kill();
         self.stop_listening();
     }
 }
 
-/// Waits for processes that have been told to end, and kills those that do not.
-pub(super) fn await_end(processes: &mut [RoleProcess]) {
+/// Waits for processes that have been told to end, but not for ever.
+pub(super) fn await_end<'a>(processes: impl Iterator<Item = &'a mut RoleProcess>) {
     let limit = Instant::now() + END_LIMIT;
-    while processes.iter_mut().any(|process| process.ended().is_none()) && Instant::now() < limit {
-        std::thread::sleep(Duration::from_millis(1));
+    for process in processes {
+        while process.ended().is_none() && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
     }
 }
 

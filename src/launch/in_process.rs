@@ -39,6 +39,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
             .map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()))
             .collect(),
         score: scorer.finish()?,
+        incidents: Vec::new(),
         grants: Vec::new(),
         domain: None,
         signal: if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 },

@@ -7,17 +7,19 @@ mod in_process;
 mod outcome;
 mod processes;
 mod score;
+mod supervision;
 mod table;
 
 pub use children::janitor;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
+pub use supervision::{Action, Incident};
 pub use table::{line_words, table};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
-use crate::telemetry::Grant;
+use crate::telemetry::{Grant, LedgerError};
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
@@ -68,6 +70,9 @@ pub enum LaunchError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// The roles' books could not be opened.
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
     /// A file of the domain could not be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {
@@ -84,7 +89,7 @@ pub enum LaunchError {
         /// The system's reason.
         source: io::Error,
     },
-    /// A role ended before its time.
+    /// A role failed before the ticks ran.
     #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; it said: {last_words}") })]
     Died {
         /// The role.

@@ -2,7 +2,7 @@
 //!
 //! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
 
-use super::Score;
+use super::{Action, Incident, Score};
 use crate::config::Scenario;
 use crate::rig::CertificateReport;
 use crate::serial::LineBook;
@@ -25,6 +25,8 @@ pub struct Outcome {
     pub reports: Vec<RoleReport>,
     /// The score.
     pub score: Score,
+    /// Roles that failed while the ticks ran.
+    pub incidents: Vec<Incident>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
     /// The domain that was used, if there was one.
@@ -58,6 +60,8 @@ pub struct Summary {
     pub criteria: Vec<Criterion>,
     /// The score.
     pub score: Score,
+    /// Roles that failed while the ticks ran, and what became of them.
+    pub incidents: Vec<Incident>,
     /// What a reader of the results must know of the scenario.
     pub notes: Vec<String>,
     /// What is proven of the loop.
@@ -172,8 +176,12 @@ struct Host {
 impl Summary {
     /// Draws up the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
-        let latencies = latencies(&outcome.reports);
-        let books = Books::new(scenario, &outcome.reports, outcome.signal != 0);
+        let mut latencies = latencies(&outcome.reports);
+        latencies.extend(incident_figures(&outcome.incidents));
+        let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
+        let lost: Vec<&str> = lost.map(|incident| incident.role.as_str()).collect();
+        let interrupted = outcome.signal != 0 || !lost.is_empty();
+        let books = Books::new(scenario, &outcome.reports, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies);
         Self {
             schema: SCHEMA,
@@ -190,6 +198,7 @@ impl Summary {
             accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
             criteria,
             score: outcome.score.clone(),
+            incidents: outcome.incidents.clone(),
             notes: scenario.rig.notes(),
             certificates: scenario.rig.certificates(),
             state: State::new(&outcome.reports, &books),
@@ -202,24 +211,27 @@ impl Summary {
 }
 
 impl Books {
-    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool) -> Self {
+    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool, lost: &[&str]) -> Self {
         let mut problems = Vec::new();
-        let written: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
+        let written = reports.iter().flat_map(|report| report.written.iter().map(move |link| (&*report.role, link)));
+        let written: Vec<(&str, &LinkWritten)> = written.collect();
         for report in reports {
             let Ticks { elapsed, executed, missed, .. } = report.ticks;
             if executed + missed != elapsed || (!interrupted && elapsed != scenario.last_tick + 1) {
                 problems.push(format!("{}: {executed} executed + {missed} missed of {elapsed} ticks", report.role));
             }
         }
-        for link in &written {
+        for (_, link) in &written {
             if link.published + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
         }
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
-            if let Some(written) = written.iter().find(|written| written.service == read.service) {
-                links.push(LinkBook::new(&report.role, written, read, scenario, &mut problems));
+            if let Some((writer, written)) = written.iter().find(|(_, written)| written.service == read.service) {
+                // A role that died may have sent a sample that it had no time to book: whoever received it knows.
+                let in_flight = lost.contains(writer) && read.last_tick > written.last_tick;
+                links.push(LinkBook::new(&report.role, written, in_flight, read, scenario, &mut problems));
             }
         }
         Self {
@@ -236,23 +248,25 @@ impl LinkBook {
     fn new(
         reader: &str,
         written: &LinkWritten,
+        in_flight: bool,
         read: &LinkRead,
         scenario: &Scenario,
         problems: &mut Vec<String>,
     ) -> Self {
         let covered = read.last_tick.map_or(0, |tick| tick + 1);
+        let sent = written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
         let book = Self {
             service: read.service.clone(),
             reader: reader.to_owned(),
-            published: written.published,
+            published: written.published + u64::from(in_flight),
             received: read.received,
             skipped: written.skipped,
             gaps: read.gaps,
-            unread: written.last_tick.map_or(0, |tick| tick + 1).saturating_sub(covered),
+            unread: sent.saturating_sub(covered),
         };
         let lossless = scenario.clock != crate::config::ClockKind::Realtime;
         let balanced = read.received + read.gaps == covered
-            && read.last_tick <= written.last_tick
+            && covered <= sent
             && read.stale == 0
             && book.published + book.skipped == book.received + book.gaps + book.unread
             && (!lossless || read.gaps == 0);
@@ -288,6 +302,25 @@ impl State {
             checkpoints,
         }
     }
+}
+
+/// How long roles that failed were out, and how long the loop took to recover from it, by role.
+fn incident_figures(incidents: &[Incident]) -> Vec<StageFigures> {
+    let mut stages: BTreeMap<(&str, &str), Latency> = BTreeMap::new();
+    for incident in incidents {
+        for (stage, seconds) in [("outage", incident.outage_s), ("recovery", incident.recovery_s)] {
+            if let Some(seconds) = seconds {
+                stages.entry((&incident.role, stage)).or_default().record(0, (seconds * 1e9) as u64);
+            }
+        }
+    }
+    let figures = |((role, stage), latency): ((&str, &str), Latency)| StageFigures {
+        role: role.to_owned(),
+        stage: stage.to_owned(),
+        figures: latency.percentiles(),
+        latency,
+    };
+    stages.into_iter().map(figures).collect()
 }
 
 fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {

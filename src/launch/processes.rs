@@ -2,17 +2,22 @@
 //!
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
-use super::children::{Janitor, RoleProcess, await_end};
+use super::children::{Janitor, await_end};
 use super::score::{self, Scorer};
+use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
-use crate::bus::domain::OwnedDomain;
+use crate::bus::domain::{Domain, OwnedDomain};
 use crate::bus::iox::IoxBus;
-use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
-use crate::clock::{monotonic_ns, sleep_until};
+use crate::bus::{Bus, BusError, Signal, Write};
+use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, Scenario};
-use crate::runtime::{Backoff, RoleId, depths, hold_low_latency_idle, report_path, scenario_path, topic, write_whole};
-use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use crate::runtime::{
+    Backoff, RoleId, depths, hold_low_latency_idle, report, report_path, scenario_path, topic, write_whole,
+};
+use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::{Grant, RoleReport};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 /// Between two looks at the roles, ns.
@@ -30,7 +35,8 @@ const HUNG_PERIODS: u64 = 10;
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     let owned = OwnedDomain::create()?;
-    let path = scenario_path(owned.domain());
+    let domain = owned.domain();
+    let path = scenario_path(domain);
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     // Declared before the roles, so that it is dropped, and cleans up, after them.
     let _janitor = Janitor::start(&launch.program)?;
@@ -38,58 +44,48 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
     };
-    let bus = IoxBus::enter(owned.domain(), "launcher", depths(scenario))?;
-    let mut crew = Crew::start(scenario, launch, &owned, &bus)?;
+    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?;
+    domain.seal()?;
+    let mut crew = Crew::start(scenario, launch, domain, &bus)?;
     let mut scorer = score::open(scenario, &bus)?;
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;
-    let reports = crew.dismiss()?;
-    Ok(Outcome { reports, score: scorer.finish()?, grants, domain: Some(owned.domain().root().to_owned()), signal })
-}
-
-/// One role, seen from the launcher.
-struct Member {
-    name: String,
-    external: bool,
-    health: <IoxBus as Bus>::Reader<Health>,
-    last: Health,
-}
-
-impl Member {
-    fn state(&self) -> RoleState {
-        RoleState::from_number(self.last.state)
-    }
+    let reports = crew.dismiss();
+    let score = scorer.finish()?;
+    let incidents = crew.incidents(&score.recoveries_s);
+    Ok(Outcome { reports, score, incidents, grants, domain: Some(domain.root().to_owned()), signal })
 }
 
 /// All roles of a run, and the launcher's line to them.
 struct Crew<'a> {
     scenario: &'a Scenario,
+    domain: &'a Domain,
+    bus: &'a IoxBus,
+    program: PathBuf,
     members: Vec<Member>,
-    processes: Vec<RoleProcess>,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
     word: Schedule,
-    domain: std::path::PathBuf,
+    incidents: Vec<Incident>,
 }
 
 impl<'a> Crew<'a> {
     fn start(
         scenario: &'a Scenario,
         launch: &Launch<'_>,
-        owned: &OwnedDomain,
-        bus: &IoxBus,
+        domain: &'a Domain,
+        bus: &'a IoxBus,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule))?;
-        let (mut members, mut processes) = (Vec::new(), Vec::new());
+        let mut members = Vec::new();
         for role in RoleId::all(scenario) {
-            let name = role.name(scenario).to_owned();
-            let external = launch.external.contains(&name);
+            let external = launch.external.iter().any(|name| name == role.name(scenario));
+            let mut member = Member::new(scenario, role, external, domain, bus)?;
             if !external {
-                processes.push(RoleProcess::start(&launch.program, scenario, role, owned.domain())?);
+                member.start(&launch.program, scenario, domain, monotonic_ns())?;
             }
-            let health = bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?;
-            members.push(Member { name, external, health, last: Health::default() });
+            members.push(member);
         }
-        let domain = owned.domain().root().to_owned();
-        Ok(Self { scenario, members, processes, schedule, word: Schedule::default(), domain })
+        let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
+        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents })
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -119,7 +115,8 @@ impl<'a> Crew<'a> {
         self.follow(scorer, launch)
     }
 
-    /// Waits until every role has reached a state; false if a signal came first.
+    /// Waits until every role has reached a state; false if a signal came first. A role that fails on the way will not do
+    /// better the next time.
     fn await_state(
         &mut self,
         state: RoleState,
@@ -133,6 +130,11 @@ impl<'a> Crew<'a> {
             self.listen()?;
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
+            for member in &mut self.members {
+                if let Some(Failure { cause, last_words }) = member.failure(self.scenario) {
+                    return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
+                }
+            }
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
             if missing.is_empty() {
                 return Ok(true);
@@ -146,15 +148,15 @@ impl<'a> Crew<'a> {
             if monotonic_ns() > end_ns && external.is_empty() {
                 return Err(LaunchError::StartUp { limit_s, roles: roles.join(", ") });
             }
-            (launch.progress)(&Progress::Waiting { roles, external, domain: self.domain.clone() });
-            sleep_until(monotonic_ns() + LOOK_NS);
+            (launch.progress)(&Progress::Waiting { roles, external, domain: self.domain.root().to_owned() });
+            self.pause(monotonic_ns() + LOOK_NS);
         }
     }
 
     /// Follows the ticks to the end: scores, gives credit, watches over the roles.
     fn follow(&mut self, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> Result<usize, LaunchError> {
         let lockstep = self.scenario.clock != ClockKind::Realtime;
-        let mut watch = Watch::new(self.scenario);
+        let mut stall = Stall::new(self.scenario);
         let mut backoff = Backoff::default();
         let mut next_look_ns = 0;
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
@@ -165,11 +167,14 @@ impl<'a> Crew<'a> {
                 backoff = Backoff::default();
             }
             let now_ns = monotonic_ns();
-            if now_ns >= next_look_ns {
+            if now_ns >= next_look_ns || self.somebody_ended() {
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
-                watch.look(&self.members, now_ns)?;
+                if !self.supervise(scorer, now_ns)? {
+                    return Ok(0);
+                }
+                stall.look(&self.members, now_ns)?;
                 let signal = launch.signal.load(Ordering::Relaxed);
                 if signal != 0 {
                     return Ok(signal);
@@ -179,11 +184,46 @@ impl<'a> Crew<'a> {
             }
             match (scored, lockstep) {
                 (0, true) => backoff.wait(),
-                (0, false) => sleep_until(next_look_ns),
+                (0, false) => self.pause(next_look_ns),
                 _ => {}
             }
         }
         Ok(0)
+    }
+
+    /// Notices roles that have failed and brings them back; false if the run is to end for that.
+    fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
+        let mut go_on = true;
+        for member in &mut self.members {
+            if let Some(failure) = member.failure(self.scenario) {
+                let incident = member.fail(failure, self.scenario, now_ns);
+                eprintln!("corotate: {incident}");
+                self.bus.clear_dead();
+                scorer.incident(incident.tick);
+                go_on &= incident.action == Action::Restarted;
+                self.incidents.push(incident);
+            }
+            member.restart(&self.program, self.scenario, self.domain, now_ns)?;
+            if let Some(outage_ns) = member.back_after_ns(now_ns) {
+                let last = self.incidents.iter_mut().rev().find(|incident| incident.role == member.name);
+                last.into_iter().for_each(|incident| incident.outage_s = Some(outage_ns as f64 / 1e9));
+            }
+        }
+        Ok(go_on)
+    }
+
+    /// Waits until `until_ns`, or until a role's process ends.
+    fn pause(&self, until_ns: u64) {
+        let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle());
+        let mut handles: Vec<PollFd<'_>> = handles.map(|handle| PollFd::new(handle, PollFlags::IN)).collect();
+        let wait_ns = until_ns.saturating_sub(monotonic_ns());
+        let timeout = Timespec { tv_sec: (wait_ns / 1_000_000_000) as i64, tv_nsec: (wait_ns % 1_000_000_000) as _ };
+        // Woken early or not, the caller looks for itself.
+        let _ = poll(&mut handles, Some(&timeout));
+    }
+
+    fn somebody_ended(&mut self) -> bool {
+        self.members.iter_mut().filter_map(|member| member.process.as_mut()).any(|process| process.ended().is_some())
     }
 
     /// Says the launcher's word again.
@@ -194,73 +234,61 @@ impl<'a> Crew<'a> {
         self.schedule.send(|sample| *sample = word)
     }
 
-    /// Hears how the roles are, and whether their processes live.
-    fn listen(&mut self) -> Result<(), LaunchError> {
-        for member in &mut self.members {
-            while member.health.advance()? {}
-            if let Some(health) = member.health.current() {
-                member.last = *health;
-            }
-        }
-        for process in &mut self.processes {
-            if let Some(status) = process.ended() {
-                // A role that was done may have left without the word, if this process was kept from giving it.
-                let done = |member: &Member| member.name == process.name && member.state() == RoleState::Done;
-                if !(status.success() && self.members.iter().any(done)) {
-                    return Err(process.died(status));
-                }
-            }
-        }
-        Ok(())
+    /// Hears how the roles are.
+    fn listen(&mut self) -> Result<(), BusError> {
+        let now_ns = monotonic_ns();
+        self.members.iter_mut().try_for_each(|member| member.listen(now_ns))
     }
 
     fn denied(&mut self, own: &[Grant]) -> LaunchError {
         let mut denied: Vec<(String, Grant)> = own.iter().map(|grant| ("launcher".to_owned(), grant.clone())).collect();
-        for report in self.stop_and_collect() {
+        for report in self.dismiss() {
             denied.extend(report.grants.into_iter().map(|grant| (report.role.clone(), grant)));
         }
         denied.retain(|(_, grant)| !grant.granted);
         LaunchError::Privileges { denied }
     }
 
-    /// Lets the roles go and gathers their reports.
-    fn dismiss(&mut self) -> Result<Vec<RoleReport>, LaunchError> {
-        let reports = self.stop_and_collect();
-        for process in &mut self.processes {
-            let reported = reports.iter().any(|report| report.role == process.name);
-            match process.ended() {
-                Some(status) if !status.success() || !reported => return Err(process.died(status)),
-                Some(_) => {}
-                None => {
-                    let roles = process.name.clone();
-                    return Err(LaunchError::Hung { limit_s: 5.0, roles });
-                }
-            }
-        }
-        Ok(reports)
-    }
-
-    fn stop_and_collect(&mut self) -> Vec<RoleReport> {
+    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its books.
+    fn dismiss(&mut self) -> Vec<RoleReport> {
         self.word.phase = Phase::Stop as u64;
         // A link that fails now changes nothing: whoever does not end by itself is ended.
         let _ = self.announce();
-        await_end(&mut self.processes);
-        let read = |member: &Member| {
-            let path = report_path(&self.domain, &member.name);
-            std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok())
-        };
-        self.members.iter().filter_map(read).collect()
+        await_end(self.members.iter_mut().filter_map(|member| member.process.as_mut()));
+        let mut reports = Vec::new();
+        for member in &mut self.members {
+            let file = std::fs::read(report_path(self.domain.root(), &member.name));
+            let reported: Option<RoleReport> = file.ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+            if let Some(failure) = member.bad_end(reported.is_some()) {
+                let stopped = Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) };
+                eprintln!("corotate: {stopped}");
+                self.incidents.push(stopped);
+            }
+            let from_books = || report(self.scenario, member.role, &member.ledger, Vec::new(), Vec::new());
+            reports.push(reported.unwrap_or_else(from_books));
+        }
+        reports
+    }
+
+    /// What happened, with the scorer's times of recovery.
+    fn incidents(self, recoveries_s: &[Option<f64>]) -> Vec<Incident> {
+        let recoveries = recoveries_s.iter().copied().chain(std::iter::repeat(None));
+        self.incidents
+            .into_iter()
+            .zip(recoveries)
+            .map(|(incident, recovery_s)| Incident { recovery_s, ..incident })
+            .collect()
     }
 }
 
 /// Notices that nothing moves any more.
-struct Watch {
+struct Stall {
     limit_ns: u64,
     moved_ns: u64,
     ticks: Vec<u64>,
 }
 
-impl Watch {
+impl Stall {
     fn new(scenario: &Scenario) -> Self {
         let limit_ns = HUNG_NS.max(HUNG_PERIODS * scenario.period_ns);
         Self { limit_ns, moved_ns: monotonic_ns(), ticks: Vec::new() }

@@ -6,6 +6,7 @@ use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Command, Estimate, Rig, Truth};
 use crate::runtime::{Input, Seek, topic};
+use crate::sample::Sample;
 use crate::with_rig;
 use serde::Serialize;
 
@@ -22,6 +23,9 @@ pub struct Score {
     pub metrics: Vec<MetricScore>,
     /// How the live certificate fared, if the rig has one.
     pub certificate: Option<CertificateScore>,
+    /// Per incident: from its tick until every metric with a limit was within it for good, or until the next incident, s.
+    #[serde(skip)]
+    pub recoveries_s: Vec<Option<f64>>,
 }
 
 /// For how many steps of all driven bodies the published bound on V̇ held: V(k+1) ≤ V(k) + h·bound(k).
@@ -70,6 +74,8 @@ pub trait Scorer {
     fn next_tick(&self) -> u64;
     /// The latest value of the first metric.
     fn latest(&self) -> f64;
+    /// Notes that a role failed at a tick.
+    fn incident(&mut self, tick: u64);
     /// Scores what is there, complete or not, and closes the account.
     ///
     /// # Errors
@@ -104,8 +110,12 @@ struct RigScorer<R: Rig, B: Bus> {
     estimate: Input<B, Estimate<R>>,
     /// Commands of the driven bodies.
     commands: Vec<DrivenBody<R, B>>,
+    /// The generations of leader, observer and controllers at the last tick: a successor begins anew, and V with it.
+    generations: u64,
     next_tick: u64,
     last_tick: u64,
+    /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
+    incidents: Vec<(u64, u64)>,
     values: Vec<f64>,
     score: Score,
 }
@@ -134,8 +144,10 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 .collect::<Result<_, _>>()?,
             estimate: Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
             commands: driven.map(command).collect::<Result<_, BusError>>()?,
+            generations: 0,
             next_tick: 0,
             last_tick: scenario.last_tick,
+            incidents: Vec::new(),
             values: vec![f64::NAN; rig.metrics().len()],
             score: Score {
                 scored_ticks: 0,
@@ -143,6 +155,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 faulted_ticks: 0,
                 metrics: rig.metrics().iter().map(metric).collect(),
                 certificate: None,
+                recoveries_s: Vec::new(),
             },
         })
     }
@@ -170,12 +183,47 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);
         }
+        if !self.within()
+            && let Some((_, last)) = self.incidents.iter_mut().rfind(|(from, _)| *from <= tick)
+        {
+            *last = tick;
+        }
+        let generations = self.generations();
+        let continued = generations == self.generations;
+        self.generations = generations;
         for driven in &mut self.commands {
             // A follower that held or was safe did not apply what the certificate is about.
             let undisturbed = at(&self.truths[driven.body], tick).is_some_and(|truth| R::undisturbed(truth));
-            driven.judge(tick, self.tick_s, undisturbed, &mut self.score.certificate);
+            driven.judge(tick, self.tick_s, undisturbed && continued, &mut self.score.certificate);
         }
         self.next_tick += 1;
+    }
+}
+
+impl<R: Rig, B: Bus> RigScorer<R, B> {
+    /// Whether every metric that has a limit is known and within it.
+    fn within(&self) -> bool {
+        let limit = |name: &str| self.accept.metric_max.get(name).copied().unwrap_or(f64::INFINITY);
+        self.rig.metrics().iter().zip(&self.values).all(|(name, value)| *value <= limit(name))
+    }
+
+    /// The sum of everybody's generation, which changes whenever one does: none ever falls.
+    fn generations(&self) -> u64 {
+        let of = |sample: Option<u64>| sample.unwrap_or(0);
+        let truths: u64 = self.truths.iter().map(|truth| of(truth.sample().map(|s| s.stamp().generation))).sum();
+        let commands: u64 =
+            self.commands.iter().map(|driven| of(driven.command.sample().map(|s| s.stamp().generation))).sum();
+        truths + commands + of(self.estimate.sample().map(|s| s.stamp().generation))
+    }
+
+    /// The recoveries, as far as there are limits to recover to.
+    fn recoveries_s(&self) -> Vec<Option<f64>> {
+        let recovery = |&(from, last_outside): &(u64, u64)| {
+            let back = last_outside + 1;
+            let judged = !self.accept.metric_max.is_empty() && back < self.next_tick;
+            judged.then(|| back.saturating_sub(from) as f64 * self.tick_s)
+        };
+        self.incidents.iter().map(recovery).collect()
     }
 }
 
@@ -198,7 +246,7 @@ impl<R: Rig, B: Bus> DrivenBody<R, B> {
 }
 
 /// The sample at hand if it is that tick's.
-fn at<B: Bus, S: crate::sample::Sample>(input: &Input<B, S>, tick: u64) -> Option<&S> {
+fn at<B: Bus, S: Sample>(input: &Input<B, S>, tick: u64) -> Option<&S> {
     input.sample().filter(|sample| sample.stamp().tick == tick)
 }
 
@@ -234,6 +282,10 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
     }
 
+    fn incident(&mut self, tick: u64) {
+        self.incidents.push((tick, tick));
+    }
+
     fn finish(&mut self) -> Result<Score, BusError> {
         // What has not come by now never will: go on as long as anything newer waits anywhere.
         loop {
@@ -247,6 +299,7 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
             }
             self.score_tick();
         }
+        self.score.recoveries_s = self.recoveries_s();
         let (tick_s, ticks) = (self.tick_s, self.next_tick);
         for metric in &mut self.score.metrics {
             let first_within = metric.last_above.map_or(0, |tick| tick + 1);

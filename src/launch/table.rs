@@ -1,6 +1,6 @@
 //! The end of a run on the screen.
 
-use super::Summary;
+use super::{Incident, Summary};
 use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
@@ -23,6 +23,9 @@ pub fn table(summary: &Summary) -> String {
         let _ = writeln!(text, "note: {note}");
     }
     results(summary, &mut text);
+    for incident in &summary.incidents {
+        let _ = writeln!(text, "{incident}{}", times(incident));
+    }
     if !summary.latencies.is_empty() {
         let _ = writeln!(text, "\n{}", latencies(summary));
     }
@@ -91,6 +94,11 @@ fn results(summary: &Summary, text: &mut String) {
         let _ =
             writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
     }
+}
+
+fn times(incident: &Incident) -> String {
+    let told = |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {s:.3} s"));
+    told("back", incident.outage_s) + &told("recovered", incident.recovery_s)
 }
 
 fn verdict(holds: Option<bool>) -> String {

@@ -154,13 +154,34 @@ pub struct DeviceLink {
 }
 
 impl DeviceLink {
-    fn new(line: Line, greeting: Greeting, terms: Terms, patience_s: f64) -> Self {
-        let patience_ns = (patience_s * 1e9) as u64;
-        Self { line, host: Host::new(terms), greeting, patience_ns, reopen_ns: 0 }
+    /// Opens the line to a device that is to be a body of a scenario; `run` tells this run from others.
+    ///
+    /// # Errors
+    /// [`DeviceError::Line`] and [`DeviceError::TooSlow`].
+    pub fn open(seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
+        with_rig!(&scenario.rig, rig => Self::of_rig(rig, seat, scenario, run))
+    }
+
+    fn of_rig<R: Rig>(rig: &R, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
+        let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
+        check_speed(seat.baud, scenario, command + measurement)?;
+        let greeting = Greeting::new(rig, scenario, &seat.body, run);
+        let terms = Terms {
+            run,
+            period_ns: greeting.realtime.then_some(scenario.period_ns),
+            measurement_length: measurement,
+            truth_length: content_length::<Truth<R>>(),
+        };
+        let patience_ns = (seat.patience_s * 1e9) as u64;
+        let line = Line::open(&seat.path, seat.baud)?;
+        Ok(Self { line, host: Host::new(terms), greeting, patience_ns, reopen_ns: 0 })
     }
 
     /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first.
-    fn greet(&mut self, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
+    ///
+    /// # Errors
+    /// [`DeviceError`] if it refuses, or stays silent for too long.
+    pub fn greet(&mut self, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
         let mut name = None;
         while !terminated.load(Ordering::Relaxed) {
             self.exchange(monotonic_ns(), |heard| {
@@ -322,17 +343,16 @@ fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result
     Ok(())
 }
 
-fn link<R: Rig>(rig: &R, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError> {
-    let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
-    check_speed(seat.baud, scenario, command + measurement)?;
-    let greeting = Greeting::new(rig, scenario, &seat.body, run);
-    let terms = Terms {
-        run,
-        period_ns: greeting.realtime.then_some(scenario.period_ns),
-        measurement_length: measurement,
-        truth_length: content_length::<Truth<R>>(),
-    };
-    Ok(DeviceLink::new(Line::open(&seat.path, seat.baud)?, greeting, terms, seat.patience_s))
+/// The seat's body, if a device can be it.
+fn driven(scenario: &Scenario, name: &str) -> Result<usize, RoleError> {
+    let bodies = scenario.rig.bodies();
+    match find_role(scenario, name)? {
+        RoleId::Plant(index) if bodies[index].driven => Ok(index),
+        _ => {
+            let driven = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect::<Vec<_>>();
+            Err(RoleError::NotDriven { role: name.to_owned(), driven: driven.join(", ") })
+        }
+    }
 }
 
 /// Puts a device into the seat of a driven body and serves it to the end of the run. `welcomed` is told the device's name.
@@ -346,22 +366,13 @@ pub fn run_bridge(
     welcomed: impl FnOnce(&str),
 ) -> Result<Option<LineBook>, RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
-    let role = find_role(&scenario, &seat.body)?;
-    let bodies = scenario.rig.bodies();
-    let index = match role {
-        RoleId::Plant(index) if bodies[index].driven => index,
-        _ => {
-            let driven =
-                bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect::<Vec<_>>().join(", ");
-            return Err(RoleError::NotDriven { role: seat.body.clone(), driven });
-        }
-    };
+    let index = driven(&scenario, &seat.body)?;
     // A bridge that is started again in the same run finds a device that knows it.
     let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
-    let mut link = with_rig!(&scenario.rig, rig => link(rig, seat, &scenario, run))?;
+    let mut link = DeviceLink::open(seat, &scenario, run)?;
     let Some(name) = link.greet(terminated)? else { return Ok(None) };
     welcomed(&name);
-    let mut book = None;
-    in_domain(&domain, &scenario, Occupant::Device(index, Box::new(link)), terminated, |report| book = report.line)?;
+    let (mut book, occupant) = (None, Occupant::Device(index, Box::new(link)));
+    in_domain(&domain, &scenario, occupant, terminated, |report| book = report.line)?;
     Ok(book)
 }

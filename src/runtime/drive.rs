@@ -4,6 +4,7 @@
 //! and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
 use super::WINDOW_TICKS;
+use super::hooks::{self, Place};
 use super::node::{Gate, Node, Poll, ReadyNode};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
@@ -150,6 +151,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 Poll::Waiting => {}
                 done => return Ok(Some(done)),
             }
+            hooks::at(Place::Waiting);
             if now_ns < spin_end_ns {
                 std::hint::spin_loop();
             } else if now_ns > end_ns {
@@ -167,6 +169,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
     fn idle_until(&mut self, until_ns: u64, node: &dyn Node) -> Result<bool, BusError> {
         while monotonic_ns() < until_ns {
+            hooks::at(Place::Waiting);
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
             if until_ns > monotonic_ns() && self.turn(node)? {
                 return Ok(true);
@@ -208,6 +211,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                     continue;
                 }
             } else {
+                hooks::at(Place::Waiting);
                 backoff.wait();
             }
             if self.turn_is_due() {

@@ -2,6 +2,7 @@
 //!
 //! Samples of generation 0 are warm-up: they pass through the link and go no further.
 
+use super::hooks::{self, Place};
 use crate::bus::{Bus, BusError, Read, Reader, Topic, Write};
 use crate::sample::{Sample, Stamp};
 use crate::telemetry::{Ledger, ReadBook, WriteBook};
@@ -36,7 +37,10 @@ impl<B: Bus, S: Sample> Output<B, S> {
             fill(sample);
             sample.stamp_mut().generation = generation;
             *sent = *sample;
-        })
+            hooks::at(Place::Loaned);
+        })?;
+        hooks::at(Place::Sent);
+        Ok(())
     }
 
     /// Does what a sent sample leaves to be done: books, hash, memory for the next. Off the critical path.

@@ -5,6 +5,7 @@
 
 mod bridge;
 mod drive;
+mod hooks;
 mod line;
 mod link;
 mod node;
@@ -15,10 +16,11 @@ pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{Input, Output, Seek};
+pub(crate) use node::next_tick;
 pub use node::{Gate, Node, Occupant, Poll, ReadyNode, RoleId, build, private_ledger, report, topic};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
-pub(crate) use process::{report_path, scenario_path, write_whole};
+pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Scenario};

@@ -210,6 +210,11 @@ pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
 }
 
+/// The tick that a role has not finished, by its ledger.
+pub(crate) fn next_tick(ledger: &Ledger) -> u64 {
+    TickBook::open(&ledger.reopened()).next()
+}
+
 /// What a role's ledger says, with what the role itself has to add.
 pub fn report(
     scenario: &Scenario,

@@ -4,6 +4,7 @@
 
 use super::bridge::DeviceError;
 use super::drive::{Control, Drive, Ended};
+use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
 use super::{depths, privileges};
 use crate::bus::domain::{Domain, DomainError};
@@ -137,7 +138,9 @@ pub(super) fn in_domain(
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
-    let ledger = open_ledger(domain, scenario, role)?;
+    let ledger = Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))?;
+    hooks::enter(role.name(scenario), ledger.generation() + 1);
+    hooks::at(Place::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
     serve(scenario, occupant, &bus, &ledger, terminated, grants, |report| {
         reported(report);
@@ -145,10 +148,13 @@ pub(super) fn in_domain(
     })
 }
 
-/// A role's ledger in a domain.
+/// A role's ledger in a domain, to be read.
 pub(crate) fn open_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
-    let path = domain.shared(&format!("{}.books", role.name(scenario)));
-    Ledger::shared(&path, ledger_words(scenario, role))
+    Ledger::shared(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
+}
+
+fn ledger_path(domain: &Domain, scenario: &Scenario, role: RoleId) -> PathBuf {
+    domain.shared(&format!("{}.books", role.name(scenario)))
 }
 
 fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
@@ -232,6 +238,7 @@ fn begin<B: Bus>(
     if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) && control.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
+    hooks::at(Place::Ready);
     await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
 }
 

@@ -22,9 +22,19 @@ impl TickBook {
     /// The first disturbed tick + 1; 0 if there is none.
     const DISTURBED: usize = 5;
 
-    /// Opens the book, as it was left.
+    /// Opens the book, as it was left, to be read.
     pub fn open(ledger: &Ledger) -> Self {
         Self { words: ledger.take(Self::WORDS) }
+    }
+
+    /// Opens the book, as it was left, to go on with it. A successor lacks what its predecessor had in mind: nothing from
+    /// here on is as it would have been.
+    pub fn go_on(ledger: &Ledger) -> Self {
+        let mut book = Self::open(ledger);
+        if ledger.generation() > 1 {
+            book.disturbed(book.next());
+        }
+        book
     }
 
     /// The next tick to execute.

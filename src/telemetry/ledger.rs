@@ -4,9 +4,9 @@
 //! is counted.
 
 use memmap2::MmapRaw;
-use rustix::fs::{FallocateFlags, fallocate};
+use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
 use std::cell::Cell;
-use std::fs::OpenOptions;
+use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
@@ -23,6 +23,12 @@ pub enum LedgerError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
+    },
+    /// Another process writes in it.
+    #[error("{} is held by another process: that seat is taken; end it first", path.display())]
+    Taken {
+        /// The file.
+        path: PathBuf,
     },
     /// The file is there and has another size.
     #[error("{} holds {found} bytes, not {expected}: it was written by another version of this program", path.display())]
@@ -46,7 +52,8 @@ pub struct Ledger {
 #[derive(Debug)]
 enum Memory {
     Private(Box<[AtomicU64]>),
-    Shared(MmapRaw),
+    /// The file is kept open for the lock that a writer has on it; the kernel lets go of it when the writer dies.
+    Shared(MmapRaw, File),
 }
 
 impl Memory {
@@ -57,7 +64,7 @@ impl Memory {
             Self::Private(words) => words,
             // SAFETY: the mapping is writable, page-aligned, at least `len` bytes long (the file was allocated so, and no
             // process of a run shortens it), and lives as long as `self`; every access to it, in any process, is atomic.
-            Self::Shared(map) => unsafe {
+            Self::Shared(map, _) => unsafe {
                 std::slice::from_raw_parts(map.as_ptr().cast::<AtomicU64>(), map.len() / size_of::<u64>())
             },
         }
@@ -73,7 +80,7 @@ impl Ledger {
         Self::over(Memory::Private((0..Self::FIRST + words).map(|_| AtomicU64::new(0)).collect()))
     }
 
-    /// The ledger in a file of shared memory, as it was left, or new and all zero.
+    /// The ledger in a file of shared memory, as it was left, or new and all zero; to be read.
     ///
     /// # Errors
     /// [`LedgerError`].
@@ -86,13 +93,27 @@ impl Ledger {
                 fallocate(&file, FallocateFlags::empty(), 0, expected)?;
             }
             let found = file.metadata()?.len();
-            Ok((found, MmapRaw::map_raw(&file)?))
+            Ok((found, Memory::Shared(MmapRaw::map_raw(&file)?, file)))
         };
-        let (found, map) = open().map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
+        let (found, memory) = open().map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
         if found != expected {
             return Err(LedgerError::Size { path: path.to_owned(), found, expected });
         }
-        Ok(Self::over(Memory::Shared(map)))
+        Ok(Self::over(memory))
+    }
+
+    /// The same, to be written: there is one writer at a time.
+    ///
+    /// # Errors
+    /// [`LedgerError`].
+    pub fn taken(path: &Path, words: usize) -> Result<Self, LedgerError> {
+        let ledger = Self::shared(path, words)?;
+        match &*ledger.memory {
+            Memory::Shared(_, file) if flock(file, FlockOperation::NonBlockingLockExclusive).is_err() => {
+                Err(LedgerError::Taken { path: path.to_owned() })
+            }
+            _ => Ok(ledger),
+        }
     }
 
     fn over(memory: Memory) -> Self {
@@ -172,6 +193,10 @@ mod tests {
         ours.set(2, 7);
         ours.add(2, 1);
         assert_eq!((theirs.get(2), theirs.get(0)), (8, 0));
+        let writer = Ledger::taken(&path, 5).unwrap();
+        assert!(matches!(Ledger::taken(&path, 5), Err(LedgerError::Taken { .. })));
+        drop(writer);
+        Ledger::taken(&path, 5).unwrap();
         drop((first, ours));
         assert_eq!(theirs.get(2), 8);
         assert!(matches!(Ledger::shared(&path, 6), Err(LedgerError::Size { found: 48, expected: 56, .. })));

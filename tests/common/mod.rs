@@ -143,7 +143,7 @@ impl Bench {
 }
 
 impl Running {
-    fn new(command: &mut Command) -> Self {
+    pub fn new(command: &mut Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = await_some(|| match command.spawn() {
             // Another test's child held the copied program open for writing when it was forked; it execs soon.

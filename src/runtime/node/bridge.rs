@@ -62,7 +62,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             assert!(content_length::<Truth<R>>() <= MAX_CONTENT);
         }
         let (scenario, body) = (seat.scenario, &rig.bodies()[index].name);
-        // The same books in the same order as a simulated plant's.
+        // The same books in the same order as a simulated plant's. A successor lacks nothing: the state is in the device.
         let book = TickBook::open(seat.ledger);
         let measurement = seat.output(body, Signal::Measurement)?;
         let truth = seat.output(body, Signal::Truth)?;

@@ -38,7 +38,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let book = TickBook::open(seat.ledger);
+        let book = TickBook::go_on(seat.ledger);
         let driven = || rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
         // In the order of the books: everything written, then everything read.
         let commands: Vec<Output<B, Command<R>>> =

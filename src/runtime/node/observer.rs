@@ -34,7 +34,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0].name;
-        let book = TickBook::open(seat.ledger);
+        let book = TickBook::go_on(seat.ledger);
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
             observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),

@@ -29,7 +29,7 @@ pub struct PlantNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> PlantNode<R, B> {
     pub fn open(rig: &R, index: usize, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
-        let book = TickBook::open(seat.ledger);
+        let book = TickBook::go_on(seat.ledger);
         let measurement = seat.output(&body.name, Signal::Measurement)?;
         let truth = seat.output(&body.name, Signal::Truth)?;
         let command = body.driven.then(|| seat.input(&body.name, Signal::Command)).transpose()?;

@@ -1,0 +1,233 @@
+//! One role, seen from the launcher: its process, its heartbeat, its starts; and what became of it when it failed.
+//!
+//! Must not decide when a run ends, nor lead it; [`super::processes`] does.
+
+use super::LaunchError;
+use super::children::{END_LIMIT, RoleProcess};
+use crate::bus::domain::Domain;
+use crate::bus::iox::IoxBus;
+use crate::bus::{Bus, BusError, Read, Reader, Signal};
+use crate::config::{OnFailure, Scenario};
+use crate::runtime::{RoleId, open_ledger, topic};
+use crate::sample::{Health, RoleState};
+use crate::telemetry::Ledger;
+use serde::Serialize;
+use std::fmt;
+use std::path::Path;
+
+/// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
+/// clock of silence too: a role is only judged for the time in which it was listened to.
+const LOOK_MAX_NS: u64 = 100_000_000;
+
+/// A role that failed while the ticks ran, and what was done.
+#[derive(Debug, Clone, Serialize)]
+pub struct Incident {
+    /// The role.
+    pub role: String,
+    /// Which generation of it.
+    pub generation: u64,
+    /// The tick that it had not finished.
+    pub tick: u64,
+    /// How it failed.
+    pub cause: String,
+    /// The end of its error output.
+    pub last_words: String,
+    /// What was done.
+    pub action: Action,
+    /// From when it was noticed until its successor ran, s.
+    pub outage_s: Option<f64>,
+    /// From `tick` on until every metric with a limit was within it and stayed there, s. None if that did not happen, or if
+    /// there is no limit.
+    pub recovery_s: Option<f64>,
+}
+
+/// What is done about a role that failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Action {
+    /// It was started anew.
+    Restarted,
+    /// The run was ended in order.
+    Stopped,
+}
+
+impl fmt::Display for Incident {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} died at tick {}: {}", self.role, self.tick, self.cause)?;
+        if !self.last_words.is_empty() {
+            write!(f, "; it said: {}", self.last_words)?;
+        }
+        f.write_str(match self.action {
+            Action::Restarted => "; it is started anew",
+            Action::Stopped => "; the run ends",
+        })
+    }
+}
+
+/// How a role failed, in words.
+pub(super) struct Failure {
+    pub cause: String,
+    pub last_words: String,
+}
+
+/// One role, seen from the launcher.
+pub(super) struct Member {
+    pub name: String,
+    pub role: RoleId,
+    /// None for a role that somebody else starts, and between a death and the next start.
+    pub process: Option<RoleProcess>,
+    pub external: bool,
+    pub last: Health,
+    pub ledger: Ledger,
+    health: <IoxBus as Bus>::Reader<Health>,
+    /// Health of an earlier generation is a dead role's.
+    generation: u64,
+    silent_ns: u64,
+    looked_ns: u64,
+    started_ns: u64,
+    restarts: u64,
+    /// When the successor is due, and when the failure was noticed, ns.
+    restart: Option<(u64, u64)>,
+}
+
+impl Member {
+    /// A role whose process, if it is ours, is not started yet.
+    pub fn new(
+        scenario: &Scenario,
+        role: RoleId,
+        external: bool,
+        domain: &Domain,
+        bus: &IoxBus,
+    ) -> Result<Self, LaunchError> {
+        let name = role.name(scenario).to_owned();
+        Ok(Self {
+            health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
+            ledger: open_ledger(domain, scenario, role)?,
+            name,
+            role,
+            process: None,
+            external,
+            last: Health::default(),
+            generation: 1,
+            silent_ns: 0,
+            looked_ns: 0,
+            started_ns: 0,
+            restarts: 0,
+            restart: None,
+        })
+    }
+
+    /// Starts its process.
+    pub fn start(
+        &mut self,
+        program: &Path,
+        scenario: &Scenario,
+        domain: &Domain,
+        now_ns: u64,
+    ) -> Result<(), LaunchError> {
+        self.process = Some(RoleProcess::start(program, scenario, self.role, domain)?);
+        (self.started_ns, self.looked_ns, self.silent_ns) = (now_ns, now_ns, 0);
+        Ok(())
+    }
+
+    /// Where the role stands, as far as it has said.
+    pub fn state(&self) -> RoleState {
+        RoleState::from_number(self.last.state)
+    }
+
+    /// Hears how the role is.
+    pub fn listen(&mut self, now_ns: u64) -> Result<(), BusError> {
+        self.silent_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
+        self.looked_ns = now_ns;
+        while self.health.advance()? {
+            if let Some(health) = self.health.current().filter(|health| health.stamp.generation >= self.generation) {
+                self.last = *health;
+                self.silent_ns = 0;
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether and how the role has failed: its process has ended, or it has been silent for too long.
+    pub fn failure(&mut self, scenario: &Scenario) -> Option<Failure> {
+        let done = self.state() == RoleState::Done;
+        let process = self.process.as_mut()?;
+        if let Some(status) = process.ended() {
+            // A role that was done may have left without the word, if this process was kept from giving it.
+            return (!(status.success() && done)).then(|| process.failure(status));
+        }
+        // A successor has as long to come up as the first.
+        let heard = self.last.stamp.generation >= self.generation;
+        let limit_s = if heard { scenario.supervision.heartbeat_timeout_s } else { scenario.startup_timeout_s };
+        if self.silent_ns as f64 <= limit_s * 1e9 {
+            return None;
+        }
+        process.kill();
+        let said = if heard { "said nothing" } else { "was not ready" };
+        Some(Failure { cause: format!("it {said} for {limit_s} s and was killed"), last_words: process.last_words() })
+    }
+
+    /// How the role failed to end in order, if so.
+    pub fn bad_end(&mut self, reported: bool) -> Option<Failure> {
+        let process = self.process.as_mut()?;
+        match process.ended() {
+            Some(status) if status.success() && reported => None,
+            Some(status) => Some(process.failure(status)),
+            None => {
+                process.kill();
+                let limit_s = END_LIMIT.as_secs();
+                let cause = format!("it did not end within {limit_s} s of being told to and was killed");
+                Some(Failure { cause, last_words: process.last_words() })
+            }
+        }
+    }
+
+    /// Decides what is done about a failure, and prepares it.
+    pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
+        let supervision = &scenario.supervision;
+        let again = supervision.of(&self.name) == OnFailure::Restart && self.restarts < supervision.restarts_max;
+        let incident = Incident {
+            role: self.name.clone(),
+            generation: self.generation,
+            tick: crate::runtime::next_tick(&self.ledger),
+            cause: failure.cause,
+            last_words: failure.last_words,
+            action: if again { Action::Restarted } else { Action::Stopped },
+            outage_s: None,
+            recovery_s: None,
+        };
+        // Reaped here, before anybody takes the seat.
+        self.process = None;
+        if again {
+            self.restarts += 1;
+            self.generation = self.ledger.generation() + 1;
+            self.last = Health::default();
+            let earliest_ns = self.started_ns + (supervision.restart_interval_s * 1e9) as u64;
+            self.restart = Some((earliest_ns.max(now_ns), now_ns));
+        }
+        incident
+    }
+
+    /// Starts the successor if it is due.
+    pub fn restart(
+        &mut self,
+        program: &Path,
+        scenario: &Scenario,
+        domain: &Domain,
+        now_ns: u64,
+    ) -> Result<(), LaunchError> {
+        match self.restart {
+            Some((due_ns, _)) if self.process.is_none() && now_ns >= due_ns => {
+                self.start(program, scenario, domain, now_ns)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// How long the role was out, ns: told once, as soon as its successor runs.
+    pub fn back_after_ns(&mut self, now_ns: u64) -> Option<u64> {
+        let (_, noticed_ns) = self.restart.filter(|_| self.state() >= RoleState::Running)?;
+        self.restart = None;
+        Some(now_ns - noticed_ns)
+    }
+}

@@ -1,0 +1,93 @@
+//! Named places in a role's life at which a test makes it die or stand still. Empty unless the feature `hooks` is on, which
+//! is for tests alone.
+//!
+//! `COROTATE_HOOK="observer sent 1500 KILL"`: the observer, the 1500th time that it has just sent a sample, gets SIGKILL
+//! from itself, once in a run. Must not do anything else to a role.
+
+/// A place in a role's life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// Before it opens its links.
+    Opening,
+    /// All is open and warm; it waits for the word to run.
+    Ready,
+    /// It has filled a sample that it has not sent.
+    Loaned,
+    /// It has just sent a sample that is not in its books yet.
+    Sent,
+    /// It has nothing to do but to wait.
+    Waiting,
+}
+
+#[cfg(not(feature = "hooks"))]
+pub use off::{at, enter};
+
+#[cfg(not(feature = "hooks"))]
+mod off {
+    use super::Place;
+
+    /// Nothing.
+    #[inline(always)]
+    pub fn enter(_role: &str, _generation: u64) {}
+
+    /// Nothing.
+    #[inline(always)]
+    pub fn at(_place: Place) {}
+}
+
+#[cfg(feature = "hooks")]
+pub use on::{at, enter};
+
+#[cfg(feature = "hooks")]
+mod on {
+    use super::Place;
+    use rustix::process::{Signal, getpid, kill_process};
+    use std::sync::OnceLock;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    struct Hook {
+        place: Place,
+        left: AtomicU64,
+        signal: Signal,
+    }
+
+    static HOOK: OnceLock<Option<Hook>> = OnceLock::new();
+
+    /// Arms the hook if it is meant for this role, and for nobody before it.
+    pub fn enter(role: &str, generation: u64) {
+        HOOK.get_or_init(|| parse(&std::env::var("COROTATE_HOOK").ok()?, role).filter(|_| generation == 1));
+    }
+
+    fn parse(text: &str, role: &str) -> Option<Hook> {
+        let mut words = text.split_whitespace();
+        if words.next()? != role {
+            return None;
+        }
+        let place = match words.next()? {
+            "opening" => Place::Opening,
+            "ready" => Place::Ready,
+            "loaned" => Place::Loaned,
+            "sent" => Place::Sent,
+            "waiting" => Place::Waiting,
+            _ => return None,
+        };
+        let left = AtomicU64::new(words.next()?.parse().ok()?);
+        let signal = match words.next()? {
+            "KILL" => Signal::KILL,
+            "STOP" => Signal::STOP,
+            _ => return None,
+        };
+        Some(Hook { place, left, signal })
+    }
+
+    /// Passes a place.
+    #[inline]
+    pub fn at(place: Place) {
+        if let Some(Some(hook)) = HOOK.get()
+            && hook.place == place
+            && hook.left.fetch_sub(1, Ordering::Relaxed) == 1
+        {
+            let _ = kill_process(getpid(), hook.signal);
+        }
+    }
+}

@@ -1,0 +1,137 @@
+//! Every role, killed and stopped by itself at every place of its life: the run ends as it should, or recovers.
+//!
+//! Needs the feature `hooks`, which compiles those places into the program; `tests/run` turns it on.
+
+mod common;
+
+use common::{Bench, Done, Running, shipped};
+use serde_json::Value;
+
+const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];
+/// Where a role may fail once ticks run, and the how manieth time it comes by there.
+const RUNNING: [&str; 3] = ["loaned 901", "sent 902", "waiting 400"];
+
+/// Starts a run whose `role` fails at a place by a signal.
+fn start(bench: &Bench, role: &str, place: &str, signal: &str, more: &[&str]) -> Running {
+    let file = shipped("rigid-pair");
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--set", "launch.startup_timeout_s=20"];
+    let mut command = bench.command();
+    command.args([&common[..], more].concat()).env("COROTATE_HOOK", format!("{role} {place} {signal}"));
+    Running::new(&mut command)
+}
+
+fn summary(done: &Done) -> Value {
+    serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("no summary: {done:?}"))
+}
+
+/// What holds after every failure that a run survives: nobody hung, the role is named, the books balance, nothing is left.
+fn assert_survived(bench: &Bench, done: &Done, role: &str, case: &str) -> Value {
+    assert_eq!(done.code, Some(0), "{case}: {done:?}");
+    let summary = summary(done);
+    let first = &summary["incidents"][0];
+    assert_eq!((first["role"].as_str(), first["action"].as_str()), (Some(role), Some("restarted")), "{case}: {first}");
+    assert!(first["outage_s"].as_f64().unwrap() > 0.0, "{case}: {first}");
+    assert_eq!(summary["books"]["balanced"], true, "{case}: {:#}", summary["books"]);
+    bench.assert_clean(&[]);
+    summary
+}
+
+/// Lockstep waits for whoever is gone, so nothing is lost at all: not a tick, and, where the role has no memory of its own
+/// or its memory survives it, not a bit.
+#[test]
+fn in_lockstep_a_killed_role_costs_nothing_but_what_it_had_in_mind() {
+    let lockstep = ["--clock", "lockstep"];
+    let bench = Bench::new();
+    let undisturbed = bench.summary("rigid-pair", &lockstep);
+    for role in ROLES {
+        for place in RUNNING {
+            let case = format!("{role} {place}");
+            let done = start(&bench, role, place, "KILL", &lockstep).wait();
+            let summary = assert_survived(&bench, &done, role, &case);
+            assert!(done.stderr.contains("it was killed by SIGKILL; it is started anew"), "{case}: {done:?}");
+            assert_eq!(summary["books"]["missed_ticks"], 0, "{case}");
+            assert_eq!(summary["score"]["unscored_ticks"], 0, "{case}");
+            assert!(summary["incidents"][0]["recovery_s"].is_number(), "{case}");
+            // The observer's estimate dies with it, and is void when the leader is another. Both converge again.
+            if ["follower", "controller"].contains(&role) {
+                assert_eq!(summary["state"]["hash"], undisturbed["state"]["hash"], "{case}");
+            } else {
+                assert_ne!(
+                    summary["state"]["hash"], undisturbed["state"]["hash"],
+                    "{case}: it was not restarted at all"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn in_lockstep_a_role_that_stands_still_is_killed_and_brought_back() {
+    for role in ROLES {
+        let bench = Bench::new();
+        let more = ["--clock", "lockstep", "--set", "supervision.heartbeat_timeout_s=0.5"];
+        let done = start(&bench, role, "sent 902", "STOP", &more).wait();
+        assert_survived(&bench, &done, role, role);
+        assert!(done.stderr.contains("it said nothing for 0.5 s and was killed"), "{done:?}");
+    }
+}
+
+/// In real time the others go on: ticks are missed, counted, and the follower stays where its expiry keeps it.
+#[test]
+fn in_real_time_a_killed_or_stopped_role_is_back_and_the_follower_is_bounded_meanwhile() {
+    let more = [
+        "--tick-hz=200",
+        "--duration=3",
+        "--set=accept={settled_by_s=0,sync_error_rad_s_max=3}",
+        "--set=supervision.heartbeat_timeout_s=0.5",
+    ];
+    // Counted at 200 Hz: about the second half of the run's first second.
+    let places = ["loaned 150", "sent 151", "waiting 150"];
+    let cases = ROLES.iter().flat_map(|role| places.iter().flat_map(move |p| ["KILL", "STOP"].map(|s| (*role, *p, s))));
+    let cases: Vec<_> = cases.collect();
+    for group in cases.chunks(4) {
+        let started: Vec<_> = group
+            .iter()
+            .map(|case| {
+                let bench = Bench::new();
+                let running = start(&bench, case.0, case.1, case.2, &more);
+                (bench, running, case)
+            })
+            .collect();
+        for (bench, running, case) in started {
+            assert_survived(&bench, &running.wait(), case.0, &format!("{case:?}"));
+        }
+    }
+}
+
+/// A role that fails before the ticks run will not do better the next time.
+#[test]
+fn a_role_that_fails_before_it_is_ready_ends_the_run() {
+    for role in ROLES {
+        for place in ["opening 1", "ready 1"] {
+            for (signal, clock) in [("KILL", "realtime"), ("KILL", "lockstep"), ("STOP", "lockstep")] {
+                let bench = Bench::new();
+                let limits = ["--set=launch.startup_timeout_s=1", "--set=supervision.heartbeat_timeout_s=1"];
+                let done = start(&bench, role, place, signal, &[&["--clock", clock][..], &limits].concat()).wait();
+                let case = format!("{role} {place} {signal} {clock}");
+                assert_eq!(done.code, Some(4), "{case}: {done:?}");
+                assert!(done.stderr.contains(role), "{case}: {done:?}");
+                bench.assert_clean(&[]);
+            }
+        }
+    }
+}
+
+/// A role that dies again and again is given up, and everything that was learned until then is told.
+#[test]
+fn the_number_of_restarts_is_limited() {
+    let bench = Bench::new();
+    let more = ["--clock=lockstep", "--set=supervision.restarts_max=0"];
+    let done = start(&bench, "controller", "sent 902", "KILL", &more).wait();
+    assert_eq!(done.code, Some(4), "{done:?}");
+    let summary = summary(&done);
+    assert_eq!(summary["incidents"][0]["action"], "stopped");
+    assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
+    assert_eq!(summary["books"]["roles"]["controller"]["executed"], 901, "the books of the dead are read too");
+    bench.assert_clean(&[]);
+}
