@@ -214,7 +214,9 @@ fn counts(text: &str, with_device: bool) -> Vec<(RoleReport, Count)> {
             .collect();
         conduct(scenario, domain);
         let counts = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
-        by_device.map(|device| device.join().unwrap());
+        if let Some(device) = by_device {
+            device.join().unwrap();
+        }
         counts
     })
 }
