@@ -194,9 +194,9 @@ fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
 }
 
 fn counts(text: &str, with_device: bool) -> Vec<(RoleReport, Count)> {
-    let overrides = ["clock=realtime", "duration_s=1", "accept={}"].map(str::to_owned);
+    let overrides = ["clock=realtime", "duration_s=1", "accept={}", "fault=[]", "watchdog={}"].map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
-    let domain = OwnedDomain::create().unwrap();
+    let domain = OwnedDomain::create(0).unwrap();
     let (roles, (far, path)) = (RoleId::all(&scenario), line());
     std::thread::scope(|scope| {
         let (scenario, domain) = (&scenario, &domain);

@@ -340,7 +340,13 @@ fn actuators_real_time_and_launch_have_limits() {
         ("launch.startup_timeout_s", "0", "no time to wait", "give 0.1 to 3600"),
         ("launch.startup_timeout_s", "-1", "no time to wait", "give 0.1 to 3600"),
         ("launch.startup_timeout_s", "1e9", "no time to wait", "give 0.1 to 3600"),
+        ("launch.external", "\"follower\"", "got string", "give a list"),
+        ("launch.external", "[1]", "got integer", "give a text in quotes"),
+        ("launch.external", "[\"nosuch\"]", "no role `nosuch`", "has: leader, follower, observer, controller"),
+        ("launch.external", "[\"follower\", \"\"]", "no role ``", "has: leader, follower, observer, controller"),
     ]);
+    let alone = with(&with(PAIR, "launch.external", "[\"follower\"]"), "clock", "\"in-process\"");
+    assert_refused(&alone, "launch.external", &["one process", "or leave it empty"]);
 }
 
 #[test]
@@ -766,7 +772,8 @@ fn options_are_checked_as_their_keys_are() {
 fn a_command_line_that_makes_no_sense_is_refused() {
     let bench = Bench::new();
     let path = bench.path("");
-    let cases: [(&[&str], &str, &str); 19] = [
+    let pair = shipped("rigid-pair").display().to_string();
+    let cases: [(&[&str], &str, &str); 25] = [
         (&["nosuch"], "unrecognized subcommand 'nosuch'", "--help"),
         (&["--nosuch"], "unexpected argument '--nosuch'", "--help"),
         (&[""], "unrecognized subcommand", "--help"),
@@ -776,6 +783,12 @@ fn a_command_line_that_makes_no_sense_is_refused() {
         (&["run", "--external", "x"], "no such role", "has: leader"),
         (&["run", "--set", "tick_herz=1"], "--set tick_herz=1", "did you mean"),
         (&["check"], "<FILES>", "--help"),
+        (&["seat"], "<FILE>", "--help"),
+        (&["seat", "nosuch.toml"], "<ROLE>", "--help"),
+        (&["seat", "nosuch.toml", "leader"], "nosuch.toml: cannot be read", "give the path of a scenario file"),
+        (&["seat", &pair, "nosuch"], "no role `nosuch`", "it has: leader, follower, observer, controller"),
+        (&["seat", &pair, "leader", "--clock", "in-process"], "no seats", "give --clock realtime or lockstep"),
+        (&["seat", &pair, "leader", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
         (&["init"], "<NAME>", "--help"),
         (&["init", "nosuch"], "no scenario `nosuch`", "there are: rigid-pair"),
         (&["init", ""], "no scenario ``", "there are: rigid-pair"),

@@ -5,6 +5,7 @@ mod check;
 mod init;
 mod role;
 mod run;
+mod seat;
 
 use clap::{Parser, Subcommand};
 use std::io::{self, Write};
@@ -29,6 +30,8 @@ Examples:
   corotate init rigid-trio > trio.toml           a commented scenario to start from
   corotate check trio.toml                       validate it, print what is proven of it
   corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
+  corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
+  corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
                                                  a device as the follower of a run --external follower";
 
@@ -40,6 +43,8 @@ enum Command {
     Check(check::Arguments),
     /// Print a commented scenario to start from
     Init(init::Arguments),
+    /// Print what a program of your own needs to take a role's seat, as JSON
+    Seat(seat::Arguments),
     /// Take the seat of a body in a run (the launcher starts it; so can you)
     Plant(role::PlantArguments),
     /// Take the observer's seat in a run
@@ -88,13 +93,18 @@ fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
     exit
 }
 
-/// Prints to stdout; a reader that has gone is an error, where `print!` would panic.
-fn say(text: &str) -> Result<(), Exit> {
+/// Prints to stdout, or says why not; a reader that has gone is an error, where `print!` would panic.
+fn print(text: &str) -> Result<(), String> {
     let mut stdout = io::stdout().lock();
     stdout
         .write_all(text.as_bytes())
         .and_then(|()| stdout.flush())
-        .map_err(|error| fail(Exit::Failure, &format!("cannot write to stdout: {error}; give it a reader")))
+        .map_err(|error| format!("cannot write to stdout: {error}; give it a reader"))
+}
+
+/// Prints to stdout; where that fails, says so and gives the exit code.
+fn say(text: &str) -> Result<(), Exit> {
+    print(text).map_err(|reason| fail(Exit::Failure, &reason))
 }
 
 fn main() -> ExitCode {
@@ -103,6 +113,7 @@ fn main() -> ExitCode {
         Some(Command::Run(arguments)) => run::run(&arguments),
         Some(Command::Check(arguments)) => check::check(&arguments),
         Some(Command::Init(arguments)) => init::init(&arguments),
+        Some(Command::Seat(arguments)) => seat::seat(&arguments),
         Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),

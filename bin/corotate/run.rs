@@ -1,8 +1,9 @@
 //! `corotate run`: one scenario from file to verdict.
 
-use crate::{Exit, fail, say};
+use crate::{Exit, fail, print};
 use corotate::config::{ClockKind, SHIPPED, Scenario};
-use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, table, write_run};
+use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, junit, table, write_run};
+use corotate::runtime::seat_path;
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
@@ -36,6 +37,9 @@ pub struct Arguments {
     /// Do not start this role; somebody else will, in the domain that is printed
     #[arg(long, value_name = "ROLE")]
     external: Vec<String>,
+    /// Write the verdict to this file as JUnit XML, one test case per criterion
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
     /// Print the summary as one JSON object on stdout, everything else on stderr
     #[arg(long)]
     json: bool,
@@ -48,43 +52,88 @@ impl Arguments {
         self.set.iter().cloned().chain(named).collect()
     }
 
-    fn scenario(&self) -> Result<Scenario, Exit> {
+    /// What to call the run where the scenario's name is not known.
+    fn stem(&self) -> String {
+        let stem = self.file.as_deref().and_then(Path::file_stem);
+        stem.map_or(SHIPPED[0].0.to_owned(), |stem| stem.to_string_lossy().into_owned())
+    }
+
+    fn scenario(&self) -> Result<Scenario, Failure> {
         let loaded = match &self.file {
             Some(path) => Scenario::load(path, &self.overrides()),
             None => Scenario::parse(SHIPPED[0].1, &format!("{}.toml", SHIPPED[0].0), &self.overrides()),
         };
-        let scenario = loaded.map_err(|error| fail(Exit::Usage, &error))?;
+        let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
+        self.check_external(&scenario).map_err(|reason| Failure { exit: Exit::Usage, reason })?;
+        Ok(scenario)
+    }
+
+    fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
         if let (Some(role), ClockKind::InProcess) = (self.external.first(), scenario.clock) {
             let reason = "one process has no room for another's role; give --clock realtime or lockstep";
-            return Err(fail(Exit::Usage, &format!("--external {role}: {reason}")));
+            return Err(format!("--external {role}: {reason}"));
         }
-        let roles: Vec<&str> =
-            corotate::runtime::RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
+        let roles = scenario.rig.roles();
         match self.external.iter().find(|role| !roles.contains(&role.as_str())) {
             Some(role) => {
                 let known = roles.join(", ");
-                Err(fail(Exit::Usage, &format!("--external {role}: there is no such role; this scenario has: {known}")))
+                Err(format!("--external {role}: there is no such role; this scenario has: {known}"))
             }
-            None => Ok(scenario),
+            None => Ok(()),
         }
+    }
+}
+
+/// Why a run has no verdict.
+struct Failure {
+    exit: Exit,
+    reason: String,
+}
+
+impl Failure {
+    fn new(exit: Exit, reason: impl ToString) -> Self {
+        Self { exit, reason: reason.to_string() }
     }
 }
 
 /// Runs a scenario.
 pub fn run(arguments: &Arguments) -> Exit {
-    attempt(arguments).unwrap_or_else(|exit| exit)
+    let loaded = arguments.scenario();
+    let name = loaded.as_ref().map_or_else(|_| arguments.stem(), |scenario| scenario.name.clone());
+    let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, ended));
+    // Whoever reads the file finds no older verdict, however this run ends.
+    if let Err(exit) = write_verdict(Err("the run did not come to an end")) {
+        return exit;
+    }
+    let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
+    let written = write_verdict(ended.as_ref().map_err(|failure| failure.reason.as_str()));
+    let exit = match &ended {
+        Ok(summary) => verdict(summary),
+        Err(failure) => fail(failure.exit, &failure.reason),
+    };
+    match (written, exit) {
+        (Err(failed), Exit::Ok) => failed,
+        _ => exit,
+    }
 }
 
-fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
-    let scenario = arguments.scenario()?;
+fn write_junit(path: &Path, name: &str, ended: Result<&Summary, &str>) -> Result<(), Exit> {
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let made = directory.map_or(Ok(()), std::fs::create_dir_all);
+    made.and_then(|()| std::fs::write(path, junit(name, ended)))
+        .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
+}
+
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failure> {
+    let broken = |reason: String| Failure { exit: Exit::Failure, reason };
     let started = jiff::Timestamp::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
-        .map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory with --out")))?;
-    let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
-    let program = std::env::current_exe().map_err(|error| fail(Exit::Failure, &error))?;
+        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
+    let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
     let mut screen = Screen::default();
     let outcome = corotate::launch::run(
-        &scenario,
+        scenario,
         &mut Launch {
             program,
             external: arguments.external.clone(),
@@ -94,22 +143,22 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
         },
     );
     screen.clear();
-    let outcome = outcome.map_err(|error| fail(exit_of(&error), &error))?;
-    let summary = Summary::new(&scenario, &outcome, started);
-    let written = write_run(&directory, &scenario, &summary);
+    let outcome = outcome.map_err(|error| Failure::new(exit_of(&error), error))?;
+    let summary = Summary::new(scenario, &outcome, started);
+    let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
-    written.map_err(|error| fail(Exit::Failure, &format!("cannot write the results: {error}")))?;
-    reported?;
-    Ok(verdict(&summary))
+    written.map_err(|error| broken(format!("cannot write the results: {error}")))?;
+    reported.map_err(broken)?;
+    Ok(summary)
 }
 
-fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), Exit> {
+fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
     let text = format!("{}results in {}\n", table(summary), directory.display());
     if arguments.json {
         eprint!("{text}");
-        say(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
+        print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
-        say(&text)
+        print(&text)
     }
 }
 
@@ -136,6 +185,7 @@ fn exit_of(error: &LaunchError) -> Exit {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
         LaunchError::Domain(_)
+        | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }
@@ -184,6 +234,7 @@ impl Screen {
                 self.asked = true;
                 for role in external {
                     eprintln!("waiting for {role}: start it with\n  {}", by_hand(role, domain));
+                    eprintln!("or give a program of your own the seat\n  {}", seat_path(domain, role).display());
                 }
             }
             Progress::Waiting { .. } => {}

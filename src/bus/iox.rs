@@ -13,6 +13,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
@@ -24,7 +25,78 @@ const MAX_READERS: usize = 8;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
+/// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
+pub const VERSION: &str = "0.10.0";
+
+/// An upper bound on what the transport puts before a sample, bytes.
+const HEADER_BYTES: usize = 64;
+/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
+const SIGNAL_BYTES: usize = 64 << 10;
+
 type Ipc = ipc::Service;
+
+/// An upper bound on the shared memory that one signal with samples of `size` bytes takes, bytes.
+pub fn footprint(depths: Depths, signal: Signal, size: usize) -> usize {
+    let qos = Qos::of(signal, depths);
+    let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
+    (MAX_READERS * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
+}
+
+/// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Qos {
+    /// One writer per signal.
+    pub max_publishers: usize,
+    /// The most readers.
+    pub max_subscribers: usize,
+    /// The most processes.
+    pub max_nodes: usize,
+    /// Samples for readers that come later.
+    pub history_size: usize,
+    /// The most samples that may wait for one reader.
+    pub subscriber_max_buffer_size: usize,
+    /// The most samples that one reader may hold.
+    pub subscriber_max_borrowed_samples: usize,
+    /// Whether the oldest waiting sample gives way to a new one.
+    pub enable_safe_overflow: bool,
+}
+
+impl Qos {
+    /// That of a signal on links of these depths.
+    pub fn of(signal: Signal, depths: Depths) -> Self {
+        Self {
+            max_publishers: 1,
+            max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
+            max_nodes: MAX_NODES,
+            history_size: history(signal, depths),
+            subscriber_max_buffer_size: deepest(signal, depths),
+            subscriber_max_borrowed_samples: MAX_BORROWED,
+            enable_safe_overflow: true,
+        }
+    }
+}
+
+/// How many samples of a signal may wait for a reader.
+pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
+    depths.of(reader).min(deepest(signal, depths))
+}
+
+/// What roles say of themselves and hear from the launcher is said again and again.
+fn history(signal: Signal, depths: Depths) -> usize {
+    match signal {
+        Signal::Health | Signal::Schedule => 0,
+        Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.history,
+    }
+}
+
+/// Only what is scored needs room for the scorer.
+fn deepest(signal: Signal, depths: Depths) -> usize {
+    match signal {
+        Signal::Truth | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
+        Signal::Measurement => depths.role,
+        Signal::Health | Signal::Schedule => 1,
+    }
+}
 
 /// A sample as iceoryx2 sees it.
 #[repr(transparent)]
@@ -60,20 +132,20 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        let readers = if topic.signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS };
+        let qos = Qos::of(topic.signal, self.depths);
         let name = topic.to_string();
         let open = |reason: String| BusError::Open { service: topic.to_string(), end, reason };
         let name: ServiceName = name.as_str().try_into().map_err(|error| open(format!("{error:?}")))?;
         self.node
             .service_builder(&name)
             .publish_subscribe::<Wire<S>>()
-            .max_publishers(1)
-            .max_subscribers(readers)
-            .max_nodes(MAX_NODES)
-            .history_size(self.history(topic.signal))
-            .subscriber_max_buffer_size(self.deepest(topic.signal))
-            .subscriber_max_borrowed_samples(MAX_BORROWED)
-            .enable_safe_overflow(true)
+            .max_publishers(qos.max_publishers)
+            .max_subscribers(qos.max_subscribers)
+            .max_nodes(qos.max_nodes)
+            .history_size(qos.history_size)
+            .subscriber_max_buffer_size(qos.subscriber_max_buffer_size)
+            .subscriber_max_borrowed_samples(qos.subscriber_max_borrowed_samples)
+            .enable_safe_overflow(qos.enable_safe_overflow)
             .open_or_create()
             .map_err(|error| open(format!("{error:?}")))
     }
@@ -83,31 +155,20 @@ impl IoxBus {
         // What cannot be put away now is so when the successor enters.
         let _ = self.node.try_cleanup_dead_nodes();
     }
-
-    /// What roles say of themselves and hear from the launcher is said again and again.
-    fn history(&self, signal: Signal) -> usize {
-        match signal {
-            Signal::Health | Signal::Schedule => 0,
-            Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => self.depths.history,
-        }
-    }
-
-    /// Only what is scored needs room for the scorer.
-    fn deepest(&self, signal: Signal) -> usize {
-        match signal {
-            Signal::Truth | Signal::Estimate | Signal::Command => self.depths.scorer.max(self.depths.role),
-            Signal::Measurement => self.depths.role,
-            Signal::Health | Signal::Schedule => 1,
-        }
-    }
 }
 
-fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+/// The transport's configuration by which a process enters a domain.
+fn config(domain: &Domain) -> Result<Config, String> {
     let mut config = Config::default();
     let root = domain.root().to_string_lossy();
     let root = Path::new(root.as_bytes()).map_err(|error| format!("{error:?}"))?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|error| format!("{error:?}"))?;
+    Ok(config)
+}
+
+fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+    let config = config(domain)?;
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
         .config(&config)
@@ -136,12 +197,14 @@ impl Bus for IoxBus {
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
-        let depth = self.depths.of(reader).min(self.deepest(topic.signal));
-        let subscriber =
-            self.service::<S>(topic, "reader")?.subscriber_builder().buffer_size(depth).create().map_err(|error| {
-                BusError::Open { service: topic.to_string(), end: "reader", reason: format!("{error:?}") }
-            })?;
-        Ok(IoxReader { subscriber, current: None, topic: topic.clone() })
+        let depth = buffer_size(topic.signal, reader, self.depths);
+        let service = self.service::<S>(topic, "reader")?;
+        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
+            service: topic.to_string(),
+            end: "reader",
+            reason: format!("{error:?}"),
+        })?;
+        Ok(IoxReader { service, subscriber, current: None, topic: topic.clone() })
     }
 }
 
@@ -191,9 +254,17 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
 
 /// The reading end.
 pub struct IoxReader<S: Sample> {
+    service: PortFactory<Ipc, Wire<S>, ()>,
     subscriber: Subscriber<Ipc, Wire<S>, ()>,
     current: Option<Received<Ipc, Wire<S>, ()>>,
     topic: Topic,
+}
+
+impl<S: Sample> IoxReader<S> {
+    /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
+    pub fn written(&self) -> bool {
+        self.service.dynamic_config().number_of_publishers() > 0
+    }
 }
 
 impl<S: Sample> Read<S> for IoxReader<S> {
@@ -231,11 +302,13 @@ mod tests {
 
     #[test]
     fn a_deep_reader_gets_every_sample_and_a_shallow_one_the_newest() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
+        assert!(!newest.written());
         let mut writer = ours.writer::<RateTruth>(&topic()).unwrap();
+        assert!(newest.written());
         assert!(!newest.advance().unwrap() && !every.advance().unwrap());
         for tick in 0..5 {
             writer.prepare().unwrap();
@@ -253,7 +326,7 @@ mod tests {
 
     #[test]
     fn refuses_a_second_writer_and_another_type() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let _writer = bus.writer::<RateTruth>(&topic()).unwrap();
         assert!(matches!(bus.writer::<RateTruth>(&topic()), Err(BusError::Open { .. })));
@@ -261,9 +334,23 @@ mod tests {
         assert!(error.to_string().contains("IncompatibleTypes"), "{error}");
     }
 
+    /// A foreign program is told this version: it must be the one that is linked.
+    #[test]
+    fn the_version_is_the_transport_s_own() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let _reader = bus(&domain).reader::<RateTruth>(&topic(), Reader::Role).unwrap();
+        let mut versions = Vec::new();
+        Ipc::list(&config(domain.domain()).unwrap(), |service| {
+            versions.push(service.static_details.iceoryx2_version().to_string());
+            CallbackProgression::Continue
+        })
+        .unwrap();
+        assert_eq!(versions, [VERSION]);
+    }
+
     #[test]
     fn two_domains_never_meet() {
-        let (one, other) = (OwnedDomain::create().unwrap(), OwnedDomain::create().unwrap());
+        let (one, other) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
         let mut writer = bus(&one).writer::<RateTruth>(&topic()).unwrap();
         let mut reader = bus(&other).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         reader.advance().unwrap();

@@ -20,7 +20,8 @@ pub enum Signal {
 }
 
 impl Signal {
-    fn name(self) -> &'static str {
+    /// Its part of the service's name.
+    pub fn name(self) -> &'static str {
         match self {
             Self::Truth => "truth",
             Self::Measurement => "measurement",

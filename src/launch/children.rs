@@ -9,6 +9,7 @@ use crate::bus::domain::{self, Domain};
 use crate::config::Scenario;
 use crate::runtime::RoleId;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::fd::OwnedFd;
@@ -17,7 +18,7 @@ use std::path::Path;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// How long a role may take to end once it has been told to.
 pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
@@ -38,13 +39,8 @@ impl RoleProcess {
     /// Starts a role of a scenario in a domain.
     pub fn start(program: &Path, scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
         let name = role.name(scenario).to_owned();
-        let kind = match role {
-            RoleId::Plant(_) => "plant",
-            RoleId::Observer => "observer",
-            RoleId::Controller => "controller",
-        };
         let mut command = Command::new(program);
-        command.arg(kind).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
+        command.arg(role.kind()).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
         if let RoleId::Plant(_) = role {
             command.arg("--body").arg(&name);
         }
@@ -87,9 +83,13 @@ impl RoleProcess {
         words.join(" | ")
     }
 
-    /// Ends the process at once and reaps it.
+    /// Ends the process at once and reaps it. Also one whose core somebody else keeps busy at a higher priority: it must
+    /// run to die, so it is let go to any core.
     pub fn kill(&mut self) {
         if self.ended().is_none() {
+            let mut any = CpuSet::new();
+            (0..CpuSet::MAX_CPU).for_each(|core| any.set(core));
+            let _ = sched_setaffinity(Pid::from_raw(self.child.id() as i32), &any);
             let _ = self.child.kill();
             self.status = self.child.wait().ok();
         }
@@ -106,16 +106,6 @@ impl Drop for RoleProcess {
     fn drop(&mut self) {
         self.kill();
         self.stop_listening();
-    }
-}
-
-/// Waits for processes that have been told to end, but not for ever.
-pub(super) fn await_end<'a>(processes: impl Iterator<Item = &'a mut RoleProcess>) {
-    let limit = Instant::now() + END_LIMIT;
-    for process in processes {
-        while process.ended().is_none() && Instant::now() < limit {
-            std::thread::sleep(Duration::from_millis(1));
-        }
     }
 }
 

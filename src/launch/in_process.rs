@@ -38,6 +38,8 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
             .zip(&ledgers)
             .map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()))
             .collect(),
+        unbooked: Vec::new(),
+        problems: Vec::new(),
         score: scorer.finish()?,
         incidents: Vec::new(),
         grants: Vec::new(),

@@ -4,13 +4,16 @@
 
 mod children;
 mod in_process;
+mod junit;
 mod outcome;
 mod processes;
 mod score;
 mod supervision;
 mod table;
+mod trace;
 
 pub use children::janitor;
+pub use junit::junit;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
@@ -28,7 +31,7 @@ use std::sync::atomic::AtomicUsize;
 pub struct Launch<'a> {
     /// The program whose subcommands are the roles: this one.
     pub program: PathBuf,
-    /// Roles that somebody else starts.
+    /// Roles that somebody else starts, besides the scenario's own.
     pub external: Vec<String>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
@@ -47,7 +50,7 @@ pub enum Progress<'a> {
         roles: Vec<&'a str>,
         /// External roles among them.
         external: Vec<&'a str>,
-        /// The domain's directory.
+        /// The domain's directory; it holds a file with the seat of each external role.
         domain: PathBuf,
     },
     /// Ticks run.
@@ -73,6 +76,14 @@ pub enum LaunchError {
     /// The roles' books could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
+    /// There are too few descriptors. Found out later it would fail in the midst of the transport.
+    #[error("the limit on open files is {limit} and this run may need {needed}; raise it with `ulimit -n {needed}`")]
+    Descriptors {
+        /// The limit.
+        limit: u64,
+        /// What each process of the run may open.
+        needed: u64,
+    },
     /// A file of the domain could not be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {

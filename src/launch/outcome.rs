@@ -4,10 +4,10 @@
 
 use super::{Action, Incident, Score};
 use crate::config::Scenario;
-use crate::rig::CertificateReport;
+use crate::rig::{CertificateReport, Figure};
 use crate::serial::LineBook;
 use crate::telemetry::{
-    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, combine, write_hgrm, write_hlog,
+    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm, write_hlog,
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -23,6 +23,10 @@ const SCHEMA: &str = "corotate/summary/v1";
 pub struct Outcome {
     /// The roles' own accounts, in the order of a tick.
     pub reports: Vec<RoleReport>,
+    /// External roles that keep no books.
+    pub unbooked: Vec<String>,
+    /// What is wrong with accounts that were left.
+    pub problems: Vec<String>,
     /// The score.
     pub score: Score,
     /// Roles that failed while the ticks ran.
@@ -39,8 +43,8 @@ pub struct Outcome {
 #[derive(Debug, Serialize)]
 pub struct Summary {
     schema: &'static str,
-    version: &'static str,
-    revision: &'static str,
+    pub(super) version: &'static str,
+    pub(super) revision: &'static str,
     /// The scenario's name.
     pub scenario: String,
     /// The clock's name.
@@ -49,7 +53,7 @@ pub struct Summary {
     pub tick_hz: f64,
     /// The last tick of the scenario.
     pub last_tick: u64,
-    started_utc: String,
+    pub(super) started_utc: String,
     host: Host,
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
@@ -64,6 +68,10 @@ pub struct Summary {
     pub incidents: Vec<Incident>,
     /// What a reader of the results must know of the scenario.
     pub notes: Vec<String>,
+    /// The physical bounds that samples are held against.
+    pub limits: Vec<Figure>,
+    /// What the watchdog saw, if anything is watched.
+    pub watchdog: Option<WatchReport>,
     /// What is proven of the loop.
     pub certificates: Vec<CertificateReport>,
     /// The books.
@@ -99,12 +107,18 @@ pub struct Books {
     pub balanced: bool,
     /// Where they do not.
     pub problems: Vec<String>,
+    /// External roles that keep no books: nothing is known of their ticks, nor of the links that they write and read.
+    pub unbooked: Vec<String>,
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
     pub links: Vec<LinkBook>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
+    /// Samples received and not believed, all links together.
+    pub rejected_samples: u64,
+    /// Samples that scripted faults touched, and stalls.
+    pub injected_faults: u64,
 }
 
 /// One reading end beside its writing end.
@@ -124,6 +138,14 @@ pub struct LinkBook {
     pub gaps: u64,
     /// Sent after the reader's last look.
     pub unread: u64,
+    /// Ticks for which the writer sent a void, and voids received.
+    pub void: [u64; 2],
+    /// Samples that were not newer than the one before.
+    pub stale: u64,
+    /// Samples received and not believed.
+    pub rejected: u64,
+    /// Samples that scripted faults touched on the writing end.
+    pub injected: u64,
 }
 
 /// The state hash of a run, comparable between clocks.
@@ -181,7 +203,7 @@ impl Summary {
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
         let lost: Vec<&str> = lost.map(|incident| incident.role.as_str()).collect();
         let interrupted = outcome.signal != 0 || !lost.is_empty();
-        let books = Books::new(scenario, &outcome.reports, interrupted, &lost);
+        let books = Books::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies);
         Self {
             schema: SCHEMA,
@@ -200,6 +222,8 @@ impl Summary {
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
             notes: scenario.rig.notes(),
+            limits: scenario.rig.limits(),
+            watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),
             certificates: scenario.rig.certificates(),
             state: State::new(&outcome.reports, &books),
             books,
@@ -211,8 +235,8 @@ impl Summary {
 }
 
 impl Books {
-    fn new(scenario: &Scenario, reports: &[RoleReport], interrupted: bool, lost: &[&str]) -> Self {
-        let mut problems = Vec::new();
+    fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool, lost: &[&str]) -> Self {
+        let (reports, mut problems) = (&outcome.reports, outcome.problems.clone());
         let written = reports.iter().flat_map(|report| report.written.iter().map(move |link| (&*report.role, link)));
         let written: Vec<(&str, &LinkWritten)> = written.collect();
         for report in reports {
@@ -222,7 +246,7 @@ impl Books {
             }
         }
         for (_, link) in &written {
-            if link.published + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
+            if link.published + link.void + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
         }
@@ -237,7 +261,11 @@ impl Books {
         Self {
             balanced: problems.is_empty(),
             problems,
+            unbooked: outcome.unbooked.clone(),
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
+            rejected_samples: links.iter().map(|link| link.rejected).sum(),
+            injected_faults: written.iter().map(|(_, link)| link.injected).sum::<u64>()
+                + reports.iter().map(|report| report.ticks.stalled).sum::<u64>(),
             roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
             links,
         }
@@ -263,17 +291,29 @@ impl LinkBook {
             skipped: written.skipped,
             gaps: read.gaps,
             unread: sent.saturating_sub(covered),
+            void: [written.void, read.void],
+            stale: read.stale,
+            rejected: read.rejected,
+            injected: written.injected,
         };
         let lossless = scenario.clock != crate::config::ClockKind::Realtime;
-        let balanced = read.received + read.gaps == covered
+        // Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
+        let balanced = read.received + read.void + read.gaps == covered
             && covered <= sent
-            && read.stale == 0
-            && book.published + book.skipped == book.received + book.gaps + book.unread
+            && read.stale <= written.extra
+            && book.published + written.void + book.skipped == book.received + read.void + book.gaps + book.unread
             && (!lossless || read.gaps == 0);
         if !balanced {
             problems.push(format!(
-                "{} at {reader}: {} published, {} received, {} gaps, {} stale",
-                book.service, book.published, book.received, book.gaps, read.stale
+                "{} at {reader}: {} published, {} received, {} gaps, {} stale of {} extra, {} of {} void",
+                book.service,
+                book.published,
+                book.received,
+                book.gaps,
+                read.stale,
+                written.extra,
+                read.void,
+                written.void
             ));
         }
         book
@@ -282,18 +322,19 @@ impl LinkBook {
 
 impl State {
     fn new(reports: &[RoleReport], books: &Books) -> Self {
-        let mut links: Vec<&LinkWritten> = reports.iter().flat_map(|report| &report.written).collect();
-        links.sort_by(|a, b| a.service.cmp(&b.service));
-        let stride = links.iter().map(|link| link.hash.stride).max().unwrap_or(1);
-        let count = links.iter().map(|link| link.hash.hashes.len()).min().unwrap_or(0);
+        let written = reports.iter().flat_map(|report| &report.written);
+        let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
+        links.sort_by_key(|(service, _)| *service);
+        let stride = links.iter().map(|(_, hash)| hash.stride).max().unwrap_or(1);
+        let count = links.iter().map(|(_, hash)| hash.hashes.len()).min().unwrap_or(0);
         let checkpoints: Vec<(u64, u64)> = (0..count)
-            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|link| link.hash.hashes[index]))))
+            .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|(_, hash)| hash.hashes[index]))))
             .collect();
         let first_disturbed_tick = books.roles.values().filter_map(|ticks| ticks.first_disturbed).min();
         let clean =
             checkpoints.iter().rev().find(|(ticks, _)| first_disturbed_tick.is_none_or(|first| *ticks <= first));
         let (clean_ticks, clean_hash) = clean.copied().unwrap_or((0, 0));
-        let hash = combine(links.iter().map(|link| link.hash.last));
+        let hash = combine(links.iter().map(|(_, hash)| hash.last));
         Self {
             hash: format!("{hash:016x}"),
             first_disturbed_tick,
@@ -353,6 +394,10 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
     for (metric, limit) in &accept.metric_max {
         let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
         add(format!("{metric}_max"), *limit, score.and_then(|score| score.settled_max), true);
+    }
+    for (metric, limit) in &accept.metric_peak {
+        let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
+        add(format!("{metric}_peak"), *limit, score.and_then(|score| score.peak), true);
     }
     // Asked for or not: a run that lost a body is not accepted.
     if outcome.score.faulted_ticks > 0 {

@@ -2,7 +2,7 @@
 //!
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
-use super::children::{Janitor, await_end};
+use super::children::{END_LIMIT, Janitor};
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
@@ -12,11 +12,13 @@ use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    Backoff, RoleId, depths, hold_low_latency_idle, report, report_path, scenario_path, topic, write_whole,
+    Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
+    shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::{Grant, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -28,16 +30,21 @@ const SCORE_NS: u64 = 10_000_000;
 const EPOCH_LEAD_NS: u64 = 50_000_000;
 /// Ticks scored between two credits in lockstep.
 const CREDIT_TICKS: u64 = 16;
+/// Upper bounds on the files that the process which opens most of them, the launcher, has open.
+const DESCRIPTORS: u64 = 32;
+const DESCRIPTORS_PER_ROLE: u64 = 24;
 /// Without any progress for so long the run counts as hung, ns, and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
 
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
-    let owned = OwnedDomain::create()?;
+    require_descriptors(scenario)?;
+    let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    describe_seats(scenario, launch, domain)?;
     // Declared before the roles, so that it is dropped, and cleans up, after them.
     let _janitor = Janitor::start(&launch.program)?;
     let (_low_latency, grants) = match scenario.clock {
@@ -49,10 +56,46 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let mut crew = Crew::start(scenario, launch, domain, &bus)?;
     let mut scorer = score::open(scenario, &bus)?;
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;
-    let reports = crew.dismiss();
+    let Dismissal { reports, unbooked, problems } = crew.dismiss();
     let score = scorer.finish()?;
     let incidents = crew.incidents(&score.recoveries_s);
-    Ok(Outcome { reports, score, incidents, grants, domain: Some(domain.root().to_owned()), signal })
+    let domain = Some(domain.root().to_owned());
+    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, domain, signal })
+}
+
+fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
+    launch.external.iter().chain(&scenario.external).any(|external| external == role)
+}
+
+/// Leaves the seat of every external role in the domain, for the program that is to take it.
+fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
+    let roles = RoleId::all(scenario).into_iter();
+    for role in roles.filter(|role| is_external(scenario, launch, role.name(scenario))) {
+        let path = seat_path(domain.root(), role.name(scenario));
+        let seat = describe_seat(scenario, role, Some(domain)).to_json();
+        write_whole(&path, seat.as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    }
+    Ok(())
+}
+
+/// What the roles left when they went.
+#[derive(Default)]
+struct Dismissal {
+    reports: Vec<RoleReport>,
+    /// External roles that keep no books.
+    unbooked: Vec<String>,
+    /// What is wrong with what was left.
+    problems: Vec<String>,
+}
+
+/// Raises the limit on open files as far as it goes, for this process and its children, and checks that it is enough.
+fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
+    let limits = getrlimit(Resource::Nofile);
+    // What cannot be raised is judged as it is.
+    let _ = setrlimit(Resource::Nofile, Rlimit { current: limits.maximum, ..limits });
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    let needed = DESCRIPTORS + DESCRIPTORS_PER_ROLE * RoleId::all(scenario).len() as u64;
+    if limit < needed { Err(LaunchError::Descriptors { limit, needed }) } else { Ok(()) }
 }
 
 /// All roles of a run, and the launcher's line to them.
@@ -77,7 +120,7 @@ impl<'a> Crew<'a> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule))?;
         let mut members = Vec::new();
         for role in RoleId::all(scenario) {
-            let external = launch.external.iter().any(|name| name == role.name(scenario));
+            let external = is_external(scenario, launch, role.name(scenario));
             let mut member = Member::new(scenario, role, external, domain, bus)?;
             if !external {
                 member.start(&launch.program, scenario, domain, monotonic_ns())?;
@@ -131,7 +174,7 @@ impl<'a> Crew<'a> {
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
             for member in &mut self.members {
-                if let Some(Failure { cause, last_words }) = member.failure(self.scenario) {
+                if let Some(Failure { cause, last_words }) = member.failure(self.scenario, self.bus) {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
@@ -195,7 +238,7 @@ impl<'a> Crew<'a> {
     fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
         for member in &mut self.members {
-            if let Some(failure) = member.failure(self.scenario) {
+            if let Some(failure) = member.failure(self.scenario, self.bus) {
                 let incident = member.fail(failure, self.scenario, now_ns);
                 eprintln!("corotate: {incident}");
                 self.bus.clear_dead();
@@ -242,32 +285,43 @@ impl<'a> Crew<'a> {
 
     fn denied(&mut self, own: &[Grant]) -> LaunchError {
         let mut denied: Vec<(String, Grant)> = own.iter().map(|grant| ("launcher".to_owned(), grant.clone())).collect();
-        for report in self.dismiss() {
+        for report in self.dismiss().reports {
             denied.extend(report.grants.into_iter().map(|grant| (report.role.clone(), grant)));
         }
         denied.retain(|(_, grant)| !grant.granted);
         LaunchError::Privileges { denied }
     }
 
-    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its books.
-    fn dismiss(&mut self) -> Vec<RoleReport> {
+    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its books, unless it was none of
+    /// ours.
+    fn dismiss(&mut self) -> Dismissal {
         self.word.phase = Phase::Stop as u64;
-        // A link that fails now changes nothing: whoever does not end by itself is ended.
-        let _ = self.announce();
-        await_end(self.members.iter_mut().filter_map(|member| member.process.as_mut()));
-        let mut reports = Vec::new();
+        let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
+        self.bus.clear_dead();
+        while self.members.iter_mut().any(Member::lingers) && monotonic_ns() < limit_ns {
+            // Again and again: who is only just coming up has not heard it yet. A link that fails now changes nothing:
+            // whoever does not end by itself is ended.
+            let _ = self.announce();
+            self.pause(monotonic_ns() + LOOK_NS);
+        }
+        let mut dismissal = Dismissal::default();
         for member in &mut self.members {
-            let file = std::fs::read(report_path(self.domain.root(), &member.name));
-            let reported: Option<RoleReport> = file.ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
-            if let Some(failure) = member.bad_end(reported.is_some()) {
+            let file = std::fs::read(report_path(self.domain.root(), &member.name)).ok();
+            if let Some(failure) = member.bad_end(file.is_some()) {
                 let stopped = Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) };
                 eprintln!("corotate: {stopped}");
                 self.incidents.push(stopped);
             }
-            let from_books = || report(self.scenario, member.role, &member.ledger, Vec::new(), Vec::new());
-            reports.push(reported.unwrap_or_else(from_books));
+            match file.map(|bytes| serde_json::from_slice(&bytes)) {
+                Some(Ok(report)) => dismissal.reports.push(report),
+                Some(Err(error)) => dismissal.problems.push(format!("{}: its report is none: {error}", member.name)),
+                None if member.ledger.generation() > 0 => {
+                    dismissal.reports.push(report(self.scenario, member.role, &member.ledger, Vec::new(), Vec::new()));
+                }
+                None => dismissal.unbooked.push(member.name.clone()),
+            }
         }
-        reports
+        dismissal
     }
 
     /// What happened, with the scorer's times of recovery.

@@ -4,10 +4,11 @@
 
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
+use super::trace::Trace;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
-use crate::config::{OnFailure, Scenario};
+use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::runtime::{RoleId, open_ledger, topic};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
@@ -18,6 +19,9 @@ use std::path::Path;
 /// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
 /// clock of silence too: a role is only judged for the time in which it was listened to.
 const LOOK_MAX_NS: u64 = 100_000_000;
+
+/// An external role that is seen by its samples alone may be silent for at least so many periods.
+const SILENT_PERIODS: f64 = 10.0;
 
 /// A role that failed while the ticks ran, and what was done.
 #[derive(Debug, Clone, Serialize)]
@@ -79,6 +83,8 @@ pub(super) struct Member {
     pub external: bool,
     pub last: Health,
     pub ledger: Ledger,
+    /// What there is to go by where an external role says nothing of itself.
+    trace: Option<Trace>,
     health: <IoxBus as Bus>::Reader<Health>,
     /// Health of an earlier generation is a dead role's.
     generation: u64,
@@ -103,6 +109,7 @@ impl Member {
         Ok(Self {
             health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
             ledger: open_ledger(domain, scenario, role)?,
+            trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
             name,
             role,
             process: None,
@@ -135,7 +142,7 @@ impl Member {
         RoleState::from_number(self.last.state)
     }
 
-    /// Hears how the role is.
+    /// Hears how the role is; an external one that does not tell is seen by its samples.
     pub fn listen(&mut self, now_ns: u64) -> Result<(), BusError> {
         self.silent_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
         self.looked_ns = now_ns;
@@ -145,11 +152,29 @@ impl Member {
                 self.silent_ns = 0;
             }
         }
+        if let Some(trace) = self.trace.as_mut().filter(|_| !self.health.written()) {
+            let told = trace.look()?;
+            if told != self.last {
+                self.last = told;
+                self.silent_ns = 0;
+            }
+        }
         Ok(())
     }
 
+    /// Whether it is on its way out: its process has not ended, or, if it is external, it still has its line open.
+    pub fn lingers(&mut self) -> bool {
+        match &mut self.process {
+            Some(process) => process.ended().is_none(),
+            None => self.external && self.health.written(),
+        }
+    }
+
     /// Whether and how the role has failed: its process has ended, or it has been silent for too long.
-    pub fn failure(&mut self, scenario: &Scenario) -> Option<Failure> {
+    pub fn failure(&mut self, scenario: &Scenario, bus: &IoxBus) -> Option<Failure> {
+        if self.external {
+            return self.fell_silent(scenario, bus);
+        }
         let done = self.state() == RoleState::Done;
         let process = self.process.as_mut()?;
         if let Some(status) = process.ended() {
@@ -165,6 +190,29 @@ impl Member {
         process.kill();
         let said = if heard { "said nothing" } else { "was not ready" };
         Some(Failure { cause: format!("it {said} for {limit_s} s and was killed"), last_words: process.last_words() })
+    }
+
+    /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next
+    /// is due; in lockstep that is when the others let it, so there it fails only by leaving.
+    fn fell_silent(&self, scenario: &Scenario, bus: &IoxBus) -> Option<Failure> {
+        let (state, tells) = (self.state(), self.health.written());
+        let present = tells || self.trace.as_ref().is_some_and(Trace::written);
+        let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
+        if state == RoleState::Running && !present {
+            return fail("it left before its last tick".to_owned());
+        }
+        let timeout_s = scenario.supervision.heartbeat_timeout_s;
+        let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
+        if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
+            return None;
+        }
+        // One that was killed has left once its remains are cleared.
+        bus.clear_dead();
+        match (tells, state, scenario.clock) {
+            (true, ..) => fail(format!("it said nothing for {limit_s} s")),
+            (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),
+            _ => None,
+        }
     }
 
     /// How the role failed to end in order, if so.
@@ -185,11 +233,13 @@ impl Member {
     /// Decides what is done about a failure, and prepares it.
     pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
-        let again = supervision.of(&self.name) == OnFailure::Restart && self.restarts < supervision.restarts_max;
+        let again = !self.external
+            && supervision.of(&self.name) == OnFailure::Restart
+            && self.restarts < supervision.restarts_max;
         let incident = Incident {
             role: self.name.clone(),
             generation: self.generation,
-            tick: crate::runtime::next_tick(&self.ledger),
+            tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
             cause: failure.cause,
             last_words: failure.last_words,
             action: if again { Action::Restarted } else { Action::Stopped },

@@ -1,5 +1,6 @@
 //! The end of a run on the screen.
 
+use super::outcome::LinkBook;
 use super::{Incident, Summary};
 use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
@@ -30,6 +31,7 @@ pub fn table(summary: &Summary) -> String {
         let _ = writeln!(text, "\n{}", latencies(summary));
     }
     books(summary, &mut text);
+    watchdog(summary, &mut text);
     for (body, book) in &summary.lines {
         let _ = writeln!(text, "{}", line_words(body, book));
     }
@@ -84,8 +86,9 @@ fn results(summary: &Summary, text: &mut String) {
     }
     let of_metric = |name: &str| summary.score.metrics.iter().any(|metric| name == format!("{}_max", metric.name));
     for criterion in summary.criteria.iter().filter(|criterion| !of_metric(&criterion.name)) {
-        let value = criterion.value.map_or("not measured".to_owned(), |value| format!("{value}"));
-        let limit = format!("{}", criterion.limit);
+        let number = |value: f64| if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
+        let value = criterion.value.map_or("not measured".to_owned(), number);
+        let limit = number(criterion.limit);
         rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
     }
     let _ = writeln!(text, "\n{rows}");
@@ -93,6 +96,19 @@ fn results(summary: &Summary, text: &mut String) {
         let judged = score.held + score.broken;
         let _ =
             writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
+    }
+}
+
+fn watchdog(summary: &Summary, text: &mut String) {
+    let Some(report) = &summary.watchdog else { return };
+    for one in &report.watched {
+        let largest = one.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
+        let _ = write!(text, "watchdog, {}: {} of {} beyond {:.0e}", one.quantity, one.breaches, one.judged, one.max);
+        let first = one.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
+        let _ = writeln!(text, ", largest {largest}{first}");
+    }
+    if let Some(tick) = report.latched_at_tick {
+        let _ = writeln!(text, "watchdog: safe command latched at tick {tick}");
     }
 }
 
@@ -133,8 +149,22 @@ fn books(summary: &Summary, text: &mut String) {
         summary.score.scored_ticks,
         summary.score.scored_ticks + summary.score.unscored_ticks,
     );
+    if books.injected_faults + books.rejected_samples > 0 {
+        let _ = writeln!(
+            text,
+            "scripted faults: acted {} times; {} samples rejected",
+            books.injected_faults, books.rejected_samples
+        );
+    }
+    for link in books.links.iter().filter(|link| link.rejected + link.stale + link.void[1] > 0) {
+        let LinkBook { service, reader, rejected, stale, void, .. } = link;
+        let _ = writeln!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void[1]);
+    }
     for problem in &books.problems {
         let _ = writeln!(text, "  {problem}");
+    }
+    if !books.unbooked.is_empty() {
+        let _ = writeln!(text, "no books of {}, nor of the signals there", books.unbooked.join(", "));
     }
     let _ = match state.first_disturbed_tick {
         None => writeln!(text, "state hash {} (every tick undisturbed)", state.hash),

@@ -117,6 +117,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             if self.idle_until(due_ns.saturating_sub(lead_ns), node)? {
                 return Ok(Ended::Stopped);
             }
+            node.before_tick();
             let begun = if node.time_triggered() { self.on_time(node, grid, lead_ns)? } else { Poll::Waiting };
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
             let executed = if waits { self.on_arrival(node, grid, settings)? } else { Some(begun) };
@@ -204,6 +205,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         let mut up_to = WINDOW_TICKS.min(self.last_tick);
         let mut backoff = Backoff::default();
         while node.next_tick() <= self.last_tick {
+            node.before_tick();
             if node.poll(Gate::Inputs { up_to })? == Poll::Executed {
                 node.settle()?;
                 backoff = Backoff::default();
@@ -256,6 +258,7 @@ pub fn in_turn(
 ) -> Result<Ended, BusError> {
     for tick in 0..=last_tick {
         for node in nodes.iter_mut() {
+            node.before_tick();
             if node.poll(Gate::Inputs { up_to: tick })? == Poll::Executed {
                 node.settle()?;
             }

@@ -6,16 +6,22 @@ mod bridge;
 mod controller;
 mod observer;
 mod plant;
+mod ports;
+
+pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
 use super::bridge::DeviceLink;
-use super::link::{Input, Output};
+use super::disturb::{Disturbance, Interruptions};
+use super::link::{Horizon, Input, Output};
+use crate::bus::iox::footprint;
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
 use crate::rig::{Rig, Truth};
+use crate::role::Guard;
 use crate::sample::Sample;
 use crate::serial::LineBook;
-use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WriteBook};
+use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
 use crate::with_rig;
 
 /// Which role of a scenario.
@@ -41,6 +47,20 @@ impl RoleId {
     pub fn name(self, scenario: &Scenario) -> &str {
         match self {
             Self::Plant(index) => &scenario.rig.bodies()[index].name,
+            Self::Observer => "observer",
+            Self::Controller => "controller",
+        }
+    }
+
+    /// The role of this name, if the scenario has one.
+    pub fn named(scenario: &Scenario, name: &str) -> Option<Self> {
+        Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
+    }
+
+    /// What kind of role it is, as the command line calls it.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Plant(_) => "plant",
             Self::Observer => "observer",
             Self::Controller => "controller",
         }
@@ -97,7 +117,7 @@ pub enum Gate {
 pub enum Poll {
     /// It did; [`Node::settle`] is due.
     Executed,
-    /// It waits for inputs.
+    /// It waits for inputs, or has passed over a tick of which there are none.
     Waiting,
     /// It has given the tick up and counted it as missed.
     Missed,
@@ -113,6 +133,8 @@ pub trait Node {
     /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor left undone
     /// before that counts as missed.
     fn start(&mut self, grid: Grid, first_tick: u64);
+    /// Lets scripted interruptions of this role act: before every tick, once.
+    fn before_tick(&mut self);
     /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
     ///
     /// # Errors
@@ -152,43 +174,42 @@ pub type ReadyNode = Box<dyn Node>;
 pub struct Seat<'a, B> {
     bus: &'a B,
     scenario: &'a Scenario,
+    role: RoleId,
     generation: u64,
     ledger: &'a Ledger,
     clock: Clock,
 }
 
 impl<B: Bus> Seat<'_, B> {
-    fn input<S: Sample>(&self, body: &str, signal: Signal) -> Result<Input<B, S>, BusError> {
-        Input::open(self.bus, &topic(self.scenario, body, signal), Reader::Role, self.ledger)
+    fn input<S: Sample, G: Guard<S>>(&self, body: &str, signal: Signal, guard: G) -> Result<Input<B, S, G>, BusError> {
+        let topic = topic(self.scenario, body, signal);
+        let mut input = Input::open(self.bus, &topic, Reader::Role, self.ledger)?.guarded(guard);
+        input.expect(horizon(self.scenario, None));
+        Ok(input)
     }
 
     fn output<S: Sample>(&self, body: &str, signal: Signal) -> Result<Output<B, S>, BusError> {
         let topic = topic(self.scenario, body, signal);
-        Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)
+        let output = Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)?;
+        // Nobody in the loop reads the truth, and the score is to tell what really happened.
+        let disturbance = match signal {
+            Signal::Truth => None,
+            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), body),
+        };
+        Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+    }
+
+    fn interruptions(&self) -> Interruptions {
+        Interruptions::of(self.scenario, self.role.name(self.scenario), self.generation)
     }
 }
 
-/// The signals that a role writes and reads, in the order of its books.
-fn signals(scenario: &Scenario, role: RoleId) -> (Vec<Topic>, Vec<Topic>) {
-    let bodies = scenario.rig.bodies();
-    let driven = || bodies.iter().filter(|body| body.driven);
-    let of = |body: &str, signal| topic(scenario, body, signal);
-    match role {
-        RoleId::Plant(index) => {
-            let body = &bodies[index];
-            let command = body.driven.then(|| of(&body.name, Signal::Command));
-            (vec![of(&body.name, Signal::Measurement), of(&body.name, Signal::Truth)], command.into_iter().collect())
-        }
-        RoleId::Observer => {
-            (vec![of(&bodies[0].name, Signal::Estimate)], vec![of(&bodies[0].name, Signal::Measurement)])
-        }
-        RoleId::Controller => {
-            let measurements = driven().map(|body| of(&body.name, Signal::Measurement));
-            (
-                driven().map(|body| of(&body.name, Signal::Command)).collect(),
-                std::iter::once(of(&bodies[0].name, Signal::Estimate)).chain(measurements).collect(),
-            )
-        }
+/// Which ticks samples can have; in real time only once the grid is known.
+pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
+    match (scenario.clock, grid) {
+        (ClockKind::Realtime, None) => Horizon::Unknown,
+        (ClockKind::Realtime, Some(grid)) => Horizon::Due(grid),
+        (ClockKind::Lockstep | ClockKind::InProcess, _) => Horizon::Next,
     }
 }
 
@@ -197,17 +218,32 @@ pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
     fn state_words<R: Rig>(_: &R) -> usize {
         plant::StateBook::<Truth<R>>::WORDS
     }
-    let (written, read) = signals(scenario, role);
+    let ports = ports(scenario, role);
     let state = match role {
         RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
-        RoleId::Observer | RoleId::Controller => 0,
+        RoleId::Observer => 0,
+        RoleId::Controller => WatchBook::WORDS,
     };
-    TickBook::WORDS + written.len() * WriteBook::words(scenario.last_tick) + read.len() * ReadBook::WORDS + state
+    TickBook::WORDS
+        + ports.writes.len() * WriteBook::words(scenario.last_tick)
+        + ports.reads.len() * ReadBook::WORDS
+        + state
 }
 
 /// A ledger for a role that no successor will need.
 pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
+}
+
+/// An upper bound on the shared memory that a run takes, bytes.
+pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
+    let depths = super::depths(scenario);
+    let port = |port: &Port| footprint(depths, port.topic.signal, port.size);
+    let role = |role: RoleId| {
+        let Ports { writes, health, .. } = ports(scenario, role);
+        writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
+    };
+    port(&ports(scenario, RoleId::Observer).schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.
@@ -223,16 +259,19 @@ pub fn report(
     stages: Vec<StageReport>,
     grants: Vec<Grant>,
 ) -> RoleReport {
-    let (written, read) = signals(scenario, role);
+    let ports = ports(scenario, role);
     let ledger = ledger.reopened();
+    let watches = role == RoleId::Controller;
     RoleReport {
         role: role.name(scenario).to_owned(),
         ticks: TickBook::open(&ledger).report(),
-        written: written
+        written: ports
+            .writes
             .iter()
-            .map(|topic| WriteBook::open(&ledger, scenario.last_tick).report(&topic.to_string()))
+            .map(|port| WriteBook::open(&ledger, scenario.last_tick).report(&port.topic.to_string()))
             .collect(),
-        read: read.iter().map(|topic| ReadBook::open(&ledger).report(&topic.to_string())).collect(),
+        read: ports.reads.iter().map(|port| ReadBook::open(&ledger).report(&port.topic.to_string())).collect(),
+        watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
         stages,
         grants,
         line: None,
@@ -258,11 +297,27 @@ pub fn build<R: Rig, B: Bus + 'static>(
     let generation = ledger.enter();
     let ledger = &ledger.reopened();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let seat = Seat { bus, scenario, generation, ledger, clock };
-    Ok(match occupant.into() {
+    let occupant = occupant.into();
+    let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
+    Ok(match occupant {
         Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
         Occupant::Role(RoleId::Plant(index)) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
         Occupant::Role(RoleId::Observer) => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
         Occupant::Role(RoleId::Controller) => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+
+    #[test]
+    fn every_role_of_a_scenario_has_the_name_that_the_rig_gives_it() {
+        for (name, text) in SHIPPED {
+            let scenario = Scenario::parse(text, name, &[]).unwrap();
+            let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
+            assert_eq!(names, scenario.rig.roles(), "{name}");
+        }
+    }
 }

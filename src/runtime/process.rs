@@ -22,9 +22,9 @@ use std::sync::atomic::AtomicBool;
 /// How often a role looks for the next phase before its ticks, ns.
 const LOOK_NS: u64 = 1_000_000;
 /// Samples that every link carries before the first tick.
-const WARM_UP_SAMPLES: usize = 200;
+pub(super) const WARM_UP_SAMPLES: usize = 200;
 /// The pause between them, ns.
-const WARM_UP_PAUSE_NS: u64 = 100_000;
+pub(super) const WARM_UP_PAUSE_NS: u64 = 100_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
 const BASELINE_PERIOD_NS: u64 = 1_000_000;
@@ -56,6 +56,14 @@ pub enum RoleError {
         role: String,
         /// The roles there are.
         known: String,
+    },
+    /// The domain's run is one of another scenario.
+    #[error("the run in {} is not one of this scenario with these overrides; give its own file, {}", domain.display(), scenario.display())]
+    OtherScenario {
+        /// The domain's directory.
+        domain: PathBuf,
+        /// The scenario of its run.
+        scenario: PathBuf,
     },
     /// The role is no body that a device could be.
     #[error("a device can be a driven body only, and `{role}` is none; this scenario has: {driven}")]
@@ -119,11 +127,8 @@ pub(super) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
 
 /// The role of this name.
 pub(super) fn find_role(scenario: &Scenario, name: &str) -> Result<RoleId, RoleError> {
-    let roles = RoleId::all(scenario);
-    roles.iter().find(|role| role.name(scenario) == name).copied().ok_or_else(|| RoleError::NoSuchRole {
-        role: name.to_owned(),
-        known: roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(", "),
-    })
+    RoleId::named(scenario, name)
+        .ok_or_else(|| RoleError::NoSuchRole { role: name.to_owned(), known: scenario.rig.roles().join(", ") })
 }
 
 /// Serves a seat in a domain to the end of the run, and leaves its report there; `reported` sees it too.
@@ -188,10 +193,12 @@ pub fn serve<B: Bus + 'static>(
     let occupant = occupant.into();
     let role = occupant.role();
     let name = role.name(scenario);
+    // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
+    let health = bus.writer(&topic(scenario, name, Signal::Health))?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
-        bus.writer(&topic(scenario, name, Signal::Health))?,
+        health,
         ledger.generation(),
         grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,

@@ -26,6 +26,26 @@ pub struct Stamp {
     pub sent_ns: u64,
 }
 
+impl Stamp {
+    /// The fields, in order.
+    pub const FIELDS: [Field; 4] = [
+        Self::field("tick", core::mem::offset_of!(Self, tick)),
+        Self::field("generation", core::mem::offset_of!(Self, generation)),
+        Self::field("origin_ns", core::mem::offset_of!(Self, origin_ns)),
+        Self::field("sent_ns", core::mem::offset_of!(Self, sent_ns)),
+    ];
+
+    const fn field(name: &'static str, offset: usize) -> Field {
+        Field { name, offset, kind: FieldKind::U64, count: 1 }
+    }
+}
+
+/// Set in a stamp's generation: of this tick there is no sample, and there will be none. A void.
+///
+/// Where everybody waits for inputs (lockstep, one thread), a sample that is missing would stop the loop; a void stands in
+/// its place. Readers count it and treat the tick as they treat a sample that was lost. Real time needs none.
+pub const VOID: u64 = 1 << 63;
+
 /// The type of one field's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FieldKind {
@@ -166,7 +186,8 @@ pub mod status {
     pub const INITIAL: u64 = 1 << 2;
     /// The motion did not reveal the unknown since the last sample: the estimate moved by the model alone.
     pub const UNOBSERVABLE: u64 = 1 << 3;
-    /// The measurement lacked a component that the observer needs, or was not finite: the estimate is the previous one.
+    /// The measurement lacked a component that the observer needs, or was not finite: the estimate went on by the model
+    /// alone, or is the previous one where the model is being learned.
     pub const UNUSABLE: u64 = 1 << 4;
     /// The observer learns the body's inertia from all components.
     pub const LEARNING: u64 = 1 << 5;
@@ -178,6 +199,24 @@ pub mod status {
     pub const NOT_EXCITED: u64 = 1 << 8;
     /// The body met an end of its model (it hit something, or left for good) and is frozen at its last good state.
     pub const FAULT: u64 = 1 << 9;
+    /// The input of this tick was there and was not believed: not finite, of a wrong life of its sender, or physically
+    /// impossible. It is treated as missing.
+    pub const REJECTED: u64 = 1 << 10;
+
+    /// Every bit with its name.
+    pub const NAMES: [(&str, u64); 11] = [
+        ("holding", HOLDING),
+        ("safe", SAFE),
+        ("initial", INITIAL),
+        ("unobservable", UNOBSERVABLE),
+        ("unusable", UNUSABLE),
+        ("learning", LEARNING),
+        ("axis_lost", AXIS_LOST),
+        ("degraded", DEGRADED),
+        ("not_excited", NOT_EXCITED),
+        ("fault", FAULT),
+        ("rejected", REJECTED),
+    ];
 }
 
 #[cfg(test)]
@@ -185,13 +224,26 @@ mod tests {
     use super::*;
 
     fn check<S: Sample>() {
-        let mut next = size_of::<Stamp>();
+        let mut next = 0;
+        for field in Stamp::FIELDS {
+            assert_eq!(field.offset, next, "{} follows its predecessor", field.name);
+            assert!(S::FIELDS.iter().all(|other| other.name != field.name), "{}: {}", S::TYPE_NAME, field.name);
+            next += 8 * field.count;
+        }
+        assert_eq!(next, size_of::<Stamp>(), "the fields fill the stamp");
         for field in S::FIELDS {
             assert_eq!(field.offset, next, "{}: {} follows its predecessor", S::TYPE_NAME, field.name);
             next += 8 * field.count;
         }
         assert_eq!(next, size_of::<S>(), "{}: the fields fill the sample", S::TYPE_NAME);
         assert_eq!(S::default().content().len() + size_of::<Stamp>(), size_of::<S>());
+    }
+
+    #[test]
+    fn every_status_bit_has_one_name() {
+        for (index, (name, bit)) in status::NAMES.into_iter().enumerate() {
+            assert_eq!(bit, 1 << index, "{name}");
+        }
     }
 
     #[test]

@@ -43,9 +43,13 @@ pub enum Phase {
 }
 
 impl Phase {
+    /// Every phase with its name.
+    pub const NAMES: [(&str, Self); 4] =
+        [("gather", Self::Gather), ("warm_up", Self::WarmUp), ("run", Self::Run), ("stop", Self::Stop)];
+
     /// The phase with this number; an unknown number reads as [`Phase::Stop`], the safe one.
     pub fn from_number(number: u64) -> Self {
-        [Self::Gather, Self::WarmUp, Self::Run].into_iter().find(|phase| *phase as u64 == number).unwrap_or(Self::Stop)
+        Self::NAMES.into_iter().find(|(_, phase)| *phase as u64 == number).map_or(Self::Stop, |(_, phase)| phase)
     }
 }
 
@@ -66,11 +70,17 @@ pub enum RoleState {
 }
 
 impl RoleState {
+    /// Every state with its name.
+    pub const NAMES: [(&str, Self); 5] = [
+        ("absent", Self::Absent),
+        ("open", Self::Open),
+        ("ready", Self::Ready),
+        ("running", Self::Running),
+        ("done", Self::Done),
+    ];
+
     /// The state with this number; an unknown number reads as [`RoleState::Absent`].
     pub fn from_number(number: u64) -> Self {
-        [Self::Open, Self::Ready, Self::Running, Self::Done]
-            .into_iter()
-            .find(|state| *state as u64 == number)
-            .unwrap_or(Self::Absent)
+        Self::NAMES.into_iter().find(|(_, state)| *state as u64 == number).map_or(Self::Absent, |(_, state)| state)
     }
 }

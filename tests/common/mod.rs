@@ -63,10 +63,15 @@ impl Bench {
     }
 
     pub fn command(&self) -> Command {
-        let mut command = Command::new(match self.user {
+        self.command_of(&match self.user {
             Some(_) => self.path("corotate"),
             None => env!("CARGO_BIN_EXE_corotate").into(),
-        });
+        })
+    }
+
+    /// A command in this bench by another program than ours.
+    pub fn command_of(&self, program: &Path) -> Command {
+        let mut command = Command::new(program);
         if let Some(user) = self.user {
             command.uid(user).gid(user);
         }
@@ -76,6 +81,10 @@ impl Bench {
 
     pub fn start(&self, arguments: &[&str]) -> Running {
         Running::new(self.command().args(arguments))
+    }
+
+    pub fn start_program(&self, program: &Path, arguments: &[&str]) -> Running {
+        Running::new(self.command_of(program).args(arguments))
     }
 
     pub fn run(&self, arguments: &[&str]) -> Done {
@@ -142,6 +151,14 @@ impl Bench {
     }
 }
 
+/// A test that fails leaves no run behind: the roles die with their launcher, and the janitor cleans up.
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
 impl Running {
     pub fn new(command: &mut Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -169,10 +186,7 @@ impl Running {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
             }
-            if Instant::now() > end {
-                self.child.kill().unwrap();
-                panic!("the program hung");
-            }
+            assert!(Instant::now() < end, "the program hung");
             std::thread::sleep(Duration::from_millis(2));
         };
         let text = |reader: Option<JoinHandle<String>>| reader.unwrap().join().unwrap();

@@ -9,7 +9,8 @@ use crate::clock::{Clock, Grid, monotonic_ns};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::CommandEvent;
 use crate::runtime::bridge::DeviceLink;
-use crate::runtime::link::{Input, Output, Seek};
+use crate::runtime::disturb::Interruptions;
+use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::{Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineBook, MAX_CONTENT};
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
@@ -17,13 +18,14 @@ use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 /// A device with its links and books.
 pub struct BridgeNode<R: Rig, B: Bus> {
     link: Box<DeviceLink>,
-    command: Input<B, Command<R>>,
+    command: Input<B, Command<R>, R::CommandGuard>,
     measurement: Output<B, Measurement<R>>,
     truth: Output<B, Truth<R>>,
     clock: Clock,
     grid: Grid,
     last_tick: u64,
     book: TickBook,
+    interruptions: Interruptions,
     state: StateBook<Truth<R>>,
     /// Whether the device has been asked for the next tick, when, and when its command's chain began, ns.
     asked: bool,
@@ -66,7 +68,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         let book = TickBook::open(seat.ledger);
         let measurement = seat.output(body, Signal::Measurement)?;
         let truth = seat.output(body, Signal::Truth)?;
-        let command = seat.input(body, Signal::Command)?;
+        let command = seat.input(body, Signal::Command, rig.command_guard(index))?;
         Ok(Self {
             link,
             command,
@@ -76,6 +78,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
             book,
+            interruptions: seat.interruptions(),
             state: StateBook::open(seat.ledger),
             asked: false,
             asked_ns: 0,
@@ -175,7 +178,15 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     /// The device is where it is: it needs nothing of what a predecessor knew.
     fn start(&mut self, grid: Grid, first_tick: u64) {
         self.grid = grid;
+        if self.clock == Clock::Monotonic {
+            self.command.expect(Horizon::Due(grid));
+        }
         self.skip_to(first_tick);
+    }
+
+    #[inline]
+    fn before_tick(&mut self) {
+        self.book.stalled(self.interruptions.before(self.book.next()));
     }
 
     #[inline]

@@ -1,0 +1,168 @@
+//! A run's verdict as JUnit XML, for whoever collects test results: one suite per run, one case per criterion.
+//!
+//! Must not be more lenient than the exit code, nor ever be without a case: what did not run is an error.
+
+use super::{Action, Criterion, Summary};
+use quick_xml::Writer;
+use std::io;
+
+type Xml = Writer<Vec<u8>>;
+
+/// What became of a case.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Verdict {
+    Passed,
+    /// The loop did not do what the scenario asks for.
+    Failed(String),
+    /// The run itself went wrong.
+    Error(String),
+    Skipped(String),
+}
+
+struct Case {
+    name: String,
+    verdict: Verdict,
+}
+
+/// The verdict on a run of the scenario of that name: its summary, or why there is none.
+pub fn junit(scenario: &str, run: Result<&Summary, &str>) -> String {
+    let mut xml = Writer::new_with_indent(Vec::new(), b' ', 2);
+    write(&mut xml, scenario, run).expect("memory takes every text");
+    String::from_utf8_lossy(&xml.into_inner()).into_owned() + "\n"
+}
+
+fn write(xml: &mut Xml, scenario: &str, run: Result<&Summary, &str>) -> io::Result<()> {
+    let cases = run.map_or_else(|reason| vec![Case::new("run", Verdict::Error(reason.to_owned()))], cases);
+    let count = |matches: fn(&Verdict) -> bool| cases.iter().filter(|case| matches(&case.verdict)).count().to_string();
+    let counts = [
+        ("tests", cases.len().to_string()),
+        ("failures", count(|verdict| matches!(verdict, Verdict::Failed(_)))),
+        ("errors", count(|verdict| matches!(verdict, Verdict::Error(_)))),
+        ("skipped", count(|verdict| matches!(verdict, Verdict::Skipped(_)))),
+    ];
+    let counts = || counts.iter().map(|(name, count)| (*name, count.as_str()));
+    xml.write_event(quick_xml::events::Event::Decl(quick_xml::events::BytesDecl::new("1.0", Some("UTF-8"), None)))?;
+    xml.create_element("testsuites").with_attributes(counts()).write_inner_content(|xml| {
+        let name = printable(scenario);
+        let mut suite = xml.create_element("testsuite").with_attribute(("name", &*name)).with_attributes(counts());
+        if let Ok(summary) = run {
+            suite = suite.with_attribute(("timestamp", &*summary.started_utc));
+        }
+        suite.write_inner_content(|xml| {
+            run.map_or(Ok(()), |summary| properties(xml, summary))?;
+            cases.iter().try_for_each(|case| case.write(xml, &name))
+        })?;
+        Ok(())
+    })?;
+    Ok(())
+}
+
+/// What tells this run from another one of the same scenario.
+fn properties(xml: &mut Xml, summary: &Summary) -> io::Result<()> {
+    let (tick_hz, incidents) = (summary.tick_hz.to_string(), summary.incidents.len().to_string());
+    let properties = [
+        ("clock", summary.clock),
+        ("tick_hz", &tick_hz),
+        ("state_hash", &summary.state.hash),
+        ("incidents", &incidents),
+        ("version", summary.version),
+        ("revision", summary.revision),
+    ];
+    xml.create_element("properties").write_inner_content(|xml| {
+        properties.iter().try_for_each(|(name, value)| {
+            xml.create_element("property").with_attributes([("name", *name), ("value", *value)]).write_empty().map(drop)
+        })
+    })?;
+    Ok(())
+}
+
+/// The run, its books, and the criteria in their order.
+fn cases(summary: &Summary) -> Vec<Case> {
+    let stopped = summary.incidents.iter().find(|incident| incident.action == Action::Stopped);
+    let run = match (stopped, summary.signal) {
+        (Some(incident), _) => Verdict::Error(incident.to_string()),
+        (None, 0) => Verdict::Passed,
+        (None, signal) => Verdict::Error(format!("ended by signal {signal} before its last tick")),
+    };
+    let books = match summary.books.balanced {
+        true => Verdict::Passed,
+        false => Verdict::Failed(format!("the books do not balance: {}", summary.books.problems.join("; "))),
+    };
+    let criteria = summary.criteria.iter().map(|criterion| Case::new(&criterion.name, judge(criterion)));
+    [Case::new("run", run), Case::new("books", books)].into_iter().chain(criteria).collect()
+}
+
+fn judge(criterion: &Criterion) -> Verdict {
+    let limit = criterion.limit;
+    match (criterion.holds, criterion.value) {
+        (Some(true), _) => Verdict::Passed,
+        (Some(false), Some(value)) => Verdict::Failed(format!("{value:e} is above the limit {limit:e}")),
+        (Some(false), None) => Verdict::Failed(format!("nothing was measured; the limit is {limit:e}")),
+        (None, _) => Verdict::Skipped("cannot be judged with this clock".to_owned()),
+    }
+}
+
+impl Case {
+    fn new(name: &str, verdict: Verdict) -> Self {
+        Self { name: name.to_owned(), verdict }
+    }
+
+    fn write(&self, xml: &mut Xml, suite: &str) -> io::Result<()> {
+        let case = xml.create_element("testcase").with_attributes([("classname", suite), ("name", &self.name)]);
+        let (element, message) = match &self.verdict {
+            Verdict::Passed => return case.write_empty().map(drop),
+            Verdict::Failed(message) => ("failure", message),
+            Verdict::Error(message) => ("error", message),
+            Verdict::Skipped(message) => ("skipped", message),
+        };
+        let message = printable(message);
+        case.write_inner_content(|xml| {
+            xml.create_element(element).with_attribute(("message", &*message)).write_empty().map(drop)
+        })?;
+        Ok(())
+    }
+}
+
+/// A text with what XML cannot hold replaced: a role's last words may be anything.
+fn printable(text: &str) -> String {
+    let held = |c: char| matches!(c, '\t' | '\n' | ' '..='\u{d7ff}' | '\u{e000}'..='\u{fffd}' | '\u{10000}'..);
+    text.chars().map(|c| if held(c) { c } else { char::REPLACEMENT_CHARACTER }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn criterion(value: Option<f64>, holds: Option<bool>) -> Criterion {
+        Criterion { name: "sync_error_rad_s_max".to_owned(), limit: 1e-6, value, holds }
+    }
+
+    #[test]
+    fn a_verdict_says_the_value_and_the_limit() {
+        assert_eq!(judge(&criterion(Some(1e-7), Some(true))), Verdict::Passed);
+        assert_eq!(
+            judge(&criterion(Some(0.25), Some(false))),
+            Verdict::Failed("2.5e-1 is above the limit 1e-6".into())
+        );
+        let infinite = judge(&criterion(Some(f64::INFINITY), Some(false)));
+        assert_eq!(infinite, Verdict::Failed("inf is above the limit 1e-6".into()));
+        let nothing = judge(&criterion(None, Some(false)));
+        assert_eq!(nothing, Verdict::Failed("nothing was measured; the limit is 1e-6".into()));
+        assert!(matches!(judge(&criterion(None, None)), Verdict::Skipped(_)));
+    }
+
+    /// Whatever a dying role says, the file can be read, by a parser that is not the writer's.
+    #[test]
+    fn a_run_that_failed_is_one_error_whatever_its_reason_holds() {
+        let reason = "follower died: \u{1b}[31m<oops> & \"gone\"\0\u{ffff}\nline 2 ]]> é";
+        let text = junit("a<b", Err(reason));
+        let document = roxmltree::Document::parse(&text).unwrap();
+        let suite = document.root_element().first_element_child().unwrap();
+        assert_eq!((suite.tag_name().name(), suite.attribute("name")), ("testsuite", Some("a<b")));
+        assert_eq!((suite.attribute("tests"), suite.attribute("errors")), (Some("1"), Some("1")));
+        let error = document.descendants().find(|node| node.has_tag_name("error")).unwrap();
+        let message = error.attribute("message").unwrap();
+        assert!(message.starts_with("follower died: \u{fffd}[31m<oops> & \"gone\"\u{fffd}\u{fffd}"), "{message:?}");
+        assert!(message.ends_with("]]> é"), "{message:?}");
+    }
+}

@@ -1,0 +1,262 @@
+//! A role's seat as told to a program that is not ours: everything it needs to take it, in one JSON object.
+//!
+//! Must not hold anything that a foreign program would have to look up elsewhere, nor anything that is not so.
+
+use super::node::{Port, RoleId, ports};
+use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, scenario_path};
+use super::{WINDOW_TICKS, depths};
+use crate::bus::domain::Domain;
+use crate::bus::iox::{self, Qos};
+use crate::bus::{Depths, Reader};
+use crate::config::Scenario;
+use crate::role::Rearm;
+use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, status};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Layout version of the description.
+const SCHEMA: &str = "corotate/seat/v1";
+
+/// What a foreign program must know to take a role's seat.
+#[derive(Debug, Serialize)]
+pub struct SeatDescription {
+    schema: &'static str,
+    version: &'static str,
+    /// The role's name, and what kind of role it is.
+    role: String,
+    kind: &'static str,
+    /// The body that a plant is; none for the other roles.
+    body: Option<String>,
+    scenario_name: String,
+    clock: &'static str,
+    tick_hz: f64,
+    period_ns: u64,
+    /// The last tick; the first is 0.
+    last_tick: u64,
+    /// How far a plant may run ahead of the credit in lockstep.
+    window_ticks: u64,
+    command_timeout_ticks: u64,
+    rearm: &'static str,
+    transport: Transport,
+    /// The loop's signals, in the order in which our own role opens them.
+    writes: Vec<SignalDescription>,
+    reads: Vec<SignalDescription>,
+    /// The role's word to the launcher, and the launcher's to it.
+    health: SignalDescription,
+    schedule: SignalDescription,
+    /// What the schedule's `phase` and health's `state` mean.
+    phases: BTreeMap<&'static str, u64>,
+    states: BTreeMap<&'static str, u64>,
+    /// The bits of every sample's `status`.
+    status: BTreeMap<&'static str, u64>,
+    warm_up: WarmUp,
+    /// Where the role may leave its books, and where this description lies while a run waits; none without a domain.
+    report: Option<PathBuf>,
+    /// The scenario as resolved: parameters and initial states of all bodies.
+    scenario: toml::Table,
+}
+
+/// How to reach the shared memory. Without a domain only the version is known.
+#[derive(Debug, Serialize)]
+struct Transport {
+    name: &'static str,
+    /// The version that every process of a run must have.
+    version: &'static str,
+    /// The run's directory.
+    domain: Option<PathBuf>,
+    /// `global.root_path` and `global.prefix` of the transport's configuration.
+    root_path: Option<PathBuf>,
+    prefix: Option<String>,
+}
+
+/// One signal: its service, the layout of its samples, and what to ask of the service.
+#[derive(Debug, Serialize)]
+struct SignalDescription {
+    signal: &'static str,
+    service: String,
+    type_name: &'static str,
+    /// Bytes.
+    size: usize,
+    fields: Vec<FieldDescription>,
+    qos: Qos,
+    /// How many samples may wait for our own role; only where the role reads.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    buffer_size: Option<usize>,
+}
+
+#[derive(Debug, Serialize)]
+struct FieldDescription {
+    name: &'static str,
+    /// Bytes from the start of the sample.
+    offset: usize,
+    kind: &'static str,
+    count: usize,
+}
+
+/// How links are exercised before the first tick: so many samples of generation 0, so far apart.
+#[derive(Debug, Serialize)]
+struct WarmUp {
+    samples: usize,
+    pause_ns: u64,
+}
+
+/// Describes a role's seat; in the run of that domain, or in any.
+pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>) -> SeatDescription {
+    let (ports, depths) = (ports(scenario, role), depths(scenario));
+    let written = |port: &Port| SignalDescription::new(port, depths, None);
+    let read = |port: &Port| SignalDescription::new(port, depths, Some(Reader::Role));
+    let name = role.name(scenario);
+    SeatDescription {
+        schema: SCHEMA,
+        version: env!("CARGO_PKG_VERSION"),
+        role: name.to_owned(),
+        kind: role.kind(),
+        body: matches!(role, RoleId::Plant(_)).then(|| name.to_owned()),
+        scenario_name: scenario.name.clone(),
+        clock: scenario.clock.name(),
+        tick_hz: 1e9 / scenario.period_ns as f64,
+        period_ns: scenario.period_ns,
+        last_tick: scenario.last_tick,
+        window_ticks: WINDOW_TICKS,
+        command_timeout_ticks: scenario.command_timeout_ticks,
+        rearm: match scenario.rearm {
+            Rearm::Auto => "auto",
+            Rearm::Manual => "manual",
+        },
+        transport: Transport::new(domain),
+        writes: ports.writes.iter().map(written).collect(),
+        reads: ports.reads.iter().map(read).collect(),
+        health: written(&ports.health),
+        schedule: read(&ports.schedule),
+        phases: Phase::NAMES.into_iter().map(|(name, phase)| (name, phase as u64)).collect(),
+        states: RoleState::NAMES.into_iter().map(|(name, state)| (name, state as u64)).collect(),
+        status: status::NAMES.into_iter().collect(),
+        warm_up: WarmUp { samples: WARM_UP_SAMPLES, pause_ns: WARM_UP_PAUSE_NS },
+        report: domain.map(|domain| report_path(domain.root(), name)),
+        scenario: scenario.resolved.clone(),
+    }
+}
+
+impl SeatDescription {
+    /// The description as a text for people and programs.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a description of plain values is JSON") + "\n"
+    }
+}
+
+/// The domain at a directory, whose run must be one of this very scenario: all that is told of a seat depends on both.
+///
+/// # Errors
+/// [`RoleError::Domain`], [`RoleError::Config`], [`RoleError::OtherScenario`].
+pub fn join_run(scenario: &Scenario, root: &Path) -> Result<Domain, RoleError> {
+    let domain = Domain::join(root)?;
+    let path = scenario_path(&domain);
+    if Scenario::load(&path, &[])?.resolved != scenario.resolved {
+        return Err(RoleError::OtherScenario { domain: root.to_owned(), scenario: path });
+    }
+    Ok(domain)
+}
+
+/// The file in a domain's directory that describes an external role's seat.
+pub fn seat_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.seat.json"))
+}
+
+impl Transport {
+    fn new(domain: Option<&Domain>) -> Self {
+        let root = domain.map(|domain| domain.root().to_owned());
+        Self {
+            name: "iceoryx2",
+            version: iox::VERSION,
+            domain: root.clone(),
+            root_path: root,
+            prefix: domain.map(Domain::prefix),
+        }
+    }
+}
+
+impl SignalDescription {
+    fn new(port: &Port, depths: Depths, reader: Option<Reader>) -> Self {
+        let signal = port.topic.signal;
+        Self {
+            signal: signal.name(),
+            service: port.topic.to_string(),
+            type_name: port.type_name,
+            size: port.size,
+            fields: Stamp::FIELDS.iter().chain(port.fields).map(FieldDescription::new).collect(),
+            qos: Qos::of(signal, depths),
+            buffer_size: reader.map(|reader| iox::buffer_size(signal, reader, depths)),
+        }
+    }
+}
+
+impl FieldDescription {
+    fn new(field: &Field) -> Self {
+        let kind = match field.kind {
+            FieldKind::U64 => "u64",
+            FieldKind::F64 => "f64",
+        };
+        Self { name: field.name, offset: field.offset, kind, count: field.count }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::config::SHIPPED;
+    use serde_json::Value;
+
+    fn described(text: &str, role: &str, domain: Option<&Domain>) -> Value {
+        let scenario = Scenario::parse(text, "test", &["clock=lockstep".to_owned()]).unwrap();
+        let role = RoleId::named(&scenario, role).unwrap();
+        serde_json::from_str(&describe_seat(&scenario, role, domain).to_json()).unwrap()
+    }
+
+    /// Whoever lays the fields out one after another gets the size, in every seat of every shipped scenario.
+    #[test]
+    fn the_fields_of_every_signal_fill_its_size() {
+        let mut signals = 0;
+        for (name, text) in SHIPPED {
+            let scenario = Scenario::parse(text, name, &[]).unwrap();
+            for role in RoleId::all(&scenario) {
+                let seat = describe_seat(&scenario, role, None);
+                for signal in seat.writes.iter().chain(&seat.reads).chain([&seat.health, &seat.schedule]) {
+                    let end = signal.fields.iter().fold(0, |end, field| {
+                        assert_eq!(field.offset, end, "{}: {}", signal.service, field.name);
+                        end + 8 * field.count
+                    });
+                    assert_eq!(end, signal.size, "{}", signal.service);
+                    signals += 1;
+                }
+            }
+        }
+        assert!(signals > 100, "{signals}");
+    }
+
+    #[test]
+    fn a_follower_s_seat_says_where_and_what() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let seat = described(SHIPPED[0].1, "follower", Some(domain.domain()));
+        assert_eq!(seat["kind"], "plant");
+        assert_eq!(seat["reads"][0]["service"], "corotate/rigid-pair/follower/command");
+        assert_eq!(seat["reads"][0]["buffer_size"], 128);
+        assert_eq!(seat["writes"][0]["signal"], "measurement");
+        assert_eq!(seat["writes"][0]["fields"][0]["name"], "tick");
+        assert_eq!(seat["writes"][0]["qos"]["subscriber_max_buffer_size"], 128);
+        assert_eq!(seat["schedule"]["buffer_size"], 1);
+        assert_eq!(seat["transport"]["prefix"], domain.domain().prefix());
+        assert_eq!(seat["phases"]["warm_up"], 1);
+        assert_eq!(seat["states"]["done"], 4);
+        assert_eq!(seat["status"]["fault"], 512);
+        assert_eq!(seat["scenario"]["leader"]["inertia_kg_m2"][2], 2.5);
+        assert_eq!(seat["scenario"]["follower"][0]["inertia_factor"][0], 1.0);
+    }
+
+    #[test]
+    fn without_a_domain_nothing_is_made_up() {
+        let seat = described(SHIPPED[0].1, "controller", None);
+        assert!(seat["transport"]["prefix"].is_null() && seat["report"].is_null() && seat["body"].is_null());
+    }
+}

@@ -1,0 +1,446 @@
+//! Hardware in the loop: a follower that shares no code with ours (tests/hil/follower.py) in a seat of a run, against our
+//! leader, observer and controller. The verdict is read as a CI reads it, from the JUnit file.
+
+mod common;
+
+use common::{Bench, Done, Running, await_some};
+use corotate::bus::domain::{Domain, OwnedDomain};
+use corotate::bus::iox::IoxBus;
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Bus, Read, Reader, Signal, Write};
+use corotate::config::Scenario;
+use corotate::runtime::{
+    Gate, Input, Poll, RoleId, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
+};
+use corotate::sample::{
+    FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
+};
+use corotate::with_rig;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+use std::time::Duration;
+
+/// By how much a value that the foreign follower published, or that our controller made of it, may differ from the run
+/// with the built-in one, rad/s and rad/s². Both integrate by Runge-Kutta steps whose error is far below a rounding, the
+/// foreign one in twice as many; so they differ by a rounding of 1e-16 per step, which the closed loop forgets within a
+/// second, times the gain of 6/s in a command. Ten times what that comes to.
+const TOLERANCE: f64 = 1e-14;
+
+const SIGINT: i32 = 2;
+const SIGKILL: i32 = 9;
+
+fn file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil").join(name)
+}
+
+/// The interpreter that has the foreign follower's requirements; made by the script that says what is missing if it fails.
+fn python() -> &'static Path {
+    static PYTHON: OnceLock<PathBuf> = OnceLock::new();
+    PYTHON.get_or_init(|| {
+        let made = Command::new(file("venv")).output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
+    })
+}
+
+/// Starts the foreign follower in a seat.
+fn start_follower(bench: &Bench, seat: &Path, options: &[&str]) -> Running {
+    let program = file("follower.py");
+    bench.start_program(python(), &[&[program.to_str().unwrap(), seat.to_str().unwrap()], options].concat())
+}
+
+/// Makes the foreign follower leave what it published and received.
+const RECORD: [&str; 2] = ["--record", "record"];
+
+/// The seat that a run of this bench leaves while it waits.
+fn await_seat(bench: &Bench, role: &str) -> PathBuf {
+    await_some(|| bench.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
+}
+
+/// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
+fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
+    let scenario = file("pair.toml");
+    let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out"];
+    let running = bench.start(&[&common[..], arguments].concat());
+    let seat = await_seat(bench, "follower");
+    (running, seat)
+}
+
+/// A run with the foreign follower in its seat, which both must end well.
+fn run_with_follower(bench: &Bench, clock: &str, options: &[&str]) -> Done {
+    let (running, seat) = start_waiting(bench, &["--clock", clock]);
+    let domains = bench.domains();
+    let follower = start_follower(bench, &seat, options);
+    let (run, follower) = (running.wait(), follower.wait());
+    assert_eq!((run.code, follower.code), (Some(0), Some(0)), "{run:?} {follower:?}");
+    bench.assert_clean(&domains);
+    run
+}
+
+/// The cases of a JUnit file: name, and the element and message of what is not well.
+fn cases(bench: &Bench) -> Vec<(String, Option<String>)> {
+    let text = std::fs::read_to_string(bench.path("verdict.xml")).unwrap();
+    let document = roxmltree::Document::parse(&text).unwrap();
+    let case = |node: roxmltree::Node<'_, '_>| {
+        let trouble = node.first_element_child();
+        let told = |node: roxmltree::Node<'_, '_>| {
+            format!("{}: {}", node.tag_name().name(), node.attribute("message").unwrap_or_default())
+        };
+        (node.attribute("name").unwrap().to_owned(), trouble.map(told))
+    };
+    document.descendants().filter(|node| node.has_tag_name("testcase")).map(case).collect()
+}
+
+/// Asserts that the run was accepted as a CI would see it.
+fn assert_accepted(bench: &Bench) {
+    let expected = ["run", "books", "estimate_error_rad_s_max", "sync_error_rad_s_max"];
+    assert_eq!(cases(bench), expected.map(|name| (name.to_owned(), None)));
+}
+
+fn tell(clock: &str, run: &Done) -> Value {
+    let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+    let (metrics, missed) = (&summary["score"]["metrics"], &summary["books"]["missed_ticks"]);
+    println!("{clock}: {metrics}, {missed} ticks missed or starved");
+    summary
+}
+
+/// The books of the foreign follower are whole, and the launcher takes them for what they are.
+fn assert_booked(summary: &Value) {
+    let follower = &summary["books"]["roles"]["follower"];
+    let ticks = |key: &str| follower[key].as_u64().unwrap();
+    assert_eq!(ticks("executed") + ticks("missed"), 10_001, "the books of the foreign follower: {follower}");
+    let link = |link: &Value| link["service"] == "corotate/hil-pair/follower/command";
+    assert!(summary["books"]["links"].as_array().unwrap().iter().any(link), "its commands are in the books");
+}
+
+#[test]
+fn the_foreign_follower_synchronises_in_real_time() {
+    let bench = Bench::new();
+    let run = run_with_follower(&bench, "realtime", &[]);
+    assert_booked(&tell("realtime", &run));
+    assert_accepted(&bench);
+}
+
+/// In lockstep every value of every sample agrees with the run that has the built-in follower.
+#[test]
+fn in_lockstep_the_foreign_follower_does_what_the_built_in_one_does() {
+    let bench = Bench::new();
+    let run = run_with_follower(&bench, "lockstep", &RECORD);
+    assert_booked(&tell("lockstep", &run));
+    assert_accepted(&bench);
+    let expected = built_in();
+    let worst = [
+        deviation(&record::<RateMeasurement>(&bench, "measurement"), &expected.0),
+        deviation(&record::<RateTruth>(&bench, "truth"), &expected.1),
+        // No tick follows the last, so nobody reads its command.
+        deviation(&record::<RateCommand>(&bench, "command"), &expected.2[..expected.2.len() - 1]),
+    ];
+    println!("lockstep: measurement, truth and command deviate by at most {worst:?}");
+    assert!(worst.iter().all(|worst| *worst <= TOLERANCE), "{worst:?}");
+}
+
+/// What the follower of the same scenario publishes and receives where it is the built-in one.
+fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
+    let overrides = ["launch.external=[]", "clock=in-process"].map(str::to_owned);
+    let scenario = Scenario::load(&file("pair.toml"), &overrides).unwrap();
+    let bus = MemoryBus::new(depths(&scenario));
+    let node = |role: RoleId| {
+        let ledger = private_ledger(&scenario, role);
+        with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+    };
+    let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
+    let mut measurement = reader(&bus, &scenario, Signal::Measurement);
+    let mut truth = reader(&bus, &scenario, Signal::Truth);
+    let mut command = reader(&bus, &scenario, Signal::Command);
+    let mut seen = (Vec::new(), Vec::new(), Vec::new());
+    in_turn(&mut nodes, scenario.last_tick, |_| {
+        seen.0.push(next(&mut measurement));
+        seen.1.push(next(&mut truth));
+        seen.2.push(next(&mut command));
+        true
+    })
+    .unwrap();
+    seen
+}
+
+fn reader<S: Sample>(bus: &MemoryBus, scenario: &Scenario, signal: Signal) -> Input<MemoryBus, S> {
+    Input::watch(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
+}
+
+fn next<S: Sample>(input: &mut Input<MemoryBus, S>) -> S {
+    assert!(input.advance().unwrap());
+    *input.sample().unwrap()
+}
+
+/// What the foreign follower recorded of a signal, byte for byte.
+fn record<S: Sample>(bench: &Bench, signal: &str) -> Vec<S> {
+    let bytes = std::fs::read(bench.path("record").join(format!("{signal}.bin"))).unwrap();
+    bytes.chunks(size_of::<S>()).map(bytemuck::pod_read_unaligned).collect()
+}
+
+/// The largest difference of any number in two series of samples; stamps and all words that are no numbers must be equal.
+fn deviation<S: Sample>(seen: &[S], expected: &[S]) -> f64 {
+    assert_eq!(seen.len(), expected.len(), "{}", S::TYPE_NAME);
+    let mut worst = 0.0_f64;
+    for (seen, expected) in seen.iter().zip(expected) {
+        assert_eq!(seen.stamp(), expected.stamp(), "{}", S::TYPE_NAME);
+        for field in S::FIELDS {
+            for at in (field.offset..).step_by(8).take(field.count) {
+                let word = |sample: &S| bytemuck::pod_read_unaligned::<u64>(&bytemuck::bytes_of(sample)[at..at + 8]);
+                let difference = match field.kind {
+                    FieldKind::F64 => (f64::from_bits(word(seen)) - f64::from_bits(word(expected))).abs(),
+                    FieldKind::U64 if word(seen) == word(expected) => 0.0,
+                    FieldKind::U64 => f64::INFINITY,
+                };
+                assert!(difference < 1.0, "{} {}: {seen:?}, not {expected:?}", S::TYPE_NAME, field.name);
+                worst = worst.max(difference);
+            }
+        }
+    }
+    worst
+}
+
+/// The last tick of the runs that this process conducts itself: everything that is sent fits into one link.
+const CONDUCTED_TICKS: u64 = 100;
+
+/// A scenario for a foreign body without any other role: this process leads it and commands it.
+fn conducted(rearm: &str) -> Scenario {
+    let rearm = format!("actuator.rearm={rearm}");
+    let overrides = ["clock=lockstep", "duration_s=0.1", "accept={}", "actuator.command_timeout_ticks=5", &rearm];
+    let scenario = Scenario::load(&file("pair.toml"), &overrides.map(str::to_owned)).unwrap();
+    assert_eq!(scenario.last_tick, CONDUCTED_TICKS);
+    scenario
+}
+
+/// Commands with everything that can be wrong: one missing, some fewer than the timeout, more than it, one not finite.
+fn commands() -> Vec<RateCommand> {
+    let missing = |tick: &u64| matches!(tick, 10 | 20..24 | 40..50);
+    let command = |tick: u64| {
+        let mut command = RateCommand::default();
+        (command.stamp.tick, command.stamp.generation) = (tick, 1);
+        let third = if tick == 60 { f64::NAN } else { 0.25 };
+        command.acceleration_rad_s2 = [0.1 + 0.01 * tick as f64, -0.005 * tick as f64, third];
+        command
+    };
+    (0..CONDUCTED_TICKS).filter(|tick| !missing(tick)).map(command).collect()
+}
+
+/// What the built-in body makes of the commands.
+fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
+    let bus = MemoryBus::new(depths(scenario));
+    let follower = RoleId::named(scenario, "follower").unwrap();
+    let ledger = private_ledger(scenario, follower);
+    let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, &ledger)).unwrap();
+    let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
+    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    commands().iter().for_each(|command| writer.send(|sample| *sample = *command).unwrap());
+    let mut seen = Vec::new();
+    for tick in 0..=CONDUCTED_TICKS {
+        assert_eq!(node.poll(Gate::Inputs { up_to: tick }).unwrap(), Poll::Executed);
+        node.settle().unwrap();
+        seen.push(next(&mut truth));
+    }
+    seen
+}
+
+/// Leads the foreign body through a run as the launcher does, and sends it the commands before its first tick.
+fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
+    let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
+    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
+    let mut health = bus.reader::<Health>(&topic(scenario, "follower", Signal::Health), Reader::Role).unwrap();
+    let mut command = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    let mut lead = |phase: Phase, until: RoleState| {
+        await_some(|| {
+            schedule.send(|word| (word.phase, word.credit_tick) = (phase as u64, scenario.last_tick)).unwrap();
+            while health.advance().unwrap() {}
+            health.current().filter(|health| RoleState::from_number(health.state) >= until).map(|_| ())
+        });
+    };
+    lead(Phase::Gather, RoleState::Open);
+    lead(Phase::WarmUp, RoleState::Ready);
+    commands().iter().for_each(|sample| command.send(|slot| *slot = *sample).unwrap());
+    lead(Phase::Run, RoleState::Done);
+    lead(Phase::Stop, RoleState::Absent);
+}
+
+/// Late, missing and unusable commands: held, safe after the timeout, re-armed or not, tick by tick as our own body does.
+#[test]
+fn the_foreign_follower_treats_its_commands_as_ours_does() {
+    for (rearm, safe_ticks) in [("auto", 6), ("manual", 56)] {
+        let (bench, scenario, domain) = (Bench::new(), conducted(rearm), OwnedDomain::create(0).unwrap());
+        let role = RoleId::named(&scenario, "follower").unwrap();
+        let seat = bench.path("seat.json");
+        std::fs::write(&seat, describe_seat(&scenario, role, Some(domain.domain())).to_json()).unwrap();
+        let follower = start_follower(&bench, &seat, &RECORD);
+        conduct(&scenario, &domain);
+        let follower = follower.wait();
+        assert_eq!(follower.code, Some(0), "{follower:?}");
+        let (seen, expected) = (record::<RateTruth>(&bench, "truth"), built_in_under_commands(&scenario));
+        let worst = deviation(&seen, &expected);
+        println!("{rearm}: truth deviates by at most {worst:e}");
+        assert!(worst <= TOLERANCE, "{worst:e}");
+        let count = |bit: u64| seen.iter().filter(|truth| truth.status & bit != 0).count();
+        assert_eq!(count(status::SAFE), safe_ticks, "{rearm}: the commands were such that it goes safe");
+        assert!(count(status::HOLDING) >= 9, "{rearm}: and holds before");
+    }
+}
+
+/// Waits until a signal carries a sample of this kind, as a watcher in the domain of a run.
+fn await_sample<S: Sample>(domain: &Path, body: &str, signal: Signal, wanted: impl Fn(&S) -> bool) {
+    let scenario = Scenario::load(&domain.join("scenario.toml"), &[]).unwrap();
+    let bus = IoxBus::enter(&Domain::join(domain).unwrap(), "watcher", depths(&scenario)).unwrap();
+    let mut reader = bus.reader::<S>(&topic(&scenario, body, signal), Reader::Role).unwrap();
+    await_some(|| (reader.advance().unwrap() && reader.current().is_some_and(&wanted)).then_some(()));
+}
+
+/// Waits until the follower's ticks run.
+fn await_ticks(domain: &Path) {
+    await_sample(domain, "follower", Signal::Measurement, |sample: &RateMeasurement| sample.stamp.generation > 0);
+}
+
+#[test]
+fn a_waiting_run_leaves_the_seat_that_the_command_prints_and_ends_in_order() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep", "--set", "controller.predict=false"]);
+    let (domains, domain) = (bench.domains(), seat.parent().unwrap().to_str().unwrap());
+    // The launcher says who is missing before it looks at its roles a second time.
+    await_sample(&domains[0], "run", Signal::Schedule, |word: &Schedule| word.stamp.tick > 2);
+    let own = format!("{domain}/scenario.toml");
+    let printed = bench.run(&["seat", &own, "follower", "--domain", domain]);
+    assert_eq!(printed.stdout, std::fs::read_to_string(&seat).unwrap(), "{printed:?}");
+    assert_eq!(printed.code, Some(0));
+    let other = bench.run(&["seat", file("pair.toml").to_str().unwrap(), "follower", "--domain", domain]);
+    assert_eq!((other.code, other.stdout.as_str()), (Some(2), ""), "{other:?}");
+    assert!(other.stderr.contains(&format!("give its own file, {own}")), "{other:?}");
+    running.signal(SIGINT);
+    let done = running.wait();
+    assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");
+    assert!(done.stderr.contains("waiting for follower") && done.stderr.contains(seat.to_str().unwrap()), "{done:?}");
+    assert_eq!(cases(&bench)[0], ("run".to_owned(), Some("error: ended by signal 2 before its last tick".into())));
+    bench.assert_clean(&domains);
+}
+
+/// However far the roles have come: each hears that the run is over.
+#[test]
+fn a_signal_while_the_roles_come_up_ends_the_run_in_order() {
+    for pause_ms in [0, 3, 6, 10, 20, 40, 80] {
+        let bench = Bench::new();
+        let (running, _) = start_waiting(&bench, &["--clock", "lockstep"]);
+        let domains = bench.domains();
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        running.signal(SIGINT);
+        let done = running.wait();
+        assert_eq!(done.code, Some(128 + SIGINT), "after {pause_ms} ms: {done:?}");
+        bench.assert_clean(&domains);
+    }
+}
+
+/// Hardware need not know of health, nor keep books: it is there, runs and is done by its samples.
+#[test]
+fn a_follower_that_says_nothing_of_itself_is_seen_by_its_samples() {
+    for clock in ["lockstep", "realtime"] {
+        let bench = Bench::new();
+        let summary = tell(clock, &run_with_follower(&bench, clock, &["--silent"]));
+        assert_accepted(&bench);
+        assert_eq!(summary["books"]["unbooked"], serde_json::json!(["follower"]));
+        assert!(summary["books"]["roles"]["follower"].is_null());
+        assert!(summary["score"]["scored_ticks"].as_u64().unwrap() > 1_000, "{summary:#}");
+    }
+}
+
+/// Whether it told of itself or not: the run ends in order, by name and cause.
+#[test]
+fn a_follower_that_is_killed_ends_the_run() {
+    for (clock, options, cause) in [
+        ("realtime", &[][..], "it said nothing for 0.5 s"),
+        ("lockstep", &[], "it said nothing for 0.5 s"),
+        ("realtime", &["--silent"], "it sent nothing for 0.5 s"),
+        ("lockstep", &["--silent"], "it left before its last tick"),
+    ] {
+        let bench = Bench::new();
+        let endless = ["--duration", "100000", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=0.5"];
+        let (running, seat) = start_waiting(&bench, &[&["--clock", clock], &endless[..]].concat());
+        let domains = bench.domains();
+        let follower = start_follower(&bench, &seat, options);
+        await_ticks(&domains[0]);
+        follower.signal(SIGKILL);
+        let (done, _) = (running.wait(), follower.wait());
+        assert_eq!(done.code, Some(4), "{clock} {options:?}: {done:?}");
+        let died = done.stderr.lines().find(|line| line.contains("follower died at tick ")).unwrap();
+        assert!(died.contains(cause) && died.contains("the run ends"), "{clock} {options:?}: {died}");
+        let (name, trouble) = cases(&bench).remove(0);
+        assert!(name == "run" && trouble.is_some_and(|trouble| trouble.contains(cause)), "{clock} {options:?}");
+        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+        bench.assert_clean(&domains);
+    }
+}
+
+/// A program that leaves before the ticks run is waited for again.
+#[test]
+fn a_seat_that_was_left_before_the_run_can_be_taken_again() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep", "--external", "observer"]);
+    let domains = bench.domains();
+    let first = start_follower(&bench, &seat, &[]);
+    await_sample(&domains[0], "follower", Signal::Health, |health: &Health| health.state == RoleState::Open as u64);
+    first.signal(SIGINT);
+    assert_eq!(first.wait().code, Some(128 + SIGINT));
+    let second = start_follower(&bench, &seat, &[]);
+    let observer = bench.start(&["observer", "--domain", domains[0].to_str().unwrap()]);
+    let ended = [running, second, observer].map(Running::wait);
+    assert!(ended.iter().all(|done| done.code == Some(0)), "{ended:?}");
+    assert_accepted(&bench);
+    bench.assert_clean(&domains);
+}
+
+/// What a foreign program leaves as its books is looked at, not believed.
+#[test]
+fn a_report_that_is_none_is_told() {
+    let bench = Bench::new();
+    let (running, seat) = start_waiting(&bench, &["--clock", "lockstep"]);
+    std::fs::write(seat.with_file_name("follower.report.json"), "{}").unwrap();
+    let follower = start_follower(&bench, &seat, &["--silent"]);
+    let (done, follower) = (running.wait(), follower.wait());
+    assert_eq!((done.code, follower.code), (Some(1), Some(0)), "{done:?} {follower:?}");
+    let books = cases(&bench).into_iter().find(|(name, _)| name == "books").unwrap().1.unwrap();
+    assert!(books.starts_with("failure: ") && books.contains("follower: its report is none: missing field"), "{books}");
+}
+
+/// A seat that is no driven body's, or that is in no run, is refused before anything is opened.
+#[test]
+fn the_foreign_follower_takes_only_a_seat_of_its_kind() {
+    let bench = Bench::new();
+    for (role, reason) in
+        [("follower", "names no domain"), ("leader", "no driven body"), ("observer", "no driven body")]
+    {
+        let printed = bench.run(&["seat", file("pair.toml").to_str().unwrap(), role]);
+        assert!(printed.stderr.contains("a domain exists while a run does"), "{printed:?}");
+        std::fs::write(bench.path("seat.json"), printed.stdout).unwrap();
+        let refused = start_follower(&bench, &bench.path("seat.json"), &[]).wait();
+        assert_eq!(refused.code, Some(2), "{refused:?}");
+        assert!(refused.stderr.contains(reason), "{refused:?}");
+    }
+}
+
+/// The launcher is killed: the foreign program notices that its run is gone, and leaves.
+#[test]
+fn the_foreign_follower_does_not_outlive_its_run() {
+    for clock in ["realtime", "lockstep"] {
+        let bench = Bench::new();
+        let (running, seat) = start_waiting(&bench, &["--clock", clock, "--duration", "100000", "--set", "accept={}"]);
+        let domains = bench.domains();
+        let follower = start_follower(&bench, &seat, &RECORD);
+        await_sample(&domains[0], "follower", Signal::Measurement, |sample: &RateMeasurement| {
+            sample.stamp.generation > 0
+        });
+        running.signal(SIGKILL);
+        running.wait();
+        let follower = follower.wait();
+        assert_eq!(follower.code, Some(1), "{follower:?}");
+        assert!(follower.stderr.contains("the run was killed"), "{follower:?}");
+        bench.assert_clean(&domains);
+    }
+}
