@@ -160,7 +160,7 @@ fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
 fn counts(text: &str) -> Vec<(RoleReport, Count)> {
     let overrides = ["clock=realtime", "duration_s=1", "accept={}"].map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
-    let domain = OwnedDomain::create().unwrap();
+    let domain = OwnedDomain::create(0).unwrap();
     let roles = RoleId::all(&scenario);
     std::thread::scope(|scope| {
         let threads: Vec<_> = roles.iter().map(|role| scope.spawn(|| count_role(&scenario, *role, &domain))).collect();

@@ -269,7 +269,7 @@ fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
 #[test]
 fn the_foreign_follower_treats_its_commands_as_ours_does() {
     for (rearm, safe_ticks) in [("auto", 6), ("manual", 56)] {
-        let (bench, scenario, domain) = (Bench::new(), conducted(rearm), OwnedDomain::create().unwrap());
+        let (bench, scenario, domain) = (Bench::new(), conducted(rearm), OwnedDomain::create(0).unwrap());
         let role = RoleId::named(&scenario, "follower").unwrap();
         let seat = bench.path("seat.json");
         std::fs::write(&seat, describe_seat(&scenario, role, Some(domain.domain())).to_json()).unwrap();

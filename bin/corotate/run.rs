@@ -185,6 +185,7 @@ fn exit_of(error: &LaunchError) -> Exit {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
         LaunchError::Domain(_)
+        | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }

@@ -3,7 +3,7 @@
 //! Knows files and locks, not the transport. The lock says whether the run is alive; the kernel lets go of it when the
 //! launcher dies, however it dies. Must not touch a domain whose lock is held.
 
-use rustix::fs::{FlockOperation, flock, fstat};
+use rustix::fs::{FlockOperation, flock, fstat, statvfs};
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
@@ -40,6 +40,14 @@ pub enum DomainError {
         /// The system's reason.
         source: io::Error,
     },
+    /// There is too little shared memory. Found out later it would kill whoever touches the missing page.
+    #[error("/dev/shm has {} KiB free and the run may take {}; free some, or mount it larger", free >> 10, needed >> 10)]
+    NoRoom {
+        /// Bytes free.
+        free: u64,
+        /// Bytes that a run may take.
+        needed: u64,
+    },
     /// The directory's path is too long for the transport's sockets.
     #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for socket names; set XDG_RUNTIME_DIR to a shorter one", path.display())]
     TooLong {
@@ -63,14 +71,16 @@ fn base() -> PathBuf {
 }
 
 impl OwnedDomain {
-    /// Makes a new domain, after removing those that dead runs of this user left behind.
+    /// Makes a new domain with room for `bytes` of shared memory, after removing those that dead runs of this user left
+    /// behind.
     ///
     /// # Errors
     /// [`DomainError`].
-    pub fn create() -> Result<Self, DomainError> {
+    pub fn create(bytes: usize) -> Result<Self, DomainError> {
         let base = base();
         let create = |path: &Path, source| DomainError::Create { path: path.to_owned(), source };
         remove_dead(&base);
+        require_room(bytes as u64)?;
         loop {
             // Within the loop: another run that ends may remove the directory as long as it is empty.
             DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
@@ -152,7 +162,10 @@ impl Domain {
     fn remove(&self) {
         self.in_shared_memory().for_each(|path| drop(fs::remove_file(path)));
         let _ = fs::remove_dir_all(&self.root);
-        let _ = fs::remove_file(lock_path(&self.root));
+        // What could not be removed stays marked, for the next run of this user.
+        if !self.root.exists() {
+            let _ = fs::remove_file(lock_path(&self.root));
+        }
         // The directory of all domains goes with the last; it is not empty while another run lives.
         let _ = self.root.parent().map(fs::remove_dir);
     }
@@ -161,6 +174,12 @@ impl Domain {
 /// Removes the domains of this user whose launcher is dead.
 pub fn remove_dead_domains() {
     remove_dead(&base());
+}
+
+fn require_room(needed: u64) -> Result<(), DomainError> {
+    // A system that does not tell how much is left is not refused for it.
+    let free = statvfs(SHARED_MEMORY).map_or(u64::MAX, |room| room.f_bavail.saturating_mul(room.f_frsize));
+    if free < needed { Err(DomainError::NoRoom { free, needed }) } else { Ok(()) }
 }
 
 fn remove_dead(base: &Path) {
@@ -214,7 +233,7 @@ mod tests {
 
     #[test]
     fn a_domain_is_private_and_goes_without_a_trace() {
-        let owned = OwnedDomain::create().unwrap();
+        let owned = OwnedDomain::create(0).unwrap();
         let domain = owned.domain().clone();
         assert_eq!(fs::metadata(domain.root()).unwrap().mode() & 0o777, 0o700);
         assert_eq!(Domain::join(domain.root()).unwrap(), domain);

@@ -25,6 +25,11 @@ const MAX_READERS: usize = 8;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
+/// An upper bound on the size of a sample with the transport's header, bytes.
+const CHUNK_BYTES: usize = 256;
+/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
+const SIGNAL_BYTES: usize = 64 << 10;
+
 /// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
 pub const VERSION: &str = "0.10.0";
 
@@ -57,7 +62,7 @@ impl Qos {
             max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
             max_nodes: MAX_NODES,
             history_size: history(signal, depths),
-            subscriber_max_buffer_size: deepest(signal, depths),
+            subscriber_max_buffer_size: depths.deepest(signal),
             subscriber_max_borrowed_samples: MAX_BORROWED,
             enable_safe_overflow: true,
         }
@@ -66,7 +71,7 @@ impl Qos {
 
 /// How many samples of a signal may wait for a reader.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
-    depths.of(reader).min(deepest(signal, depths))
+    depths.of(reader).min(depths.deepest(signal))
 }
 
 /// What roles say of themselves and hear from the launcher is said again and again.
@@ -77,13 +82,10 @@ fn history(signal: Signal, depths: Depths) -> usize {
     }
 }
 
-/// Only what is scored needs room for the scorer.
-fn deepest(signal: Signal, depths: Depths) -> usize {
-    match signal {
-        Signal::Truth | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
-        Signal::Measurement => depths.role,
-        Signal::Health | Signal::Schedule => 1,
-    }
+/// An upper bound on the shared memory that one signal takes, bytes.
+pub fn footprint(depths: Depths, signal: Signal) -> usize {
+    let chunks = MAX_READERS * (depths.deepest(signal) + MAX_BORROWED) + depths.history + 2;
+    chunks * CHUNK_BYTES + SIGNAL_BYTES
 }
 
 /// A sample as iceoryx2 sees it.
@@ -290,7 +292,7 @@ mod tests {
 
     #[test]
     fn a_deep_reader_gets_every_sample_and_a_shallow_one_the_newest() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
@@ -314,7 +316,7 @@ mod tests {
 
     #[test]
     fn refuses_a_second_writer_and_another_type() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let _writer = bus.writer::<RateTruth>(&topic()).unwrap();
         assert!(matches!(bus.writer::<RateTruth>(&topic()), Err(BusError::Open { .. })));
@@ -325,7 +327,7 @@ mod tests {
     /// A foreign program is told this version: it must be the one that is linked.
     #[test]
     fn the_version_is_the_transport_s_own() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let _reader = bus(&domain).reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut versions = Vec::new();
         Ipc::list(&config(domain.domain()).unwrap(), |service| {
@@ -338,7 +340,7 @@ mod tests {
 
     #[test]
     fn two_domains_never_meet() {
-        let (one, other) = (OwnedDomain::create().unwrap(), OwnedDomain::create().unwrap());
+        let (one, other) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
         let mut writer = bus(&one).writer::<RateTruth>(&topic()).unwrap();
         let mut reader = bus(&other).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         reader.advance().unwrap();

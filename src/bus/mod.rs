@@ -83,6 +83,15 @@ impl Depths {
             Reader::Scorer => self.scorer,
         }
     }
+
+    /// How many samples may wait for any reader of a signal: only what is scored needs room for the scorer.
+    pub fn deepest(&self, signal: Signal) -> usize {
+        match signal {
+            Signal::Truth | Signal::Estimate | Signal::Command => self.scorer.max(self.role),
+            Signal::Measurement => self.role,
+            Signal::Health | Signal::Schedule => 1,
+        }
+    }
 }
 
 /// Opens links.

@@ -9,6 +9,7 @@ use crate::bus::domain::{self, Domain};
 use crate::config::Scenario;
 use crate::runtime::RoleId;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::fd::OwnedFd;
@@ -82,9 +83,13 @@ impl RoleProcess {
         words.join(" | ")
     }
 
-    /// Ends the process at once and reaps it.
+    /// Ends the process at once and reaps it. Also one whose core somebody else keeps busy at a higher priority: it must
+    /// run to die, so it is let go to any core.
     pub fn kill(&mut self) {
         if self.ended().is_none() {
+            let mut any = CpuSet::new();
+            (0..CpuSet::MAX_CPU).for_each(|core| any.set(core));
+            let _ = sched_setaffinity(Pid::from_raw(self.child.id() as i32), &any);
             let _ = self.child.kill();
             self.status = self.child.wait().ok();
         }

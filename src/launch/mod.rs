@@ -76,6 +76,14 @@ pub enum LaunchError {
     /// The roles' books could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
+    /// There are too few descriptors. Found out later it would fail in the midst of the transport.
+    #[error("the limit on open files is {limit} and this run may need {needed}; raise it with `ulimit -n {needed}`")]
+    Descriptors {
+        /// The limit.
+        limit: u64,
+        /// What each process of the run may open.
+        needed: u64,
+    },
     /// A file of the domain could not be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {

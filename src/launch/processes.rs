@@ -13,11 +13,12 @@ use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
-    topic, write_whole,
+    shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::{Grant, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -29,13 +30,17 @@ const SCORE_NS: u64 = 10_000_000;
 const EPOCH_LEAD_NS: u64 = 50_000_000;
 /// Ticks scored between two credits in lockstep.
 const CREDIT_TICKS: u64 = 16;
+/// Upper bounds on the files that the process which opens most of them, the launcher, has open.
+const DESCRIPTORS: u64 = 32;
+const DESCRIPTORS_PER_ROLE: u64 = 24;
 /// Without any progress for so long the run counts as hung, ns, and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
 
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
-    let owned = OwnedDomain::create()?;
+    require_descriptors(scenario)?;
+    let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
@@ -81,6 +86,16 @@ struct Dismissal {
     unbooked: Vec<String>,
     /// What is wrong with what was left.
     problems: Vec<String>,
+}
+
+/// Raises the limit on open files as far as it goes, for this process and its children, and checks that it is enough.
+fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
+    let limits = getrlimit(Resource::Nofile);
+    // What cannot be raised is judged as it is.
+    let _ = setrlimit(Resource::Nofile, Rlimit { current: limits.maximum, ..limits });
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    let needed = DESCRIPTORS + DESCRIPTORS_PER_ROLE * RoleId::all(scenario).len() as u64;
+    if limit < needed { Err(LaunchError::Descriptors { limit, needed }) } else { Ok(()) }
 }
 
 /// All roles of a run, and the launcher's line to them.

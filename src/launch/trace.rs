@@ -97,7 +97,7 @@ mod tests {
     fn a_silent_role_is_there_runs_and_is_done_by_its_samples() {
         let overrides = ["clock=lockstep", "duration_s=0.002", "accept={}"].map(str::to_owned);
         let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let bus = || IoxBus::enter(domain.domain(), "test", depths(&scenario)).unwrap();
         let (ours, theirs) = (bus(), bus());
         let mut trace = Trace::open(&scenario, RoleId::named(&scenario, "follower").unwrap(), &ours).unwrap();

@@ -13,10 +13,10 @@ mod seat;
 
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use link::{Input, Output, Seek};
-pub(crate) use node::next_tick;
 pub use node::{
     Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic, visit_writes,
 };
+pub(crate) use node::{next_tick, shared_memory_bytes};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};

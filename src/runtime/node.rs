@@ -10,6 +10,7 @@ mod ports;
 pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
 use super::link::{Input, Output};
+use crate::bus::iox::footprint;
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
@@ -170,6 +171,17 @@ pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
 /// A ledger for a role that no successor will need.
 pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
+}
+
+/// An upper bound on the shared memory that a run takes, bytes.
+pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
+    let depths = super::depths(scenario);
+    let role = |role: RoleId| {
+        let writes = ports(scenario, role).writes;
+        let signals = writes.iter().map(|port| port.topic.signal).chain([Signal::Health]);
+        signals.map(|signal| footprint(depths, signal)).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
+    };
+    footprint(depths, Signal::Schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.

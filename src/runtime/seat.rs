@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn a_follower_s_seat_says_where_and_what() {
-        let domain = OwnedDomain::create().unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
         let seat = described(SHIPPED[0].1, "follower", Some(domain.domain()));
         assert_eq!(seat["kind"], "plant");
         assert_eq!(seat["reads"][0]["service"], "corotate/rigid-pair/follower/command");

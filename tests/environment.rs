@@ -1,0 +1,186 @@
+//! A machine that is short of everything: memory, descriptors, disk, time, cores. A run says what it lacks or counts what it
+//! lost; it never hangs, never panics, and leaves nothing behind.
+
+mod common;
+
+use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use serde_json::Value;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::process::Command;
+use std::time::Duration;
+
+const SIGSTOP: i32 = 19;
+const SIGCONT: i32 = 18;
+
+/// A shell that runs a line in the bench.
+fn start_in_shell(bench: &Bench, line: &str) -> Running {
+    let mut shell = Command::new("/bin/sh");
+    let like = bench.command();
+    shell.current_dir(like.get_current_dir().unwrap()).args(["-c", line]);
+    for (key, value) in like.get_envs() {
+        shell.env(key, value.unwrap());
+    }
+    Running::new(&mut shell)
+}
+
+/// The line of a run of half a second.
+fn short_run(clock: &str) -> String {
+    let (program, file) = (env!("CARGO_BIN_EXE_corotate"), shipped("rigid-pair"));
+    format!("exec {program} run {} --clock {clock} --set accept={{}} --duration 0.5 --out out", file.display())
+}
+
+/// Ended by its own decision, with a reason if it is not well.
+fn assert_in_order(done: &Done, case: &str) {
+    assert!(matches!(done.code, Some(0 | 1 | 4)), "{case}: {done:?}");
+    assert!(!done.stderr.contains("panicked"), "{case}: {done:?}");
+    assert!(done.code == Some(0) || done.stderr.contains("corotate: "), "{case}: it did not say why: {done:?}");
+}
+
+#[test]
+fn too_little_shared_memory_is_told_before_anything_dies_of_it() {
+    // In a mount namespace of its own; as another user in a user namespace, which the kernel must allow.
+    let root = rustix::process::getuid().is_root();
+    let unshare = if root { "unshare -m" } else { "unshare -rm" };
+    let inside = |size: &str, clock: &str| {
+        let bench = Bench::new();
+        let line = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm && {}", short_run(clock));
+        let done = start_in_shell(&bench, &format!("exec {unshare} /bin/sh -c '{line}'")).wait();
+        bench.assert_clean(&[]);
+        done
+    };
+    for clock in ["realtime", "lockstep"] {
+        for size in ["4k", "64k", "256k", "1m", "2m"] {
+            let done = inside(size, clock);
+            assert_eq!(done.code, Some(1), "{clock} {size}: {done:?}");
+            assert!(done.stderr.contains("/dev/shm"), "{clock} {size}: {done:?}");
+        }
+        let done = inside("16m", clock);
+        assert_eq!(done.code, Some(0), "{clock}, enough: {done:?}");
+    }
+}
+
+#[test]
+fn a_limit_on_descriptors_is_an_error_and_not_the_end_of_the_world() {
+    for limit in [4, 8, 12, 16, 20, 24, 32, 48, 64, 128] {
+        let bench = Bench::new();
+        let done = start_in_shell(&bench, &format!("ulimit -n {limit}; {}", short_run("lockstep"))).wait();
+        assert_in_order(&done, &format!("{limit} descriptors"));
+        bench.assert_clean(&[]);
+    }
+}
+
+/// A full disk and a vanished directory: the run's results cannot be written, but they are still on the screen.
+#[test]
+fn results_that_cannot_be_written_are_told_and_still_shown() {
+    for file in ["summary.json", "scenario.toml", "hashes.txt"] {
+        let bench = Bench::new();
+        std::fs::create_dir(bench.path("out")).unwrap();
+        symlink("/dev/full", bench.path("out").join(file)).unwrap();
+        let run = shipped("rigid-pair");
+        let done = bench.run(&["run", run.to_str().unwrap(), "--clock=lockstep", "--out=out"]);
+        assert_eq!(done.code, Some(1), "{file}: {done:?}");
+        assert!(done.stderr.contains(file) && done.stderr.contains("No space left"), "{file}: {done:?}");
+        assert!(done.stdout.contains("books balance"), "{file}: {done:?}");
+        bench.assert_clean(&[]);
+    }
+    let bench = Bench::new();
+    let run = shipped("rigid-pair");
+    let running = bench.start(&[
+        "run",
+        run.to_str().unwrap(),
+        "--duration=1",
+        "--set=accept={}",
+        "--out=out",
+        "--clock=realtime",
+    ]);
+    bench.await_role("controller");
+    std::fs::remove_dir_all(bench.path("out")).unwrap();
+    let done = running.wait();
+    assert_eq!(done.code, Some(1), "{done:?}");
+    assert!(done.stderr.contains("cannot write the results") && done.stdout.contains("books balance"), "{done:?}");
+}
+
+#[test]
+fn a_directory_that_may_not_be_written_is_refused_before_the_run() {
+    // Root may write everywhere: this is for everybody else.
+    let bench = Bench::unprivileged();
+    std::fs::create_dir(bench.path("locked")).unwrap();
+    std::fs::set_permissions(bench.path("locked"), std::fs::Permissions::from_mode(0o555)).unwrap();
+    let file = bench.path("pair.toml");
+    std::fs::copy(shipped("rigid-pair"), &file).unwrap();
+    let done = bench.run(&["run", file.to_str().unwrap(), "--out=locked/out"]);
+    assert_eq!(done.code, Some(1), "{done:?}");
+    assert!(done.stderr.contains("locked/out") && done.stderr.contains("--out"), "{done:?}");
+}
+
+/// As a host does to a virtual machine: everything stands still for two seconds, and the clock has gone on.
+#[test]
+fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let running =
+        bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=5", "--set=accept={}", "--out=out"]);
+    bench.await_role("controller");
+    std::thread::sleep(Duration::from_millis(1500));
+    let everybody = bench.processes();
+    everybody.iter().for_each(|pid| send_signal(*pid, SIGSTOP));
+    std::thread::sleep(Duration::from_secs(2));
+    everybody.iter().for_each(|pid| send_signal(*pid, SIGCONT));
+    let done = running.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
+    assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
+    for role in ["leader", "follower"] {
+        let missed = summary["books"]["roles"][role]["missed"].as_u64().unwrap();
+        assert!(missed > 1900, "{role} missed {missed}: this test is about more");
+    }
+    let sync = summary["score"]["metrics"][0]["last"].as_f64().unwrap();
+    assert!(sync < 2.0, "the follower is bounded: {sync}");
+    bench.assert_clean(&[]);
+}
+
+/// A role that stands still for less than the limit is waited for: the plant's own expiry covers the gap.
+#[test]
+fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let running =
+        bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=3", "--set=accept={}", "--out=out"]);
+    let controller = bench.await_role("controller");
+    std::thread::sleep(Duration::from_millis(1500));
+    send_signal(controller, SIGSTOP);
+    std::thread::sleep(Duration::from_millis(300));
+    send_signal(controller, SIGCONT);
+    let done = running.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
+    let (follower, controller) = (&summary["books"]["roles"]["follower"], &summary["books"]["roles"]["controller"]);
+    assert!(controller["missed"].as_u64().unwrap() > 250, "{controller}");
+    assert!(follower["safe"].as_u64().unwrap() > 200, "{follower}");
+    bench.assert_clean(&[]);
+}
+
+/// A neighbour of higher priority takes one core for more than a second.
+#[test]
+fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let running =
+        bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=3", "--set=accept={}", "--out=out"]);
+    bench.await_role("controller");
+    std::thread::sleep(Duration::from_millis(800));
+    let core = std::thread::available_parallelism().unwrap().get() - 1;
+    let priority = if rustix::process::getuid().is_root() { "chrt -f 90" } else { "nice -n 0" };
+    // The one that ends it must not be behind it.
+    let hog = format!("timeout -s KILL 1.2 {priority} taskset -c {core} sh -c 'while :; do :; done'");
+    let mut hog = Command::new("/bin/sh").args(["-c", &hog]).spawn().unwrap();
+    let done = running.wait();
+    await_some(|| hog.try_wait().unwrap());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
+    assert!(summary["score"]["metrics"][0]["last"].as_f64().unwrap() < 2.0, "{:#}", summary["score"]);
+    bench.assert_clean(&[]);
+}
