@@ -5,7 +5,7 @@
 use corotate::bus::memory::MemoryBus;
 use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Command, Estimate, Measurement, Rig};
-use corotate::role::{Body, Controller, Observer};
+use corotate::role::{Body, Controller, Guard, Observer};
 use corotate::runtime::{RoleId, build, depths, in_turn, private_ledger};
 use corotate::sample::Sample;
 use corotate::with_rig;
@@ -61,6 +61,31 @@ fn step_of<R: Rig>(rig: &R, scenario: &Scenario, bencher: &mut Bencher<'_>) {
     });
 }
 
+/// What the receiving ends check before any of it: the observed body's measurement, and a driven body's.
+fn guards(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("guards of the step's two measurements");
+    for (name, text) in SHIPPED {
+        let scenario = scenario(text, &[]);
+        if scenario.rig.bodies().iter().any(|body| body.driven) {
+            group.throughput(Throughput::Elements(1000));
+            group.bench_function(name, |bencher| with_rig!(&scenario.rig, rig => guards_of(rig, &scenario, bencher)));
+        }
+    }
+}
+
+fn guards_of<R: Rig>(rig: &R, scenario: &Scenario, bencher: &mut Bencher<'_>) {
+    let driven = rig.bodies().iter().position(|body| body.driven).expect("somebody is driven");
+    let samples = measurements(rig, driven, scenario);
+    bencher.iter(|| {
+        let mut guards = [rig.measurement_guard(0, false), rig.measurement_guard(driven, true)];
+        for pair in &samples {
+            for (guard, measurement) in guards.iter_mut().zip(pair) {
+                assert!(guard.accepts(black_box(measurement)), "a shipped scenario's samples are possible");
+            }
+        }
+    });
+}
+
 /// Whole ticks of all roles in one thread: plants, observer, controller, links, books, hash.
 fn in_process(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("in-process loop");
@@ -81,5 +106,5 @@ fn in_process(criterion: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, step, in_process);
+criterion_group!(benches, step, guards, in_process);
 criterion_main!(benches);

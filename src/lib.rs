@@ -7,8 +7,10 @@
 //! | [`model`] | bodies and their motion | yes, `no_std` |
 //! | [`observe`] | invariant relations and the filter that serves them all | yes, `no_std` |
 //! | [`control`] | control laws and their certificates | yes, `no_std` |
+//! | [`fault`] | scripted faults: what goes wrong with a sample or a role, and when | yes, `no_std` |
 //! | [`sample`] | the fixed-size samples that travel between roles | yes, `no_std` |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
+//! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
 //! | `config` | scenario files: as typed, then as resolved | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
@@ -24,10 +26,14 @@
 #![cfg_attr(not(feature = "runtime"), no_std)]
 
 pub mod control;
+pub mod fault;
 pub mod model;
 pub mod observe;
 pub mod role;
 pub mod sample;
+
+#[cfg(feature = "serial")]
+pub mod serial;
 
 #[cfg(feature = "runtime")]
 pub mod bus;

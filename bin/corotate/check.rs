@@ -42,6 +42,9 @@ fn tell(path: &Path, scenario: &Scenario) -> String {
 
 fn tell_proof(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
+    for limit in scenario.rig.limits() {
+        writeln!(text, "# limit: {}: {:.4}", limit.name, limit.value)?;
+    }
     scenario.rig.certificates().iter().try_for_each(|certificate| tell_certificate(certificate, text))
 }
 

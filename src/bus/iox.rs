@@ -25,15 +25,22 @@ const MAX_READERS: usize = 8;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
-/// An upper bound on the size of a sample with the transport's header, bytes.
-const CHUNK_BYTES: usize = 256;
-/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
-const SIGNAL_BYTES: usize = 64 << 10;
-
 /// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
 pub const VERSION: &str = "0.10.0";
 
+/// An upper bound on what the transport puts before a sample, bytes.
+const HEADER_BYTES: usize = 64;
+/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
+const SIGNAL_BYTES: usize = 64 << 10;
+
 type Ipc = ipc::Service;
+
+/// An upper bound on the shared memory that one signal with samples of `size` bytes takes, bytes.
+pub fn footprint(depths: Depths, signal: Signal, size: usize) -> usize {
+    let qos = Qos::of(signal, depths);
+    let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
+    (MAX_READERS * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
+}
 
 /// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -62,7 +69,7 @@ impl Qos {
             max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
             max_nodes: MAX_NODES,
             history_size: history(signal, depths),
-            subscriber_max_buffer_size: depths.deepest(signal),
+            subscriber_max_buffer_size: deepest(signal, depths),
             subscriber_max_borrowed_samples: MAX_BORROWED,
             enable_safe_overflow: true,
         }
@@ -71,7 +78,7 @@ impl Qos {
 
 /// How many samples of a signal may wait for a reader.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
-    depths.of(reader).min(depths.deepest(signal))
+    depths.of(reader).min(deepest(signal, depths))
 }
 
 /// What roles say of themselves and hear from the launcher is said again and again.
@@ -82,10 +89,13 @@ fn history(signal: Signal, depths: Depths) -> usize {
     }
 }
 
-/// An upper bound on the shared memory that one signal takes, bytes.
-pub fn footprint(depths: Depths, signal: Signal) -> usize {
-    let chunks = MAX_READERS * (depths.deepest(signal) + MAX_BORROWED) + depths.history + 2;
-    chunks * CHUNK_BYTES + SIGNAL_BYTES
+/// Only what is scored needs room for the scorer.
+fn deepest(signal: Signal, depths: Depths) -> usize {
+    match signal {
+        Signal::Truth | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
+        Signal::Measurement => depths.role,
+        Signal::Health | Signal::Schedule => 1,
+    }
 }
 
 /// A sample as iceoryx2 sees it.

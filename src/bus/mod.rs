@@ -44,6 +44,12 @@ pub enum BusError {
         /// The transport's reason.
         reason: String,
     },
+    /// The device at the end of a serial line is gone for good.
+    #[error("{reason}")]
+    Device {
+        /// Which, why, and what to do.
+        reason: String,
+    },
     /// A sample could not be received.
     #[error("cannot receive on {service}: {reason}")]
     Receive {
@@ -81,15 +87,6 @@ impl Depths {
         match reader {
             Reader::Role => self.role,
             Reader::Scorer => self.scorer,
-        }
-    }
-
-    /// How many samples may wait for any reader of a signal: only what is scored needs room for the scorer.
-    pub fn deepest(&self, signal: Signal) -> usize {
-        match signal {
-            Signal::Truth | Signal::Estimate | Signal::Command => self.scorer.max(self.role),
-            Signal::Measurement => self.role,
-            Signal::Health | Signal::Schedule => 1,
         }
     }
 }

@@ -2,21 +2,26 @@
 //!
 //! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
 
+mod accept;
 mod document;
 mod error;
+mod fault;
 mod raw;
 mod scenario;
+mod watchdog;
 
+pub use accept::Accept;
 pub use document::Document;
 pub use error::{ConfigError, Problem};
+pub use fault::ScriptedFault;
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision};
-pub use scenario::{Accept, Scenario};
+pub use scenario::Scenario;
 
 pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 10] = [
+pub const SHIPPED: [(&str, &str); 11] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
@@ -25,6 +30,7 @@ pub const SHIPPED: [(&str, &str); 10] = [
     ("inertia", include_str!("../../config/inertia.toml")),
     ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
     ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("faults", include_str!("../../config/faults.toml")),
     ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
     ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
 ];

@@ -2,6 +2,7 @@
 //!
 //! Must not judge values; [`super::scenario`] does.
 
+use super::fault::RawFault;
 use crate::role::Rearm;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -26,7 +27,11 @@ pub(super) struct Raw {
     #[serde(default)]
     pub supervision: Supervision,
     #[serde(default)]
+    pub watchdog: Watchdog,
+    #[serde(default)]
     pub accept: BTreeMap<String, f64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub fault: Vec<RawFault>,
 }
 
 fn default_seed() -> u64 {
@@ -147,6 +152,47 @@ impl Default for Launch {
     fn default() -> Self {
         Self { startup_timeout_s: 30.0, external: Vec::new() }
     }
+}
+
+/// What the controller holds its inputs and its V against. A bound that is left out is not watched.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Watchdog {
+    pub from_s: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub energy_drift_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub momentum_drift_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub innovation_rad_s_max: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lyapunov_rad2_s2_max: Option<f64>,
+    pub on_breach: OnBreach,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub latch_after_ticks: Option<u64>,
+}
+
+impl Watchdog {
+    /// The bounds with their keys, in the order of [`crate::control::Watched::ALL`].
+    pub fn bounds(&self) -> [(&'static str, Option<f64>); 4] {
+        [
+            ("watchdog.energy_drift_max", self.energy_drift_max),
+            ("watchdog.momentum_drift_max", self.momentum_drift_max),
+            ("watchdog.innovation_rad_s_max", self.innovation_rad_s_max),
+            ("watchdog.lyapunov_rad2_s2_max", self.lyapunov_rad2_s2_max),
+        ]
+    }
+}
+
+/// What follows from a breach.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum OnBreach {
+    /// It is counted.
+    #[default]
+    Count,
+    /// The controller falls silent for good, and the safe command takes over.
+    Safe,
 }
 
 /// What the launcher does about roles that die or hang while the ticks run.

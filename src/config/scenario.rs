@@ -1,10 +1,11 @@
 //! A scenario as resolved: every value checked, every default filled in, ready to run.
 
+use super::fault::{self, ScriptedFault};
 use super::raw::{Policy, Raw};
-use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, nearest};
+use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, accept, nearest, watchdog};
+use crate::control::WatchBounds;
 use crate::rig::{self, AnyRig, Frame};
 use crate::role::{Actuation, Rearm};
-use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The slowest tick: a period must lie well within what a latency histogram holds.
@@ -14,18 +15,21 @@ const MAX_TICK_HZ: f64 = 1e5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
 /// The tables whose content belongs to the rig.
-const RIG_SECTIONS: [&str; 6] = ["central_body", "leader", "spacecraft", "follower", "observer", "controller"];
+const RIG_SECTIONS: [&str; 7] =
+    ["central_body", "leader", "spacecraft", "follower", "observer", "controller", "limits"];
 /// The keys that hold one table each.
-const TABLES: [&str; 10] = [
+const TABLES: [&str; 12] = [
     "central_body",
     "leader",
     "spacecraft",
     "observer",
     "controller",
+    "limits",
     "actuator",
     "realtime",
     "launch",
     "supervision",
+    "watchdog",
     "accept",
 ];
 
@@ -52,25 +56,16 @@ pub struct Scenario {
     pub external: Vec<String>,
     /// What the launcher does about roles that fail.
     pub supervision: Supervision,
+    /// What is to go wrong.
+    pub faults: Vec<ScriptedFault>,
+    /// What the controller watches.
+    pub watch: WatchBounds,
     /// What the run is judged by.
-    pub accept: Accept,
+    pub accept: accept::Accept,
     /// Bodies, observer and laws.
     pub rig: AnyRig,
     /// The scenario as a file that resolves to itself.
     pub resolved: toml::Table,
-}
-
-/// Acceptance criteria. Without any, every run that ends is accepted.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Accept {
-    /// From this time on the limits apply, s.
-    pub settled_by_s: f64,
-    /// Largest allowed value per metric of the rig, after settling.
-    pub metric_max: BTreeMap<String, f64>,
-    /// Most ticks that all roles together may miss.
-    pub missed_ticks_max: Option<u64>,
-    /// Limit of the 99th percentile of the estimate and of the control step, µs.
-    pub step_latency_p99_us_max: Option<f64>,
 }
 
 impl Scenario {
@@ -103,10 +98,15 @@ impl Scenario {
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
-        let accept = resolve_accept(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
+        let accept = accept::resolve(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
         check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
+        let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
+            let setting = fault::Setting { rig, clock: raw.clock, last_tick, seed: raw.seed };
+            faults = fault::resolve(&raw.fault, &setting, &mut checks);
+            watch = watchdog::resolve(&raw.watchdog, rig, tick_s, raw.duration_s, &mut checks);
         }
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
@@ -115,13 +115,15 @@ impl Scenario {
             name: raw.name,
             clock: raw.clock,
             period_ns,
-            last_tick: (raw.duration_s * 1e9 / period_ns as f64).round() as u64,
+            last_tick,
             command_timeout_ticks: raw.actuator.command_timeout_ticks,
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
             external: raw.launch.external,
             supervision: raw.supervision,
+            faults,
+            watch,
             accept,
             rig,
             resolved,
@@ -284,53 +286,4 @@ fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
             "the list is empty or names a core beyond 1023; name cores of this machine, \"auto\" or \"any\"".to_owned()
         });
     }
-}
-
-/// Without a rig, `metrics` are not known and nothing is said of criteria that may be theirs.
-fn resolve_accept(
-    raw: &BTreeMap<String, f64>,
-    duration_s: f64,
-    metrics: Option<&[&str]>,
-    checks: &mut Checks<'_>,
-) -> Accept {
-    let mut accept = Accept::default();
-    for (key, &value) in raw {
-        let path = format!("accept.{key}");
-        checks
-            .require(value >= 0.0, &path, || format!("{value} is below zero, which no result can be; give 0 or more"));
-        match key.as_str() {
-            "settled_by_s" => {
-                accept.settled_by_s = value;
-                checks.require(value < duration_s, &path, || {
-                    format!(
-                        "{value} s is not before the end of the run at {duration_s} s, so nothing would be judged; lower it \
-                         or raise duration_s"
-                    )
-                });
-            }
-            "missed_ticks_max" => {
-                accept.missed_ticks_max = Some(value as u64);
-                checks.require(value.fract() == 0.0, &path, || {
-                    format!("{value} is no count of ticks; give a whole number")
-                });
-            }
-            "step_latency_p99_us_max" => accept.step_latency_p99_us_max = Some(value),
-            _ => {
-                let Some(metrics) = metrics else { continue };
-                match key.strip_suffix("_max").filter(|metric| metrics.contains(metric)) {
-                    Some(metric) => {
-                        accept.metric_max.insert(metric.to_owned(), value);
-                    }
-                    None => {
-                        let mut known: Vec<String> = metrics.iter().map(|metric| format!("{metric}_max")).collect();
-                        known
-                            .extend(["settled_by_s", "missed_ticks_max", "step_latency_p99_us_max"].map(str::to_owned));
-                        let known: Vec<&str> = known.iter().map(String::as_str).collect();
-                        checks.refuse(&path, format!("unknown criterion; {}", nearest(key, &known)));
-                    }
-                }
-            }
-        }
-    }
-    accept
 }

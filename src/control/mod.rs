@@ -5,9 +5,11 @@ mod certificate;
 mod orbit_certificate;
 mod orbit_hold;
 mod synchronizer;
+mod watchdog;
 
 pub use adaptation::InertiaAdaptation;
 pub use certificate::{Certificate, Condition};
 pub use orbit_certificate::OrbitCertificate;
 pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::Synchronizer;
+pub use watchdog::{Breaches, WatchBounds, Watchdog, Watched};

@@ -4,9 +4,10 @@
 
 use super::{Action, Incident, Score};
 use crate::config::Scenario;
-use crate::rig::CertificateReport;
+use crate::rig::{CertificateReport, Figure};
+use crate::serial::LineBook;
 use crate::telemetry::{
-    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, combine, write_hgrm, write_hlog,
+    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm, write_hlog,
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -67,6 +68,10 @@ pub struct Summary {
     pub incidents: Vec<Incident>,
     /// What a reader of the results must know of the scenario.
     pub notes: Vec<String>,
+    /// The physical bounds that samples are held against.
+    pub limits: Vec<Figure>,
+    /// What the watchdog saw, if anything is watched.
+    pub watchdog: Option<WatchReport>,
     /// What is proven of the loop.
     pub certificates: Vec<CertificateReport>,
     /// The books.
@@ -75,6 +80,9 @@ pub struct Summary {
     pub state: State,
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
+    /// The books of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub lines: BTreeMap<String, LineBook>,
     /// Everything that was asked of the machine.
     pub privileges: Vec<RoleGrant>,
 }
@@ -107,6 +115,10 @@ pub struct Books {
     pub links: Vec<LinkBook>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
+    /// Samples received and not believed, all links together.
+    pub rejected_samples: u64,
+    /// Samples that scripted faults touched, and stalls.
+    pub injected_faults: u64,
 }
 
 /// One reading end beside its writing end.
@@ -126,6 +138,14 @@ pub struct LinkBook {
     pub gaps: u64,
     /// Sent after the reader's last look.
     pub unread: u64,
+    /// Ticks for which the writer sent a void, and voids received.
+    pub void: [u64; 2],
+    /// Samples that were not newer than the one before.
+    pub stale: u64,
+    /// Samples received and not believed.
+    pub rejected: u64,
+    /// Samples that scripted faults touched on the writing end.
+    pub injected: u64,
 }
 
 /// The state hash of a run, comparable between clocks.
@@ -202,10 +222,13 @@ impl Summary {
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
             notes: scenario.rig.notes(),
+            limits: scenario.rig.limits(),
+            watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),
             certificates: scenario.rig.certificates(),
             state: State::new(&outcome.reports, &books),
             books,
             latencies,
+            lines: lines(&outcome.reports),
             privileges: privileges(outcome),
         }
     }
@@ -223,7 +246,7 @@ impl Books {
             }
         }
         for (_, link) in &written {
-            if link.published + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
+            if link.published + link.void + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
         }
@@ -240,6 +263,9 @@ impl Books {
             problems,
             unbooked: outcome.unbooked.clone(),
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
+            rejected_samples: links.iter().map(|link| link.rejected).sum(),
+            injected_faults: written.iter().map(|(_, link)| link.injected).sum::<u64>()
+                + reports.iter().map(|report| report.ticks.stalled).sum::<u64>(),
             roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
             links,
         }
@@ -265,17 +291,29 @@ impl LinkBook {
             skipped: written.skipped,
             gaps: read.gaps,
             unread: sent.saturating_sub(covered),
+            void: [written.void, read.void],
+            stale: read.stale,
+            rejected: read.rejected,
+            injected: written.injected,
         };
         let lossless = scenario.clock != crate::config::ClockKind::Realtime;
-        let balanced = read.received + read.gaps == covered
+        // Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
+        let balanced = read.received + read.void + read.gaps == covered
             && covered <= sent
-            && read.stale == 0
-            && book.published + book.skipped == book.received + book.gaps + book.unread
+            && read.stale <= written.extra
+            && book.published + written.void + book.skipped == book.received + read.void + book.gaps + book.unread
             && (!lossless || read.gaps == 0);
         if !balanced {
             problems.push(format!(
-                "{} at {reader}: {} published, {} received, {} gaps, {} stale",
-                book.service, book.published, book.received, book.gaps, read.stale
+                "{} at {reader}: {} published, {} received, {} gaps, {} stale of {} extra, {} of {} void",
+                book.service,
+                book.published,
+                book.received,
+                book.gaps,
+                read.stale,
+                written.extra,
+                read.void,
+                written.void
             ));
         }
         book
@@ -334,6 +372,10 @@ fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {
     reports.iter().flat_map(|report| report.stages.iter().map(move |stage| figures(report, stage))).collect()
 }
 
+fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineBook> {
+    reports.iter().filter_map(|report| Some((report.role.clone(), report.line?))).collect()
+}
+
 fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {
     let own = outcome.grants.iter().map(|grant| RoleGrant { role: "launcher".to_owned(), grant: grant.clone() });
     let roles = outcome.reports.iter().flat_map(|report| {
@@ -352,6 +394,10 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
     for (metric, limit) in &accept.metric_max {
         let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
         add(format!("{metric}_max"), *limit, score.and_then(|score| score.settled_max), true);
+    }
+    for (metric, limit) in &accept.metric_peak {
+        let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
+        add(format!("{metric}_peak"), *limit, score.and_then(|score| score.peak), true);
     }
     // Asked for or not: a run that lost a body is not accepted.
     if outcome.score.faulted_ticks > 0 {

@@ -5,6 +5,7 @@
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Command, Estimate, Rig, Truth};
+use crate::role::Guard;
 use crate::runtime::{Input, Seek, topic};
 use crate::sample::Sample;
 use crate::with_rig;
@@ -57,6 +58,10 @@ pub struct MetricScore {
     pub last: f64,
     /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
     pub settled_max: Option<f64>,
+    /// The largest value from `accept.peak_from_s` on, settled or not; none if nothing was scored by then.
+    pub peak: Option<f64>,
+    /// The tick of that.
+    pub peak_tick: Option<u64>,
     /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
     pub settled_at_s: Option<f64>,
     #[serde(skip)]
@@ -107,7 +112,7 @@ struct RigScorer<R: Rig, B: Bus> {
     accept: Accept,
     tick_s: f64,
     truths: Vec<Input<B, Truth<R>>>,
-    estimate: Input<B, Estimate<R>>,
+    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     /// Commands of the driven bodies.
     commands: Vec<DrivenBody<R, B>>,
     /// The generations of leader, observer and controllers at the last tick: a successor begins anew, and V with it.
@@ -123,15 +128,24 @@ struct RigScorer<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
         let bodies = rig.bodies().iter();
+        let horizon = crate::runtime::horizon(scenario, None);
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven);
         let command = |(body, info): (usize, &BodyInfo)| {
-            let command = Input::watch(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
+            let mut command = Input::watch(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
+            command.expect(horizon);
             Ok(DrivenBody { body, command, before: None })
         };
+        // What no role uses is not scored either.
+        let mut estimate =
+            Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
+                .guarded(rig.estimate_guard());
+        estimate.expect(horizon);
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
             settled_max: None,
+            peak: None,
+            peak_tick: None,
             settled_at_s: None,
             last_above: None,
         };
@@ -142,7 +156,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             truths: bodies
                 .map(|body| Input::watch(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
                 .collect::<Result<_, _>>()?,
-            estimate: Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?,
+            estimate,
             commands: driven.map(command).collect::<Result<_, BusError>>()?,
             generations: 0,
             next_tick: 0,
@@ -229,7 +243,9 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
 
 impl<R: Rig, B: Bus> DrivenBody<R, B> {
     fn judge(&mut self, tick: u64, tick_s: f64, undisturbed: bool, score: &mut Option<CertificateScore>) {
-        let now = at(&self.command, tick).and_then(R::lyapunov).map(|(v, bound)| (tick, v, bound));
+        let told =
+            at(&self.command, tick).and_then(R::lyapunov).filter(|(v, bound)| v.is_finite() && bound.is_finite());
+        let now = told.map(|(v, bound)| (tick, v, bound));
         if let Some((tick, v, _)) = now {
             let score = score.get_or_insert_default();
             match self.before {
@@ -246,7 +262,7 @@ impl<R: Rig, B: Bus> DrivenBody<R, B> {
 }
 
 /// The sample at hand if it is that tick's.
-fn at<B: Bus, S: Sample>(input: &Input<B, S>, tick: u64) -> Option<&S> {
+fn at<B: Bus, S: Sample, G: Guard<S>>(input: &Input<B, S, G>, tick: u64) -> Option<&S> {
     input.sample().filter(|sample| sample.stamp().tick == tick)
 }
 
@@ -258,6 +274,9 @@ impl MetricScore {
         self.last = value;
         if time_s >= accept.settled_by_s {
             self.settled_max = Some(self.settled_max.map_or(value, |worst| worst.max(value)));
+        }
+        if time_s >= accept.peak_from_s && self.peak.is_none_or(|peak| value > peak) {
+            (self.peak, self.peak_tick) = (Some(value), Some(tick));
         }
         if accept.metric_max.get(&self.name).is_some_and(|limit| value > *limit) {
             self.last_above = Some(tick);

@@ -1,6 +1,8 @@
 //! The end of a run on the screen.
 
+use super::outcome::LinkBook;
 use super::{Incident, Summary};
+use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -29,8 +31,44 @@ pub fn table(summary: &Summary) -> String {
         let _ = writeln!(text, "\n{}", latencies(summary));
     }
     books(summary, &mut text);
+    watchdog(summary, &mut text);
+    for (body, book) in &summary.lines {
+        let _ = writeln!(text, "{}", line_words(body, book));
+    }
     privileges(summary, &mut text);
     text
+}
+
+/// The books of a serial line in words, one line for what went well and one for what did not.
+pub fn line_words(body: &str, book: &LineBook) -> String {
+    let well = format!(
+        "line of {body}: {} frames and {} bytes sent, {} and {} received, {}",
+        book.frames_sent,
+        book.bytes_sent,
+        book.frames_received,
+        book.bytes_received,
+        match book.handshakes {
+            1 => "1 handshake".to_owned(),
+            count => format!("{count} handshakes"),
+        },
+    );
+    let ill = [
+        (book.crc_errors, "CRC errors"),
+        (book.malformed, "malformed blocks"),
+        (book.dropped_bytes, "bytes dropped"),
+        (book.resyncs, "resyncs"),
+        (book.sequence_gaps, "frames lost on the way here"),
+        (book.repeats, "requests repeated"),
+        (book.unanswered, "ticks unanswered"),
+        (book.late, "late answers"),
+        (book.duplicates, "answers twice"),
+        (book.echoes, "echoes"),
+        (book.unsent, "frames the line did not take"),
+        (book.reopened, "times opened again"),
+    ];
+    let ill: Vec<String> =
+        ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
+    if ill.is_empty() { format!("{well}; no fault") } else { format!("{well}\n  {}", ill.join(", ")) }
 }
 
 fn results(summary: &Summary, text: &mut String) {
@@ -48,8 +86,9 @@ fn results(summary: &Summary, text: &mut String) {
     }
     let of_metric = |name: &str| summary.score.metrics.iter().any(|metric| name == format!("{}_max", metric.name));
     for criterion in summary.criteria.iter().filter(|criterion| !of_metric(&criterion.name)) {
-        let value = criterion.value.map_or("not measured".to_owned(), |value| format!("{value}"));
-        let limit = format!("{}", criterion.limit);
+        let number = |value: f64| if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
+        let value = criterion.value.map_or("not measured".to_owned(), number);
+        let limit = number(criterion.limit);
         rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
     }
     let _ = writeln!(text, "\n{rows}");
@@ -57,6 +96,19 @@ fn results(summary: &Summary, text: &mut String) {
         let judged = score.held + score.broken;
         let _ =
             writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
+    }
+}
+
+fn watchdog(summary: &Summary, text: &mut String) {
+    let Some(report) = &summary.watchdog else { return };
+    for one in &report.watched {
+        let largest = one.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
+        let _ = write!(text, "watchdog, {}: {} of {} beyond {:.0e}", one.quantity, one.breaches, one.judged, one.max);
+        let first = one.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
+        let _ = writeln!(text, ", largest {largest}{first}");
+    }
+    if let Some(tick) = report.latched_at_tick {
+        let _ = writeln!(text, "watchdog: safe command latched at tick {tick}");
     }
 }
 
@@ -97,6 +149,17 @@ fn books(summary: &Summary, text: &mut String) {
         summary.score.scored_ticks,
         summary.score.scored_ticks + summary.score.unscored_ticks,
     );
+    if books.injected_faults + books.rejected_samples > 0 {
+        let _ = writeln!(
+            text,
+            "scripted faults: acted {} times; {} samples rejected",
+            books.injected_faults, books.rejected_samples
+        );
+    }
+    for link in books.links.iter().filter(|link| link.rejected + link.stale + link.void[1] > 0) {
+        let LinkBook { service, reader, rejected, stale, void, .. } = link;
+        let _ = writeln!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void[1]);
+    }
     for problem in &books.problems {
         let _ = writeln!(text, "  {problem}");
     }

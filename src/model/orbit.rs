@@ -133,6 +133,11 @@ impl CentralField {
         self.mu
     }
 
+    /// The radius of the central body, du.
+    pub fn inner(&self) -> f64 {
+        self.inner
+    }
+
     /// Whether a distance from the centre is one at which a body can be, du.
     pub fn holds(&self, r: f64) -> bool {
         r > self.inner && r < self.outer

@@ -10,8 +10,9 @@ pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use rigid_body::RigidBodyRig;
 
 use crate::config::{Checks, ConfigError, Document, finite_positive, nearest};
+use crate::control::Watched;
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
-use crate::role::{Body, Estimator, Law};
+use crate::role::{Body, Estimator, Guard, Law};
 use nalgebra::SVector;
 use serde::Serialize;
 
@@ -41,6 +42,14 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type Estimator: Estimator<Measurement = Measurement<Self>>;
     /// What drives a driven body.
     type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>>;
+    /// What keeps measurements that cannot be from observer and law.
+    type MeasurementGuard: Guard<Measurement<Self>>;
+    /// What keeps estimates that cannot be from the law.
+    type EstimateGuard: Guard<Estimate<Self>>;
+    /// What keeps commands that cannot be from the actuators.
+    type CommandGuard: Guard<Command<Self>>;
+    /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
+    const AXES: usize;
 
     /// The bodies; the first is the observed one.
     fn bodies(&self) -> &[BodyInfo];
@@ -50,6 +59,22 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn estimator(&self) -> Self::Estimator;
     /// The law of a driven body.
     fn law(&self, index: usize) -> Self::Law;
+    /// A guard for a body's measurements at a new reader, which `acts` on them or only observes.
+    fn measurement_guard(&self, index: usize, acts: bool) -> Self::MeasurementGuard;
+    /// A guard for estimates at a new reader.
+    fn estimate_guard(&self) -> Self::EstimateGuard;
+    /// A guard for a body's commands.
+    fn command_guard(&self, index: usize) -> Self::CommandGuard;
+    /// The physical bounds that the guards work with.
+    fn limits(&self) -> Vec<Figure>;
+    /// Energy and angular momentum of the observed body as estimated, in any unit, if they are to stay constant.
+    fn invariants(&self, estimate: &Estimate<Self>) -> Option<[f64; 2]>;
+    /// The observer's innovation.
+    fn innovation(_estimate: &Estimate<Self>) -> f64 {
+        0.0
+    }
+    /// Why a quantity cannot be watched in this scenario, if so.
+    fn unwatched(&self, watched: Watched) -> Option<&'static str>;
     /// What a run is scored by; the unit is the last part of each name.
     fn metrics(&self) -> &'static [&'static str];
     /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample, +inf once a body is
@@ -157,6 +182,16 @@ impl AnyRig {
         with_rig!(self, rig => rig.certificates())
     }
 
+    /// The physical bounds that the guards work with.
+    pub fn limits(&self) -> Vec<Figure> {
+        with_rig!(self, rig => rig.limits())
+    }
+
+    /// Why a quantity cannot be watched in this scenario, if so.
+    pub fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        with_rig!(self, rig => rig.unwatched(watched))
+    }
+
     /// What a reader of the results must know of the scenario.
     pub fn notes(&self) -> Vec<String> {
         with_rig!(self, rig => rig.notes())
@@ -196,6 +231,8 @@ enum FilterDesign<const N: usize> {
 const DAMPING: f64 = core::f64::consts::FRAC_1_SQRT_2;
 /// The standard deviation of a guess of which nothing is known, in the unit of the unknown.
 const UNKNOWN_DEVIATION: f64 = 10.0;
+/// Of white noise, so many standard deviations never occur: once in 10¹⁸ samples.
+const SURE_DEVIATIONS: f64 = 9.0;
 
 impl<const N: usize> FilterDesign<N> {
     /// Checks the three keys of which one must be given.

@@ -4,19 +4,22 @@
 //! leader, and followers are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
 //! `resolve`, the mathematics in `model`, `observe` and `control`.
 
+mod limits;
 mod resolve;
 mod roles;
 
+pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub(super) use resolve::{hold, rendezvous};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
 use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig};
-use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold};
+use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold, Watched};
 use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
 use crate::sample::{OrbitEstimate, OrbitTruth, status};
+use limits::Limits;
 use nalgebra::Vector2;
-use roles::Aim;
+use roles::{Aim, POSITION, VELOCITY};
 
 /// Bodies in a central field, the observer of the first one's velocity, and the law of the driven ones.
 #[derive(Debug, Clone)]
@@ -30,6 +33,7 @@ pub struct OrbitRig {
     gains: OrbitGains,
     law: OrbitHold,
     aim: Aim,
+    limits: Limits,
     tick_s: f64,
 }
 
@@ -38,6 +42,7 @@ pub struct OrbitRig {
 struct Sensors {
     noise: Noise<4>,
     deviation: [f64; 4],
+    bias: [f64; 4],
 }
 
 impl OrbitRig {
@@ -137,6 +142,10 @@ impl Rig for OrbitRig {
     type Body = OrbitPlant;
     type Estimator = OrbitObserver;
     type Law = OrbitLaw;
+    type MeasurementGuard = MeasurementGuard;
+    type EstimateGuard = EstimateGuard;
+    type CommandGuard = CommandGuard;
+    const AXES: usize = 4;
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies
@@ -151,7 +160,47 @@ impl Rig for OrbitRig {
     fn estimator(&self) -> OrbitObserver {
         let [r, theta, ..] = self.sensors[0].deviation;
         let relation = OrbitVelocity::new(self.field.mu()).with_variance(r * r, theta * theta);
-        OrbitObserver::new(relation, self.filter, self.initial_guess)
+        OrbitObserver::new(relation, self.field, self.filter, self.initial_guess)
+    }
+
+    /// A law acts on the position, and on the velocity where it takes that from the body's own sensors; an observer says
+    /// itself what it needs.
+    fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
+        let Sensors { deviation, bias, .. } = self.sensors[index];
+        let own_velocity = !matches!(self.aim, Aim::Circle { full_state: false, .. });
+        let needed = if own_velocity { POSITION | VELOCITY } else { POSITION };
+        self.limits.measurement(deviation, bias, if acts { needed } else { 0 })
+    }
+
+    fn estimate_guard(&self) -> EstimateGuard {
+        let Sensors { deviation, bias, .. } = self.sensors[0];
+        self.limits.estimate(deviation, bias)
+    }
+
+    fn command_guard(&self, _index: usize) -> CommandGuard {
+        self.limits.command()
+    }
+
+    fn limits(&self) -> Vec<Figure> {
+        self.limits.figures()
+    }
+
+    /// \[orbital energy per mass, du²/s²; angular momentum per mass, du²/s\] of a free leader.
+    fn invariants(&self, estimate: &OrbitEstimate) -> Option<[f64; 2]> {
+        let [vr, vtheta] = estimate.velocity_du_s;
+        let state = OrbitState { r: estimate.radius_du, vr, theta: estimate.angle_rad, vtheta };
+        (!self.bodies[0].driven).then(|| [self.field.energy(&state), state.momentum()])
+    }
+
+    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        match watched {
+            Watched::Energy | Watched::Momentum if self.bodies[0].driven => {
+                Some("is not constant: thrust changes the energy and the momentum of the observed body")
+            }
+            Watched::Energy | Watched::Momentum => None,
+            Watched::Innovation => Some("is not published by the observer of this rig"),
+            Watched::Lyapunov => Some("is not published by the controller of this rig"),
+        }
     }
 
     fn law(&self, _index: usize) -> OrbitLaw {

@@ -4,9 +4,11 @@
 //! in lockstep and in real time; that is why all three give the same bits.
 
 mod controller;
+mod guard;
 mod observer;
 mod plant;
 
 pub use controller::{Controller, Law};
+pub use guard::{Bounds, Guard, Plausible, Unguarded};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm};

@@ -1,8 +1,9 @@
 //! The observer: measurements in, estimates out, one per measurement; a missed tick is only a longer step.
 //!
-//! Must not see the truth, and must not let a measurement that is not finite or lacks a component reach its filter.
+//! Must not see the truth, and must not let a measurement that is not finite, lacks a component or is not believed reach its
+//! filter: the estimate goes on by the model then.
 
-use crate::sample::Sample;
+use crate::sample::{Sample, Stamp, status};
 
 /// The estimator of one rig.
 pub trait Estimator {
@@ -17,6 +18,9 @@ pub trait Estimator {
     fn start(&mut self, measurement: &Self::Measurement);
     /// Learns from a measurement `dt_s` seconds after the last one learned from. `dt_s` is positive.
     fn update(&mut self, measurement: &Self::Measurement, dt_s: f64);
+    /// Goes on by the model alone for `dt_s` seconds, or stays where there is none. The next update is still one from the
+    /// last measurement learned from.
+    fn coast(&mut self, dt_s: f64);
     /// Writes the estimate, with the given further status bits, everything but the stamp.
     fn write(&self, status: u64, out: &mut Self::Estimate);
 }
@@ -26,28 +30,44 @@ pub trait Estimator {
 pub struct Observer<E> {
     estimator: E,
     tick_s: f64,
-    /// Tick and generation of the last measurement learned from.
-    last: Option<(u64, u64)>,
+    /// The tick of the last measurement learned from.
+    last: Option<u64>,
+    /// The tick of the last estimate.
+    said: u64,
 }
 
 impl<E: Estimator> Observer<E> {
     /// An observer at its initial guess. `tick_s` is the period h in seconds.
     pub fn new(estimator: E, tick_s: f64) -> Self {
-        Self { estimator, tick_s, last: None }
+        Self { estimator, tick_s, last: None, said: 0 }
     }
 
     /// Turns measurement k into estimate k. The caller fills the stamp's `generation` and `sent_ns`.
     ///
-    /// The first measurement, and the first of a restarted sender, yields the initial guess.
+    /// The first measurement yields the initial guess. A sender that was started anew speaks of the same body, which has
+    /// moved on: its first measurement is only a longer step.
     #[inline]
     pub fn step(&mut self, measurement: &E::Measurement, out: &mut E::Estimate) {
-        let stamp = measurement.stamp();
         let status = if self.estimator.usable(measurement) {
             self.learn(measurement);
             0
         } else {
-            crate::sample::status::UNUSABLE
+            self.coast(measurement.stamp().tick);
+            status::UNUSABLE
         };
+        self.write(measurement.stamp(), status, out);
+    }
+
+    /// Makes estimate k without measurement k, which was there under this stamp and is not believed.
+    #[inline]
+    pub fn reject(&mut self, stamp: &Stamp, out: &mut E::Estimate) {
+        self.coast(stamp.tick);
+        self.write(stamp, status::UNUSABLE | status::REJECTED, out);
+    }
+
+    #[inline]
+    fn write(&mut self, stamp: &Stamp, status: u64, out: &mut E::Estimate) {
+        self.said = stamp.tick;
         self.estimator.write(status, out);
         let out = out.stamp_mut();
         out.tick = stamp.tick;
@@ -56,15 +76,19 @@ impl<E: Estimator> Observer<E> {
 
     #[inline]
     fn learn(&mut self, measurement: &E::Measurement) {
-        let stamp = measurement.stamp();
+        let tick = measurement.stamp().tick;
         match self.last {
-            Some((tick, generation)) if generation == stamp.generation && tick < stamp.tick => {
-                self.estimator.update(measurement, (stamp.tick - tick) as f64 * self.tick_s);
-            }
+            Some(last) if last < tick => self.estimator.update(measurement, (tick - last) as f64 * self.tick_s),
             // The same tick again teaches nothing; an older one cannot come on an ordered link.
-            Some((_, generation)) if generation == stamp.generation => return,
-            _ => self.estimator.start(measurement),
+            Some(_) => return,
+            None => self.estimator.start(measurement),
         }
-        self.last = Some((stamp.tick, stamp.generation));
+        self.last = Some(tick);
+    }
+
+    fn coast(&mut self, tick: u64) {
+        if self.last.is_some() && tick > self.said {
+            self.estimator.coast((tick - self.said) as f64 * self.tick_s);
+        }
     }
 }

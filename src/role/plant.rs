@@ -52,6 +52,7 @@ pub struct Actuation {
 
 /// What became of the command due at a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serial", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandEvent {
     /// None was due: the body is free or the tick is the first.
     NotDue,
@@ -82,12 +83,14 @@ pub struct Plant<B> {
     tick_s: f64,
     silent_ticks: u64,
     safe: bool,
+    /// Whether the command of this tick was there and was not believed.
+    rejected: bool,
 }
 
 impl<B: Body> Plant<B> {
     /// A plant at its initial state. `tick_s` is the period h in seconds.
     pub fn new(body: B, actuation: Actuation, tick_s: f64) -> Self {
-        Self { body, actuation, tick_s, silent_ticks: 0, safe: false }
+        Self { body, actuation, tick_s, silent_ticks: 0, safe: false, rejected: false }
     }
 
     /// Whether the plant takes commands.
@@ -101,6 +104,7 @@ impl<B: Body> Plant<B> {
         if !self.actuation.driven || tick == 0 {
             return CommandEvent::NotDue;
         }
+        self.rejected = false;
         let latched = self.safe && self.actuation.rearm == Rearm::Manual;
         match command.filter(|command| command.stamp().tick == tick - 1) {
             Some(_) if latched => CommandEvent::Refused,
@@ -113,13 +117,31 @@ impl<B: Body> Plant<B> {
         }
     }
 
+    /// The command due at tick `tick` was there and is not believed: as if it were not.
+    #[inline]
+    pub fn reject(&mut self, tick: u64) -> CommandEvent {
+        let event = self.command(tick, None);
+        self.rejected = event.missed();
+        event
+    }
+
+    /// How many more ticks without a command until the safe command takes over; 0 if it acts.
+    pub fn ticks_until_safe(&self) -> u64 {
+        if self.safe { 0 } else { self.actuation.timeout_ticks.saturating_sub(self.silent_ticks).max(1) }
+    }
+
+    /// Goes to the safe command at once, as if commands had been missing for long enough.
+    pub fn expire(&mut self) {
+        self.safe = true;
+        self.body.apply_safe();
+    }
+
     fn silence(&mut self) -> CommandEvent {
         self.silent_ticks += 1;
         if self.safe {
             CommandEvent::Safe
         } else if self.silent_ticks >= self.actuation.timeout_ticks {
-            self.safe = true;
-            self.body.apply_safe();
+            self.expire();
             CommandEvent::Expired
         } else {
             CommandEvent::Held
@@ -159,10 +181,12 @@ impl<B: Body> Plant<B> {
     }
 
     fn status(&self) -> u64 {
-        match (self.safe, self.silent_ticks > 0) {
-            (true, _) => status::SAFE,
-            (false, true) => status::HOLDING,
-            (false, false) => 0,
-        }
+        let rejected = if self.rejected { status::REJECTED } else { 0 };
+        rejected
+            | match (self.safe, self.silent_ticks > 0) {
+                (true, _) => status::SAFE,
+                (false, true) => status::HOLDING,
+                (false, false) => 0,
+            }
     }
 }

@@ -1,10 +1,15 @@
-//! The two ends of a link with their books: what was sent, received, lost, and its hash.
+//! The two ends of a link with their books: what was sent, received, lost, not believed, and its hash.
 //!
-//! Samples of generation 0 are warm-up: they pass through the link and go no further.
+//! Samples of generation 0 are warm-up: they pass through the link and go no further. A void stands for a sample that does
+//! not exist, where everybody waits for inputs. Must not let a sample that its guard does not believe be seen.
 
+use super::disturb::Disturbance;
 use super::hooks::{self, Place};
 use crate::bus::{Bus, BusError, Read, Reader, Topic, Write};
-use crate::sample::{Sample, Stamp};
+use crate::clock::{Grid, monotonic_ns};
+use crate::fault::Transport;
+use crate::role::{Guard, Unguarded};
+use crate::sample::{Sample, Stamp, VOID};
 use crate::telemetry::{Ledger, ReadBook, WriteBook};
 
 /// The writing end of a signal.
@@ -13,6 +18,11 @@ pub struct Output<B: Bus, S: Sample> {
     generation: u64,
     /// The last sample sent, until [`settle`](Self::settle) has taken it in.
     sent: S,
+    /// Whether it went out as the one of its tick.
+    delivered: bool,
+    /// Whether a void takes the place of a sample that does not go out.
+    voids: bool,
+    disturbance: Option<Box<Disturbance<S>>>,
     book: WriteBook,
 }
 
@@ -23,7 +33,18 @@ impl<B: Bus, S: Sample> Output<B, S> {
     /// [`BusError::Open`].
     pub fn open(bus: &B, topic: &Topic, generation: u64, ledger: &Ledger, last_tick: u64) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
-        Ok(Self { port: bus.writer(topic)?, generation, sent: S::default(), book })
+        let port = bus.writer(topic)?;
+        Ok(Self { port, generation, sent: S::default(), delivered: true, voids: false, disturbance: None, book })
+    }
+
+    /// With voids in the place of samples that do not go out, for readers that wait for every tick.
+    pub fn with_voids(self, voids: bool) -> Self {
+        Self { voids, ..self }
+    }
+
+    /// With scripted faults.
+    pub fn disturbed(self, disturbance: Option<Box<Disturbance<S>>>) -> Self {
+        Self { disturbance, ..self }
     }
 
     /// Fills and sends one sample. `fill` writes everything but the generation.
@@ -32,6 +53,12 @@ impl<B: Bus, S: Sample> Output<B, S> {
     /// [`BusError::Send`].
     #[inline]
     pub fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        if self.disturbance.is_some() {
+            let mut sample = S::default();
+            fill(&mut sample);
+            sample.stamp_mut().generation = self.generation;
+            return self.send_disturbed(sample);
+        }
         let (generation, sent) = (self.generation, &mut self.sent);
         self.port.send(|sample| {
             fill(sample);
@@ -43,13 +70,85 @@ impl<B: Bus, S: Sample> Output<B, S> {
         Ok(())
     }
 
+    /// Sends a sample as the scripted faults have it.
+    #[cold]
+    fn send_disturbed(&mut self, mut sample: S) -> Result<(), BusError> {
+        let Some(disturbance) = &mut self.disturbance else { return Ok(()) };
+        let stamp = *sample.stamp();
+        let (mut injected, way) =
+            (disturbance.tamper(stamp.tick, &mut sample, &self.sent), disturbance.way(stamp.tick));
+        injected |= way.is_some();
+        while let Some(late) = disturbance.due(stamp.tick) {
+            self.port.send(|slot| *slot = late)?;
+            self.book.extra();
+        }
+        // A sample with a broken stamp goes out as it is, but not as the one of its tick.
+        let own = (sample.stamp().tick, sample.stamp().generation) == (stamp.tick, stamp.generation);
+        self.delivered = own && !matches!(way, Some(Transport::Drop | Transport::Delay { .. }));
+        let copies = match way {
+            Some(Transport::Drop) => 0,
+            Some(Transport::Delay { ticks }) => {
+                disturbance.keep(stamp.tick + ticks, sample);
+                0
+            }
+            Some(Transport::Duplicate) => 2,
+            None => 1,
+        };
+        for _ in 0..copies {
+            self.port.send(|slot| {
+                *slot = sample;
+                hooks::at(Place::Loaned);
+            })?;
+        }
+        (self.delivered as u64..copies).for_each(|_| self.book.extra());
+        if injected {
+            self.book.injected();
+        }
+        self.sent = sample;
+        *self.sent.stamp_mut() = stamp;
+        if !self.delivered {
+            self.send_void(&stamp)?;
+        }
+        hooks::at(Place::Sent);
+        Ok(())
+    }
+
+    /// Says that there is no sample for this tick, where readers wait for one. Without its having been made, if it never
+    /// was: an input was missing.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn pass_over(&mut self, tick: u64) -> Result<(), BusError> {
+        if self.voids {
+            self.send_void(&Stamp { tick, generation: self.generation, ..Stamp::default() })?;
+            self.book.enter_void(tick, true);
+            self.port.prepare()?;
+        }
+        Ok(())
+    }
+
+    fn send_void(&mut self, stamp: &Stamp) -> Result<(), BusError> {
+        if !self.voids {
+            return Ok(());
+        }
+        self.port.send(|slot| {
+            *slot = S::default();
+            *slot.stamp_mut() = Stamp { generation: stamp.generation | VOID, ..*stamp };
+        })
+    }
+
     /// Does what a sent sample leaves to be done: books, hash, memory for the next. Off the critical path.
     ///
     /// # Errors
     /// [`BusError::Send`].
     #[inline]
     pub fn settle(&mut self) -> Result<(), BusError> {
-        self.book.enter(&self.sent);
+        if self.delivered {
+            self.book.enter(&self.sent);
+        } else {
+            self.book.withheld();
+            self.book.enter_void(self.sent.stamp().tick, self.voids);
+        }
         self.port.prepare()
     }
 
@@ -76,9 +175,9 @@ impl<B: Bus, S: Sample> Output<B, S> {
         &self.sent
     }
 
-    /// How many samples were sent, also by predecessors.
-    pub fn published(&self) -> u64 {
-        self.book.published()
+    /// How many samples were made, sent or withheld, also by predecessors.
+    pub fn made(&self) -> u64 {
+        self.book.made()
     }
 }
 
@@ -89,17 +188,45 @@ pub enum Seek {
     Found,
     /// Nothing so new has arrived.
     NotYet,
-    /// A later sample is at hand: that tick's will never come.
+    /// Something later has arrived, or a void: that tick's will never come.
     Passed,
+    /// That tick's has arrived and is not believed.
+    Rejected,
+}
+
+/// Which ticks a sample can have.
+#[derive(Debug, Clone, Copy)]
+pub enum Horizon {
+    /// Any.
+    Unknown,
+    /// The next only: nothing is lost on this link.
+    Next,
+    /// Those that are due.
+    Due(Grid),
+}
+
+/// What has become of the newest sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Newest {
+    /// It is at hand.
+    AtHand,
+    /// It was of the tick that was due, and is not believed.
+    Rejected,
+    /// There is none, or it was a void, or it was displaced by one of no use.
+    None,
 }
 
 /// The reading end of a signal.
-pub struct Input<B: Bus, S: Sample> {
+pub struct Input<B: Bus, S: Sample, G = Unguarded> {
     port: B::Reader<S>,
-    /// Tick and generation of the last real sample.
+    guard: G,
+    horizon: Horizon,
+    /// Tick and generation of the newest tick that something is known of.
     last: Option<(u64, u64)>,
-    /// Whether that sample is still at hand: whatever arrives after it displaces it, usable or not.
-    at_hand: bool,
+    /// Whatever arrives displaces what was at hand, usable or not.
+    newest: Newest,
+    /// The generation of a sample that was taken for a predecessor's: if the next says the same, it is to be believed.
+    doubted: Option<u64>,
     book: ReadBook,
 }
 
@@ -110,7 +237,15 @@ impl<B: Bus, S: Sample> Input<B, S> {
     /// [`BusError::Open`].
     pub fn open(bus: &B, topic: &Topic, reader: Reader, ledger: &Ledger) -> Result<Self, BusError> {
         let book = ReadBook::open(ledger);
-        Ok(Self { port: bus.reader(topic, reader)?, last: None, at_hand: false, book })
+        Ok(Self {
+            port: bus.reader(topic, reader)?,
+            guard: Unguarded,
+            horizon: Horizon::Unknown,
+            last: None,
+            newest: Newest::None,
+            doubted: None,
+            book,
+        })
     }
 
     /// Opens a signal for a reader whose books nobody asks for.
@@ -121,6 +256,19 @@ impl<B: Bus, S: Sample> Input<B, S> {
         Self::open(bus, topic, reader, &Ledger::private(ReadBook::WORDS))
     }
 
+    /// The same with a guard.
+    pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
+        let Self { port, horizon, last, newest, doubted, book, .. } = self;
+        Input { port, guard, horizon, last, newest, doubted, book }
+    }
+}
+
+impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
+    /// Says which ticks samples can have from now on.
+    pub fn expect(&mut self, horizon: Horizon) {
+        self.horizon = horizon;
+    }
+
     /// Moves on to the sample of `tick`, or as far as there are older ones.
     ///
     /// # Errors
@@ -128,12 +276,13 @@ impl<B: Bus, S: Sample> Input<B, S> {
     #[inline]
     pub fn seek(&mut self, tick: u64) -> Result<Seek, BusError> {
         loop {
-            match self.last {
-                Some((last, _)) if last == tick && self.at_hand => return Ok(Seek::Found),
-                Some((last, _)) if last >= tick => return Ok(Seek::Passed),
+            match (self.last, self.newest) {
+                (Some((last, _)), Newest::AtHand) if last == tick => return Ok(Seek::Found),
+                (Some((last, _)), Newest::Rejected) if last == tick => return Ok(Seek::Rejected),
+                (Some((last, _)), _) if last >= tick => return Ok(Seek::Passed),
                 _ => {}
             }
-            if !self.advance()? {
+            if !self.take()? {
                 return Ok(Seek::NotYet);
             }
         }
@@ -145,45 +294,94 @@ impl<B: Bus, S: Sample> Input<B, S> {
     /// [`BusError::Receive`].
     #[inline]
     pub fn advance(&mut self) -> Result<bool, BusError> {
-        while self.port.advance()? {
-            let Some(stamp) = self.port.current().map(|sample| *sample.stamp()) else { return Ok(false) };
-            self.at_hand = stamp.generation != 0 && self.account(&stamp);
-            if self.at_hand {
+        while self.take()? {
+            if self.newest == Newest::AtHand {
                 return Ok(true);
             }
         }
         Ok(false)
     }
 
-    /// Enters a sample into the books; false if it is not newer than the one before.
+    /// Takes one sample off the link, whatever it is worth; false if there is none.
+    #[inline]
+    fn take(&mut self) -> Result<bool, BusError> {
+        if !self.port.advance()? {
+            return Ok(false);
+        }
+        let stamp = self.port.current().map(|sample| *sample.stamp());
+        self.newest = stamp.map_or(Newest::None, |stamp| self.account(&stamp));
+        Ok(true)
+    }
+
+    /// Enters a sample into the books.
     ///
     /// Ticks rise also from one generation of the sender to the next: a successor goes on with the grid. It may repeat the
     /// tick in which its predecessor died.
     #[inline]
-    fn account(&mut self, stamp: &Stamp) -> bool {
-        match self.last {
-            Some((tick, generation)) if stamp.tick <= tick => {
-                if generation == stamp.generation {
-                    self.book.stale();
-                }
-                return false;
+    fn account(&mut self, stamp: &Stamp) -> Newest {
+        let generation = stamp.generation & !VOID;
+        let (newest_tick, known) = match self.last {
+            Some((tick, known)) => (Some(tick), known),
+            // Warm-up.
+            None if generation == 0 => return Newest::None,
+            None => (None, 0),
+        };
+        if newest_tick.is_some_and(|tick| stamp.tick <= tick) {
+            if generation == known {
+                self.book.stale();
             }
-            _ => {}
+            return Newest::None;
         }
-        self.book.received(stamp.tick);
-        self.last = Some((stamp.tick, stamp.generation));
-        true
+        if !self.possible(stamp.tick) {
+            self.book.stray();
+            return Newest::None;
+        }
+        if generation < known && self.doubted.replace(generation) != Some(generation) {
+            self.last = Some((stamp.tick, known));
+            self.book.rejected(stamp.tick);
+            return Newest::Rejected;
+        }
+        self.doubted = None;
+        self.last = Some((stamp.tick, generation));
+        if stamp.generation & VOID != 0 {
+            self.book.void(stamp.tick);
+            return Newest::None;
+        }
+        if self.port.current().is_some_and(|sample| self.guard.accepts(sample)) {
+            self.book.received(stamp.tick);
+            return Newest::AtHand;
+        }
+        self.book.rejected(stamp.tick);
+        Newest::Rejected
     }
 
-    /// The tick of the last real sample.
+    /// Whether a sample can be of this tick, which is newer than the newest.
+    #[inline]
+    fn possible(&self, tick: u64) -> bool {
+        tick <= self.book.covered()
+            || match self.horizon {
+                Horizon::Unknown => true,
+                Horizon::Next => false,
+                Horizon::Due(grid) => tick <= grid.tick_at(monotonic_ns()),
+            }
+    }
+
+    /// The newest tick of which something is known: there was a sample, believed or not, or a void.
+    #[inline]
     pub fn last_tick(&self) -> Option<u64> {
         self.last.map(|(tick, _)| tick)
     }
 
-    /// The sample at hand, if it is a real one.
+    /// The sample at hand, if there is one that can be used.
     #[inline]
     pub fn sample(&self) -> Option<&S> {
-        self.port.current().filter(|_| self.at_hand)
+        self.port.current().filter(|_| self.newest == Newest::AtHand)
+    }
+
+    /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
+    #[inline]
+    pub fn rejected(&self) -> Option<&Stamp> {
+        self.port.current().filter(|_| self.newest == Newest::Rejected).map(Sample::stamp)
     }
 
     /// Takes what waits and forgets it, to exercise the link. Before the first tick only.

@@ -3,20 +3,27 @@
 //! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
+mod bridge;
+mod disturb;
 mod drive;
 mod hooks;
+mod line;
 mod link;
 mod node;
 mod privileges;
 mod process;
 mod seat;
 
+pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
+pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
-pub use link::{Input, Output, Seek};
+pub use line::{Line, LineError};
+pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
-    Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic, visit_writes,
+    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic,
+    visit_writes,
 };
-pub(crate) use node::{next_tick, shared_memory_bytes};
+pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::hold_low_latency_idle;
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};
@@ -34,10 +41,11 @@ pub fn depths(scenario: &Scenario) -> Depths {
     let quarter_second = (250_000_000 / scenario.period_ns).next_power_of_two() as usize;
     match scenario.clock {
         ClockKind::Realtime => Depths { role: 1, scorer: quarter_second.clamp(64, 8192), history: 0 },
-        // Nobody is more than the window ahead of anybody: twice that never overflows.
+        // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever
+        // scripted faults add.
         ClockKind::Lockstep | ClockKind::InProcess => {
-            let twice = 2 * WINDOW_TICKS as usize;
-            Depths { role: twice, scorer: twice, history: twice }
+            let deep = (2 + disturb::extra_samples(scenario)) * WINDOW_TICKS as usize;
+            Depths { role: deep, scorer: deep, history: deep }
         }
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! Must not wait, and must not decide when it runs; a driver does.
 
+mod bridge;
 mod controller;
 mod observer;
 mod plant;
@@ -9,14 +10,18 @@ mod ports;
 
 pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
-use super::link::{Input, Output};
+use super::bridge::DeviceLink;
+use super::disturb::{Disturbance, Interruptions};
+use super::link::{Horizon, Input, Output};
 use crate::bus::iox::footprint;
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
 use crate::rig::{Rig, Truth};
+use crate::role::Guard;
 use crate::sample::Sample;
-use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WriteBook};
+use crate::serial::LineBook;
+use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
 use crate::with_rig;
 
 /// Which role of a scenario.
@@ -62,6 +67,30 @@ impl RoleId {
     }
 }
 
+/// Who takes a role's seat.
+pub enum Occupant {
+    /// This program.
+    Role(RoleId),
+    /// A device, as the driven body with this index.
+    Device(usize, Box<DeviceLink>),
+}
+
+impl Occupant {
+    /// The seat.
+    pub fn role(&self) -> RoleId {
+        match self {
+            Self::Role(role) => *role,
+            Self::Device(index, _) => RoleId::Plant(*index),
+        }
+    }
+}
+
+impl From<RoleId> for Occupant {
+    fn from(role: RoleId) -> Self {
+        Self::Role(role)
+    }
+}
+
 /// When a node may execute its next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Gate {
@@ -88,19 +117,24 @@ pub enum Gate {
 pub enum Poll {
     /// It did; [`Node::settle`] is due.
     Executed,
-    /// It waits for inputs.
+    /// It waits for inputs, or has passed over a tick of which there are none.
     Waiting,
+    /// It has given the tick up and counted it as missed.
+    Missed,
 }
 
 /// A role with its links and books.
 pub trait Node {
-    /// Whether the tick alone starts it, or its inputs do.
+    /// Whether the tick alone starts it, or its inputs do. What is started by its tick may still wait for something that
+    /// the tick sets off: then it is polled until that has arrived, or is overdue.
     fn time_triggered(&self) -> bool;
     /// The next tick to execute.
     fn next_tick(&self) -> u64;
     /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor left undone
     /// before that counts as missed.
     fn start(&mut self, grid: Grid, first_tick: u64);
+    /// Lets scripted interruptions of this role act: before every tick, once.
+    fn before_tick(&mut self);
     /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
     ///
     /// # Errors
@@ -127,6 +161,10 @@ pub trait Node {
     fn ticks(&self) -> Ticks;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
+    /// The books of its device's serial line, if it has one.
+    fn line(&self) -> Option<LineBook> {
+        None
+    }
 }
 
 /// A node that can be driven.
@@ -136,19 +174,42 @@ pub type ReadyNode = Box<dyn Node>;
 pub struct Seat<'a, B> {
     bus: &'a B,
     scenario: &'a Scenario,
+    role: RoleId,
     generation: u64,
     ledger: &'a Ledger,
     clock: Clock,
 }
 
 impl<B: Bus> Seat<'_, B> {
-    fn input<S: Sample>(&self, body: &str, signal: Signal) -> Result<Input<B, S>, BusError> {
-        Input::open(self.bus, &topic(self.scenario, body, signal), Reader::Role, self.ledger)
+    fn input<S: Sample, G: Guard<S>>(&self, body: &str, signal: Signal, guard: G) -> Result<Input<B, S, G>, BusError> {
+        let topic = topic(self.scenario, body, signal);
+        let mut input = Input::open(self.bus, &topic, Reader::Role, self.ledger)?.guarded(guard);
+        input.expect(horizon(self.scenario, None));
+        Ok(input)
     }
 
     fn output<S: Sample>(&self, body: &str, signal: Signal) -> Result<Output<B, S>, BusError> {
         let topic = topic(self.scenario, body, signal);
-        Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)
+        let output = Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)?;
+        // Nobody in the loop reads the truth, and the score is to tell what really happened.
+        let disturbance = match signal {
+            Signal::Truth => None,
+            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), body),
+        };
+        Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+    }
+
+    fn interruptions(&self) -> Interruptions {
+        Interruptions::of(self.scenario, self.role.name(self.scenario), self.generation)
+    }
+}
+
+/// Which ticks samples can have; in real time only once the grid is known.
+pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
+    match (scenario.clock, grid) {
+        (ClockKind::Realtime, None) => Horizon::Unknown,
+        (ClockKind::Realtime, Some(grid)) => Horizon::Due(grid),
+        (ClockKind::Lockstep | ClockKind::InProcess, _) => Horizon::Next,
     }
 }
 
@@ -160,7 +221,8 @@ pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
     let ports = ports(scenario, role);
     let state = match role {
         RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
-        RoleId::Observer | RoleId::Controller => 0,
+        RoleId::Observer => 0,
+        RoleId::Controller => WatchBook::WORDS,
     };
     TickBook::WORDS
         + ports.writes.len() * WriteBook::words(scenario.last_tick)
@@ -176,12 +238,12 @@ pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
 /// An upper bound on the shared memory that a run takes, bytes.
 pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
     let depths = super::depths(scenario);
+    let port = |port: &Port| footprint(depths, port.topic.signal, port.size);
     let role = |role: RoleId| {
-        let writes = ports(scenario, role).writes;
-        let signals = writes.iter().map(|port| port.topic.signal).chain([Signal::Health]);
-        signals.map(|signal| footprint(depths, signal)).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
+        let Ports { writes, health, .. } = ports(scenario, role);
+        writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
     };
-    footprint(depths, Signal::Schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    port(&ports(scenario, RoleId::Observer).schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.
@@ -199,6 +261,7 @@ pub fn report(
 ) -> RoleReport {
     let ports = ports(scenario, role);
     let ledger = ledger.reopened();
+    let watches = role == RoleId::Controller;
     RoleReport {
         role: role.name(scenario).to_owned(),
         ticks: TickBook::open(&ledger).report(),
@@ -208,8 +271,10 @@ pub fn report(
             .map(|port| WriteBook::open(&ledger, scenario.last_tick).report(&port.topic.to_string()))
             .collect(),
         read: ports.reads.iter().map(|port| ReadBook::open(&ledger).report(&port.topic.to_string())).collect(),
+        watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
         stages,
         grants,
+        line: None,
     }
 }
 
@@ -225,18 +290,20 @@ pub fn topic(scenario: &Scenario, body: &str, signal: Signal) -> Topic {
 pub fn build<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Scenario,
-    role: RoleId,
+    occupant: impl Into<Occupant>,
     bus: &B,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
     let generation = ledger.enter();
     let ledger = &ledger.reopened();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let seat = Seat { bus, scenario, generation, ledger, clock };
-    Ok(match role {
-        RoleId::Plant(index) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
+    let occupant = occupant.into();
+    let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
+    Ok(match occupant {
+        Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
+        Occupant::Role(RoleId::Plant(index)) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
+        Occupant::Role(RoleId::Observer) => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
+        Occupant::Role(RoleId::Controller) => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
 }
 

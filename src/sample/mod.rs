@@ -40,6 +40,12 @@ impl Stamp {
     }
 }
 
+/// Set in a stamp's generation: of this tick there is no sample, and there will be none. A void.
+///
+/// Where everybody waits for inputs (lockstep, one thread), a sample that is missing would stop the loop; a void stands in
+/// its place. Readers count it and treat the tick as they treat a sample that was lost. Real time needs none.
+pub const VOID: u64 = 1 << 63;
+
 /// The type of one field's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FieldKind {
@@ -101,6 +107,34 @@ pub trait Sample: bytemuck::Pod + Default + PartialEq + core::fmt::Debug + Send 
     fn content(&self) -> &[u8] {
         &bytemuck::bytes_of(self)[size_of::<Stamp>()..]
     }
+
+    /// Takes over everything but the stamp from the bytes that [`content`](Self::content) gave elsewhere; false, and
+    /// nothing changed, if they are not as many.
+    fn set_content(&mut self, content: &[u8]) -> bool {
+        let own = &mut bytemuck::bytes_of_mut(self)[size_of::<Stamp>()..];
+        let fits = own.len() == content.len();
+        if fits {
+            own.copy_from_slice(content);
+        }
+        fits
+    }
+}
+
+/// Bytes of a sample's content.
+pub const fn content_length<S: Sample>() -> usize {
+    size_of::<S>() - size_of::<Stamp>()
+}
+
+/// Copies every field of `from` into the field of the same name and kind in `to`, if there is one; the stamps stay.
+pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
+    let (source, target) = (bytemuck::bytes_of(from), bytemuck::bytes_of_mut(to));
+    for field in A::FIELDS {
+        let same = |other: &&Field| (other.name, other.kind, other.count) == (field.name, field.kind, field.count);
+        if let Some(other) = B::FIELDS.iter().find(same) {
+            let length = 8 * field.count;
+            target[other.offset..][..length].copy_from_slice(&source[field.offset..][..length]);
+        }
+    }
 }
 
 /// Defines a sample. `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8.
@@ -152,7 +186,8 @@ pub mod status {
     pub const INITIAL: u64 = 1 << 2;
     /// The motion did not reveal the unknown since the last sample: the estimate moved by the model alone.
     pub const UNOBSERVABLE: u64 = 1 << 3;
-    /// The measurement lacked a component that the observer needs, or was not finite: the estimate is the previous one.
+    /// The measurement lacked a component that the observer needs, or was not finite: the estimate went on by the model
+    /// alone, or is the previous one where the model is being learned.
     pub const UNUSABLE: u64 = 1 << 4;
     /// The observer learns the body's inertia from all components.
     pub const LEARNING: u64 = 1 << 5;
@@ -164,9 +199,12 @@ pub mod status {
     pub const NOT_EXCITED: u64 = 1 << 8;
     /// The body met an end of its model (it hit something, or left for good) and is frozen at its last good state.
     pub const FAULT: u64 = 1 << 9;
+    /// The input of this tick was there and was not believed: not finite, of a wrong life of its sender, or physically
+    /// impossible. It is treated as missing.
+    pub const REJECTED: u64 = 1 << 10;
 
     /// Every bit with its name.
-    pub const NAMES: [(&str, u64); 10] = [
+    pub const NAMES: [(&str, u64); 11] = [
         ("holding", HOLDING),
         ("safe", SAFE),
         ("initial", INITIAL),
@@ -177,6 +215,7 @@ pub mod status {
         ("degraded", DEGRADED),
         ("not_excited", NOT_EXCITED),
         ("fault", FAULT),
+        ("rejected", REJECTED),
     ];
 }
 
@@ -204,6 +243,41 @@ mod tests {
     fn every_status_bit_has_one_name() {
         for (index, (name, bit)) in status::NAMES.into_iter().enumerate() {
             assert_eq!(bit, 1 << index, "{name}");
+        }
+    }
+
+    #[test]
+    fn content_goes_from_sample_to_sample_whole_or_not_at_all() {
+        let sent = RateCommand { acceleration_rad_s2: [1.0, 2.0, 3.0], ..RateCommand::default() };
+        let mut received = RateCommand { stamp: Stamp { tick: 7, ..Stamp::default() }, ..RateCommand::default() };
+        assert!(!received.set_content(&sent.content()[1..]) && received.acceleration_rad_s2 == [0.0; 3]);
+        assert!(received.set_content(sent.content()));
+        assert_eq!((received.acceleration_rad_s2, received.stamp.tick), (sent.acceleration_rad_s2, 7));
+        assert_eq!(content_length::<RateCommand>(), sent.content().len());
+    }
+
+    /// What a device measures completely is its truth, in every rig: each field of the truth is one of the measurement.
+    #[test]
+    fn fields_of_one_name_are_copied() {
+        let measured = RateMeasurement {
+            omega_rad_s: [1.0, 2.0, 3.0],
+            applied_rad_s2: [4.0, 5.0, 6.0],
+            valid: 7,
+            status: 8,
+            ..RateMeasurement::default()
+        };
+        let mut truth = RateTruth::default();
+        copy_fields(&measured, &mut truth);
+        assert_eq!((truth.omega_rad_s, truth.applied_rad_s2, truth.status), ([1.0, 2.0, 3.0], [4.0, 5.0, 6.0], 8));
+        let measured = OrbitMeasurement { radius_du: 1.0, velocity_du_s: [2.0, 3.0], ..OrbitMeasurement::default() };
+        let mut truth = OrbitTruth::default();
+        copy_fields(&measured, &mut truth);
+        assert_eq!((truth.radius_du, truth.velocity_du_s), (1.0, [2.0, 3.0]));
+        let names = |fields: &[Field]| fields.iter().map(|field| field.name).collect::<Vec<_>>();
+        for (truth, measured) in
+            [(RateTruth::FIELDS, RateMeasurement::FIELDS), (OrbitTruth::FIELDS, OrbitMeasurement::FIELDS)]
+        {
+            assert!(names(truth).iter().all(|name| names(measured).contains(name)));
         }
     }
 

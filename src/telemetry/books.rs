@@ -3,7 +3,8 @@
 //! Must not decide what counts as what; nodes and links do.
 
 use super::ledger::{Ledger, Words};
-use super::{LinkRead, LinkWritten, StateHash, Ticks};
+use super::{LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
+use crate::control::{Breaches, WatchBounds, Watchdog, Watched};
 
 /// The books of a role's ticks.
 #[derive(Debug)]
@@ -13,7 +14,7 @@ pub struct TickBook {
 
 impl TickBook {
     /// Words of the ledger.
-    pub const WORDS: usize = 6;
+    pub const WORDS: usize = 7;
     const NEXT: usize = 0;
     const EXECUTED: usize = 1;
     const MISSED: usize = 2;
@@ -21,6 +22,7 @@ impl TickBook {
     const SAFE: usize = 4;
     /// The first disturbed tick + 1; 0 if there is none.
     const DISTURBED: usize = 5;
+    const STALLED: usize = 6;
 
     /// Opens the book, as it was left, to be read.
     pub fn open(ledger: &Ledger) -> Self {
@@ -75,6 +77,14 @@ impl TickBook {
         self.words.add(Self::SAFE, 1);
     }
 
+    /// Counts scripted stalls.
+    #[inline]
+    pub fn stalled(&mut self, stalls: u64) {
+        if stalls > 0 {
+            self.words.add(Self::STALLED, stalls);
+        }
+    }
+
     /// Notes a tick whose result may differ from an undisturbed run's.
     pub fn disturbed(&mut self, tick: u64) {
         if self.words.get(Self::DISTURBED) == 0 {
@@ -90,6 +100,7 @@ impl TickBook {
             missed: self.words.get(Self::MISSED),
             starved: self.words.get(Self::STARVED),
             safe: self.words.get(Self::SAFE),
+            stalled: self.words.get(Self::STALLED),
             first_disturbed: self.words.get(Self::DISTURBED).checked_sub(1),
         }
     }
@@ -107,39 +118,72 @@ impl WriteBook {
     const SKIPPED: usize = 1;
     /// The last tick + 1; 0 before the first.
     const COVERED: usize = 2;
+    const VOID: usize = 3;
+    const WITHHELD: usize = 4;
+    const EXTRA: usize = 5;
+    const INJECTED: usize = 6;
+    const COUNTERS: usize = 7;
 
     /// Words of the ledger for a run that ends with `last_tick`.
     pub fn words(last_tick: u64) -> usize {
-        3 + StateHash::words(last_tick)
+        Self::COUNTERS + StateHash::words(last_tick)
     }
 
     /// Opens the book, as it was left.
     pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
-        Self { words: ledger.take(3), hash: StateHash::open(ledger, last_tick) }
+        Self { words: ledger.take(Self::COUNTERS), hash: StateHash::open(ledger, last_tick) }
     }
 
     /// Enters a sample that was sent.
     #[inline]
     pub fn enter(&mut self, sample: &impl crate::sample::Sample) {
-        let tick = sample.stamp().tick;
-        let covered = self.words.get(Self::COVERED);
         self.hash.absorb(sample);
-        self.words.add(Self::SKIPPED, tick.saturating_sub(covered));
         self.words.add(Self::PUBLISHED, 1);
+        self.cover(sample.stamp().tick);
+    }
+
+    /// Enters a tick of which there is no sample: a void was sent in its place, or nothing was.
+    pub fn enter_void(&mut self, tick: u64, sent: bool) {
+        self.words.add(if sent { Self::VOID } else { Self::SKIPPED }, 1);
+        self.cover(tick);
+    }
+
+    #[inline]
+    fn cover(&mut self, tick: u64) {
+        let covered = self.words.get(Self::COVERED);
+        self.words.add(Self::SKIPPED, tick.saturating_sub(covered));
         self.words.set(Self::COVERED, covered.max(tick + 1));
     }
 
-    /// How many samples were sent.
-    pub fn published(&self) -> u64 {
-        self.words.get(Self::PUBLISHED)
+    /// Counts a sample that a scripted fault touched.
+    pub fn injected(&mut self) {
+        self.words.add(Self::INJECTED, 1);
+    }
+
+    /// Counts a sample that was made and did not go out as its tick's.
+    pub fn withheld(&mut self) {
+        self.words.add(Self::WITHHELD, 1);
+    }
+
+    /// Counts a sample beyond the one that its tick has: a second, a late or a broken one.
+    pub fn extra(&mut self) {
+        self.words.add(Self::EXTRA, 1);
+    }
+
+    /// How many samples were made, sent or withheld.
+    pub fn made(&self) -> u64 {
+        self.words.get(Self::PUBLISHED) + self.words.get(Self::WITHHELD)
     }
 
     /// The book's present state.
     pub fn report(&self, service: &str) -> LinkWritten {
         LinkWritten {
             service: service.to_owned(),
-            published: self.published(),
+            published: self.words.get(Self::PUBLISHED),
             skipped: self.words.get(Self::SKIPPED),
+            void: self.words.get(Self::VOID),
+            extra: self.words.get(Self::EXTRA),
+            injected: self.words.get(Self::INJECTED),
             last_tick: self.words.get(Self::COVERED).checked_sub(1),
             hash: Some(self.hash.checkpoints()),
         }
@@ -154,25 +198,56 @@ pub struct ReadBook {
 
 impl ReadBook {
     /// Words of the ledger.
-    pub const WORDS: usize = 4;
+    pub const WORDS: usize = 6;
     const RECEIVED: usize = 0;
     const GAPS: usize = 1;
     const STALE: usize = 2;
     /// The last tick + 1; 0 before the first.
     const COVERED: usize = 3;
+    const VOID: usize = 4;
+    const REJECTED: usize = 5;
 
     /// Opens the book, as it was left.
     pub fn open(ledger: &Ledger) -> Self {
         Self { words: ledger.take(Self::WORDS) }
     }
 
+    /// The tick after the last that the book has.
+    #[inline]
+    pub fn covered(&self) -> u64 {
+        self.words.get(Self::COVERED)
+    }
+
     /// Enters the sample of a tick; one that the book has already, because a predecessor received it, is not counted again.
     #[inline]
     pub fn received(&mut self, tick: u64) {
-        let covered = self.words.get(Self::COVERED);
+        self.enter(tick, Self::RECEIVED);
+    }
+
+    /// Enters a void in the place of a tick's sample.
+    pub fn void(&mut self, tick: u64) {
+        self.enter(tick, Self::VOID);
+    }
+
+    /// Enters the sample of a tick that was received and is not believed.
+    pub fn rejected(&mut self, tick: u64) {
+        if tick >= self.covered() {
+            self.stray();
+        }
+        self.received(tick);
+    }
+
+    /// Enters a sample that is not believed and may not even be of the tick that it names.
+    pub fn stray(&mut self) {
+        self.words.add(Self::REJECTED, 1);
+    }
+
+    #[inline]
+    fn enter(&mut self, tick: u64, counter: usize) {
+        let covered = self.covered();
         if tick >= covered {
             self.words.add(Self::GAPS, tick - covered);
-            self.words.add(Self::RECEIVED, 1);
+            self.words.add(counter, 1);
             self.words.set(Self::COVERED, tick + 1);
         }
     }
@@ -190,7 +265,74 @@ impl ReadBook {
             received: self.words.get(Self::RECEIVED),
             gaps: self.words.get(Self::GAPS),
             stale: self.words.get(Self::STALE),
+            void: self.words.get(Self::VOID),
+            rejected: self.words.get(Self::REJECTED),
             last_tick: self.words.get(Self::COVERED).checked_sub(1),
         }
+    }
+}
+
+/// The books of a watchdog: a latch must outlive whoever latched it.
+#[derive(Debug)]
+pub struct WatchBook {
+    words: Words,
+}
+
+impl WatchBook {
+    /// Words of the ledger.
+    pub const WORDS: usize = Self::EACH * Watched::ALL.len() + 1;
+    /// Judged, breaches, first tick + 1 (0: none), bits of the largest value.
+    const EACH: usize = 4;
+    /// The tick of the latch + 1; 0 if there is none.
+    const LATCHED: usize = Self::EACH * Watched::ALL.len();
+
+    /// Opens the book, as it was left.
+    pub fn open(ledger: &Ledger) -> Self {
+        Self { words: ledger.take(Self::WORDS) }
+    }
+
+    /// A watchdog that goes on from here.
+    pub fn watchdog(&self, bounds: WatchBounds) -> Watchdog {
+        Watchdog::resume(bounds, Watched::ALL.map(|watched| self.breaches(watched)), self.latched_at())
+    }
+
+    /// Enters what a watchdog has seen so far.
+    #[inline]
+    pub fn store(&self, watchdog: &Watchdog) {
+        for (watched, breaches) in Watched::ALL.into_iter().zip(watchdog.breaches()) {
+            let begin = Self::EACH * watched as usize;
+            self.words.set(begin, breaches.judged);
+            self.words.set(begin + 1, breaches.count);
+            self.words.set(begin + 2, breaches.first_tick.map_or(0, |tick| tick + 1));
+            self.words.set(begin + 3, breaches.largest.to_bits());
+        }
+        self.words.set(Self::LATCHED, watchdog.latched_at().map_or(0, |tick| tick + 1));
+    }
+
+    fn breaches(&self, watched: Watched) -> Breaches {
+        let word = |index| self.words.get(Self::EACH * watched as usize + index);
+        Breaches {
+            judged: word(0),
+            count: word(1),
+            first_tick: word(2).checked_sub(1),
+            largest: f64::from_bits(word(3)),
+        }
+    }
+
+    fn latched_at(&self) -> Option<u64> {
+        self.words.get(Self::LATCHED).checked_sub(1)
+    }
+
+    /// The book's present state; nothing where nothing is watched.
+    pub fn report(&self, bounds: &WatchBounds) -> Option<WatchReport> {
+        let one = |watched: Watched| {
+            let Breaches { judged, count, first_tick, largest } = self.breaches(watched);
+            let (quantity, max) = (watched.name().to_owned(), bounds.max[watched as usize]);
+            let largest = Some(largest).filter(|largest| largest.is_finite());
+            WatchedReport { quantity, max, judged, breaches: count, first_tick, largest }
+        };
+        let watched = |watched: &Watched| bounds.max[*watched as usize] < f64::INFINITY;
+        let reports: Vec<WatchedReport> = Watched::ALL.into_iter().filter(watched).map(one).collect();
+        (!reports.is_empty()).then(|| WatchReport { watched: reports, latched_at_tick: self.latched_at() })
     }
 }

@@ -1,6 +1,7 @@
 //! What a role says of its run when it ends: the books, the hash, the histograms, the privileges.
 
 use super::{Checkpoints, Latency};
+use crate::serial::LineBook;
 use serde::{Deserialize, Serialize};
 
 /// A role's account of itself.
@@ -14,12 +15,43 @@ pub struct RoleReport {
     pub written: Vec<LinkWritten>,
     /// What it read, by signal.
     pub read: Vec<LinkRead>,
+    /// What its watchdog saw, if it has one that watches anything.
+    #[serde(default)]
+    pub watchdog: Option<WatchReport>,
     /// Its latencies, by stage.
     #[serde(default)]
     pub stages: Vec<StageReport>,
     /// What it asked of the machine, and what it got.
     #[serde(default)]
     pub grants: Vec<Grant>,
+    /// The books of its device's serial line, if a device has the seat.
+    pub line: Option<LineBook>,
+}
+
+/// What a watchdog saw.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WatchReport {
+    /// One entry per quantity that is watched.
+    pub watched: Vec<WatchedReport>,
+    /// The tick at which the safe command was latched, if it was.
+    pub latched_at_tick: Option<u64>,
+}
+
+/// How one watched quantity fared.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WatchedReport {
+    /// `energy`, `momentum` (relative drifts), `innovation`, `lyapunov`.
+    pub quantity: String,
+    /// Its bound.
+    pub max: f64,
+    /// How often it was judged.
+    pub judged: u64,
+    /// How often it was beyond its bound.
+    pub breaches: u64,
+    /// The first tick at which it was.
+    pub first_tick: Option<u64>,
+    /// The largest value; null where that is infinite or no number.
+    pub largest: Option<f64>,
 }
 
 /// The books of a role's ticks: `elapsed` = `executed` + `missed`.
@@ -37,11 +69,14 @@ pub struct Ticks {
     /// Ticks at which a plant applied its safe command.
     #[serde(default)]
     pub safe: u64,
+    /// Scripted stalls.
+    #[serde(default)]
+    pub stalled: u64,
     /// The first tick whose result differs from an undisturbed run's, if any does.
     pub first_disturbed: Option<u64>,
 }
 
-/// The books of a signal's writing end: `published` + `skipped` = `last_tick` + 1.
+/// The books of a signal's writing end: `published` + `void` + `skipped` = `last_tick` + 1.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct LinkWritten {
     /// The service.
@@ -50,6 +85,15 @@ pub struct LinkWritten {
     pub published: u64,
     /// Ticks without a sample.
     pub skipped: u64,
+    /// Ticks without a sample for which a void was sent: in lockstep and in one thread.
+    #[serde(default)]
+    pub void: u64,
+    /// Samples sent beyond the one of each tick: second, late and broken ones, by scripted faults.
+    #[serde(default)]
+    pub extra: u64,
+    /// Samples that a scripted fault touched.
+    #[serde(default)]
+    pub injected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
     /// The hash of what was sent; a program that is not ours need not keep one.
@@ -57,7 +101,7 @@ pub struct LinkWritten {
     pub hash: Option<Checkpoints>,
 }
 
-/// The books of a signal's reading end: `received` + `gaps` = `last_tick` + 1.
+/// The books of a signal's reading end: `received` + `void` + `gaps` = `last_tick` + 1.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkRead {
     /// The service.
@@ -68,6 +112,12 @@ pub struct LinkRead {
     pub gaps: u64,
     /// Samples that were not newer than the one before.
     pub stale: u64,
+    /// Voids received in the place of samples.
+    #[serde(default)]
+    pub void: u64,
+    /// Samples that were received and not believed; they count as received where they were of the tick that was due.
+    #[serde(default)]
+    pub rejected: u64,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
 }
@@ -75,7 +125,7 @@ pub struct LinkRead {
 /// One stage's latencies.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct StageReport {
-    /// `lateness`, `hop`, `step`, `age`, `baseline`.
+    /// `lateness`, `hop`, `step`, `age`, `baseline`, `serial`.
     pub stage: String,
     /// HdrHistogram V2 encoding, ns.
     pub histogram: Vec<u8>,

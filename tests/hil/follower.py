@@ -30,6 +30,8 @@ NAP_S = 50e-6
 WAKE_LEAD_NS = 150_000
 #: Ticks in lockstep between two words to the launcher.
 TURN_TICKS = 256
+#: In a generation: of this tick there is no sample.
+VOID = 1 << 63
 
 
 class SeatError(Exception):
@@ -118,7 +120,7 @@ class Reader:
         factory = transport.service(described, self.type).subscriber_builder()
         self.subscriber = factory.buffer_size(described["buffer_size"]).create()
         self.sample = None
-        self.received, self.gaps, self.stale = 0, 0, 0
+        self.received, self.gaps, self.stale, self.void = 0, 0, 0, 0
         self.last_tick, self.last_generation = None, None
         #: Every sample, byte for byte, where somebody asks for it.
         self.record = None
@@ -144,26 +146,31 @@ class Reader:
             sample = self.receive()
             if sample is None:
                 return None
-            self.sample = sample if sample.generation != 0 and self.account(sample) else None
+            real = sample.generation != 0 and self.account(sample)
+            self.sample = sample if real and not sample.generation & VOID else None
         return self.last_tick == tick and self.sample is not None
 
     def account(self, sample):
         """Enters a sample into the books; False if it is not newer than the one before."""
         expected = 0
         if self.last_tick is not None:
-            expected = self.last_tick + 1 if sample.generation == self.last_generation else sample.tick
+            known = sample.generation & ~VOID == self.last_generation
+            expected = self.last_tick + 1 if known else sample.tick
         if sample.tick < expected:
             self.stale += 1
             return False
-        self.received += 1
+        if sample.generation & VOID:
+            self.void += 1
+        else:
+            self.received += 1
         self.gaps += sample.tick - expected
-        self.last_tick, self.last_generation = sample.tick, sample.generation
+        self.last_tick, self.last_generation = sample.tick, sample.generation & ~VOID
         if self.record is not None:
             self.record += bytes(sample)
         return True
 
     def books(self):
-        keys = ("service", "received", "gaps", "stale", "last_tick")
+        keys = ("service", "received", "gaps", "stale", "void", "last_tick")
         return {key: getattr(self, key) for key in keys}
 
 

@@ -2,12 +2,13 @@
 //!
 //! Must name the key and the remedy of everything it refuses, all at once.
 
+use super::limits::{Limits, RawLimits};
 use super::roles::Aim;
 use super::{BodyInfo, OrbitRig, Sensors};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
-use crate::rig::{FilterDesign, Frame, check_name};
+use crate::rig::{FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -17,6 +18,8 @@ struct RawHold {
     spacecraft: RawBody,
     observer: RawObserver,
     controller: RawHoldController,
+    #[serde(default, skip_serializing_if = "RawLimits::is_default")]
+    limits: RawLimits,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -27,6 +30,8 @@ struct RawRendezvous {
     follower: Vec<RawFollower>,
     observer: RawObserver,
     controller: RawController,
+    #[serde(default, skip_serializing_if = "RawLimits::is_default")]
+    limits: RawLimits,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -164,10 +169,13 @@ pub(in crate::rig) fn hold(
     let full_state = raw.controller.feedback == Feedback::FullState;
     let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
     let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
+    let initial = vec![OrbitState::from(&raw.spacecraft)];
+    let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
     let rig = OrbitRig {
         bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true }],
         field,
-        initial: vec![(&raw.spacecraft).into()],
+        initial,
+        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
@@ -200,10 +208,14 @@ pub(in crate::rig) fn rendezvous(
     let sensors = vec![sensor(frame, 0, &raw.leader.noise, &raw.leader.bias)];
     let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
     let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
+    let mut initial = vec![OrbitState::from(&raw.leader)];
+    initial.extend(raw.follower.iter().map(OrbitState::from));
+    let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
     let mut rig = OrbitRig {
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
         field,
-        initial: vec![(&raw.leader).into()],
+        initial,
+        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
@@ -214,7 +226,6 @@ pub(in crate::rig) fn rendezvous(
     };
     for follower in &raw.follower {
         rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true });
-        rig.initial.push(follower.into());
         rig.sensors.push(sensor(frame, rig.sensors.len() as u64, &follower.noise, &follower.bias));
     }
     if sound {
@@ -227,6 +238,29 @@ fn sensor(frame: Frame, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sen
     Sensors {
         noise: Noise::new(frame.seed, stream, noise.components(), bias.components()),
         deviation: noise.components(),
+        bias: bias.components(),
+    }
+}
+
+/// An estimate errs by its guess until it settles; one that weighs noise may err by more.
+fn limits(
+    field: CentralField,
+    speed_du_s: f64,
+    observer: &RawObserver,
+    sensors: &Sensors,
+    thrust_du_s2: f64,
+    raw: &RawLimits,
+    frame: Frame,
+) -> Limits {
+    let guess = observer.initial_guess_du_s.iter().fold(0.0, |largest: f64, guess| largest.max(guess.abs()));
+    let noisy = sensors.deviation != [0.0; 4] || observer.decay_rate_per_s.is_none();
+    Limits {
+        field,
+        speed_du_s,
+        transient_du_s: speed_du_s + guess + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
+        thrust_du_s2,
+        tick_s: frame.tick_s,
+        repeats: raw.repeats.unwrap_or(u64::MAX),
     }
 }
 

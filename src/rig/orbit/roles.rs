@@ -11,9 +11,9 @@ use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, s
 use nalgebra::Vector2;
 
 /// The bits of r and θ in a sample's `valid`.
-const POSITION: u64 = 0b0011;
+pub(super) const POSITION: u64 = 0b0011;
 /// The bits of Vr and Vθ.
-const VELOCITY: u64 = 0b1100;
+pub(super) const VELOCITY: u64 = 0b1100;
 
 /// A body in a central field with its sensors and thrusters.
 #[derive(Debug)]
@@ -101,19 +101,36 @@ impl Body for OrbitPlant {
 #[derive(Debug)]
 pub struct OrbitObserver {
     relation: OrbitVelocity,
+    field: CentralField,
     design: FilterDesign<2>,
     /// (Vr, Vθ) before anything is known, du/s.
     guess: Vector2<f64>,
     filter: Filter<2>,
     last: Option<OrbitSample>,
+    /// Where the model has taken the body since, while no measurement was usable.
+    coasted: Option<OrbitState>,
     status: u64,
 }
 
 impl OrbitObserver {
     /// An observer of the two inertial components of the velocity, with a guess of (Vr, Vθ) in du/s.
-    pub(super) fn new(relation: OrbitVelocity, design: FilterDesign<2>, guess: Vector2<f64>) -> Self {
+    pub(super) fn new(
+        relation: OrbitVelocity,
+        field: CentralField,
+        design: FilterDesign<2>,
+        guess: Vector2<f64>,
+    ) -> Self {
         let filter = design.filter(guess);
-        Self { relation, design, guess, filter, last: None, status: status::INITIAL }
+        Self { relation, field, design, guess, filter, last: None, coasted: None, status: status::INITIAL }
+    }
+
+    /// The motion as estimated; at rest in the centre before anything was measured.
+    fn estimate(&self) -> OrbitState {
+        self.coasted.unwrap_or_else(|| {
+            let at = self.last.unwrap_or(OrbitSample { r: 0.0, theta: 0.0, thrust: Vector2::zeros() });
+            let velocity = to_polar(at.theta, self.filter.estimate());
+            OrbitState { r: at.r, vr: velocity.x, theta: at.theta, vtheta: velocity.y }
+        })
     }
 
     fn seen(measurement: &OrbitMeasurement) -> OrbitSample {
@@ -138,6 +155,7 @@ impl Estimator for OrbitObserver {
         let guess = to_inertial(measurement.angle_rad, &self.guess);
         self.filter = self.design.filter(guess);
         self.last = Some(Self::seen(measurement));
+        self.coasted = None;
         self.status = status::INITIAL;
     }
 
@@ -148,14 +166,23 @@ impl Estimator for OrbitObserver {
             self.status = 0;
         }
         self.last = Some(seen);
+        self.coasted = None;
+    }
+
+    /// Under the thrust that was reported last. Where the model ends, the estimate stays.
+    fn coast(&mut self, dt_s: f64) {
+        if let Some(OrbitSample { thrust, .. }) = &self.last {
+            let from = self.estimate();
+            self.coasted = Some(self.field.flow(&from, thrust, dt_s).unwrap_or(from));
+        }
     }
 
     fn write(&self, status: u64, out: &mut OrbitEstimate) {
         // Without any measurement there is nothing that could be said, and no bit says that there was.
-        let at = self.last.unwrap_or(OrbitSample { r: 0.0, theta: 0.0, thrust: Vector2::zeros() });
-        out.radius_du = at.r;
-        out.angle_rad = at.theta;
-        out.velocity_du_s = to_polar(at.theta, self.filter.estimate()).into();
+        let OrbitState { r, vr, theta, vtheta } = self.estimate();
+        out.radius_du = r;
+        out.angle_rad = theta;
+        out.velocity_du_s = [vr, vtheta];
         out.status = self.status | status;
         out.valid = match self.last {
             None => 0,
@@ -239,7 +266,8 @@ mod tests {
     }
 
     fn observer() -> OrbitObserver {
-        OrbitObserver::new(OrbitVelocity::new(1.0), FilterDesign::First([4.0; 2]), Vector2::new(0.0, 0.9))
+        let field = CentralField::new(1.0, 0.05, 10.0).unwrap();
+        OrbitObserver::new(OrbitVelocity::new(1.0), field, FilterDesign::First([4.0; 2]), Vector2::new(0.0, 0.9))
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The sections of a scenario that belong to this rig: as typed, with their checks.
 
+use super::limits::RawLimits;
 use crate::config::{Checks, finite_positive};
 use crate::rig::check_name;
 use serde::{Deserialize, Serialize};
@@ -16,6 +17,8 @@ pub(super) struct Raw {
     pub observer: RawObserver,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub controller: Option<RawController>,
+    #[serde(default, skip_serializing_if = "RawLimits::is_default")]
+    pub limits: RawLimits,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]

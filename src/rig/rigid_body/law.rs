@@ -16,7 +16,18 @@ pub struct RateLaw {
     pub(super) supplied: usize,
     /// Whether the law works with the coefficients that the observer has learned.
     pub(super) learned: bool,
+    /// No component is asked to be larger: the actuators would refuse it.
+    pub(super) acceleration_max_rad_s2: f64,
     pub(super) tick_s: f64,
+}
+
+impl RateLaw {
+    /// Shortened to what the actuators can do, its direction kept.
+    #[inline]
+    fn limited(&self, asked: Vector3<f64>) -> Vector3<f64> {
+        let largest = asked.amax();
+        if largest > self.acceleration_max_rad_s2 { asked * (self.acceleration_max_rad_s2 / largest) } else { asked }
+    }
 }
 
 impl Law for RateLaw {
@@ -31,7 +42,7 @@ impl Law for RateLaw {
         }
         let (w, p) = self.law.ahead(&reference, &follower, &measurement.applied_rad_s2.into());
         let correction = self.adaptation.correction(&w, &p, self.tick_s);
-        out.acceleration_rad_s2 = (self.law.command(&w, &p) + correction).into();
+        out.acceleration_rad_s2 = self.limited(self.law.command(&w, &p) + correction).into();
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
         let mut error = follower - reference;
         error[self.supplied] -= estimate.innovation_rad_s;

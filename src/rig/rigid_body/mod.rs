@@ -7,23 +7,26 @@ mod config;
 mod identifier;
 mod law;
 mod learner;
+mod limits;
 mod observer;
 mod plant;
+mod resolve;
 
 pub use law::RateLaw;
 pub use learner::Learner;
+pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
+pub(super) use resolve::resolve;
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Frame, Rig, UNKNOWN_DEVIATION};
-use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig, UNKNOWN_DEVIATION};
+use crate::config::Checks;
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
 use crate::model::{Inertia, Noise, RigidBody};
-use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter, RateNoise};
+use crate::observe::{HiddenRate, RateNoise};
 use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
-use config::{Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
-use identifier::Identifier;
-use nalgebra::{Matrix3, Vector1, Vector3};
+use limits::{Limits, Sensed};
+use nalgebra::{Vector1, Vector3};
 use observer::ALL;
 use plant::Outage;
 
@@ -45,9 +48,11 @@ pub struct RigidBodyRig {
     supplied_axis: Option<usize>,
     observer: ObserverDesign,
     controller: Option<ControllerDesign>,
-    /// Per body, what its gyros add; and the standard deviations of the leader's.
+    /// Per body, what its gyros add, and of which standard deviation and bias that is.
     noise: Vec<Noise<3>>,
-    leader_deviation_rad_s: Vector3<f64>,
+    deviations_rad_s: Vec<Vector3<f64>>,
+    biases_rad_s: Vec<Vector3<f64>>,
+    limits: Limits,
     notes: Vec<String>,
     tick_s: f64,
 }
@@ -68,203 +73,18 @@ struct ControllerDesign {
     adaptation_gain: f64,
 }
 
-/// Reads and checks the sections of this rig.
-pub(super) fn resolve(
-    sections: &Document,
-    frame: Frame,
-    checks: &mut Checks<'_>,
-) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
-    let raw: Raw = sections.read_into()?;
-    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
-    config::check(&raw, checks);
-    let supplied_axis = config::hidden_axis(&raw, checks);
-    let outages = resolve_outages(&raw, frame.tick_s, checks);
-    let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
-    let Some(inertia) = inertia else { return Ok((None, table)) };
-    let mut notes = Vec::new();
-    let observer = design_observer(&raw, &inertia, supplied_axis, &mut notes, checks);
-    let Some(observer) = observer else { return Ok((None, table)) };
-    let mut rig = RigidBodyRig {
-        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
-        inertia,
-        initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
-        inertia_factors: vec![Vector3::repeat(1.0)],
-        measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
-        outages,
-        supplied_axis,
-        observer,
-        controller: raw.controller.as_ref().map(ControllerDesign::from),
-        noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
-        leader_deviation_rad_s: raw.leader.noise_rad_s.into(),
-        notes,
-        tick_s: frame.tick_s,
-    };
-    for (index, follower) in raw.follower.into_iter().enumerate() {
-        let factor = Vector3::from(follower.inertia_factor);
-        let own = inertia.moments_kg_m2().component_mul(&factor);
-        checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
-        rig.bodies.push(BodyInfo { name: follower.name, driven: true });
-        rig.initial_rates.push(follower.initial_rate_rad_s.into());
-        rig.inertia_factors.push(factor);
-        rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
-    }
-    rig.check_tick(checks);
-    Ok((Some(rig), table))
-}
-
-fn noise(frame: Frame, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
-    Noise::new(frame.seed, stream, deviation, bias)
-}
-
-impl From<&config::RawController> for ControllerDesign {
-    fn from(raw: &config::RawController) -> Self {
-        Self {
-            gain_per_s: raw.gain_per_s.into(),
-            predict: raw.predict,
-            learned: raw.coefficients == Coefficients::Learned,
-            adaptation_gain: raw.adaptation_gain,
-        }
-    }
-}
-
-fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outage> {
-    let mut outages = Vec::new();
-    for (index, outage) in raw.leader.outage.iter().enumerate() {
-        let key = |name: &str| format!("leader.outage[{index}].{name}");
-        let known = raw.leader.measured_axes.contains(&outage.axis) && (1..=3).contains(&outage.axis);
-        checks.require(known, &key("axis"), || {
-            format!("axis {} has no gyro to fail; name one of leader.measured_axes", outage.axis)
-        });
-        checks.require(outage.from_s >= 0.0, &key("from_s"), || {
-            format!("{} is before the start; give 0 or more", outage.from_s)
-        });
-        let until_s = outage.until_s.unwrap_or(f64::INFINITY);
-        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s; raise it"));
-        let tick = |time_s: f64| (time_s / tick_s).round() as u64;
-        if known {
-            outages.push(Outage {
-                component: outage.axis - 1,
-                from_tick: tick(outage.from_s),
-                until_tick: tick(until_s),
-            });
-        }
-    }
-    outages
-}
-
-fn design_observer(
-    raw: &Raw,
-    inertia: &Inertia,
-    supplied_axis: Option<usize>,
-    notes: &mut Vec<String>,
-    checks: &mut Checks<'_>,
-) -> Option<ObserverDesign> {
-    let (observer, coefficients) = (&raw.observer, inertia.coefficients());
-    let floor_rad_s = observer.observability_floor_rad_s;
-    if let Some(axis) = supplied_axis {
-        // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
-        checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
-    }
-    let filter = FilterDesign::resolve(
-        checks,
-        observer.decay_rate_per_s.map(|rate| [rate]),
-        observer.bandwidth_rad_s.map(|bandwidth| [bandwidth]),
-        ("process_noise_rad2_s3", observer.process_noise_rad2_s3),
-    )?;
-    if let FilterDesign::Kalman(_) = filter {
-        let noisy = |axis: &usize| raw.leader.noise_rad_s.get(axis.wrapping_sub(1)).is_some_and(|noise| *noise > 0.0);
-        checks.require(raw.leader.measured_axes.iter().all(noisy), "observer.process_noise_rad2_s3", || {
-            "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
-                .to_owned()
-        });
-    }
-    match observer.kind {
-        Kind::HiddenRate => Some(ObserverDesign::Hidden {
-            relation: HiddenRate::new(&coefficients, supplied_axis?, floor_rad_s).ok()?,
-            filter,
-            guess_rad_s: observer.initial_guess_rad_s,
-        }),
-        Kind::Inertia | Kind::AxisymmetricInertia => {
-            let FilterDesign::First([decay_rate_per_s]) = filter else {
-                checks.refuse(
-                    "observer.kind",
-                    "learns with a filter of first order; give observer.decay_rate_per_s instead",
-                );
-                return None;
-            };
-            let identifier = design_identifier(&raw.leader, observer, inertia, notes, checks)?;
-            Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
-        }
-    }
-}
-
-fn design_identifier(
-    leader: &RawLeader,
-    observer: &RawObserver,
-    inertia: &Inertia,
-    notes: &mut Vec<String>,
-    checks: &mut Checks<'_>,
-) -> Option<Identifier> {
-    let floor_rad_s = observer.observability_floor_rad_s;
-    let guess = observer.initial_coefficients;
-    if observer.kind == Kind::AxisymmetricInertia {
-        let axis = observer.symmetry_axis?;
-        check_symmetry(leader, inertia, axis, floor_rad_s, checks);
-        let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
-        let design = match (&observer.identifier_decay, observer.identifier_bandwidth) {
-            (Some(IdentifierDecay::Rates(rates)), _) => FilterDesign::First([rates[0]]),
-            (_, Some(bandwidth)) => FilterDesign::Second([bandwidth[0]]),
-            _ => {
-                let key = "observer.identifier_decay";
-                checks.refuse(key, "is a matrix, but there is one unknown; give three equal rates");
-                return None;
-            }
-        };
-        let [slowest] = design.decay_rates()?;
-        let filter = design.filter(Vector1::new(guess[axis % 3]));
-        return Some(Identifier::axisymmetric(relation, axis, filter, slowest));
-    }
-    let (filter, slowest) = match (&observer.identifier_decay, observer.identifier_bandwidth) {
-        (Some(decay), _) => {
-            let matrix = match decay {
-                IdentifierDecay::Rates(rates) => Matrix3::from_diagonal(&-Vector3::from(*rates)),
-                IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
-            };
-            let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
-            notes.push(format!("observer.identifier_decay: eigenvalues {}", matrix.eigenvalues()));
-            (Filter::First(InvariantFilter::with_matrix(matrix, guess.into())), -matrix.abscissa())
-        }
-        (None, bandwidth) => {
-            let design = FilterDesign::Second(bandwidth?);
-            let slowest = design.decay_rates()?.into_iter().fold(f64::INFINITY, f64::min);
-            (design.filter(guess.into()), slowest)
-        }
-    };
-    let relation = InertiaRelation::new(floor_rad_s * floor_rad_s * floor_rad_s);
-    Some(Identifier::asymmetric(relation, filter, slowest))
-}
-
-/// A body that is said to be axisymmetric is, and spins.
-fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_s: f64, checks: &mut Checks<'_>) {
-    if !(1..=3).contains(&axis) {
-        return;
-    }
-    let (spin_rad_s, moments) = (leader.initial_rate_rad_s[axis - 1], inertia.moments_kg_m2());
-    checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
-        format!(
-            "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
-             nothing of its inertia; give component {axis} a rate"
-        )
-    });
-    checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
-        format!("the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body")
-    });
-}
-
 impl RigidBodyRig {
     /// The component that the observer supplies, 0 to 2; where there is none, any serves.
     fn supplied(&self) -> usize {
         self.supplied_axis.unwrap_or(3) - 1
+    }
+
+    /// Bounds on the leader's |a|: what an observer has to learn is not used in guarding it either.
+    fn leader_coefficients(&self) -> Vector3<f64> {
+        match &self.observer {
+            ObserverDesign::Hidden { .. } => self.inertia.coefficients().abs(),
+            ObserverDesign::Learner(_) => Vector3::repeat(1.0),
+        }
     }
 
     fn rate_bound_rad_s(&self) -> f64 {
@@ -341,6 +161,10 @@ impl Rig for RigidBodyRig {
     type Body = RatePlant;
     type Estimator = RateObserver;
     type Law = RateLaw;
+    type MeasurementGuard = MeasurementGuard;
+    type EstimateGuard = EstimateGuard;
+    type CommandGuard = CommandGuard;
+    const AXES: usize = 3;
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies
@@ -365,7 +189,7 @@ impl Rig for RigidBodyRig {
         match &self.observer {
             ObserverDesign::Hidden { relation, filter: FilterDesign::Kalman(density), guess_rad_s } => {
                 let noise = RateNoise {
-                    sensor_deviation_rad_s: self.leader_deviation_rad_s,
+                    sensor_deviation_rad_s: self.deviations_rad_s[0],
                     density: *density,
                     guess_deviation_rad_s: UNKNOWN_DEVIATION,
                 };
@@ -402,7 +226,60 @@ impl Rig for RigidBodyRig {
             certificate: self.certificate(),
             supplied: self.supplied(),
             learned: controller.learned,
+            acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
             tick_s: self.tick_s,
+        }
+    }
+
+    /// A law acts on all components; an observer says itself which it needs.
+    fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
+        let body = Sensed {
+            // A follower may have another inertia.
+            coefficients: if index == 0 { self.leader_coefficients() } else { Vector3::repeat(1.0) },
+            factor: self.inertia_factors[index],
+            driven: self.bodies[index].driven,
+            deviation: self.deviations_rad_s[index],
+            bias: self.biases_rad_s[index],
+        };
+        self.limits.measurement(&body, self.tick_s, if acts { ALL } else { 0 })
+    }
+
+    fn estimate_guard(&self) -> EstimateGuard {
+        self.limits.estimate(&self.leader_coefficients(), self.tick_s)
+    }
+
+    fn command_guard(&self, _index: usize) -> CommandGuard {
+        self.limits.command()
+    }
+
+    fn limits(&self) -> Vec<Figure> {
+        self.limits.figures()
+    }
+
+    /// Both per I1, which is what a free motion tells of the inertia: [kinetic energy, rad²/s²; momentum, rad/s].
+    fn invariants(&self, estimate: &RateEstimate) -> Option<[f64; 2]> {
+        let ([second, third], rate) = (estimate.inertia_ratios, Vector3::from(estimate.omega_rad_s));
+        let momentum = rate.component_mul(&Vector3::new(1.0, second, third));
+        Some([0.5 * rate.dot(&momentum), momentum.norm()])
+    }
+
+    fn innovation(estimate: &RateEstimate) -> f64 {
+        estimate.innovation_rad_s
+    }
+
+    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        let silent = match &self.observer {
+            ObserverDesign::Hidden { filter: FilterDesign::Kalman(_), .. } => watched == Watched::Innovation,
+            _ => false,
+        };
+        if self.controller.is_none() {
+            Some("is watched by the controller, and this scenario has none")
+        } else if silent {
+            Some("is not published by the Kalman filter")
+        } else if watched == Watched::Lyapunov && self.certificate().is_none() {
+            Some("is published with the first-order filter only")
+        } else {
+            None
         }
     }
 

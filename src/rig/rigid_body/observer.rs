@@ -1,6 +1,7 @@
 //! The observers of this rig: which components are measured, which one is supplied, and from what.
 
 use super::learner::Learner;
+use crate::model::RigidBody;
 use crate::observe::{
     Filter, GuardedKalman, HiddenRate, InertiaRatios, InvariantFilter, Observation, RateNoise, RateSample,
 };
@@ -53,6 +54,15 @@ impl Estimator for RateObserver {
         }
     }
 
+    /// What is learning its model has none to go on by: it stays.
+    fn coast(&mut self, dt_s: f64) {
+        match self {
+            Self::Hidden(observer) => observer.coast(dt_s),
+            Self::Kalman(observer) => observer.coast(dt_s),
+            Self::Learner(_) => {}
+        }
+    }
+
     fn write(&self, status: u64, out: &mut RateEstimate) {
         match self {
             Self::Hidden(observer) => observer.write(status, out),
@@ -76,6 +86,8 @@ pub struct HiddenObserver {
     filter: Filter<1>,
     hidden: usize,
     last: RateSample,
+    /// Where the model has taken the body since, while no measurement was usable.
+    coasted: Option<Vector3<f64>>,
     innovation: f64,
     status: u64,
 }
@@ -91,6 +103,7 @@ impl HiddenObserver {
             filter: guess,
             hidden,
             last,
+            coasted: None,
             innovation: 0.0,
             status: status::INITIAL,
         }
@@ -106,7 +119,7 @@ impl HiddenObserver {
 
     /// Begins anew from a known estimate at a known instant.
     pub(super) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
-        (self.filter, self.last, self.innovation, self.status) = (filter, at, 0.0, status);
+        (self.filter, self.last, self.coasted, self.innovation, self.status) = (filter, at, None, 0.0, status);
     }
 
     pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
@@ -124,6 +137,11 @@ impl HiddenObserver {
             }
         }
         self.last = to;
+        self.coasted = None;
+    }
+
+    fn coast(&mut self, dt_s: f64) {
+        self.coasted = Some(self.body.flow(&self.rate(), &self.last, dt_s));
     }
 
     /// What the last step did: bits of [`status`].
@@ -138,9 +156,11 @@ impl HiddenObserver {
 
     /// The angular velocity with the supplied component in its place, rad/s.
     pub(super) fn rate(&self) -> Vector3<f64> {
-        let mut rate = self.last.rate_rad_s;
-        rate[self.hidden] = self.filter.estimate().x;
-        rate
+        self.coasted.unwrap_or_else(|| {
+            let mut rate = self.last.rate_rad_s;
+            rate[self.hidden] = self.filter.estimate().x;
+            rate
+        })
     }
 
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
@@ -168,6 +188,11 @@ impl Knowledge {
         Self { coefficients, closure, inertia_ratios: ratios }
     }
 
+    /// Where a body of which this is true goes from `rate` in `dt_s` seconds, under the torque of `last`.
+    fn flow(&self, rate: &Vector3<f64>, last: &RateSample, dt_s: f64) -> Vector3<f64> {
+        RigidBody::with_coefficients(self.coefficients).flow(rate, &last.torque_rad_s2, dt_s)
+    }
+
     /// Writes it beside a motion.
     pub fn write(&self, rate: &Vector3<f64>, out: &mut RateEstimate) {
         out.omega_rad_s = (*rate).into();
@@ -193,6 +218,8 @@ pub struct KalmanObserver {
     /// None before the first measurement.
     filter: Option<GuardedKalman>,
     last: RateSample,
+    /// Where the model has taken the body since, while no measurement was usable.
+    coasted: Option<Vector3<f64>>,
     status: u64,
 }
 
@@ -207,7 +234,8 @@ impl KalmanObserver {
     ) -> Self {
         let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         let body = Knowledge::new(coefficients);
-        Self { body, noise, hidden, floor_rad_s, guess_rad_s, filter: None, last, status: status::INITIAL }
+        let (filter, coasted) = (None, None);
+        Self { body, noise, hidden, floor_rad_s, guess_rad_s, filter, last, coasted, status: status::INITIAL }
     }
 
     fn needed(&self) -> u64 {
@@ -215,7 +243,7 @@ impl KalmanObserver {
     }
 
     fn start(&mut self, measurement: &RateMeasurement) {
-        self.last = seen(measurement);
+        (self.last, self.coasted) = (seen(measurement), None);
         self.status = status::INITIAL;
         let (axis, first) = (self.hidden + 1, &self.last);
         // That the component can be observed was checked when the scenario was resolved.
@@ -230,12 +258,20 @@ impl KalmanObserver {
             let held = filter.step(&self.last, &to, dt_s);
             self.status = if held { 0 } else { status::UNOBSERVABLE };
         }
-        self.last = to;
+        (self.last, self.coasted) = (to, None);
+    }
+
+    fn coast(&mut self, dt_s: f64) {
+        self.coasted = Some(self.body.flow(&self.rate(), &self.last, dt_s));
+    }
+
+    fn rate(&self) -> Vector3<f64> {
+        let filtered = || self.filter.as_ref().map_or(self.last.rate_rad_s, |filter| *filter.estimate());
+        self.coasted.unwrap_or_else(filtered)
     }
 
     fn write(&self, status: u64, out: &mut RateEstimate) {
-        let rate = self.filter.as_ref().map_or(self.last.rate_rad_s, |filter| *filter.estimate());
-        self.body.write(&rate, out);
+        self.body.write(&self.rate(), out);
         out.innovation_rad_s = 0.0;
         out.excitation = 0.0;
         out.status = self.status | status;

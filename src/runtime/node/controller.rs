@@ -3,18 +3,20 @@
 use super::{Gate, Node, Poll, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
+use crate::control::{Watchdog, Watched};
 use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
 use crate::role::Controller;
-use crate::runtime::link::{Input, Output, Seek};
+use crate::runtime::disturb::Interruptions;
+use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::Sample;
-use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
+use crate::telemetry::{Latency, StageReport, TickBook, Ticks, WatchBook};
 
 /// One driven body, seen from the controller.
 struct Channel<R: Rig, B: Bus> {
     controller: Controller<R::Law>,
-    measurement: Input<B, Measurement<R>>,
+    measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     command: Output<B, Command<R>>,
-    /// Whether the measurement of the tick at hand is there.
+    /// Whether the measurement of the tick at hand is there, and a command is to be sent.
     ready: bool,
     /// When the command at hand was begun and sent, ns; sent at 0 if there is none.
     began_ns: u64,
@@ -23,10 +25,14 @@ struct Channel<R: Rig, B: Bus> {
 
 /// A controller with its links and books.
 pub struct ControllerNode<R: Rig, B: Bus> {
-    estimate: Input<B, Estimate<R>>,
+    rig: R,
+    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     channels: Vec<Channel<R, B>>,
     clock: Clock,
     book: TickBook,
+    watchdog: Watchdog,
+    watch_book: WatchBook,
+    interruptions: Interruptions,
     /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
     origin_ns: u64,
     estimate_sent_ns: u64,
@@ -43,22 +49,28 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         // In the order of the books: everything written, then everything read.
         let commands: Vec<Output<B, Command<R>>> =
             driven().map(|(_, body)| seat.output(&body.name, Signal::Command)).collect::<Result<_, _>>()?;
-        let estimate = seat.input(&rig.bodies()[0].name, Signal::Estimate)?;
+        let estimate = seat.input(&rig.bodies()[0].name, Signal::Estimate, rig.estimate_guard())?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             Ok(Channel {
                 controller: Controller::new(rig.law(index)),
-                measurement: seat.input(&body.name, Signal::Measurement)?,
+                measurement: seat.input(&body.name, Signal::Measurement, rig.measurement_guard(index, true))?,
                 command,
                 ready: false,
                 began_ns: 0,
                 sent_ns: 0,
             })
         };
+        let channels = driven().zip(commands).map(channel).collect::<Result<_, BusError>>()?;
+        let watch_book = WatchBook::open(seat.ledger);
         Ok(Self {
+            rig: rig.clone(),
             estimate,
-            channels: driven().zip(commands).map(channel).collect::<Result<_, BusError>>()?,
+            channels,
             clock: seat.clock,
             book,
+            watchdog: watch_book.watchdog(seat.scenario.watch),
+            watch_book,
+            interruptions: seat.interruptions(),
             origin_ns: 0,
             estimate_sent_ns: 0,
             received_ns: 0,
@@ -74,8 +86,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
             return Ok(false);
         }
-        let Some(estimate) = self.estimate.sample() else { return Ok(false) };
-        let tick = estimate.stamp().tick;
+        let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
+            self.pass_over()?;
+            return Ok(false);
+        };
         let mut complete = true;
         for channel in &mut self.channels {
             let found = channel.measurement.seek(tick)?;
@@ -85,17 +99,49 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(complete || overdue)
     }
 
+    /// There is no estimate for the next tick that could be used, and so there are no commands.
+    #[cold]
+    fn pass_over(&mut self) -> Result<(), BusError> {
+        let next = self.book.next();
+        for tick in next..=self.estimate.last_tick().unwrap_or(next) {
+            for channel in &mut self.channels {
+                // What is not used now will never be, and must not fill the link.
+                channel.measurement.seek(tick)?;
+                channel.command.pass_over(tick)?;
+            }
+            self.skip_to(tick + 1);
+        }
+        Ok(())
+    }
+
+    /// Holds the estimate against the physics. Whatever comes of it is up to the watchdog.
+    #[inline]
+    fn watch(&mut self) {
+        let Some(estimate) = self.estimate.sample() else { return };
+        let tick = estimate.stamp().tick;
+        if let Some(values) = self.rig.invariants(estimate) {
+            self.watchdog.invariants(tick, values);
+        }
+        self.watchdog.magnitude(Watched::Innovation, tick, R::innovation(estimate));
+    }
+
     #[inline]
     fn execute(&mut self) -> Result<Poll, BusError> {
         self.received_ns = self.clock.now_ns();
+        if self.watchdog.active() {
+            self.watch();
+        }
         let Some(estimate) = self.estimate.sample() else { return Ok(Poll::Waiting) };
         let stamp = *estimate.stamp();
+        let silent = self.watchdog.latched_at().is_some();
         let clock = self.clock;
         let mut began_ns = self.received_ns;
         let mut starved = false;
         for Channel { controller, measurement, command, ready, began_ns: began, sent_ns } in &mut self.channels {
+            starved |= !*ready;
+            *ready &= !silent;
             let Some(measurement) = measurement.sample().filter(|_| *ready) else {
-                starved = true;
+                command.pass_over(stamp.tick)?;
                 continue;
             };
             command.send(|sample| {
@@ -105,6 +151,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             })?;
             *began = began_ns;
             began_ns = *sent_ns;
+            if let (true, Some((v, _))) = (self.watchdog.active(), R::lyapunov(command.sent())) {
+                self.watchdog.magnitude(Watched::Lyapunov, stamp.tick, v);
+            }
         }
         (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
         self.skip_to(stamp.tick);
@@ -124,8 +173,17 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.book.next()
     }
 
-    fn start(&mut self, _grid: Grid, first_tick: u64) {
+    fn start(&mut self, grid: Grid, first_tick: u64) {
+        if self.clock == Clock::Monotonic {
+            self.estimate.expect(Horizon::Due(grid));
+            self.channels.iter_mut().for_each(|channel| channel.measurement.expect(Horizon::Due(grid)));
+        }
         self.skip_to(first_tick);
+    }
+
+    #[inline]
+    fn before_tick(&mut self) {
+        self.book.stalled(self.interruptions.before(self.book.next()));
     }
 
     #[inline]
@@ -146,6 +204,9 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
                 self.age.record(self.origin_ns, channel.sent_ns);
             }
             channel.command.settle()?;
+        }
+        if self.watchdog.active() {
+            self.watch_book.store(&self.watchdog);
         }
         self.book.executed();
         Ok(())

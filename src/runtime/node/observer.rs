@@ -5,7 +5,8 @@ use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
-use crate::runtime::link::{Input, Output, Seek};
+use crate::runtime::disturb::Interruptions;
+use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::Sample;
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 
@@ -21,10 +22,11 @@ struct Instants {
 /// An observer with its links and books.
 pub struct ObserverNode<R: Rig, B: Bus> {
     observer: Observer<R::Estimator>,
-    measurement: Input<B, Measurement<R>>,
+    measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     estimate: Output<B, Estimate<R>>,
     clock: Clock,
     book: TickBook,
+    interruptions: Interruptions,
     instants: Instants,
     hop: Latency,
     step: Latency,
@@ -38,10 +40,11 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
             observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),
-            measurement: seat.input(leader, Signal::Measurement)?,
+            measurement: seat.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
             estimate,
             clock: seat.clock,
             book,
+            interruptions: seat.interruptions(),
             instants: Instants::default(),
             hop: Latency::default(),
             step: Latency::default(),
@@ -52,18 +55,32 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     #[inline]
     fn execute(&mut self) -> Result<Poll, BusError> {
         let received = self.clock.now_ns();
-        let Some(measurement) = self.measurement.sample() else { return Ok(Poll::Waiting) };
-        let stamp = *measurement.stamp();
+        let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
+        let Some(stamp) = measurement.map(Sample::stamp).or(rejected).copied() else { return self.pass_over() };
         let (observer, clock) = (&mut self.observer, self.clock);
         let mut done = 0;
         self.estimate.send(|sample| {
-            observer.step(measurement, sample);
+            match measurement {
+                Some(measurement) => observer.step(measurement, sample),
+                None => observer.reject(&stamp, sample),
+            }
             done = clock.now_ns();
             sample.stamp_mut().sent_ns = done;
         })?;
         self.instants = Instants { origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
         self.skip_to(stamp.tick);
         Ok(Poll::Executed)
+    }
+
+    /// There is no measurement for the next tick, and so there is no estimate.
+    #[cold]
+    fn pass_over(&mut self) -> Result<Poll, BusError> {
+        let next = self.book.next();
+        for tick in next..=self.measurement.last_tick().unwrap_or(next) {
+            self.estimate.pass_over(tick)?;
+            self.skip_to(tick + 1);
+        }
+        Ok(Poll::Waiting)
     }
 }
 
@@ -76,8 +93,16 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.book.next()
     }
 
-    fn start(&mut self, _grid: Grid, first_tick: u64) {
+    fn start(&mut self, grid: Grid, first_tick: u64) {
+        if self.clock == Clock::Monotonic {
+            self.measurement.expect(Horizon::Due(grid));
+        }
         self.skip_to(first_tick);
+    }
+
+    #[inline]
+    fn before_tick(&mut self) {
+        self.book.stalled(self.interruptions.before(self.book.next()));
     }
 
     #[inline]

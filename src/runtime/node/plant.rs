@@ -5,7 +5,8 @@ use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::{CommandEvent, Plant};
-use crate::runtime::link::{Input, Output, Seek};
+use crate::runtime::disturb::Interruptions;
+use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::{Sample, Stamp};
 use crate::telemetry::{Latency, Ledger, StageReport, TickBook, Ticks, Words};
 use std::marker::PhantomData;
@@ -13,13 +14,14 @@ use std::marker::PhantomData;
 /// A plant with its links and books.
 pub struct PlantNode<R: Rig, B: Bus> {
     plant: Plant<R::Body>,
-    command: Option<Input<B, Command<R>>>,
+    command: Option<Input<B, Command<R>, R::CommandGuard>>,
     measurement: Output<B, Measurement<R>>,
     truth: Output<B, Truth<R>>,
     clock: Clock,
     grid: Grid,
     last_tick: u64,
     book: TickBook,
+    interruptions: Interruptions,
     state: StateBook<Truth<R>>,
     lateness: Latency,
     age: Latency,
@@ -32,7 +34,8 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
         let book = TickBook::go_on(seat.ledger);
         let measurement = seat.output(&body.name, Signal::Measurement)?;
         let truth = seat.output(&body.name, Signal::Truth)?;
-        let command = body.driven.then(|| seat.input(&body.name, Signal::Command)).transpose()?;
+        let command =
+            body.driven.then(|| seat.input(&body.name, Signal::Command, rig.command_guard(index))).transpose()?;
         Ok(Self {
             plant: Plant::new(rig.body(index), scenario.actuation(body.driven), scenario.tick_s()),
             command,
@@ -42,6 +45,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
             book,
+            interruptions: seat.interruptions(),
             state: StateBook::open(seat.ledger),
             lateness: Latency::default(),
             age: Latency::default(),
@@ -66,7 +70,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
 
     /// Takes over a body from a predecessor that died: it has moved on by itself, and its actuators have protected it.
     fn resume(&mut self, truth: &Truth<R>, first_tick: u64) {
-        self.plant.resume(truth, self.measurement.published());
+        self.plant.resume(truth, self.measurement.made());
         let first_tick = first_tick.max(truth.stamp().tick + 1);
         self.plant.advance(1);
         for tick in truth.stamp().tick + 1..first_tick {
@@ -98,8 +102,11 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
     #[inline]
     fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, BusError> {
         let Some(input) = &mut self.command else { return Ok(self.plant.command(tick, None)) };
-        let found = tick > 0 && input.seek(tick - 1)? == Seek::Found;
-        let command = input.sample().filter(|_| found);
+        let found = if tick > 0 { input.seek(tick - 1)? } else { Seek::NotYet };
+        if found == Seek::Rejected {
+            return Ok(self.plant.reject(tick));
+        }
+        let command = input.sample().filter(|_| found == Seek::Found);
         let event = self.plant.command(tick, command);
         if let (CommandEvent::Applied, Some(command), Clock::Monotonic) = (event, command, self.clock) {
             self.age.record(command.stamp().origin_ns, now_ns);
@@ -119,11 +126,19 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
 
     fn start(&mut self, grid: Grid, first_tick: u64) {
         self.grid = grid;
+        if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
+            command.expect(Horizon::Due(grid));
+        }
         if let Some(truth) = self.state.load() {
             self.resume(&truth, first_tick);
         } else {
             self.skip_to(first_tick);
         }
+    }
+
+    #[inline]
+    fn before_tick(&mut self) {
+        self.book.stalled(self.interruptions.before(self.book.next()));
     }
 
     #[inline]
@@ -200,7 +215,7 @@ impl<S: Sample> StateBook<S> {
     /// Words of the ledger: which of the two copies holds, from 1, and the copies. One of them is always whole.
     pub const WORDS: usize = 1 + 2 * Self::SAMPLE_WORDS;
 
-    fn open(ledger: &Ledger) -> Self {
+    pub fn open(ledger: &Ledger) -> Self {
         Self { words: ledger.take(Self::WORDS), sample: PhantomData }
     }
 
@@ -209,7 +224,7 @@ impl<S: Sample> StateBook<S> {
     }
 
     #[inline]
-    fn store(&mut self, sample: &S) {
+    pub fn store(&mut self, sample: &S) {
         let copy = if self.words.get(0) == 1 { 2 } else { 1 };
         let words: &[u64] = bytemuck::cast_slice(std::slice::from_ref(sample));
         for (index, word) in words.iter().enumerate() {

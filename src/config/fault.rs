@@ -1,0 +1,332 @@
+//! The `[[fault]]` tables of a scenario: as typed, with their checks, and as the runtime acts on them.
+//!
+//! Must refuse a fault that would do nothing, or something else than its author meant.
+
+use super::scenario::{Checks, finite_positive};
+use super::{ClockKind, nearest};
+use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
+use crate::rig::{AnyRig, Command, Estimate, Measurement, Rig};
+use crate::sample::FieldKind;
+use crate::with_rig;
+use serde::{Deserialize, Serialize};
+
+/// The most faults of one scenario.
+const MAX_FAULTS: usize = 64;
+/// The longest delay, ticks: so many samples are kept.
+const MAX_DELAY_TICKS: u64 = 1000;
+/// The longest stall, ms.
+const MAX_STALL_MS: f64 = 60_000.0;
+/// The field whose bits tell which components of a sample are measured or observed.
+const VALID: &str = "valid";
+
+/// A scripted fault of a scenario, and where it acts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScriptedFault {
+    /// The role.
+    pub role: String,
+    /// The body of whose signal a sample is concerned: a plant's measurement, the observer's estimate, the controller's
+    /// command. None for a fault of the role itself.
+    pub body: Option<String>,
+    /// What happens, and when.
+    pub fault: Fault,
+}
+
+/// The kinds, as a scenario names them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Kind {
+    Drop,
+    Duplicate,
+    Delay,
+    Freeze,
+    NotANumber,
+    Infinite,
+    OutOfRange,
+    BitFlip,
+    LostAxis,
+    NoiseBurst,
+    Stall,
+    Kill,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawFault {
+    pub kind: Kind,
+    pub role: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub body: Option<String>,
+    pub from_tick: u64,
+    #[serde(default = "one")]
+    pub ticks: u64,
+    #[serde(default = "always")]
+    pub probability: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub component: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub value: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bit: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub deviation: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub delay_ticks: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stall_ms: Option<f64>,
+}
+
+fn one() -> u64 {
+    1
+}
+
+fn always() -> f64 {
+    1.0
+}
+
+/// What faults are checked against.
+pub(super) struct Setting<'a> {
+    pub rig: &'a AnyRig,
+    pub clock: ClockKind,
+    pub last_tick: u64,
+    pub seed: u64,
+}
+
+/// Checks all faults of a scenario. What is refused is noted and left out.
+pub(super) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<ScriptedFault> {
+    checks.require(raw.len() <= MAX_FAULTS, "fault", || {
+        format!(
+            "{} are more than a run takes; give at most {MAX_FAULTS}, with longer ticks or a probability",
+            raw.len()
+        )
+    });
+    let each = raw.iter().enumerate().map(|(number, raw)| One { raw, number, setting, checks }.resolve());
+    each.flatten().flatten().collect()
+}
+
+/// One fault being checked.
+struct One<'a, 'c, 'd> {
+    raw: &'a RawFault,
+    number: usize,
+    setting: &'a Setting<'a>,
+    checks: &'c mut Checks<'d>,
+}
+
+impl One<'_, '_, '_> {
+    fn key(&self, name: &str) -> String {
+        format!("fault[{}].{name}", self.number)
+    }
+
+    fn require(&mut self, holds: bool, name: &str, reason: impl FnOnce() -> String) -> Option<()> {
+        let key = self.key(name);
+        self.checks.require(holds, &key, reason);
+        holds.then_some(())
+    }
+
+    /// One fault per signal that it acts on: a controller has several.
+    fn resolve(mut self) -> Option<Vec<ScriptedFault>> {
+        self.check_keys();
+        self.check_time();
+        let bodies = self.bodies()?;
+        let action = self.action()?;
+        let RawFault { from_tick, ticks, probability, .. } = *self.raw;
+        let seed = fault::seed(self.setting.seed, self.number as u64);
+        let one = |(index, body)| {
+            let fault = Fault { from_tick, ticks, probability, seed: fault::seed(seed, index), action };
+            ScriptedFault { role: self.raw.role.clone(), body, fault }
+        };
+        Some((0..).zip(bodies).map(one).collect())
+    }
+
+    /// Keys that mean nothing for the kind, and such that it cannot do without.
+    fn check_keys(&mut self) {
+        use Kind::{BitFlip, Delay, Freeze, Infinite, Kill, LostAxis, NoiseBurst, NotANumber, OutOfRange, Stall};
+        let raw = self.raw;
+        let of = |kinds: &[Kind]| kinds.contains(&raw.kind);
+        let content = of(&[Freeze, NotANumber, Infinite, OutOfRange, BitFlip, NoiseBurst]);
+        for (name, given, wanted, needed) in [
+            ("body", raw.body.is_some(), !of(&[Stall, Kill]), false),
+            ("field", raw.field.is_some(), content, false),
+            ("component", raw.component.is_some(), content || of(&[LostAxis]), of(&[LostAxis])),
+            ("value", raw.value.is_some(), of(&[OutOfRange]), of(&[OutOfRange])),
+            ("bit", raw.bit.is_some(), of(&[BitFlip]), false),
+            ("deviation", raw.deviation.is_some(), of(&[NoiseBurst]), of(&[NoiseBurst])),
+            ("delay_ticks", raw.delay_ticks.is_some(), of(&[Delay]), of(&[Delay])),
+            ("stall_ms", raw.stall_ms.is_some(), of(&[Stall]), of(&[Stall])),
+        ] {
+            self.require(wanted || !given, name, || "has no meaning for this kind; remove it".to_owned());
+            self.require(given || !needed, name, || "is missing for this kind; add it".to_owned());
+        }
+    }
+
+    fn check_time(&mut self) {
+        let (raw, last_tick) = (self.raw, self.setting.last_tick);
+        self.require(raw.from_tick <= last_tick, "from_tick", || {
+            format!("{} is after the last tick {last_tick}; lower it or raise duration_s", raw.from_tick)
+        });
+        self.require(raw.ticks >= 1, "ticks", || "0 ticks are none; give at least 1, or remove the fault".to_owned());
+        self.require(raw.probability > 0.0 && raw.probability <= 1.0, "probability", || {
+            format!("{} is none with which anything happens; give a number above 0, up to 1", raw.probability)
+        });
+        if raw.kind == Kind::Freeze {
+            self.require(raw.from_tick >= 1, "from_tick", || {
+                "at tick 0 there is nothing to stay at; give 1 or more".into()
+            });
+        }
+        if raw.kind == Kind::Kill {
+            self.require(self.setting.clock != ClockKind::InProcess, "kind", || {
+                "kills a process, and in-process roles have none of their own; use clock = \"lockstep\"".to_owned()
+            });
+        }
+    }
+
+    /// The bodies whose signals are concerned; none, once, for a fault of the role itself.
+    fn bodies(&mut self) -> Option<Vec<Option<String>>> {
+        let (raw, bodies) = (self.raw, self.setting.rig.bodies());
+        let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| body.name.as_str()).collect();
+        let mut roles: Vec<&str> = bodies.iter().map(|body| body.name.as_str()).chain(["observer"]).collect();
+        roles.extend((!driven.is_empty()).then_some("controller"));
+        self.require(roles.contains(&&*raw.role), "role", || {
+            format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
+        })?;
+        if matches!(raw.kind, Kind::Stall | Kind::Kill) {
+            return Some(vec![None]);
+        }
+        if raw.role == "controller" {
+            if let Some(body) = &raw.body {
+                self.require(driven.contains(&&**body), "body", || {
+                    format!("the controller drives no `{body}`; {}", nearest(body, &driven))
+                })?;
+            }
+            let wanted = |body: &&&str| raw.body.as_ref().is_none_or(|wanted| wanted == **body);
+            return Some(driven.iter().filter(wanted).map(|body| Some((*body).to_owned())).collect());
+        }
+        self.require(raw.body.is_none(), "body", || {
+            "is for the controller, which has a command for each driven body; remove it".to_owned()
+        })?;
+        let body = if raw.role == "observer" { &bodies[0].name } else { &raw.role };
+        Some(vec![Some(body.clone())])
+    }
+
+    fn action(&mut self) -> Option<Action> {
+        let raw = self.raw;
+        Some(match raw.kind {
+            Kind::Drop => Action::Transport(Transport::Drop),
+            Kind::Duplicate => Action::Transport(Transport::Duplicate),
+            Kind::Delay => {
+                let ticks = raw.delay_ticks?;
+                self.require((1..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", || {
+                    format!("{ticks} is no delay that is kept; give 1 to {MAX_DELAY_TICKS}, or drop the sample")
+                })?;
+                Action::Transport(Transport::Delay { ticks })
+            }
+            Kind::Stall => {
+                let ms = raw.stall_ms?;
+                self.require(ms > 0.0 && ms <= MAX_STALL_MS, "stall_ms", || {
+                    format!("{ms} ms is no stall; give a number above 0, up to {MAX_STALL_MS}")
+                })?;
+                Action::Role(Interruption::Stall { ns: (ms * 1e6) as u64 })
+            }
+            Kind::Kill => Action::Role(Interruption::Kill),
+            _ => {
+                let fields = with_rig!(self.setting.rig, rig => fields(rig, &raw.role));
+                Action::Content(self.tamper(&fields)?)
+            }
+        })
+    }
+
+    fn tamper(&mut self, fields: &Fields) -> Option<Tamper> {
+        let raw = self.raw;
+        if raw.kind == Kind::LostAxis {
+            return self.lost_axis(fields);
+        }
+        if raw.kind == Kind::Freeze && raw.field.is_none() && raw.component.is_none() {
+            return Some(Tamper { change: Change::Freeze, words: fields.content });
+        }
+        let (words, kind) = self.words(fields)?;
+        let number = !matches!(raw.kind, Kind::Freeze | Kind::BitFlip);
+        let stamp = words.first < fields.content.first;
+        self.require(!stamp || raw.kind == Kind::BitFlip, "field", || {
+            "belongs to the stamp, of which only bits can flip; use kind = \"bit-flip\" or another field".to_owned()
+        })?;
+        self.require(!number || kind == FieldKind::F64, "field", || {
+            "is a word of bits and holds no number; use kind = \"bit-flip\" or \"freeze\", or another field".to_owned()
+        })?;
+        let change = match raw.kind {
+            Kind::Freeze => Change::Freeze,
+            Kind::NotANumber => Change::Set(f64::NAN),
+            Kind::Infinite => Change::Set(f64::INFINITY),
+            Kind::OutOfRange => Change::Set(raw.value?),
+            Kind::NoiseBurst => {
+                let deviation = raw.deviation?;
+                let key = self.key("deviation");
+                finite_positive(self.checks, &key, deviation);
+                Change::Noise(deviation)
+            }
+            _ => {
+                self.require(raw.bit.is_none_or(|bit| bit < 64), "bit", || {
+                    "a word has 64 bits; give 0 (the least significant) to 63".to_owned()
+                })?;
+                Change::Flip(raw.bit.map(|bit| bit as u32))
+            }
+        };
+        Some(Tamper { change, words })
+    }
+
+    /// The words of the field and component that are named; by default the first field, and all of its components.
+    fn words(&mut self, fields: &Fields) -> Option<(Words, FieldKind)> {
+        let raw = self.raw;
+        let names: Vec<&str> = fields.all.iter().map(|(name, ..)| *name).collect();
+        let name = raw.field.as_deref().unwrap_or(fields.first);
+        let found = fields.all.iter().find(|(known, ..)| *known == name);
+        self.require(found.is_some(), "field", || {
+            format!("the sample has no field `{name}`; {}", nearest(name, &names))
+        })?;
+        let (_, words, kind) = *found?;
+        let Some(component) = raw.component else { return Some((words, kind)) };
+        self.require((1..=words.count).contains(&component), "component", || match words.count {
+            1 => format!("`{name}` has one component; give 1 or leave it out"),
+            count => format!("`{name}` has no component {component}; give 1 to {count}"),
+        })?;
+        Some((Words { first: words.first + component - 1, count: 1 }, kind))
+    }
+
+    fn lost_axis(&mut self, fields: &Fields) -> Option<Tamper> {
+        let component = self.raw.component?;
+        let valid = fields.all.iter().find(|(name, ..)| *name == VALID);
+        self.require(valid.is_some(), "kind", || {
+            "takes an axis out of what is measured or estimated, and this signal is neither; name a body or the observer"
+                .to_owned()
+        })?;
+        let (_, valid, _) = *valid?;
+        self.require((1..=fields.axes).contains(&component), "component", || {
+            format!("there is no axis {component} to lose; give 1 to {}", fields.axes)
+        })?;
+        let words = Words { first: fields.content.first + component - 1, count: 1 };
+        Some(Tamper { change: Change::Lose { valid: valid.first }, words })
+    }
+}
+
+/// What a signal's sample is made of.
+struct Fields {
+    all: Vec<(&'static str, Words, FieldKind)>,
+    first: &'static str,
+    content: Words,
+    /// How many leading components its `valid` word tells of.
+    axes: usize,
+}
+
+/// The fields of what a role sends.
+fn fields<R: Rig>(_: &R, role: &str) -> Fields {
+    fn of<S: crate::sample::Sample>(axes: usize) -> Fields {
+        let names = S::FIELDS.iter().map(|field| field.name).chain(["tick", "generation"]);
+        let all = names.filter_map(|name| fault::field::<S>(name).map(|(words, kind)| (name, words, kind)));
+        Fields { all: all.collect(), first: S::FIELDS[0].name, content: Words::content::<S>(), axes }
+    }
+    match role {
+        "observer" => of::<Estimate<R>>(R::AXES),
+        "controller" => of::<Command<R>>(0),
+        _ => of::<Measurement<R>>(R::AXES),
+    }
+}

@@ -1,0 +1,275 @@
+//! What bodies of this rig can do at the most, and the guards that hold samples against it.
+//!
+//! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
+
+use super::observer::ALL;
+use crate::config::{Checks, finite_positive};
+use crate::rig::{Figure, SURE_DEVIATIONS};
+use crate::role::{Bounds, Guard, Plausible};
+use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+
+/// A default rate limit lies so far above what the initial rates allow.
+const RATE_MARGIN: f64 = 2.0;
+
+/// The table `[limits]` as typed.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct RawLimits {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rate_rad_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration_rad_s2: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repeats: Option<u64>,
+}
+
+impl RawLimits {
+    pub fn is_default(&self) -> bool {
+        self.rate_rad_s.is_none() && self.acceleration_rad_s2.is_none() && self.repeats.is_none()
+    }
+}
+
+/// What the limits follow from where they are not given.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Circumstances {
+    /// The bound M on the leader's rate, rad/s.
+    pub leader_rad_s: f64,
+    /// The fastest initial rate of a follower, rad/s.
+    pub follower_rad_s: f64,
+    /// How far an estimate may err before it settles, rad/s.
+    pub transient_rad_s: f64,
+    /// How fast the observer moves an estimate that errs, 1/s; +inf where nothing bounds that.
+    pub correction_per_s: f64,
+    /// The largest gain of the law, 1/s.
+    pub gain_per_s: f64,
+}
+
+/// The limits as resolved. They hold for each component.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Limits {
+    pub rate_rad_s: f64,
+    pub estimate_rad_s: f64,
+    pub acceleration_rad_s2: f64,
+    correction_per_s: f64,
+    repeats: u64,
+}
+
+impl Limits {
+    /// The limits given, or those that follow from the circumstances.
+    ///
+    /// By default the acceleration is what the law can ask for on whatever passes the other limits, the coefficients of a
+    /// body being at most 1.
+    pub fn resolve(raw: &RawLimits, about: &Circumstances, checks: &mut Checks<'_>) -> Self {
+        for (key, value) in
+            [("limits.rate_rad_s", raw.rate_rad_s), ("limits.acceleration_rad_s2", raw.acceleration_rad_s2)]
+        {
+            value.iter().for_each(|value| finite_positive(checks, key, *value));
+        }
+        let fastest_rad_s = about.leader_rad_s.max(about.follower_rad_s);
+        if let Some(rate_rad_s) = raw.rate_rad_s {
+            checks.require(rate_rad_s > fastest_rad_s, "limits.rate_rad_s", || {
+                format!("{rate_rad_s} is not above the {fastest_rad_s:.3} rad/s that a body may turn at; raise it")
+            });
+        }
+        let default_rad_s = RATE_MARGIN * (about.leader_rad_s + about.follower_rad_s);
+        let rate_rad_s = raw.rate_rad_s.unwrap_or(default_rad_s.max(f64::MIN_POSITIVE));
+        let estimate_rad_s = rate_rad_s + about.transient_rad_s;
+        let demand = about.gain_per_s * (estimate_rad_s + rate_rad_s)
+            + estimate_rad_s * estimate_rad_s
+            + rate_rad_s * rate_rad_s;
+        Self {
+            rate_rad_s,
+            estimate_rad_s,
+            acceleration_rad_s2: raw.acceleration_rad_s2.unwrap_or(demand),
+            correction_per_s: about.correction_per_s,
+            repeats: raw.repeats.unwrap_or(u64::MAX),
+        }
+    }
+
+    /// For people.
+    pub fn figures(&self) -> Vec<Figure> {
+        let figure = |name: &str, value| Figure { name: name.to_owned(), value };
+        vec![
+            figure("largest |rate| of a component, rad/s", self.rate_rad_s),
+            figure("largest |estimate| of a component, rad/s", self.estimate_rad_s),
+            figure("largest |acceleration| of a component that is asked for, rad/s^2", self.acceleration_rad_s2),
+        ]
+    }
+
+    /// A guard for a body's measurements. `coefficients` bound |a| of the body, `factor` is its inertia over the nominal
+    /// one; without the components in `needed` a measurement is of no use to the reader.
+    pub fn measurement(&self, body: &Sensed, tick_s: f64, needed: u64) -> MeasurementGuard {
+        let free = body.coefficients * (self.rate_rad_s * self.rate_rad_s);
+        let driven =
+            if body.driven { body.factor.map(|factor| self.acceleration_rad_s2 / factor) } else { Vector3::zeros() };
+        let spread = body.deviation * SURE_DEVIATIONS;
+        let rounding = Vector3::repeat(8.0 * f64::EPSILON * self.rate_rad_s);
+        let bounds = Bounds {
+            magnitude: (Vector3::repeat(self.rate_rad_s) + body.bias.abs() + spread).into(),
+            slew_per_tick: ((free + driven) * tick_s).into(),
+            allowance: (spread * 2.0 + rounding).into(),
+            repeats: self.repeats,
+        };
+        MeasurementGuard { rate: Plausible::new(bounds), acceleration_rad_s2: self.acceleration_rad_s2, needed }
+    }
+
+    /// A guard for estimates of a body whose |a| are at most `coefficients`.
+    pub fn estimate(&self, coefficients: &Vector3<f64>, tick_s: f64) -> EstimateGuard {
+        let free = coefficients * (self.estimate_rad_s * self.estimate_rad_s);
+        let corrected = Vector3::repeat(self.correction_per_s * 2.0 * self.estimate_rad_s);
+        let bounds = Bounds {
+            magnitude: [self.estimate_rad_s; 3],
+            slew_per_tick: ((free + corrected) * tick_s).into(),
+            allowance: [0.0; 3],
+            repeats: self.repeats,
+        };
+        EstimateGuard { rate: Plausible::new(bounds) }
+    }
+
+    /// A guard for commands.
+    pub fn command(&self) -> CommandGuard {
+        CommandGuard { acceleration_rad_s2: self.acceleration_rad_s2 }
+    }
+}
+
+/// A body as its measurements show it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sensed {
+    /// Bounds on |a| of \[D\](2).
+    pub coefficients: Vector3<f64>,
+    /// Inertia over the nominal one.
+    pub factor: Vector3<f64>,
+    pub driven: bool,
+    /// Of the sensors, rad/s.
+    pub deviation: Vector3<f64>,
+    pub bias: Vector3<f64>,
+}
+
+/// Guards measurements: their range, and how fast Euler's equations and the actuators let them change.
+#[derive(Debug)]
+pub struct MeasurementGuard {
+    rate: Plausible<3>,
+    acceleration_rad_s2: f64,
+    needed: u64,
+}
+
+impl Guard<RateMeasurement> for MeasurementGuard {
+    #[inline]
+    fn accepts(&mut self, sample: &RateMeasurement) -> bool {
+        sample.valid & self.needed == self.needed
+            && within(&sample.applied_rad_s2, self.acceleration_rad_s2)
+            && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid)
+    }
+}
+
+/// Guards estimates: their range, how fast the body and the observer's correction let them change, and that a component
+/// which is not valid is said to be a guess. Without a filter of first order on quiet sensors their slew is not bounded.
+#[derive(Debug)]
+pub struct EstimateGuard {
+    rate: Plausible<3>,
+}
+
+impl Guard<RateEstimate> for EstimateGuard {
+    #[inline]
+    fn accepts(&mut self, sample: &RateEstimate) -> bool {
+        let told = sample.valid & ALL == ALL || sample.status & (status::INITIAL | status::DEGRADED) != 0;
+        told && within(&sample.coefficients, f64::MAX)
+            && sample.innovation_rad_s.is_finite()
+            && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, ALL)
+    }
+}
+
+/// Guards commands: the actuators can do what is asked.
+#[derive(Debug)]
+pub struct CommandGuard {
+    acceleration_rad_s2: f64,
+}
+
+impl Guard<RateCommand> for CommandGuard {
+    #[inline]
+    fn accepts(&mut self, sample: &RateCommand) -> bool {
+        within(&sample.acceleration_rad_s2, self.acceleration_rad_s2)
+    }
+}
+
+/// Whether all components are at most so large; what is no number is not.
+#[inline]
+fn within(values: &[f64; 3], limit: f64) -> bool {
+    values.iter().all(|value| value.abs() <= limit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample::Stamp;
+
+    const LIMITS: Limits = Limits {
+        rate_rad_s: 2.0,
+        estimate_rad_s: 3.0,
+        acceleration_rad_s2: 8.0,
+        correction_per_s: f64::INFINITY,
+        repeats: u64::MAX,
+    };
+
+    fn sensed(driven: bool) -> Sensed {
+        let zero = Vector3::zeros();
+        Sensed { coefficients: Vector3::repeat(0.5), factor: Vector3::repeat(2.0), driven, deviation: zero, bias: zero }
+    }
+
+    fn measurement(tick: u64, rate: f64) -> RateMeasurement {
+        let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+        RateMeasurement { stamp, omega_rad_s: [rate; 3], valid: ALL, ..RateMeasurement::default() }
+    }
+
+    #[test]
+    fn a_body_changes_by_its_dynamics_and_a_driven_one_by_its_actuators_too() {
+        for (driven, slew) in [(false, 0.5 * 4.0), (true, 0.5 * 4.0 + 8.0 / 2.0)] {
+            let mut guard = LIMITS.measurement(&sensed(driven), 1e-3, ALL);
+            assert!(guard.accepts(&measurement(0, 1.0)));
+            assert!(!guard.accepts(&measurement(1, 1.0 + 1.01e-3 * slew)));
+            assert!(guard.accepts(&measurement(1, 1.0 + 0.99e-3 * slew)));
+        }
+    }
+
+    #[test]
+    fn a_reader_that_needs_a_component_does_not_do_without() {
+        let lame = RateMeasurement { valid: 0b011, ..measurement(0, 1.0) };
+        assert!(LIMITS.measurement(&sensed(false), 1e-3, 0b011).accepts(&lame));
+        assert!(!LIMITS.measurement(&sensed(false), 1e-3, ALL).accepts(&lame));
+    }
+
+    #[test]
+    fn an_estimate_that_lacks_a_component_says_why_or_is_not_believed() {
+        let estimate = |valid, status| RateEstimate { valid, status, ..RateEstimate::default() };
+        let mut guard = LIMITS.estimate(&Vector3::repeat(1.0), 1e-3);
+        assert!(guard.accepts(&estimate(ALL, 0)) && guard.accepts(&estimate(0b011, status::INITIAL)));
+        assert!(!guard.accepts(&estimate(0b011, 0)));
+        assert!(!guard.accepts(&RateEstimate { omega_rad_s: [0.0, 3.1, 0.0], ..estimate(ALL, 0) }));
+        assert!(!guard.accepts(&RateEstimate { coefficients: [0.0, f64::NAN, 0.0], ..estimate(ALL, 0) }));
+    }
+
+    #[test]
+    fn a_quiet_estimate_moves_with_the_body_and_the_correction() {
+        let limits = Limits { correction_per_s: 6.0, ..LIMITS };
+        let slew = 0.5 * 9.0 + 6.0 * 6.0;
+        let estimate = |tick, rate| {
+            let stamp = Stamp { tick, generation: 1, ..Stamp::default() };
+            RateEstimate { stamp, omega_rad_s: [rate; 3], valid: ALL, ..RateEstimate::default() }
+        };
+        let mut guard = limits.estimate(&Vector3::repeat(0.5), 1e-3);
+        assert!(guard.accepts(&estimate(0, 0.0)) && !guard.accepts(&estimate(1, 1.01e-3 * slew)));
+        assert!(guard.accepts(&estimate(1, 0.99e-3 * slew)));
+        let mut loose = LIMITS.estimate(&Vector3::repeat(0.5), 1e-3);
+        assert!(loose.accepts(&estimate(0, 0.0)) && loose.accepts(&estimate(1, 3.0)));
+    }
+
+    #[test]
+    fn a_command_beyond_the_actuators_is_refused() {
+        let command = |value| RateCommand { acceleration_rad_s2: [0.0, value, 0.0], ..RateCommand::default() };
+        let mut guard = LIMITS.command();
+        assert!(guard.accepts(&command(-8.0)));
+        assert!(!guard.accepts(&command(8.1)) && !guard.accepts(&command(f64::NAN)));
+    }
+}

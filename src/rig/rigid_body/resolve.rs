@@ -1,0 +1,231 @@
+//! Reads and checks the sections of this rig, and designs what follows from them.
+//!
+//! Must name the key and the remedy of everything it refuses, all at once.
+
+use super::config::{self, Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
+use super::identifier::Identifier;
+use super::limits::{Circumstances, Limits};
+use super::plant::Outage;
+use super::{ControllerDesign, ObserverDesign, RigidBodyRig, learner};
+use crate::config::{Checks, ConfigError, Document};
+use crate::model::{Inertia, Noise};
+use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
+use crate::rig::{BodyInfo, FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
+use nalgebra::{Matrix3, Vector1, Vector3};
+
+/// Reads and checks the sections of this rig.
+pub(in crate::rig) fn resolve(
+    sections: &Document,
+    frame: Frame,
+    checks: &mut Checks<'_>,
+) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
+    let raw: Raw = sections.read_into()?;
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    config::check(&raw, checks);
+    let supplied_axis = config::hidden_axis(&raw, checks);
+    let outages = resolve_outages(&raw, frame.tick_s, checks);
+    let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
+    let Some(inertia) = inertia else { return Ok((None, table)) };
+    let mut notes = Vec::new();
+    let observer = design_observer(&raw, &inertia, supplied_axis, &mut notes, checks);
+    let Some(observer) = observer else { return Ok((None, table)) };
+    let mut rig = RigidBodyRig {
+        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
+        inertia,
+        initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
+        inertia_factors: vec![Vector3::repeat(1.0)],
+        measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
+        outages,
+        supplied_axis,
+        observer,
+        controller: raw.controller.as_ref().map(ControllerDesign::from),
+        noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
+        deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
+        biases_rad_s: vec![raw.leader.bias_rad_s.into()],
+        limits: design_limits(&raw, &inertia, checks),
+        notes,
+        tick_s: frame.tick_s,
+    };
+    for (index, follower) in raw.follower.into_iter().enumerate() {
+        let factor = Vector3::from(follower.inertia_factor);
+        let own = inertia.moments_kg_m2().component_mul(&factor);
+        checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
+        rig.bodies.push(BodyInfo { name: follower.name, driven: true });
+        rig.initial_rates.push(follower.initial_rate_rad_s.into());
+        rig.inertia_factors.push(factor);
+        rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
+        rig.deviations_rad_s.push(follower.noise_rad_s.into());
+        rig.biases_rad_s.push(follower.bias_rad_s.into());
+    }
+    rig.check_tick(checks);
+    Ok((Some(rig), table))
+}
+
+fn noise(frame: Frame, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
+    Noise::new(frame.seed, stream, deviation, bias)
+}
+
+impl From<&config::RawController> for ControllerDesign {
+    fn from(raw: &config::RawController) -> Self {
+        Self {
+            gain_per_s: raw.gain_per_s.into(),
+            predict: raw.predict,
+            learned: raw.coefficients == Coefficients::Learned,
+            adaptation_gain: raw.adaptation_gain,
+        }
+    }
+}
+
+fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outage> {
+    let mut outages = Vec::new();
+    for (index, outage) in raw.leader.outage.iter().enumerate() {
+        let key = |name: &str| format!("leader.outage[{index}].{name}");
+        let known = raw.leader.measured_axes.contains(&outage.axis) && (1..=3).contains(&outage.axis);
+        checks.require(known, &key("axis"), || {
+            format!("axis {} has no gyro to fail; name one of leader.measured_axes", outage.axis)
+        });
+        checks.require(outage.from_s >= 0.0, &key("from_s"), || {
+            format!("{} is before the start; give 0 or more", outage.from_s)
+        });
+        let until_s = outage.until_s.unwrap_or(f64::INFINITY);
+        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s; raise it"));
+        let tick = |time_s: f64| (time_s / tick_s).round() as u64;
+        if known {
+            outages.push(Outage {
+                component: outage.axis - 1,
+                from_tick: tick(outage.from_s),
+                until_tick: tick(until_s),
+            });
+        }
+    }
+    outages
+}
+
+fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limits {
+    let fastest =
+        |rates: &mut dyn Iterator<Item = [f64; 3]>| rates.map(|rate| Vector3::from(rate).norm()).fold(0.0, f64::max);
+    let noisy = raw.leader.noise_rad_s != [0.0; 3] || raw.observer.decay_rate_per_s.is_none();
+    let gain_per_s = raw.controller.as_ref().map_or(0.0, |controller| Vector3::from(controller.gain_per_s).amax());
+    let about = Circumstances {
+        leader_rad_s: inertia.rate_bound_rad_s(&raw.leader.initial_rate_rad_s.into()),
+        follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.initial_rate_rad_s)),
+        transient_rad_s: raw.observer.initial_guess_rad_s.abs()
+            + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
+        // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.
+        correction_per_s: match raw.observer.decay_rate_per_s {
+            Some(decay) if !noisy && raw.observer.kind == Kind::HiddenRate => decay,
+            _ => f64::INFINITY,
+        },
+        gain_per_s,
+    };
+    Limits::resolve(&raw.limits, &about, checks)
+}
+
+fn design_observer(
+    raw: &Raw,
+    inertia: &Inertia,
+    supplied_axis: Option<usize>,
+    notes: &mut Vec<String>,
+    checks: &mut Checks<'_>,
+) -> Option<ObserverDesign> {
+    let (observer, coefficients) = (&raw.observer, inertia.coefficients());
+    let floor_rad_s = observer.observability_floor_rad_s;
+    if let Some(axis) = supplied_axis {
+        // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
+        checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
+    }
+    let filter = FilterDesign::resolve(
+        checks,
+        observer.decay_rate_per_s.map(|rate| [rate]),
+        observer.bandwidth_rad_s.map(|bandwidth| [bandwidth]),
+        ("process_noise_rad2_s3", observer.process_noise_rad2_s3),
+    )?;
+    if let FilterDesign::Kalman(_) = filter {
+        let noisy = |axis: &usize| raw.leader.noise_rad_s.get(axis.wrapping_sub(1)).is_some_and(|noise| *noise > 0.0);
+        checks.require(raw.leader.measured_axes.iter().all(noisy), "observer.process_noise_rad2_s3", || {
+            "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
+                .to_owned()
+        });
+    }
+    match observer.kind {
+        Kind::HiddenRate => Some(ObserverDesign::Hidden {
+            relation: HiddenRate::new(&coefficients, supplied_axis?, floor_rad_s).ok()?,
+            filter,
+            guess_rad_s: observer.initial_guess_rad_s,
+        }),
+        Kind::Inertia | Kind::AxisymmetricInertia => {
+            let FilterDesign::First([decay_rate_per_s]) = filter else {
+                checks.refuse(
+                    "observer.kind",
+                    "learns with a filter of first order; give observer.decay_rate_per_s instead",
+                );
+                return None;
+            };
+            let identifier = design_identifier(&raw.leader, observer, inertia, notes, checks)?;
+            Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
+        }
+    }
+}
+
+fn design_identifier(
+    leader: &RawLeader,
+    observer: &RawObserver,
+    inertia: &Inertia,
+    notes: &mut Vec<String>,
+    checks: &mut Checks<'_>,
+) -> Option<Identifier> {
+    let floor_rad_s = observer.observability_floor_rad_s;
+    let guess = observer.initial_coefficients;
+    if observer.kind == Kind::AxisymmetricInertia {
+        let axis = observer.symmetry_axis?;
+        check_symmetry(leader, inertia, axis, floor_rad_s, checks);
+        let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
+        let design = match (&observer.identifier_decay, observer.identifier_bandwidth) {
+            (Some(IdentifierDecay::Rates(rates)), _) => FilterDesign::First([rates[0]]),
+            (_, Some(bandwidth)) => FilterDesign::Second([bandwidth[0]]),
+            _ => {
+                let key = "observer.identifier_decay";
+                checks.refuse(key, "is a matrix, but there is one unknown; give three equal rates");
+                return None;
+            }
+        };
+        let [slowest] = design.decay_rates()?;
+        let filter = design.filter(Vector1::new(guess[axis % 3]));
+        return Some(Identifier::axisymmetric(relation, axis, filter, slowest));
+    }
+    let (filter, slowest) = match (&observer.identifier_decay, observer.identifier_bandwidth) {
+        (Some(decay), _) => {
+            let matrix = match decay {
+                IdentifierDecay::Rates(rates) => Matrix3::from_diagonal(&-Vector3::from(*rates)),
+                IdentifierDecay::Matrix(rows) => Matrix3::from_fn(|row, column| rows[row][column]),
+            };
+            let matrix = checks.accept("observer.identifier_decay", Hurwitz::new(matrix))?;
+            notes.push(format!("observer.identifier_decay: eigenvalues {}", matrix.eigenvalues()));
+            (Filter::First(InvariantFilter::with_matrix(matrix, guess.into())), -matrix.abscissa())
+        }
+        (None, bandwidth) => {
+            let design = FilterDesign::Second(bandwidth?);
+            let slowest = design.decay_rates()?.into_iter().fold(f64::INFINITY, f64::min);
+            (design.filter(guess.into()), slowest)
+        }
+    };
+    let relation = InertiaRelation::new(floor_rad_s * floor_rad_s * floor_rad_s);
+    Some(Identifier::asymmetric(relation, filter, slowest))
+}
+
+/// A body that is said to be axisymmetric is, and spins.
+fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_s: f64, checks: &mut Checks<'_>) {
+    if !(1..=3).contains(&axis) {
+        return;
+    }
+    let (spin_rad_s, moments) = (leader.initial_rate_rad_s[axis - 1], inertia.moments_kg_m2());
+    checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
+        format!(
+            "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
+             nothing of its inertia; give component {axis} a rate"
+        )
+    });
+    checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
+        format!("the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body")
+    });
+}

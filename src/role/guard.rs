@@ -1,0 +1,222 @@
+//! What the receiving end checks of a sample before anything is made of it: numbers, range, and how fast they change.
+//!
+//! Must not repair anything: a sample is believed whole or not at all. Must not refuse for ever what was right: the change
+//! that is allowed grows with the time since the last sample that was believed.
+
+use crate::sample::Stamp;
+
+/// Judges the samples of one signal, in the order of their ticks.
+pub trait Guard<S> {
+    /// Whether the sample is to be believed. One that is becomes what the next are compared with.
+    fn accepts(&mut self, sample: &S) -> bool;
+}
+
+/// Believes everything: for those who watch and do not act.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Unguarded;
+
+impl<S> Guard<S> for Unguarded {
+    #[inline]
+    fn accepts(&mut self, _sample: &S) -> bool {
+        true
+    }
+}
+
+/// What N components of a body can be. Units are those of the components, and ticks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds<const N: usize> {
+    /// The largest magnitude.
+    pub magnitude: [f64; N],
+    /// The largest change per tick; +inf where nothing bounds it.
+    pub slew_per_tick: [f64; N],
+    /// What may be added to a change however short the time: the noise of two samples.
+    pub allowance: [f64; N],
+    /// So often in a row a component may be the same to the last bit; then it is stuck.
+    pub repeats: u64,
+}
+
+/// After a gap of so many ticks in what was believed, a sample must also continue what came just before it.
+const SHORT_GAP_TICKS: u64 = 2;
+
+/// Components that are checked against their bounds and against the last ones believed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plausible<const N: usize> {
+    bounds: Bounds<N>,
+    generation: u64,
+    /// Per component, the last value that was believed, and its tick.
+    believed: [f64; N],
+    believed_tick: [Option<u64>; N],
+    /// The sample before, believed or not, and how often its components have been repeated.
+    before: [f64; N],
+    before_tick: u64,
+    repeated: [u64; N],
+    /// Whether that one was believed.
+    trusted: bool,
+}
+
+impl<const N: usize> Plausible<N> {
+    /// Nothing is known yet: the first value of a component is checked for its magnitude only.
+    pub fn new(bounds: Bounds<N>) -> Self {
+        Self {
+            bounds,
+            generation: 0,
+            believed: [0.0; N],
+            believed_tick: [None; N],
+            before: [f64::NAN; N],
+            before_tick: 0,
+            repeated: [0; N],
+            trusted: true,
+        }
+    }
+
+    /// Whether those components of a sample that `valid` has a bit for are possible; if so they are remembered.
+    ///
+    /// A sender that has been started anew is a new one: nothing is concluded from what it said before.
+    #[inline]
+    pub fn accepts(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) -> bool {
+        let slew = self.bounds.slew_per_tick;
+        self.accepts_within(stamp, values, valid, |i, _, ticks| slew[i] * ticks)
+    }
+
+    /// The same where the change that is possible depends on where the body was: `change` tells that of a component, from
+    /// all of them and the number of ticks.
+    #[inline]
+    pub fn accepts_within(
+        &mut self,
+        stamp: &Stamp,
+        values: &[f64; N],
+        valid: u64,
+        change: impl Fn(usize, &[f64; N], f64) -> f64,
+    ) -> bool {
+        if stamp.generation != self.generation {
+            *self = Self { generation: stamp.generation, ..Self::new(self.bounds) };
+        }
+        let counts = self.bounds.repeats != u64::MAX;
+        let mut believed = true;
+        for (i, &value) in values.iter().enumerate() {
+            if counts {
+                self.repeated[i] = if value == self.before[i] { self.repeated[i] + 1 } else { 0 };
+            }
+            believed &= valid >> i & 1 == 0
+                || (self.in_range(i, value)
+                    && self.repeated[i] <= self.bounds.repeats
+                    && self.reached(i, value, stamp.tick, &change));
+        }
+        if believed {
+            for i in (0..N).filter(|i| valid >> i & 1 == 1) {
+                (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
+            }
+        }
+        (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
+        believed
+    }
+
+    /// What is not a number is in no range.
+    #[inline]
+    fn in_range(&self, i: usize, value: f64) -> bool {
+        value.abs() <= self.bounds.magnitude[i]
+    }
+
+    /// Whether a component can have come to a value from where it was last believed to be. As the time grows so does what can
+    /// be reached, and noise comes to be possible; so after doubts it must have come smoothly, too.
+    #[inline]
+    fn reached(&self, i: usize, value: f64, tick: u64, change: &impl Fn(usize, &[f64; N], f64) -> f64) -> bool {
+        let within = |from: &[f64; N], since: u64| {
+            let ticks = tick.saturating_sub(since).max(1) as f64;
+            (value - from[i]).abs() <= self.bounds.allowance[i] + change(i, from, ticks)
+        };
+        self.believed_tick[i].is_none_or(|since| {
+            let smooth = self.trusted || tick.saturating_sub(since) <= SHORT_GAP_TICKS;
+            within(&self.believed, since) && (smooth || within(&self.before, self.before_tick))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn guard() -> Plausible<3> {
+        let slew_per_tick = [0.01, 0.01, f64::INFINITY];
+        Plausible::new(Bounds { magnitude: [2.0; 3], slew_per_tick, allowance: [0.001; 3], repeats: u64::MAX })
+    }
+
+    fn accepts(guard: &mut Plausible<3>, tick: u64, values: [f64; 3], valid: u64) -> bool {
+        guard.accepts(&Stamp { tick, generation: 1, ..Stamp::default() }, &values, valid)
+    }
+
+    #[test]
+    fn what_is_no_number_or_out_of_range_is_not_believed() {
+        for wrong in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 2.1, -2.1, f64::MAX] {
+            for component in 0..3 {
+                let mut values = [0.5; 3];
+                values[component] = wrong;
+                assert!(!accepts(&mut guard(), 0, values, 7), "{wrong}");
+                assert!(accepts(&mut guard(), 0, values, 7 & !(1 << component)), "what is not valid is not looked at");
+            }
+        }
+        assert!(accepts(&mut guard(), 0, [2.0, -2.0, 0.0], 7));
+    }
+
+    #[test]
+    fn a_jump_is_refused_until_there_was_time_for_it() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 0, [0.0; 3], 7));
+        assert!(accepts(&mut guard, 1, [0.0109, 0.0, 1.9], 7), "slew and allowance");
+        let jump = [0.5, 0.0, 0.0];
+        let first = (2..100).find(|tick| accepts(&mut guard, *tick, jump, 7));
+        assert_eq!(first, Some(50), "(0.5 - 0.0109 - 0.001) / 0.01 = 48.8 ticks after tick 1");
+        assert!(accepts(&mut guard, 51, jump, 7), "and from then on at once");
+    }
+
+    #[test]
+    fn every_flip_of_an_exponent_or_sign_is_seen_and_the_next_good_sample_is_believed() {
+        let (value, mut refused) = (0.6, 0);
+        for bit in 0..64 {
+            let mut guard = guard();
+            assert!(accepts(&mut guard, 0, [value; 3], 7));
+            let wrong = f64::from_bits(f64::to_bits(value) ^ 1 << bit);
+            let believed = accepts(&mut guard, 1, [wrong, value, value], 7);
+            assert_eq!(believed, (wrong - value).abs() <= 0.011, "bit {bit}: {wrong}");
+            refused += u32::from(!believed);
+            assert!(accepts(&mut guard, 2, [value; 3], 7), "bit {bit}");
+        }
+        assert!(refused >= 12, "eleven bits of exponent, and the sign: {refused}");
+    }
+
+    #[test]
+    fn a_new_life_of_the_sender_begins_anew() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 5, [0.0; 3], 7) && !accepts(&mut guard, 6, [1.0; 3], 7));
+        let stamp = Stamp { tick: 6, generation: 2, ..Stamp::default() };
+        assert!(guard.accepts(&stamp, &[1.0, 1.0, 1.0], 7));
+    }
+
+    #[test]
+    fn noise_is_not_believed_because_it_has_lasted() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 0, [0.0; 3], 7));
+        let wild = |tick: u64| if tick.is_multiple_of(2) { 0.2 } else { -0.2 };
+        let believed = (1..500).filter(|tick| accepts(&mut guard, *tick, [wild(*tick), 0.0, 0.0], 7)).count();
+        assert_eq!(believed, 0, "it could have been reached, but no body moves so");
+        let good = (500..510).find(|tick| accepts(&mut guard, *tick, [0.1, 0.0, 0.0], 7));
+        assert_eq!(good, Some(501), "the second one continues the first");
+    }
+
+    #[test]
+    fn a_short_gap_needs_no_second_sample_and_a_lost_one_is_no_doubt() {
+        let mut guard = guard();
+        assert!(accepts(&mut guard, 0, [0.0; 3], 7) && !accepts(&mut guard, 1, [1.0; 3], 7));
+        assert!(accepts(&mut guard, 2, [0.0; 3], 7));
+        assert!(accepts(&mut guard, 100, [0.5, 0.0, 0.0], 7), "nothing came in between");
+    }
+
+    #[test]
+    fn what_is_stuck_is_believed_for_a_while_only() {
+        let mut guard = Plausible::new(Bounds { repeats: 3, ..guard().bounds });
+        let believed = (0..10).filter(|tick| accepts(&mut guard, *tick, [0.5; 3], 7)).count();
+        assert_eq!(believed, 4, "the first, and three repetitions");
+        assert!(!accepts(&mut guard, 10, [0.501, 0.501, 0.5], 7), "one component is stuck still");
+        assert!(accepts(&mut guard, 11, [0.502, 0.502, 0.501], 7), "it moves again");
+    }
+}

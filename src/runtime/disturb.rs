@@ -1,0 +1,178 @@
+//! Scripted faults at the places where they act: a writing end's samples, and a role before its tick.
+//!
+//! Must cost an undisturbed role nothing but one look whether there is anything to do.
+
+use crate::clock::{monotonic_ns, sleep_until};
+use crate::config::{Scenario, ScriptedFault};
+use crate::fault::{Action, Change, Fault, Interruption, Transport};
+use crate::sample::Sample;
+
+/// What happens to the samples of one signal.
+#[derive(Debug)]
+pub struct Disturbance<S> {
+    faults: Vec<Fault>,
+    /// Samples on their long way, in the order of their ticks, each with the tick at which it is sent. As much room as
+    /// can ever be needed is taken at the start.
+    late: Vec<(u64, S)>,
+}
+
+impl<S: Sample> Disturbance<S> {
+    /// What a scenario does to a role's signal about a body; nothing if there is nothing.
+    pub fn of(scenario: &Scenario, role: &str, body: &str) -> Option<Box<Self>> {
+        let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == Some(body);
+        Self::new(scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect())
+    }
+
+    fn new(faults: Vec<Fault>) -> Option<Box<Self>> {
+        let kept = |fault: &Fault| match fault.action {
+            Action::Transport(Transport::Delay { ticks }) => ticks.min(fault.ticks) as usize,
+            _ => 0,
+        };
+        let late = Vec::with_capacity(faults.iter().map(kept).sum());
+        (!faults.is_empty()).then(|| Box::new(Self { faults, late }))
+    }
+
+    /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
+    pub fn tamper(&self, tick: u64, sample: &mut S, last: &S) -> bool {
+        let acting = self.faults.iter().filter(|fault| fault.tampers() && fault.acts(tick));
+        acting.map(|fault| fault.tamper(tick, sample, last)).count() > 0
+    }
+
+    /// What happens to the sample of `tick` on its way: of several faults, what the first says.
+    pub fn way(&self, tick: u64) -> Option<Transport> {
+        self.faults.iter().find_map(|fault| match fault.action {
+            Action::Transport(transport) if fault.acts(tick) => Some(transport),
+            _ => None,
+        })
+    }
+
+    /// Keeps a sample until `tick`.
+    pub fn keep(&mut self, tick: u64, sample: S) {
+        self.late.push((tick, sample));
+    }
+
+    /// A sample that was kept and is to be sent before that of `tick`.
+    pub fn due(&mut self, tick: u64) -> Option<S> {
+        let due = self.late.iter().position(|(due, _)| *due <= tick)?;
+        Some(self.late.remove(due).1)
+    }
+}
+
+/// How many samples per tick a signal of a scenario may carry beyond the one that is its own.
+pub fn extra_samples(scenario: &Scenario) -> usize {
+    let extra = |scripted: &&ScriptedFault| match scripted.fault.action {
+        Action::Transport(transport) => transport != Transport::Drop,
+        // A flip of a bit may make a sample that belongs to no tick, beside the void in its place.
+        Action::Content(tamper) => matches!(tamper.change, Change::Flip(_)),
+        Action::Role(_) => false,
+    };
+    scenario.faults.iter().filter(extra).count()
+}
+
+/// What happens to a role before its ticks.
+#[derive(Debug)]
+pub struct Interruptions {
+    faults: Vec<Fault>,
+    first_life: bool,
+    /// Ticks before this one have been looked at.
+    next: u64,
+}
+
+impl Interruptions {
+    /// What a scenario does to a role in this generation of it.
+    pub fn of(scenario: &Scenario, role: &str, generation: u64) -> Self {
+        let here = |fault: &&ScriptedFault| fault.role == role && fault.body.is_none();
+        let faults = scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect();
+        Self { faults, first_life: generation == 1, next: 0 }
+    }
+
+    /// Acts before `tick`, once, and tells how many stalls there were.
+    #[inline]
+    pub fn before(&mut self, tick: u64) -> u64 {
+        if self.faults.is_empty() || tick < self.next { 0 } else { self.act(tick) }
+    }
+
+    #[cold]
+    fn act(&mut self, tick: u64) -> u64 {
+        self.next = tick + 1;
+        let mut stalls = 0;
+        for fault in self.faults.iter().filter(|fault| fault.acts(tick)) {
+            match fault.action {
+                Action::Role(Interruption::Stall { ns }) => {
+                    stall(ns);
+                    stalls += 1;
+                }
+                Action::Role(Interruption::Kill) if self.first_life => kill(),
+                _ => {}
+            }
+        }
+        stalls
+    }
+}
+
+/// Does nothing for so long, deaf to everything.
+fn stall(ns: u64) {
+    let end_ns = monotonic_ns() + ns;
+    while monotonic_ns() < end_ns {
+        sleep_until(end_ns);
+    }
+}
+
+/// Ends this process as the kernel or an operator would: without a word, without cleaning up.
+fn kill() {
+    // Nothing is left to do if the kernel should refuse; then the role lives on, and the fault was none.
+    let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample::RateCommand;
+
+    fn fault(from_tick: u64, ticks: u64, action: Action) -> Fault {
+        Fault { from_tick, ticks, probability: 1.0, seed: 1, action }
+    }
+
+    #[test]
+    fn what_is_kept_comes_in_order_when_it_is_due_and_takes_no_memory_on_the_way() {
+        let delay = Action::Transport(Transport::Delay { ticks: 3 });
+        let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)]).unwrap();
+        let room = disturbance.late.capacity();
+        assert_eq!(room, 3);
+        for tick in 5..105_u64 {
+            let sent = std::iter::from_fn(|| disturbance.due(tick)).map(|sample| sample.stamp.tick).collect::<Vec<_>>();
+            assert_eq!(sent, if tick < 8 { vec![] } else { vec![tick - 3] });
+            assert_eq!(disturbance.way(tick), Some(Transport::Delay { ticks: 3 }));
+            let mut sample = RateCommand::default();
+            sample.stamp.tick = tick;
+            disturbance.keep(tick + 3, sample);
+        }
+        assert_eq!((disturbance.way(105), disturbance.late.capacity()), (None, room));
+    }
+
+    #[test]
+    fn of_several_faults_the_first_decides_the_way() {
+        let [drop, twice] = [Transport::Drop, Transport::Duplicate].map(Action::Transport);
+        let disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)]).unwrap();
+        let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.way(tick));
+        let (drop, twice) = (Some(Transport::Drop), Some(Transport::Duplicate));
+        assert_eq!(ways, [None, twice, twice, drop, None]);
+        assert!(Disturbance::<RateCommand>::new(Vec::new()).is_none());
+    }
+
+    #[test]
+    fn a_stall_holds_the_role_up_once_per_tick() {
+        let faults = vec![fault(3, 2, Action::Role(Interruption::Stall { ns: 2_000_000 }))];
+        let mut interruptions = Interruptions { faults, first_life: false, next: 0 };
+        let begun = monotonic_ns();
+        let stalls = [0, 1, 3, 3, 4, 5].map(|tick| interruptions.before(tick));
+        assert_eq!(stalls, [0, 0, 1, 0, 1, 0]);
+        assert!(monotonic_ns() - begun >= 4_000_000);
+    }
+
+    #[test]
+    fn a_successor_is_not_killed_again() {
+        let faults = vec![fault(3, 1, Action::Role(Interruption::Kill))];
+        assert_eq!(Interruptions { faults, first_life: false, next: 0 }.before(3), 0, "and lives to say so");
+    }
+}

@@ -1,0 +1,440 @@
+//! Scripted faults: no single one moves a follower outside the declared bound, every one is counted somewhere, the books
+//! balance, the loop converges again; and the clocks agree on all of it.
+
+mod common;
+
+use common::{Bench, shipped};
+use corotate::config::Scenario;
+use corotate::launch::{Launch, Summary, run};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// The declared bound: that of `faults.toml`, rad/s.
+const BOUND_RAD_S: f64 = 0.1;
+/// A fault that nobody noticed has moved nobody further than this, rad/s: where V of the watchdog's bound begins.
+const HARMLESS_RAD_S: f64 = 0.01;
+/// What the loop has converged to at the end, rad/s.
+const SETTLED_RAD_S: f64 = 1e-6;
+/// When the faults of the matrix begin: at two places of the leader's motion.
+const FROM_TICKS: [u64; 2] = [200, 1777];
+/// A loop that is settled from the first tick on, so that whatever moves was moved by a fault.
+const SETTLED: [&str; 6] = [
+    "clock=in-process",
+    "duration_s=7",
+    "accept={}",
+    "watchdog.from_s=0.1",
+    "follower.0.initial_rate_rad_s=[0.6, -0.4, 0.8]",
+    "observer.initial_guess_rad_s=0.8",
+];
+
+/// `faults.toml` with other faults than its own.
+fn text(faults: &str) -> String {
+    let text = std::fs::read_to_string(shipped("faults")).unwrap();
+    text.split("\n# Every fault").next().unwrap().to_owned() + "\n" + faults
+}
+
+/// What one disturbed run came to.
+struct Disturbed {
+    peak: f64,
+    last: f64,
+    summary: Value,
+}
+
+impl Disturbed {
+    /// Runs a scenario in this thread.
+    fn run(scenario: &Scenario) -> Self {
+        let mut launch = Launch {
+            program: PathBuf::new(),
+            external: Vec::new(),
+            require_realtime: false,
+            signal: &AtomicUsize::new(0),
+            progress: &mut |_| {},
+        };
+        let outcome = run(scenario, &mut launch).unwrap();
+        let summary = serde_json::to_value(Summary::new(scenario, &outcome, jiff::Timestamp::UNIX_EPOCH)).unwrap();
+        let metric = &summary["score"]["metrics"][0];
+        let number = |key: &str| metric[key].as_f64().unwrap_or(f64::INFINITY);
+        Self { peak: number("peak"), last: number("last"), summary }
+    }
+
+    fn of(fault: &str, overrides: &[&str]) -> Self {
+        let overrides: Vec<String> = overrides.iter().map(|set| (*set).to_owned()).collect();
+        Self::run(
+            &Scenario::parse(&text(fault), "matrix", &overrides).unwrap_or_else(|error| panic!("{fault}: {error}")),
+        )
+    }
+
+    fn count(&self, counter: &str) -> u64 {
+        self.summary["books"][counter].as_u64().unwrap()
+    }
+
+    /// Whether any counter but that of the injection itself says that something was wrong.
+    fn noticed(&self) -> bool {
+        let links = self.summary["books"]["links"].as_array().unwrap();
+        let of_link = |link: &Value| link["stale"].as_u64().unwrap() + link["void"][1].as_u64().unwrap();
+        let breaches = self.summary["watchdog"]["watched"].as_array().unwrap().iter();
+        self.count("rejected_samples")
+            + self.count("missed_ticks")
+            + links.iter().map(of_link).sum::<u64>()
+            + breaches.map(|one| one["breaches"].as_u64().unwrap()).sum::<u64>()
+            > 0
+    }
+}
+
+fn fault(kind: &str, role: &str, from_tick: u64, ticks: u64, further: &str) -> String {
+    format!("[[fault]]\nkind = \"{kind}\"\nrole = \"{role}\"\nfrom_tick = {from_tick}\nticks = {ticks}\n{further}\n")
+}
+
+/// What each role sends: fields and their components.
+fn fields(role: &str) -> &'static [(&'static str, usize)] {
+    match role {
+        "observer" => &[
+            ("omega_rad_s", 3),
+            ("innovation_rad_s", 1),
+            ("coefficients", 3),
+            ("closure", 1),
+            ("inertia_ratios", 2),
+            ("excitation", 1),
+            ("valid", 1),
+            ("status", 1),
+            ("tick", 1),
+            ("generation", 1),
+        ],
+        "controller" => &[
+            ("acceleration_rad_s2", 3),
+            ("lyapunov_rad2_s2", 1),
+            ("lyapunov_rate_bound_rad2_s3", 1),
+            ("tick", 1),
+            ("generation", 1),
+        ],
+        _ => &[("omega_rad_s", 3), ("applied_rad_s2", 3), ("valid", 1), ("status", 1), ("tick", 1), ("generation", 1)],
+    }
+}
+
+const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];
+
+/// Every bit of everything that is sent.
+fn flips() -> Vec<String> {
+    let mut faults = Vec::new();
+    for role in ROLES {
+        for (field, count) in fields(role) {
+            for (component, bit) in (1..=*count).flat_map(|component| (0..64).map(move |bit| (component, bit))) {
+                let what = format!("field = \"{field}\"\ncomponent = {component}\nbit = {bit}");
+                faults.push(fault("bit-flip", role, FROM_TICKS[0], 1, &what));
+            }
+        }
+    }
+    faults
+}
+
+/// Every other kind, on every role where it makes sense, for a tick to a second.
+fn others() -> Vec<String> {
+    let mut faults = Vec::new();
+    for (role, from) in ROLES.into_iter().flat_map(|role| FROM_TICKS.map(|from| (role, from))) {
+        for ticks in [1, 5, 20, 200, 1000] {
+            let mut add = |kind: &str, further: &str| faults.push(fault(kind, role, from, ticks, further));
+            ["drop", "duplicate", "freeze", "not-a-number", "infinite"].into_iter().for_each(|kind| add(kind, ""));
+            ["delay_ticks = 1", "delay_ticks = 3", "delay_ticks = 50"].into_iter().for_each(|by| add("delay", by));
+            for component in 1..=3 {
+                add("not-a-number", &format!("component = {component}"));
+                add("freeze", &format!("component = {component}"));
+                add("out-of-range", &format!("value = 9.0\ncomponent = {component}"));
+                add("out-of-range", &format!("value = -1e30\ncomponent = {component}"));
+                if role != "controller" {
+                    add("lost-axis", &format!("component = {component}"));
+                }
+            }
+            if ticks <= 200 {
+                let deviations = ["1e-3", "0.1", "1.0"];
+                deviations.into_iter().for_each(|by| add("noise-burst", &format!("deviation = {by}")));
+            }
+        }
+        faults.push(fault("stall", role, from, 3, "stall_ms = 0.1"));
+    }
+    faults
+}
+
+/// Runs every fault by itself, on all cores, and hands each result to `judge`.
+fn every(faults: &[String], overrides: &[&str], judge: impl Fn(&str, &Disturbed) + Sync) {
+    let (next, worst) = (AtomicUsize::new(0), Mutex::new(BTreeMap::<String, (u64, f64)>::new()));
+    let work = || {
+        while let Some(fault) = faults.get(next.fetch_add(1, Ordering::Relaxed)) {
+            let done = Disturbed::of(fault, overrides);
+            judge(fault, &done);
+            let kind = fault.split('"').nth(1).unwrap().to_owned();
+            let mut worst = worst.lock().unwrap();
+            let entry = worst.entry(kind).or_default();
+            *entry = (entry.0 + 1, entry.1.max(done.peak));
+        }
+    };
+    std::thread::scope(|scope| {
+        (0..std::thread::available_parallelism().map_or(1, usize::from)).for_each(|_| {
+            scope.spawn(work);
+        });
+    });
+    let worst = worst.into_inner().unwrap();
+    worst.iter().for_each(|(kind, (count, peak))| println!("{kind}: {count} faults, worst excursion {peak:.1e}"));
+}
+
+fn stays_within_the_bound(fault: &str, done: &Disturbed) {
+    assert!(done.peak <= BOUND_RAD_S, "{fault}: {:e}", done.peak);
+    assert!(done.last < SETTLED_RAD_S, "{fault}: {:e} at the end", done.last);
+    assert_eq!(done.summary["books"]["balanced"], true, "{fault}: {}", done.summary["books"]["problems"]);
+    assert!(done.count("injected_faults") >= 1, "{fault} did not act");
+    assert!(done.noticed() || done.peak < HARMLESS_RAD_S, "{fault}: {:e}, and nobody noticed", done.peak);
+}
+
+#[test]
+fn no_flip_of_any_bit_moves_the_follower_outside_the_declared_bound() {
+    let faults = flips();
+    assert!(faults.len() > 2500, "{}", faults.len());
+    every(&faults, &SETTLED, stays_within_the_bound);
+}
+
+#[test]
+fn no_other_fault_moves_the_follower_outside_the_declared_bound() {
+    every(&others(), &SETTLED, stays_within_the_bound);
+}
+
+/// Drawn bits of drawn components, over and over, with several seeds.
+#[test]
+fn nor_do_drawn_flips_whatever_the_seed() {
+    for seed in 1..=8 {
+        let seed = format!("seed={seed}");
+        let faults = ROLES.map(|role| fault("bit-flip", role, FROM_TICKS[0], 50, "probability = 0.3"));
+        every(&faults, &[&SETTLED[..], &[&seed]].concat(), stays_within_the_bound);
+    }
+}
+
+/// The bound is one that can be broken: by a command that is wrong for a second and no more than the actuators can do.
+#[test]
+fn what_the_limits_allow_may_break_the_bound_and_the_watchdog_ends_it() {
+    let push = fault("out-of-range", "controller", FROM_TICKS[0], 1000, "value = 7.9\ncomponent = 1");
+    let done = Disturbed::of(&push, &SETTLED);
+    assert!(done.peak > 10.0 * BOUND_RAD_S, "{:e}", done.peak);
+    let safe = [&SETTLED[..], &["watchdog.on_breach=safe", "watchdog.latch_after_ticks=3"]].concat();
+    let ended = Disturbed::of(&push, &safe);
+    let latched = ended.summary["watchdog"]["latched_at_tick"].as_u64().unwrap();
+    assert!(latched > FROM_TICKS[0] && latched < FROM_TICKS[0] + 50, "{latched}");
+    assert!(ended.peak < 0.5 * done.peak, "{:e} {:e}", ended.peak, done.peak);
+    assert_eq!(ended.summary["books"]["balanced"], true, "{:#}", ended.summary["books"]);
+    let safe_ticks = ended.summary["books"]["roles"]["follower"]["safe"].as_u64().unwrap();
+    assert_eq!(safe_ticks, 7000 - latched - 20, "for good, 20 silent ticks after the latch");
+}
+
+#[test]
+fn the_watchdog_counts_what_breaks_the_physics() {
+    let quiet = Disturbed::of("", &SETTLED);
+    for one in quiet.summary["watchdog"]["watched"].as_array().unwrap() {
+        assert_eq!(one["breaches"], 0, "{one}");
+        assert!(one["judged"].as_u64().unwrap() > 6000, "{one}");
+    }
+    // An estimate may be wrong where no guard can know.
+    let wrong = fault("noise-burst", "observer", 300, 100, "deviation = 0.01");
+    let tight = ["watchdog.energy_drift_max=1e-3", "watchdog.momentum_drift_max=1e-3"];
+    let done = Disturbed::of(&wrong, &[&SETTLED[..], &tight].concat());
+    for quantity in ["energy", "momentum"] {
+        let watched = done.summary["watchdog"]["watched"].as_array().unwrap();
+        let one = watched.iter().find(|one| one["quantity"] == quantity).unwrap();
+        assert!(one["breaches"].as_u64().unwrap() > 50, "{one}");
+        assert_eq!(one["first_tick"].as_u64().unwrap() / 10, 30, "{one}");
+    }
+}
+
+/// The orbit rigs have the same guards: what cannot be moves no follower.
+#[test]
+fn a_follower_in_orbit_stays_where_it_is_too() {
+    let text = std::fs::read_to_string(shipped("orbit-rendezvous")).unwrap();
+    let declared =
+        ["accept.peak_from_s=11.0", "accept.radius_error_du_peak=1e-3", "accept.velocity_error_du_s_peak=1e-3"];
+    let overrides = [&["clock=in-process", "limits.repeats=2"], &declared[..]].concat();
+    let overrides: Vec<String> = overrides.into_iter().map(str::to_owned).collect();
+    let (mut count, mut worst) = (0, 0.0_f64);
+    for role in ROLES {
+        for (kind, further) in [
+            ("drop", ""),
+            ("duplicate", ""),
+            ("delay", "delay_ticks = 3"),
+            ("freeze", ""),
+            ("not-a-number", ""),
+            ("infinite", ""),
+            ("out-of-range", "value = 1e3"),
+            ("out-of-range", "value = -1.0"),
+            ("lost-axis", "component = 1"),
+            ("bit-flip", "bit = 62"),
+            ("bit-flip", "field = \"tick\"\nbit = 40"),
+        ] {
+            if (kind, role) == ("lost-axis", "controller") {
+                continue;
+            }
+            let fault = fault(kind, role, 11_000, 10, further);
+            let text = format!("{text}\n{fault}");
+            let done = Disturbed::run(&Scenario::parse(&text, "orbit", &overrides).unwrap());
+            assert_eq!(done.summary["accepted"], true, "{fault}: {}", done.summary["criteria"]);
+            assert_eq!(done.summary["books"]["balanced"], true, "{fault}: {}", done.summary["books"]["problems"]);
+            assert_eq!(done.count("injected_faults"), 10, "{fault}");
+            (count, worst) = (count + 1, worst.max(done.peak));
+        }
+    }
+    println!("{count} faults in orbit, worst excursion {worst:.1e} du of 1e-3 declared");
+}
+
+/// One fault of each kind, as processes in lockstep and in one thread: the same bits, counters and verdict.
+#[test]
+fn every_fault_is_the_same_in_lockstep_and_in_process() {
+    let cases = [
+        fault("drop", "leader", 100, 7, "probability = 0.5"),
+        fault("drop", "leader", 100, 300, ""),
+        fault("drop", "controller", 100, 30, ""),
+        fault("duplicate", "follower", 100, 200, ""),
+        fault("delay", "observer", 100, 5, "delay_ticks = 3"),
+        fault("delay", "leader", 100, 90, "delay_ticks = 40"),
+        fault("freeze", "follower", 100, 40, ""),
+        fault("not-a-number", "leader", 100, 40, ""),
+        fault("infinite", "observer", 100, 200, ""),
+        fault("out-of-range", "controller", 100, 10, "value = 1e3"),
+        fault("bit-flip", "leader", 100, 50, ""),
+        fault("bit-flip", "observer", 100, 2, "field = \"tick\"\nbit = 3"),
+        fault("bit-flip", "controller", 100, 2, "field = \"generation\"\nbit = 1"),
+        fault("lost-axis", "follower", 100, 5, "component = 2"),
+        fault("noise-burst", "leader", 100, 50, "deviation = 0.1"),
+        fault("stall", "observer", 100, 3, "stall_ms = 2.0"),
+    ];
+    let bench = Bench::new();
+    for case in cases {
+        let file = bench.path("case.toml");
+        std::fs::write(&file, text(&case)).unwrap();
+        let summary = |clock: &str| -> Value {
+            let arguments = ["run", file.to_str().unwrap(), "--json", "--clock", clock, "--duration", "0.6"];
+            let sets = ["--set", "accept={}", "--set", "watchdog.from_s=0"];
+            let done = bench.run(&[&arguments[..], &sets].concat());
+            assert_eq!(done.code, Some(0), "{case}: {done:?}");
+            serde_json::from_str(&done.stdout).unwrap()
+        };
+        let (one, many) = (summary("in-process"), summary("lockstep"));
+        assert_eq!(one["state"], many["state"], "{case}");
+        assert_eq!(one["books"], many["books"], "{case}");
+        assert_eq!(one["watchdog"], many["watchdog"], "{case}");
+        assert_eq!(one["books"]["balanced"], true, "{case}: {}", one["books"]["problems"]);
+        assert!(one["books"]["injected_faults"].as_u64().unwrap() > 0, "{case}");
+    }
+}
+
+/// In real time samples are really lost, doubled and late; up to the first disturbed tick the bits are the same.
+#[test]
+fn real_time_has_the_same_faults_and_balances_its_books() {
+    let bench = Bench::new();
+    for (case, undisturbed_until) in [
+        (fault("drop", "leader", 300, 5, ""), 300),
+        (fault("duplicate", "leader", 300, 20, ""), u64::MAX),
+        (fault("delay", "observer", 300, 4, "delay_ticks = 2"), 300),
+        (fault("not-a-number", "leader", 300, 20, ""), u64::MAX),
+        (fault("stall", "follower", 300, 1, "stall_ms = 20.0"), 300),
+    ] {
+        let file = bench.path("case.toml");
+        std::fs::write(&file, text(&case)).unwrap();
+        let arguments = ["run", file.to_str().unwrap(), "--json", "--duration", "1", "--tick-hz", "500"];
+        let sets = ["--set", "accept={}", "--set", "watchdog.from_s=0", "--clock", "realtime"];
+        let done = bench.run(&[&arguments[..], &sets].concat());
+        assert_eq!(done.code, Some(0), "{case}: {done:?}");
+        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        assert_eq!(summary["books"]["balanced"], true, "{case}: {}", summary["books"]["problems"]);
+        let injected = summary["books"]["injected_faults"].as_u64().unwrap();
+        let missed = summary["books"]["missed_ticks"].as_u64().unwrap();
+        // On a loaded machine the tick of the fault may itself be missed.
+        assert!(injected > 0 || missed > 0, "{case}");
+        let first = summary["state"]["first_disturbed_tick"].as_u64().unwrap_or(u64::MAX);
+        assert!(first <= undisturbed_until, "{case}: {first}");
+        let overrides = ["clock=in-process", "duration_s=1", "tick_hz=500", "accept={}", "watchdog.from_s=0"];
+        let clean = summary["state"]["clean_ticks"].as_u64().unwrap();
+        let expected = hash_after(&case, &overrides, clean);
+        assert_eq!(summary["state"]["clean_hash"].as_str().unwrap(), expected, "{case}: {clean} ticks");
+    }
+}
+
+/// The hash over the first ticks of a run in one thread, as `hashes.txt` has it.
+fn hash_after(case: &str, overrides: &[&str], ticks: u64) -> String {
+    let bench = Bench::new();
+    let file = bench.path("case.toml");
+    std::fs::write(&file, text(case)).unwrap();
+    let sets: Vec<&str> = overrides.iter().flat_map(|set| ["--set", set]).collect();
+    let out = bench.path("out");
+    let done = bench.run(&[&["run", file.to_str().unwrap(), "--out", out.to_str().unwrap()], &sets[..]].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let run = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+    let directory = if run.is_dir() { run } else { out };
+    let hashes = std::fs::read_to_string(directory.join("hashes.txt")).unwrap();
+    let line = hashes.lines().find(|line| line.split(' ').next() == Some(&ticks.to_string()));
+    line.map_or("0".repeat(16), |line| line.split(' ').nth(1).unwrap().to_owned())
+}
+
+#[test]
+fn a_fault_that_makes_no_sense_is_refused_with_place_and_remedy() {
+    let bench = Bench::new();
+    let good = "kind = \"drop\"\nrole = \"leader\"\nfrom_tick = 10";
+    for (change, said) in [
+        (("\"drop\"", "\"dorp\""), "did you mean `drop`?"),
+        (("\"leader\"", "\"leadr\""), "there is no role `leadr` in this scenario; did you mean `leader`?"),
+        (("= 10", "= 14001"), "14001 is after the last tick 14000"),
+        (("= 10", "= -1"), "not below 0"),
+        (("= 10", "= 10\nticks = 0"), "0 ticks are none"),
+        (("= 10", "= 10\nprobability = 1.5"), "up to 1"),
+        (("= 10", "= 10\nvalue = 1.0"), "has no meaning for this kind; remove it"),
+        (("= 10", "= 10\nfield = \"omega_rad_s\""), "has no meaning for this kind; remove it"),
+        (("= 10", "= 10\nbody = \"follower\""), "is for the controller"),
+        (("drop\"\nrole = \"leader", "drop\"\nrole = \"controller\"\nbody = \"leader"), "drives no `leader`"),
+        (("\"drop\"", "\"delay\""), "fault[0].delay_ticks: is missing for this kind; add it"),
+        (("\"drop\"", "\"delay\"\ndelay_ticks = 0"), "give 1 to 1000"),
+        (("\"drop\"", "\"bit-flip\"\nbit = 64"), "a word has 64 bits"),
+        (("\"drop\"", "\"bit-flip\"\ncomponent = 4"), "`omega_rad_s` has no component 4; give 1 to 3"),
+        (("\"drop\"", "\"bit-flip\"\nfield = \"omga\""), "did you mean `omega_rad_s`?"),
+        (("\"drop\"", "\"not-a-number\"\nfield = \"valid\""), "holds no number"),
+        (("\"drop\"", "\"freeze\"\nfield = \"tick\""), "of which only bits can flip"),
+        (("\"drop\"", "\"lost-axis\"\ncomponent = 4"), "there is no axis 4 to lose; give 1 to 3"),
+        (
+            ("\"drop\"\nrole = \"leader\"", "\"lost-axis\"\ncomponent = 1\nrole = \"controller\""),
+            "name a body or the observer",
+        ),
+        (("\"drop\"", "\"noise-burst\"\ndeviation = -1.0"), "not above zero"),
+        (("\"drop\"", "\"stall\"\nstall_ms = 0.0"), "0 ms is no stall"),
+        (("\"drop\"", "\"kill\"\n"), "in-process roles have none of their own"),
+    ] {
+        let file = bench.path("case.toml");
+        let fault = good.replace(change.0, change.1);
+        assert_ne!(fault, good, "{change:?}");
+        std::fs::write(&file, text(&format!("[[fault]]\n{fault}\n"))).unwrap();
+        let done = bench.run(&["check", file.to_str().unwrap(), "--set", "clock=in-process"]);
+        assert_eq!(done.code, Some(2), "{fault}: {done:?}");
+        assert!(done.stderr.contains(said) && done.stderr.contains("fault[0]"), "{fault}: {}", done.stderr);
+    }
+}
+
+#[test]
+fn limits_and_watchdog_that_make_no_sense_are_refused() {
+    let bench = Bench::new();
+    for (scenario, set, said) in [
+        ("faults", "limits.rate_rad_s=0.5", "is not above the 1.510 rad/s that a body may turn at"),
+        ("faults", "limits.acceleration_rad_s2=0.0", "not above zero"),
+        ("faults", "limits.speed_du_s=1.0", "unknown key"),
+        ("orbit-hold", "limits.speed_du_s=0.5", "is not above the 0.955 du/s that a body has or is to have"),
+        ("faults", "watchdog.from_s=99.0", "is not within the run"),
+        ("faults", "watchdog.energy_drift_max=0.0", "not above zero"),
+        ("faults", "watchdog.latch_after_ticks=3", "is for on_breach = \"safe\""),
+        ("faults", "watchdog.on_breach=panic", "there is no choice `panic`"),
+        ("rigid-pair", "watchdog.on_breach=safe", "no bound is given"),
+        ("orbit-hold", "watchdog.energy_drift_max=0.1", "thrust changes the energy"),
+        ("orbit-rendezvous", "watchdog.lyapunov_rad2_s2_max=0.1", "is not published by the controller"),
+        ("noisy-pair", "watchdog.innovation_rad_s_max=0.1", "is not published by the Kalman filter"),
+        ("inertia", "watchdog.energy_drift_max=0.1", "this scenario has none"),
+        ("rigid-pair", "accept.peak_from_s=1.0", "no criterion is a peak"),
+        ("faults", "accept.sync_error_rad_s_peek=1.0", "did you mean `sync_error_rad_s_peak`?"),
+        ("faults", "accept.peak_from_s=14.0", "nothing would be judged"),
+    ] {
+        let done = bench.run(&["check", shipped(scenario).to_str().unwrap(), "--set", set]);
+        assert_eq!(done.code, Some(2), "{set}: {done:?}");
+        assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+    }
+}
