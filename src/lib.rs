@@ -10,6 +10,7 @@
 //! | [`fault`] | scripted faults: what goes wrong with a sample or a role, and when | yes, `no_std` |
 //! | [`sample`] | the fixed-size samples that travel between roles | yes, `no_std` |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
+//! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
 //! | `config` | scenario files: as typed, then as resolved | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
@@ -30,6 +31,9 @@ pub mod model;
 pub mod observe;
 pub mod role;
 pub mod sample;
+
+#[cfg(feature = "serial")]
+pub mod serial;
 
 #[cfg(feature = "runtime")]
 pub mod bus;

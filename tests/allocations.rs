@@ -5,11 +5,17 @@ use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
-use corotate::runtime::{RoleId, depths, private_ledger, serve, topic};
+use corotate::rig::Rig;
+use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, RoleId, depths, private_ledger, serve, topic};
 use corotate::sample::{Health, Phase, RoleState, Sample, Schedule};
+use corotate::serial::{Device, Hello};
 use corotate::telemetry::RoleReport;
+use corotate::with_rig;
+use rustix::fd::OwnedFd;
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -115,12 +121,14 @@ impl<S: Sample, W: Write<S>> Write<S> for CountedWriter<W> {
 }
 
 /// Serves one role in this thread and gives its report and what it allocated.
-fn count_role(scenario: &Scenario, role: RoleId, domain: &OwnedDomain) -> (RoleReport, Count) {
+fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &OwnedDomain) -> (RoleReport, Count) {
+    let occupant = occupant.into();
+    let role = occupant.role();
     let bus = CountedBus(IoxBus::enter(domain.domain(), role.name(scenario), depths(scenario)).unwrap());
     let terminated = AtomicBool::new(false);
     let mut result = None;
     let ledger = private_ledger(scenario, role);
-    serve(scenario, role, &bus, &ledger, &terminated, Vec::new(), |report| {
+    serve(scenario, occupant, &bus, &ledger, &terminated, Vec::new(), |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })
@@ -157,30 +165,86 @@ fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     schedule.send(|word| word.phase = Phase::Stop as u64).unwrap();
 }
 
-fn counts(text: &str) -> Vec<(RoleReport, Count)> {
-    let overrides = ["clock=realtime", "duration_s=1", "accept={}"].map(str::to_owned);
+/// A pty: the device's end, and the path of the bridge's.
+fn line() -> (OwnedFd, PathBuf) {
+    let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    grantpt(&far).unwrap();
+    unlockpt(&far).unwrap();
+    let name = ptsname(&far, Vec::new()).unwrap();
+    (far, PathBuf::from(name.to_str().unwrap()))
+}
+
+/// A device that is a body of the scenario, until the other end hangs up.
+fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
+    with_rig!(&scenario.rig, rig => {
+        let (mut device, mut bytes) = (Device::new("test", |_: &Hello<'_>| Some(rig.body(index))), [0; 512]);
+        while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
+            device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));
+        }
+    })
+}
+
+/// The link to that device, greeted.
+fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
+    let body = scenario.rig.bodies()[index].name.clone();
+    let seat = DeviceSeat { domain: PathBuf::new(), body, path: path.to_owned(), baud: None, patience_s: 60.0 };
+    let mut link = DeviceLink::open(&seat, scenario, 1).unwrap();
+    assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
+    Occupant::Device(index, Box::new(link))
+}
+
+fn counts(text: &str, with_device: bool) -> Vec<(RoleReport, Count)> {
+    let overrides = ["clock=realtime", "duration_s=1", "accept={}", "fault=[]", "watchdog={}"].map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
     let domain = OwnedDomain::create(0).unwrap();
-    let roles = RoleId::all(&scenario);
+    let (roles, (far, path)) = (RoleId::all(&scenario), line());
     std::thread::scope(|scope| {
-        let threads: Vec<_> = roles.iter().map(|role| scope.spawn(|| count_role(&scenario, *role, &domain))).collect();
-        conduct(&scenario, &domain);
-        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        let (scenario, domain) = (&scenario, &domain);
+        let mut by_device = None;
+        let threads: Vec<_> = roles
+            .iter()
+            .map(|role| match role {
+                RoleId::Plant(index @ 1) if with_device => {
+                    by_device = Some(scope.spawn(|| device(scenario, *index, &far)));
+                    let occupant = linked(scenario, *index, &path);
+                    scope.spawn(move || count_role(scenario, occupant, domain))
+                }
+                role => scope.spawn(move || count_role(scenario, *role, domain)),
+            })
+            .collect();
+        conduct(scenario, domain);
+        let counts = threads.into_iter().map(|thread| thread.join().unwrap()).collect();
+        if let Some(device) = by_device {
+            device.join().unwrap();
+        }
+        counts
     })
+}
+
+fn assert_none(name: &str, counts: Vec<(RoleReport, Count)>) {
+    for (report, count) in counts {
+        let ticks = report.ticks.executed;
+        println!(
+            "{name} {}: {ticks} ticks, {} allocations of ours, {} of iceoryx2 in {} loans",
+            report.role, count.of_ours_in_the_loop, count.of_the_transport, count.prepares
+        );
+        assert!(count.armed && ticks > 0, "{name} {}: nothing was counted", report.role);
+        assert_eq!(count.of_ours_in_the_loop, 0, "{name} {}", report.role);
+        assert!(count.of_the_transport <= count.prepares, "{name} {}: one per loan at most", report.role);
+    }
 }
 
 #[test]
 fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
-        for (report, count) in counts(text) {
-            let ticks = report.ticks.executed;
-            println!(
-                "{name} {}: {ticks} ticks, {} allocations of ours, {} of iceoryx2 in {} loans",
-                report.role, count.of_ours_in_the_loop, count.of_the_transport, count.prepares
-            );
-            assert!(count.armed && ticks > 0, "{name} {}: nothing was counted", report.role);
-            assert_eq!(count.of_ours_in_the_loop, 0, "{name} {}", report.role);
-            assert!(count.of_the_transport <= count.prepares, "{name} {}: one per loan at most", report.role);
-        }
+        assert_none(name, counts(text, false));
     }
+}
+
+#[test]
+fn neither_does_a_bridge_to_a_device() {
+    let (name, text) = corotate::config::SHIPPED[0];
+    let counts = counts(text, true);
+    assert!(counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
+    assert_none(name, counts);
 }

@@ -1,5 +1,6 @@
 //! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
 
+mod bridge;
 mod check;
 mod init;
 mod role;
@@ -30,7 +31,9 @@ Examples:
   corotate check trio.toml                       validate it, print what is proven of it
   corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
   corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
-  corotate seat trio.toml follower-a             what that program must know, as JSON";
+  corotate seat trio.toml follower-a             what that program must know, as JSON
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
+                                                 a device as the follower of a run --external follower";
 
 #[derive(Subcommand)]
 enum Command {
@@ -48,6 +51,8 @@ enum Command {
     Observer(role::Arguments),
     /// Take the controller's seat in a run
     Controller(role::Arguments),
+    /// Put a device behind a serial line into a driven body's seat in a run
+    Bridge(bridge::Arguments),
     /// Clean up after a launcher that was killed
     #[command(hide = true)]
     Janitor,
@@ -112,6 +117,7 @@ fn main() -> ExitCode {
         Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
+        Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
         Some(Command::Janitor) => {
             corotate::launch::janitor(std::io::stdin());
             Exit::Ok

@@ -33,12 +33,10 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
     if let Some(Err(exit)) = arguments.parent.map(die_with) {
         return exit;
     }
-    let terminated = Arc::new(AtomicBool::new(false));
-    for signal in [SIGTERM, SIGINT] {
-        if let Err(error) = signal_hook::flag::register(signal, terminated.clone()) {
-            return fail(Exit::Failure, &error);
-        }
-    }
+    let terminated = match terminated_by_signals() {
+        Ok(terminated) => terminated,
+        Err(exit) => return exit,
+    };
     let seat = RoleSeat { domain: arguments.domain.clone(), role: name.to_owned() };
     match run_role(&seat, &terminated) {
         Ok(()) => Exit::Ok,
@@ -49,8 +47,17 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
     }
 }
 
+/// A flag that the signals which ask a process to end set.
+pub fn terminated_by_signals() -> Result<Arc<AtomicBool>, Exit> {
+    let terminated = Arc::new(AtomicBool::new(false));
+    for signal in [SIGTERM, SIGINT] {
+        signal_hook::flag::register(signal, terminated.clone()).map_err(|error| fail(Exit::Failure, &error))?;
+    }
+    Ok(terminated)
+}
+
 /// Asks the kernel to kill this process when its parent dies.
-fn die_with(parent: i32) -> Result<(), Exit> {
+pub fn die_with(parent: i32) -> Result<(), Exit> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
     set_parent_process_death_signal(Some(Signal::KILL)).map_err(|error| fail(Exit::Failure, &error))?;
     // The parent may have died before the request.

@@ -257,7 +257,11 @@ fn by_hand(role: &str, domain: &Path) -> String {
     let domain = domain.display();
     match role {
         "observer" | "controller" => format!("corotate {role} --domain {domain}"),
-        body => format!("corotate plant --body {body} --domain {domain}"),
+        "leader" => format!("corotate plant --body {role} --domain {domain}"),
+        body => format!(
+            "corotate plant --body {body} --domain {domain}\nor put a device there with\n  \
+             corotate bridge --serial PATH --body {body} --domain {domain}"
+        ),
     }
 }
 

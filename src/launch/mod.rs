@@ -17,7 +17,7 @@ pub use junit::junit;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
-pub use table::table;
+pub use table::{line_words, table};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

@@ -5,6 +5,7 @@
 use super::{Action, Incident, Score};
 use crate::config::Scenario;
 use crate::rig::{CertificateReport, Figure};
+use crate::serial::LineBook;
 use crate::telemetry::{
     Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm, write_hlog,
 };
@@ -79,6 +80,9 @@ pub struct Summary {
     pub state: State,
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
+    /// The books of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub lines: BTreeMap<String, LineBook>,
     /// Everything that was asked of the machine.
     pub privileges: Vec<RoleGrant>,
 }
@@ -224,6 +228,7 @@ impl Summary {
             state: State::new(&outcome.reports, &books),
             books,
             latencies,
+            lines: lines(&outcome.reports),
             privileges: privileges(outcome),
         }
     }
@@ -365,6 +370,10 @@ fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {
         StageFigures { role: report.role.clone(), stage: stage.stage.clone(), figures: latency.percentiles(), latency }
     };
     reports.iter().flat_map(|report| report.stages.iter().map(move |stage| figures(report, stage))).collect()
+}
+
+fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineBook> {
+    reports.iter().filter_map(|report| Some((report.role.clone(), report.line?))).collect()
 }
 
 fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {

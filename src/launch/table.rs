@@ -2,6 +2,7 @@
 
 use super::outcome::LinkBook;
 use super::{Incident, Summary};
+use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -31,8 +32,43 @@ pub fn table(summary: &Summary) -> String {
     }
     books(summary, &mut text);
     watchdog(summary, &mut text);
+    for (body, book) in &summary.lines {
+        let _ = writeln!(text, "{}", line_words(body, book));
+    }
     privileges(summary, &mut text);
     text
+}
+
+/// The books of a serial line in words, one line for what went well and one for what did not.
+pub fn line_words(body: &str, book: &LineBook) -> String {
+    let well = format!(
+        "line of {body}: {} frames and {} bytes sent, {} and {} received, {}",
+        book.frames_sent,
+        book.bytes_sent,
+        book.frames_received,
+        book.bytes_received,
+        match book.handshakes {
+            1 => "1 handshake".to_owned(),
+            count => format!("{count} handshakes"),
+        },
+    );
+    let ill = [
+        (book.crc_errors, "CRC errors"),
+        (book.malformed, "malformed blocks"),
+        (book.dropped_bytes, "bytes dropped"),
+        (book.resyncs, "resyncs"),
+        (book.sequence_gaps, "frames lost on the way here"),
+        (book.repeats, "requests repeated"),
+        (book.unanswered, "ticks unanswered"),
+        (book.late, "late answers"),
+        (book.duplicates, "answers twice"),
+        (book.echoes, "echoes"),
+        (book.unsent, "frames the line did not take"),
+        (book.reopened, "times opened again"),
+    ];
+    let ill: Vec<String> =
+        ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
+    if ill.is_empty() { format!("{well}; no fault") } else { format!("{well}\n  {}", ill.join(", ")) }
 }
 
 fn results(summary: &Summary, text: &mut String) {

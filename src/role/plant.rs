@@ -52,6 +52,7 @@ pub struct Actuation {
 
 /// What became of the command due at a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serial", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandEvent {
     /// None was due: the body is free or the tick is the first.
     NotDue,
@@ -124,13 +125,23 @@ impl<B: Body> Plant<B> {
         event
     }
 
+    /// How many more ticks without a command until the safe command takes over; 0 if it acts.
+    pub fn ticks_until_safe(&self) -> u64 {
+        if self.safe { 0 } else { self.actuation.timeout_ticks.saturating_sub(self.silent_ticks).max(1) }
+    }
+
+    /// Goes to the safe command at once, as if commands had been missing for long enough.
+    pub fn expire(&mut self) {
+        self.safe = true;
+        self.body.apply_safe();
+    }
+
     fn silence(&mut self) -> CommandEvent {
         self.silent_ticks += 1;
         if self.safe {
             CommandEvent::Safe
         } else if self.silent_ticks >= self.actuation.timeout_ticks {
-            self.safe = true;
-            self.body.apply_safe();
+            self.expire();
             CommandEvent::Expired
         } else {
             CommandEvent::Held

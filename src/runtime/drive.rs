@@ -118,14 +118,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 return Ok(Ended::Stopped);
             }
             node.before_tick();
-            let executed = if node.time_triggered() {
-                self.on_time(node, grid, lead_ns)?
-            } else {
-                self.on_arrival(node, grid, settings)?
-            };
+            let begun = if node.time_triggered() { self.on_time(node, grid, lead_ns)? } else { Poll::Waiting };
+            let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
+            let executed = if waits { self.on_arrival(node, grid, settings)? } else { Some(begun) };
             match executed {
                 Some(Poll::Executed) => node.settle()?,
-                Some(Poll::Waiting) => {}
+                Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
             }
             if self.turn(node)? {
@@ -136,12 +134,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
-    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Option<Poll>, BusError> {
+    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, BusError> {
         let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
-        node.poll(Gate::Now { tick: grid.tick_at(now_ns), now_ns }).map(Some)
+        node.poll(Gate::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
-    /// Another role's tick: when its inputs are there. Spins for a while, then naps between looks.
+    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then naps between looks.
     fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Option<Poll>, BusError> {
         let tick = node.next_tick();
         let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * settings.cutoff) as u64;
@@ -150,8 +148,9 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         loop {
             let now_ns = monotonic_ns();
             let gate = if now_ns >= overdue_ns { Gate::Overdue } else { Gate::Arrived };
-            if node.poll(gate)? == Poll::Executed {
-                return Ok(Some(Poll::Executed));
+            match node.poll(gate)? {
+                Poll::Waiting => {}
+                done => return Ok(Some(done)),
             }
             hooks::at(Place::Waiting);
             if now_ns < spin_end_ns {

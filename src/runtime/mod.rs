@@ -3,20 +3,25 @@
 //! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
+mod bridge;
 mod disturb;
 mod drive;
 mod hooks;
+mod line;
 mod link;
 mod node;
 mod privileges;
 mod process;
 mod seat;
 
+pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
-    Gate, Node, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic, visit_writes,
+    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic,
+    visit_writes,
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::hold_low_latency_idle;

@@ -2,6 +2,7 @@
 //!
 //! Must not wait, and must not decide when it runs; a driver does.
 
+mod bridge;
 mod controller;
 mod observer;
 mod plant;
@@ -9,6 +10,7 @@ mod ports;
 
 pub use ports::{Port, Ports, Visit, ports, visit_writes};
 
+use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
 use super::link::{Horizon, Input, Output};
 use crate::bus::iox::footprint;
@@ -18,6 +20,7 @@ use crate::config::{ClockKind, Scenario};
 use crate::rig::{Rig, Truth};
 use crate::role::Guard;
 use crate::sample::Sample;
+use crate::serial::LineBook;
 use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
 use crate::with_rig;
 
@@ -64,6 +67,30 @@ impl RoleId {
     }
 }
 
+/// Who takes a role's seat.
+pub enum Occupant {
+    /// This program.
+    Role(RoleId),
+    /// A device, as the driven body with this index.
+    Device(usize, Box<DeviceLink>),
+}
+
+impl Occupant {
+    /// The seat.
+    pub fn role(&self) -> RoleId {
+        match self {
+            Self::Role(role) => *role,
+            Self::Device(index, _) => RoleId::Plant(*index),
+        }
+    }
+}
+
+impl From<RoleId> for Occupant {
+    fn from(role: RoleId) -> Self {
+        Self::Role(role)
+    }
+}
+
 /// When a node may execute its next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Gate {
@@ -92,11 +119,14 @@ pub enum Poll {
     Executed,
     /// It waits for inputs, or has passed over a tick of which there are none.
     Waiting,
+    /// It has given the tick up and counted it as missed.
+    Missed,
 }
 
 /// A role with its links and books.
 pub trait Node {
-    /// Whether the tick alone starts it, or its inputs do.
+    /// Whether the tick alone starts it, or its inputs do. What is started by its tick may still wait for something that
+    /// the tick sets off: then it is polled until that has arrived, or is overdue.
     fn time_triggered(&self) -> bool;
     /// The next tick to execute.
     fn next_tick(&self) -> u64;
@@ -131,6 +161,10 @@ pub trait Node {
     fn ticks(&self) -> Ticks;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
+    /// The books of its device's serial line, if it has one.
+    fn line(&self) -> Option<LineBook> {
+        None
+    }
 }
 
 /// A node that can be driven.
@@ -240,6 +274,7 @@ pub fn report(
         watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
         stages,
         grants,
+        line: None,
     }
 }
 
@@ -255,18 +290,20 @@ pub fn topic(scenario: &Scenario, body: &str, signal: Signal) -> Topic {
 pub fn build<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Scenario,
-    role: RoleId,
+    occupant: impl Into<Occupant>,
     bus: &B,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
     let generation = ledger.enter();
     let ledger = &ledger.reopened();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let seat = Seat { bus, scenario, role, generation, ledger, clock };
-    Ok(match role {
-        RoleId::Plant(index) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
+    let occupant = occupant.into();
+    let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
+    Ok(match occupant {
+        Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
+        Occupant::Role(RoleId::Plant(index)) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
+        Occupant::Role(RoleId::Observer) => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
+        Occupant::Role(RoleId::Controller) => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
 }
 

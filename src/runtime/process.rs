@@ -2,9 +2,10 @@
 //!
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
+use super::bridge::DeviceError;
 use super::drive::{Control, Drive, Ended};
 use super::hooks::{self, Place};
-use super::node::{self, ReadyNode, RoleId, ledger_words, report, topic};
+use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
 use super::{depths, privileges};
 use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
@@ -64,6 +65,17 @@ pub enum RoleError {
         /// The scenario of its run.
         scenario: PathBuf,
     },
+    /// The role is no body that a device could be.
+    #[error("a device can be a driven body only, and `{role}` is none; this scenario has: {driven}")]
+    NotDriven {
+        /// As given.
+        role: String,
+        /// The driven bodies.
+        driven: String,
+    },
+    /// There is no device for the seat.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
@@ -101,18 +113,44 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
 /// # Errors
 /// [`RoleError`].
 pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleError> {
-    let domain = Domain::join(&seat.domain)?;
+    let (domain, scenario) = join(&seat.domain)?;
+    let role = find_role(&scenario, &seat.role)?;
+    in_domain(&domain, &scenario, role.into(), terminated, |_| {})
+}
+
+/// The domain of a run with its scenario.
+pub(super) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
+    let domain = Domain::join(directory)?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
-    let role = RoleId::named(&scenario, &seat.role)
-        .ok_or_else(|| RoleError::NoSuchRole { role: seat.role.clone(), known: scenario.rig.roles().join(", ") })?;
+    Ok((domain, scenario))
+}
+
+/// The role of this name.
+pub(super) fn find_role(scenario: &Scenario, name: &str) -> Result<RoleId, RoleError> {
+    RoleId::named(scenario, name)
+        .ok_or_else(|| RoleError::NoSuchRole { role: name.to_owned(), known: scenario.rig.roles().join(", ") })
+}
+
+/// Serves a seat in a domain to the end of the run, and leaves its report there; `reported` sees it too.
+pub(super) fn in_domain(
+    domain: &Domain,
+    scenario: &Scenario,
+    occupant: Occupant,
+    terminated: &AtomicBool,
+    reported: impl FnOnce(&RoleReport),
+) -> Result<(), RoleError> {
+    let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
-    let ledger = Ledger::taken(&ledger_path(&domain, &scenario, role), ledger_words(&scenario, role))?;
-    hooks::enter(&seat.role, ledger.generation() + 1);
+    let ledger = Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))?;
+    hooks::enter(role.name(scenario), ledger.generation() + 1);
     hooks::at(Place::Opening);
-    let bus = IoxBus::enter(&domain, &seat.role, depths(&scenario))?;
-    serve(&scenario, role, &bus, &ledger, terminated, grants, |report| write_report(&domain, report))
+    let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
+    serve(scenario, occupant, &bus, &ledger, terminated, grants, |report| {
+        reported(report);
+        write_report(domain, report)
+    })
 }
 
 /// A role's ledger in a domain, to be read.
@@ -138,24 +176,26 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a role on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken, and
+/// Serves a seat on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken, and
 /// `ledger` the books, new or a predecessor's.
 ///
 /// # Errors
 /// [`RoleError`].
 pub fn serve<B: Bus + 'static>(
     scenario: &Scenario,
-    role: RoleId,
+    occupant: impl Into<Occupant>,
     bus: &B,
     ledger: &Ledger,
     terminated: &AtomicBool,
     grants: Vec<Grant>,
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
+    let occupant = occupant.into();
+    let role = occupant.role();
     let name = role.name(scenario);
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
     let health = bus.writer(&topic(scenario, name, Signal::Health))?;
-    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, role, bus, ledger))?;
+    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         health,
@@ -172,7 +212,7 @@ pub fn serve<B: Bus + 'static>(
         privileges::release();
     }
     stages.extend(node.stages());
-    deliver(&report(scenario, role, ledger, stages, grants))?;
+    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, grants) })?;
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
         let leave_ns = monotonic_ns() + LEAVE_NS;

@@ -107,6 +107,34 @@ pub trait Sample: bytemuck::Pod + Default + PartialEq + core::fmt::Debug + Send 
     fn content(&self) -> &[u8] {
         &bytemuck::bytes_of(self)[size_of::<Stamp>()..]
     }
+
+    /// Takes over everything but the stamp from the bytes that [`content`](Self::content) gave elsewhere; false, and
+    /// nothing changed, if they are not as many.
+    fn set_content(&mut self, content: &[u8]) -> bool {
+        let own = &mut bytemuck::bytes_of_mut(self)[size_of::<Stamp>()..];
+        let fits = own.len() == content.len();
+        if fits {
+            own.copy_from_slice(content);
+        }
+        fits
+    }
+}
+
+/// Bytes of a sample's content.
+pub const fn content_length<S: Sample>() -> usize {
+    size_of::<S>() - size_of::<Stamp>()
+}
+
+/// Copies every field of `from` into the field of the same name and kind in `to`, if there is one; the stamps stay.
+pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
+    let (source, target) = (bytemuck::bytes_of(from), bytemuck::bytes_of_mut(to));
+    for field in A::FIELDS {
+        let same = |other: &&Field| (other.name, other.kind, other.count) == (field.name, field.kind, field.count);
+        if let Some(other) = B::FIELDS.iter().find(same) {
+            let length = 8 * field.count;
+            target[other.offset..][..length].copy_from_slice(&source[field.offset..][..length]);
+        }
+    }
 }
 
 /// Defines a sample. `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8.
@@ -215,6 +243,41 @@ mod tests {
     fn every_status_bit_has_one_name() {
         for (index, (name, bit)) in status::NAMES.into_iter().enumerate() {
             assert_eq!(bit, 1 << index, "{name}");
+        }
+    }
+
+    #[test]
+    fn content_goes_from_sample_to_sample_whole_or_not_at_all() {
+        let sent = RateCommand { acceleration_rad_s2: [1.0, 2.0, 3.0], ..RateCommand::default() };
+        let mut received = RateCommand { stamp: Stamp { tick: 7, ..Stamp::default() }, ..RateCommand::default() };
+        assert!(!received.set_content(&sent.content()[1..]) && received.acceleration_rad_s2 == [0.0; 3]);
+        assert!(received.set_content(sent.content()));
+        assert_eq!((received.acceleration_rad_s2, received.stamp.tick), (sent.acceleration_rad_s2, 7));
+        assert_eq!(content_length::<RateCommand>(), sent.content().len());
+    }
+
+    /// What a device measures completely is its truth, in every rig: each field of the truth is one of the measurement.
+    #[test]
+    fn fields_of_one_name_are_copied() {
+        let measured = RateMeasurement {
+            omega_rad_s: [1.0, 2.0, 3.0],
+            applied_rad_s2: [4.0, 5.0, 6.0],
+            valid: 7,
+            status: 8,
+            ..RateMeasurement::default()
+        };
+        let mut truth = RateTruth::default();
+        copy_fields(&measured, &mut truth);
+        assert_eq!((truth.omega_rad_s, truth.applied_rad_s2, truth.status), ([1.0, 2.0, 3.0], [4.0, 5.0, 6.0], 8));
+        let measured = OrbitMeasurement { radius_du: 1.0, velocity_du_s: [2.0, 3.0], ..OrbitMeasurement::default() };
+        let mut truth = OrbitTruth::default();
+        copy_fields(&measured, &mut truth);
+        assert_eq!((truth.radius_du, truth.velocity_du_s), (1.0, [2.0, 3.0]));
+        let names = |fields: &[Field]| fields.iter().map(|field| field.name).collect::<Vec<_>>();
+        for (truth, measured) in
+            [(RateTruth::FIELDS, RateMeasurement::FIELDS), (OrbitTruth::FIELDS, OrbitMeasurement::FIELDS)]
+        {
+            assert!(names(truth).iter().all(|name| names(measured).contains(name)));
         }
     }
 

@@ -1,6 +1,7 @@
 //! What a role says of its run when it ends: the books, the hash, the histograms, the privileges.
 
 use super::{Checkpoints, Latency};
+use crate::serial::LineBook;
 use serde::{Deserialize, Serialize};
 
 /// A role's account of itself.
@@ -23,6 +24,8 @@ pub struct RoleReport {
     /// What it asked of the machine, and what it got.
     #[serde(default)]
     pub grants: Vec<Grant>,
+    /// The books of its device's serial line, if a device has the seat.
+    pub line: Option<LineBook>,
 }
 
 /// What a watchdog saw.
@@ -122,7 +125,7 @@ pub struct LinkRead {
 /// One stage's latencies.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct StageReport {
-    /// `lateness`, `hop`, `step`, `age`, `baseline`.
+    /// `lateness`, `hop`, `step`, `age`, `baseline`, `serial`.
     pub stage: String,
     /// HdrHistogram V2 encoding, ns.
     pub histogram: Vec<u8>,

@@ -215,7 +215,7 @@ impl<S: Sample> StateBook<S> {
     /// Words of the ledger: which of the two copies holds, from 1, and the copies. One of them is always whole.
     pub const WORDS: usize = 1 + 2 * Self::SAMPLE_WORDS;
 
-    fn open(ledger: &Ledger) -> Self {
+    pub fn open(ledger: &Ledger) -> Self {
         Self { words: ledger.take(Self::WORDS), sample: PhantomData }
     }
 
@@ -224,7 +224,7 @@ impl<S: Sample> StateBook<S> {
     }
 
     #[inline]
-    fn store(&mut self, sample: &S) {
+    pub fn store(&mut self, sample: &S) {
         let copy = if self.words.get(0) == 1 { 2 } else { 1 };
         let words: &[u64] = bytemuck::cast_slice(std::slice::from_ref(sample));
         for (index, word) in words.iter().enumerate() {

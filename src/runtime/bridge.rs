@@ -1,0 +1,378 @@
+//! A device in a role's seat: the link to it, and the process that serves it.
+//!
+//! A silent device is waited for, asked again, greeted anew, and its line opened again, for a bounded time. Must not know
+//! what its samples mean.
+
+use super::line::{Line, LineError};
+use super::node::{Occupant, RoleId};
+use super::process::{RoleError, find_role, in_domain, join};
+use crate::clock::{monotonic_ns, sleep_until};
+use crate::config::{ClockKind, Scenario};
+use crate::rig::{Command, Measurement, Rig, Truth};
+use crate::role::Rearm;
+use crate::sample::{Sample, content_length};
+use crate::serial::{Answer, Heard, Hello, Host, LineBook, Refuse, Terms, VERSION};
+use crate::with_rig;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Between two tries to open a line again, ns.
+const REOPEN_NS: u64 = 100_000_000;
+/// Between two looks at the line while the device is greeted for the first time, ns.
+const LOOK_NS: u64 = 1_000_000;
+/// How many bytes are taken from the line at once, and how often in one turn: garbage must not hold up a tick.
+const CHUNK: usize = 512;
+const CHUNKS: usize = 4;
+/// Bits on the line per byte: start, eight, stop.
+const BITS_PER_BYTE: u64 = 10;
+/// Bytes of a frame beside the samples in it: delimiters, COBS, CRC, numbers; the least.
+const FRAME_OVERHEAD: u64 = 14;
+
+/// Which seat a device takes, and where it is.
+#[derive(Debug, Clone)]
+pub struct DeviceSeat {
+    /// The domain's directory.
+    pub domain: PathBuf,
+    /// The driven body's name.
+    pub body: String,
+    /// The device's serial line.
+    pub path: PathBuf,
+    /// Its speed, bit/s; as it is, if none.
+    pub baud: Option<u32>,
+    /// How long a silent device, or one that is gone, is waited for, s.
+    pub patience_s: f64,
+}
+
+/// Why there is no device, or none any more.
+#[derive(Debug, thiserror::Error)]
+pub enum DeviceError {
+    /// Its line could not be opened.
+    #[error(transparent)]
+    Line(#[from] LineError),
+    /// It takes too long to say what must be said.
+    #[error(
+        "at {baud} baud one tick takes {line_us} us on the line, and the run has {tick_us} us for it; give --baud {least} \
+         or more, or run with a lower tick_hz"
+    )]
+    TooSlow {
+        /// The speed, bit/s.
+        baud: u32,
+        /// One request and its answer, µs.
+        line_us: u64,
+        /// The period up to its cutoff, µs.
+        tick_us: u64,
+        /// The least speed that would do, bit/s.
+        least: u64,
+    },
+    /// It does not answer.
+    #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
+    Silent {
+        /// The line.
+        path: PathBuf,
+        /// How long it was waited for, s.
+        waited_s: f64,
+        /// What to look at.
+        hint: String,
+    },
+    /// It speaks another protocol version.
+    #[error(
+        "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
+        path.display()
+    )]
+    Version {
+        /// The line.
+        path: PathBuf,
+        /// The device's version.
+        theirs: u8,
+    },
+    /// It refuses to take part.
+    #[error("the device on {} refuses to be `{body}`: {reason}", path.display())]
+    Refused {
+        /// The line.
+        path: PathBuf,
+        /// The body.
+        body: String,
+        /// Its reason, and what to do.
+        reason: String,
+    },
+}
+
+/// What a device is greeted with.
+#[derive(Debug, Clone)]
+struct Greeting {
+    run: u64,
+    realtime: bool,
+    period_ns: u64,
+    last_tick: u64,
+    timeout_ticks: u64,
+    manual_rearm: bool,
+    body: String,
+    command: &'static str,
+    measurement: &'static str,
+    truth: &'static str,
+}
+
+impl Greeting {
+    fn new<R: Rig>(_rig: &R, scenario: &Scenario, body: &str, run: u64) -> Self {
+        Self {
+            run,
+            realtime: scenario.clock == ClockKind::Realtime,
+            period_ns: scenario.period_ns,
+            last_tick: scenario.last_tick,
+            timeout_ticks: scenario.command_timeout_ticks,
+            manual_rearm: scenario.rearm == Rearm::Manual,
+            body: body.to_owned(),
+            command: Command::<R>::TYPE_NAME,
+            measurement: Measurement::<R>::TYPE_NAME,
+            truth: Truth::<R>::TYPE_NAME,
+        }
+    }
+
+    fn hello(&self) -> Hello<'_> {
+        Hello {
+            run: self.run,
+            realtime: self.realtime,
+            period_ns: self.period_ns,
+            last_tick: self.last_tick,
+            timeout_ticks: self.timeout_ticks,
+            manual_rearm: self.manual_rearm,
+            body: &self.body,
+            command: self.command,
+            measurement: self.measurement,
+            truth: self.truth,
+        }
+    }
+}
+
+/// A device on its line, with the host's end of the protocol.
+pub struct DeviceLink {
+    line: Line,
+    host: Host,
+    greeting: Greeting,
+    patience_ns: u64,
+    reopen_ns: u64,
+}
+
+impl DeviceLink {
+    /// Opens the line to a device that is to be a body of a scenario; `run` tells this run from others.
+    ///
+    /// # Errors
+    /// [`DeviceError::Line`] and [`DeviceError::TooSlow`].
+    pub fn open(seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
+        with_rig!(&scenario.rig, rig => Self::of_rig(rig, seat, scenario, run))
+    }
+
+    fn of_rig<R: Rig>(rig: &R, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
+        let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
+        check_speed(seat.baud, scenario, command + measurement)?;
+        let greeting = Greeting::new(rig, scenario, &seat.body, run);
+        let terms = Terms {
+            run,
+            period_ns: greeting.realtime.then_some(scenario.period_ns),
+            measurement_length: measurement,
+            truth_length: content_length::<Truth<R>>(),
+        };
+        let patience_ns = (seat.patience_s * 1e9) as u64;
+        let line = Line::open(&seat.path, seat.baud)?;
+        Ok(Self { line, host: Host::new(terms), greeting, patience_ns, reopen_ns: 0 })
+    }
+
+    /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first.
+    ///
+    /// # Errors
+    /// [`DeviceError`] if it refuses, or stays silent for too long.
+    pub fn greet(&mut self, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
+        let mut name = None;
+        while !terminated.load(Ordering::Relaxed) {
+            self.exchange(monotonic_ns(), |heard| {
+                if let Heard::Welcome(welcome) = heard {
+                    name = Some(printable(welcome.device));
+                }
+            })?;
+            if let Some(name) = name {
+                self.host.wait_anew();
+                return Ok(Some(name));
+            }
+            sleep_until(monotonic_ns() + LOOK_NS);
+        }
+        Ok(None)
+    }
+
+    /// Asks for a tick from now on.
+    #[inline]
+    pub fn request(&mut self, tick: u64, command: Option<&[u8]>, now_ns: u64) {
+        self.host.request(tick, command, now_ns);
+    }
+
+    /// Asks no more for the tick at hand.
+    pub fn give_up(&mut self) {
+        self.host.give_up();
+    }
+
+    /// One turn: takes what has arrived, sends what is due. `answer` gets the answer to the tick at hand.
+    ///
+    /// # Errors
+    /// [`DeviceError`] if the device has been away for too long, or will not take part any more.
+    #[inline]
+    pub fn turn(&mut self, now_ns: u64, mut answer: impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
+        self.exchange(now_ns, |heard| {
+            if let Heard::Answer(heard) = heard {
+                answer(heard);
+            }
+        })
+    }
+
+    fn exchange(&mut self, now_ns: u64, mut hear: impl FnMut(&Heard<'_>)) -> Result<(), DeviceError> {
+        if self.host.silent_ns(now_ns) > self.patience_ns {
+            return Err(self.silent(now_ns));
+        }
+        if !self.line.is_open() && !self.open_again(now_ns) {
+            return Ok(());
+        }
+        self.take_in(now_ns, &mut hear)?;
+        let Self { line, host, greeting, .. } = self;
+        let hello = greeting.hello();
+        while let Some(frame) = host.due(now_ns, &hello) {
+            if !line.write(frame) {
+                host.unsent();
+            }
+        }
+        line.flush();
+        if !line.is_open() {
+            host.cut(now_ns);
+        }
+        Ok(())
+    }
+
+    fn take_in(&mut self, now_ns: u64, hear: &mut impl FnMut(&Heard<'_>)) -> Result<(), DeviceError> {
+        let mut bytes = [0; CHUNK];
+        for _ in 0..CHUNKS {
+            let count = self.line.read(&mut bytes);
+            for &byte in &bytes[..count] {
+                match self.host.push(byte, now_ns) {
+                    None => {}
+                    Some(Heard::Refused(refuse)) => return Err(refused(&self.line, &self.greeting, &refuse)),
+                    Some(Heard::OtherVersion(theirs)) => {
+                        return Err(DeviceError::Version { path: self.line.path().to_owned(), theirs });
+                    }
+                    Some(heard) => hear(&heard),
+                }
+            }
+            if count < CHUNK {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Tries now and then; true if the line is open again.
+    fn open_again(&mut self, now_ns: u64) -> bool {
+        if now_ns < self.reopen_ns {
+            return false;
+        }
+        self.reopen_ns = now_ns + REOPEN_NS;
+        let open = self.line.reopen().is_ok();
+        if open {
+            self.host.reopened();
+        }
+        self.host.wait_since(now_ns);
+        open
+    }
+
+    fn silent(&mut self, now_ns: u64) -> DeviceError {
+        let book = self.host.book();
+        let hint = match self.line.reopen() {
+            Err(error) => error.to_string(),
+            Ok(()) if book.echoes > 0 => {
+                "its own frames came back: is the line looped, or does the far end echo?".to_owned()
+            }
+            Ok(()) if book.frames_received == 0 && book.bytes_received > 0 => format!(
+                "{} bytes came and no frame was among them: do both ends have the same speed (--baud)?",
+                book.bytes_received
+            ),
+            Ok(()) => "is it powered, wired (RX to TX), and running a program of this protocol?".to_owned(),
+        };
+        let waited_s = self.host.silent_ns(now_ns) as f64 / 1e9;
+        DeviceError::Silent { path: self.line.path().to_owned(), waited_s, hint }
+    }
+
+    /// The line's books.
+    pub fn book(&self) -> LineBook {
+        self.host.book()
+    }
+}
+
+impl Drop for DeviceLink {
+    /// However this ends, the device is told to go to its safe command; if that is lost, it does so by itself.
+    fn drop(&mut self) {
+        self.line.write(self.host.stop());
+    }
+}
+
+/// What a device says may be anything; a terminal must survive it.
+fn printable(text: &str) -> String {
+    text.escape_debug().to_string()
+}
+
+fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError {
+    use crate::serial::Reason;
+    let detail = printable(refuse.detail);
+    let reason = match refuse.reason {
+        Reason::Samples => format!(
+            "it knows samples of type `{detail}`, and this run has `{}`, `{}` and `{}`; give it the program for this rig \
+             and version",
+            greeting.command, greeting.measurement, greeting.truth
+        ),
+        Reason::Version | Reason::Body | Reason::NotGreeted => {
+            format!("{detail}; give it the program for this body, or name another one with --body")
+        }
+    };
+    DeviceError::Refused { path: line.path().to_owned(), body: greeting.body.clone(), reason }
+}
+
+/// Whether a tick and its answer have room in the period.
+fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result<(), DeviceError> {
+    let (Some(baud), ClockKind::Realtime) = (baud, scenario.clock) else { return Ok(()) };
+    let bits = BITS_PER_BYTE * (2 * FRAME_OVERHEAD + content as u64);
+    let tick_us = (scenario.period_ns as f64 * scenario.realtime.cutoff / 1e3) as u64;
+    let line_us = bits * 1_000_000 / u64::from(baud.max(1));
+    if line_us > tick_us {
+        let least = (bits * 1_000_000).div_ceil(tick_us.max(1));
+        return Err(DeviceError::TooSlow { baud, line_us, tick_us, least });
+    }
+    Ok(())
+}
+
+/// The seat's body, if a device can be it.
+fn driven(scenario: &Scenario, name: &str) -> Result<usize, RoleError> {
+    let bodies = scenario.rig.bodies();
+    match find_role(scenario, name)? {
+        RoleId::Plant(index) if bodies[index].driven => Ok(index),
+        _ => {
+            let driven = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect::<Vec<_>>();
+            Err(RoleError::NotDriven { role: name.to_owned(), driven: driven.join(", ") })
+        }
+    }
+}
+
+/// Puts a device into the seat of a driven body and serves it to the end of the run. `welcomed` is told the device's name.
+/// Gives the line's books, if a run was served.
+///
+/// # Errors
+/// [`RoleError`].
+pub fn run_bridge(
+    seat: &DeviceSeat,
+    terminated: &AtomicBool,
+    welcomed: impl FnOnce(&str),
+) -> Result<Option<LineBook>, RoleError> {
+    let (domain, scenario) = join(&seat.domain)?;
+    let index = driven(&scenario, &seat.body)?;
+    // A bridge that is started again in the same run finds a device that knows it.
+    let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
+    let mut link = DeviceLink::open(seat, &scenario, run)?;
+    let Some(name) = link.greet(terminated)? else { return Ok(None) };
+    welcomed(&name);
+    let (mut book, occupant) = (None, Occupant::Device(index, Box::new(link)));
+    in_domain(&domain, &scenario, occupant, terminated, |report| book = report.line)?;
+    Ok(book)
+}

@@ -1,0 +1,259 @@
+//! A device in a plant's seat on a bus: command in and over the line; the device's answer out as measurement and truth.
+//!
+//! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
+
+use super::plant::StateBook;
+use super::{Gate, Node, Poll, Seat};
+use crate::bus::{Bus, BusError, Signal};
+use crate::clock::{Clock, Grid, monotonic_ns};
+use crate::rig::{Command, Measurement, Rig, Truth};
+use crate::role::CommandEvent;
+use crate::runtime::bridge::DeviceLink;
+use crate::runtime::disturb::Interruptions;
+use crate::runtime::link::{Horizon, Input, Output, Seek};
+use crate::sample::{Sample, Stamp, content_length, copy_fields};
+use crate::serial::{Answer, LineBook, MAX_CONTENT};
+use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
+
+/// A device with its links and books.
+pub struct BridgeNode<R: Rig, B: Bus> {
+    link: Box<DeviceLink>,
+    command: Input<B, Command<R>, R::CommandGuard>,
+    measurement: Output<B, Measurement<R>>,
+    truth: Output<B, Truth<R>>,
+    clock: Clock,
+    grid: Grid,
+    last_tick: u64,
+    book: TickBook,
+    interruptions: Interruptions,
+    state: StateBook<Truth<R>>,
+    /// Whether the device has been asked for the next tick, when, and when its command's chain began, ns.
+    asked: bool,
+    asked_ns: u64,
+    command_origin_ns: Option<u64>,
+    reply: Reply<R>,
+    lateness: Latency,
+    serial: Latency,
+    age: Latency,
+}
+
+/// What the device answered, taken off the line.
+struct Reply<R: Rig> {
+    event: CommandEvent,
+    measurement: Measurement<R>,
+    truth: Truth<R>,
+}
+
+impl<R: Rig> Reply<R> {
+    /// The lengths are those agreed upon: the host's end drops other answers.
+    fn take(&mut self, answer: &Answer<'_>) {
+        self.event = answer.event;
+        self.measurement.set_content(answer.measurement);
+        // What a device does not know, its sensors say.
+        if !self.truth.set_content(answer.truth) {
+            copy_fields(&self.measurement, &mut self.truth);
+        }
+    }
+}
+
+impl<R: Rig, B: Bus> BridgeNode<R, B> {
+    pub fn open(rig: &R, index: usize, link: Box<DeviceLink>, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+        const {
+            assert!(content_length::<Command<R>>() <= MAX_CONTENT);
+            assert!(content_length::<Measurement<R>>() <= MAX_CONTENT);
+            assert!(content_length::<Truth<R>>() <= MAX_CONTENT);
+        }
+        let (scenario, body) = (seat.scenario, &rig.bodies()[index].name);
+        // The same books in the same order as a simulated plant's. A successor lacks nothing: the state is in the device.
+        let book = TickBook::open(seat.ledger);
+        let measurement = seat.output(body, Signal::Measurement)?;
+        let truth = seat.output(body, Signal::Truth)?;
+        let command = seat.input(body, Signal::Command, rig.command_guard(index))?;
+        Ok(Self {
+            link,
+            command,
+            measurement,
+            truth,
+            clock: seat.clock,
+            grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
+            last_tick: scenario.last_tick,
+            book,
+            interruptions: seat.interruptions(),
+            state: StateBook::open(seat.ledger),
+            asked: false,
+            asked_ns: 0,
+            command_origin_ns: None,
+            reply: Reply {
+                event: CommandEvent::NotDue,
+                measurement: Measurement::<R>::default(),
+                truth: Truth::<R>::default(),
+            },
+            lateness: Latency::default(),
+            serial: Latency::default(),
+            age: Latency::default(),
+        })
+    }
+
+    fn inputs_ready(&mut self) -> Result<bool, BusError> {
+        let next = self.book.next();
+        Ok(next == 0 || self.command.seek(next - 1)? != Seek::NotYet)
+    }
+
+    /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
+    fn catch_up(&mut self, tick: u64, now_ns: u64) {
+        for missed in self.book.next()..tick {
+            self.lateness.record(self.grid.due_ns(missed), now_ns);
+        }
+        self.skip_to(tick);
+    }
+
+    /// Asks the device for the next tick, with its command if that is there.
+    #[inline]
+    fn ask(&mut self, now_ns: u64) -> Result<(), BusError> {
+        let tick = self.book.next();
+        let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
+        let command = self.command.sample().filter(|_| found);
+        self.command_origin_ns = command.map(|command| command.stamp().origin_ns);
+        self.link.request(tick, command.map(Sample::content), now_ns);
+        (self.asked, self.asked_ns) = (true, now_ns);
+        Ok(())
+    }
+
+    /// Serves the line; publishes the measurement if the answer has come.
+    #[inline]
+    fn look(&mut self) -> Result<Poll, BusError> {
+        let (now_ns, reply) = (monotonic_ns(), &mut self.reply);
+        let mut answered = false;
+        self.link
+            .turn(now_ns, |answer| {
+                reply.take(answer);
+                answered = true;
+            })
+            .map_err(|error| BusError::Device { reason: error.to_string() })?;
+        if answered { self.publish(now_ns) } else { Ok(Poll::Waiting) }
+    }
+
+    fn publish(&mut self, now_ns: u64) -> Result<Poll, BusError> {
+        let (tick, clock) = (self.book.next(), self.clock);
+        let origin_ns = self.grid.due_ns(tick);
+        let Reply { event, measurement, .. } = &self.reply;
+        self.measurement.send(|sample| {
+            *sample = *measurement;
+            *sample.stamp_mut() = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
+        })?;
+        if event.missed() {
+            self.book.starved(tick);
+        }
+        if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
+            self.book.safe();
+        }
+        if self.clock == Clock::Monotonic {
+            self.serial.record(self.asked_ns, now_ns);
+            if let (CommandEvent::Applied, Some(origin_ns)) = (event, self.command_origin_ns) {
+                self.age.record(origin_ns, now_ns);
+            }
+        }
+        self.asked = false;
+        Ok(Poll::Executed)
+    }
+
+    /// The period is over for this tick.
+    fn give_up(&mut self) -> Poll {
+        self.link.give_up();
+        self.asked = false;
+        self.book.skip_to(self.book.next() + 1);
+        Poll::Missed
+    }
+}
+
+impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
+    fn time_triggered(&self) -> bool {
+        true
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.book.next()
+    }
+
+    /// The device is where it is: it needs nothing of what a predecessor knew.
+    fn start(&mut self, grid: Grid, first_tick: u64) {
+        self.grid = grid;
+        if self.clock == Clock::Monotonic {
+            self.command.expect(Horizon::Due(grid));
+        }
+        self.skip_to(first_tick);
+    }
+
+    #[inline]
+    fn before_tick(&mut self) {
+        self.book.stalled(self.interruptions.before(self.book.next()));
+    }
+
+    #[inline]
+    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        match gate {
+            Gate::Inputs { up_to } => {
+                if !self.asked && self.book.next() <= up_to && self.inputs_ready()? {
+                    self.ask(monotonic_ns())?;
+                }
+            }
+            Gate::Now { tick, now_ns } => {
+                self.catch_up(tick.min(self.last_tick + 1), now_ns);
+                if self.book.next() > self.last_tick {
+                    return Ok(Poll::Waiting);
+                }
+                self.lateness.record(self.grid.due_ns(tick), now_ns);
+                self.ask(now_ns)?;
+            }
+            Gate::Arrived | Gate::Overdue => {}
+        }
+        let polled = if self.asked { self.look()? } else { Poll::Waiting };
+        let overdue = self.asked && gate == Gate::Overdue;
+        Ok(if overdue { self.give_up() } else { polled })
+    }
+
+    #[inline]
+    fn settle(&mut self) -> Result<(), BusError> {
+        let (tick, clock, truth) = (self.book.next(), self.clock, &self.reply.truth);
+        let origin_ns = self.grid.due_ns(tick);
+        self.truth.send(|sample| {
+            *sample = *truth;
+            *sample.stamp_mut() = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
+        })?;
+        self.measurement.settle()?;
+        self.truth.settle()?;
+        self.state.store(self.truth.sent());
+        self.book.executed();
+        Ok(())
+    }
+
+    fn skip_to(&mut self, tick: u64) {
+        if self.book.skip_to(tick) > 0 && self.asked {
+            self.link.give_up();
+            self.asked = false;
+        }
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        self.command.warm_up()?;
+        self.measurement.warm_up()?;
+        self.truth.warm_up()
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh()?;
+        self.truth.refresh()
+    }
+
+    fn ticks(&self) -> Ticks {
+        self.book.report()
+    }
+
+    fn stages(&self) -> Vec<StageReport> {
+        StageReport::all(&[("lateness", &self.lateness), ("serial", &self.serial), ("age", &self.age)])
+    }
+
+    fn line(&self) -> Option<LineBook> {
+        Some(self.link.book())
+    }
+}

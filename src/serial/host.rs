@@ -1,0 +1,332 @@
+//! The host's end: what to send when, which answers count, and the books of the line.
+//!
+//! A request is repeated until it is answered or given up, and a device that is silent for long is greeted anew. Must not
+//! do I/O, nor look at a clock: both are handed in.
+
+use super::frame::{Decoder, MAX_FRAME, MAX_PAYLOAD, encode};
+use super::message::{Answer, Hello, MAX_CONTENT, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, write};
+use serde::{Deserialize, Serialize};
+
+/// Between two greetings, ns.
+const GREET_NS: u64 = 100_000_000;
+/// After so many requests in a row without any answer the device is greeted anew.
+const SILENT_REQUESTS: u32 = 8;
+/// The shortest time after which a request is repeated where no clock drives the ticks, and the longest, ns.
+const SHORTEST_REPEAT_NS: u64 = 5_000_000;
+const LONGEST_REPEAT_NS: u64 = 1_000_000_000;
+/// A request is repeated after so many round trips; the smoothing of that figure, as a shift.
+const PATIENT_ROUND_TRIPS: u64 = 2;
+const SMOOTHING: u32 = 3;
+
+/// The books of a line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct LineBook {
+    /// Frames sent, repeated ones too.
+    pub frames_sent: u64,
+    /// Their bytes.
+    pub bytes_sent: u64,
+    /// Frames received whole.
+    pub frames_received: u64,
+    /// Bytes received, good or bad.
+    pub bytes_received: u64,
+    /// Frames received with a wrong CRC.
+    pub crc_errors: u64,
+    /// Blocks that were no frame, and frames that were no message.
+    pub malformed: u64,
+    /// Bytes of both that were dropped.
+    pub dropped_bytes: u64,
+    /// How often a good frame followed something dropped.
+    pub resyncs: u64,
+    /// Frames that the device sent and that never came whole, by its sequence numbers.
+    pub sequence_gaps: u64,
+    /// Answers to a tick that was answered already.
+    pub duplicates: u64,
+    /// Answers to a tick that had been given up.
+    pub late: u64,
+    /// The host's own frames coming back: an echo, or a loop.
+    pub echoes: u64,
+    /// Requests sent again.
+    pub repeats: u64,
+    /// Ticks given up without an answer.
+    pub unanswered: u64,
+    /// Handshakes completed.
+    pub handshakes: u64,
+    /// How often the line was opened again.
+    pub reopened: u64,
+    /// Frames that the line did not take, for the one before was still on its way.
+    pub unsent: u64,
+}
+
+/// What the device said that its host must know.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Heard<'a> {
+    /// It takes part.
+    Welcome(Welcome<'a>),
+    /// It does not.
+    Refused(Refuse<'a>),
+    /// It speaks this version of the protocol.
+    OtherVersion(u8),
+    /// The answer to the request at hand.
+    Answer(Answer<'a>),
+}
+
+/// What a host must know of its run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Terms {
+    /// [`Hello::run`].
+    pub run: u64,
+    /// The period where ticks follow the clock, ns.
+    pub period_ns: Option<u64>,
+    /// Bytes of a measurement's content.
+    pub measurement_length: usize,
+    /// Bytes of a truth's content.
+    pub truth_length: usize,
+}
+
+/// The request at hand.
+struct Request {
+    tick: u64,
+    command: [u8; MAX_CONTENT],
+    /// Bytes of the command, if there is one.
+    length: Option<usize>,
+    /// When it is to be sent (again), ns, and how often it was.
+    due_ns: u64,
+    sent: u32,
+    /// When and in which frame it was sent last, ns.
+    sent_ns: u64,
+    sequence: u32,
+}
+
+/// The host of one device in one run.
+pub struct Host {
+    terms: Terms,
+    decoder: Decoder,
+    frame: [u8; MAX_FRAME],
+    sequence: u32,
+    /// The device's last sequence number.
+    heard: Option<u32>,
+    greeted: bool,
+    greet_due_ns: u64,
+    request: Option<Request>,
+    /// The last tick that was answered.
+    answered: Option<u64>,
+    /// Requests in a row without an answer, and since when something has been waited for, ns.
+    silent: u32,
+    silent_since_ns: Option<u64>,
+    /// Smoothed, ns.
+    round_trip_ns: u64,
+    book: LineBook,
+}
+
+impl Host {
+    /// A host that has not greeted its device yet.
+    pub fn new(terms: Terms) -> Self {
+        Self {
+            terms,
+            decoder: Decoder::default(),
+            frame: [0; MAX_FRAME],
+            sequence: 0,
+            heard: None,
+            greeted: false,
+            greet_due_ns: 0,
+            request: None,
+            answered: None,
+            silent: 0,
+            silent_since_ns: None,
+            round_trip_ns: 0,
+            book: LineBook::default(),
+        }
+    }
+
+    /// Whether the device takes part.
+    pub fn greeted(&self) -> bool {
+        self.greeted
+    }
+
+    /// Asks for a tick from now on, with the content of its command, which is at most [`MAX_CONTENT`] bytes.
+    pub fn request(&mut self, tick: u64, command: Option<&[u8]>, now_ns: u64) {
+        let mut kept = [0; MAX_CONTENT];
+        let length = command.and_then(|content| {
+            kept.get_mut(..content.len())?.copy_from_slice(content);
+            Some(content.len())
+        });
+        let request = Request { tick, command: kept, length, due_ns: now_ns, sent: 0, sent_ns: now_ns, sequence: 0 };
+        self.request = Some(request);
+    }
+
+    /// Asks no more for the tick at hand.
+    pub fn give_up(&mut self) {
+        self.book.unanswered += u64::from(self.request.take().is_some());
+    }
+
+    /// The frame to be sent now, if there is one. To be asked again until there is none.
+    pub fn due(&mut self, now_ns: u64, hello: &Hello<'_>) -> Option<&[u8]> {
+        if self.silent >= SILENT_REQUESTS {
+            self.greet_anew(now_ns);
+        }
+        if !self.greeted {
+            if now_ns < self.greet_due_ns {
+                return None;
+            }
+            self.greet_due_ns = now_ns + GREET_NS;
+            self.silent_since_ns.get_or_insert(now_ns);
+            return Some(self.say(Message::Hello(*hello)));
+        }
+        let repeat_ns = self.repeat_ns();
+        let sequence = self.sequence;
+        let request = self.request.as_mut().filter(|request| now_ns >= request.due_ns)?;
+        // Twice as long after each time: a line that is too slow for what is asked of it must not be asked more.
+        request.due_ns = now_ns + (repeat_ns << request.sent.min(8)).min(LONGEST_REPEAT_NS.max(repeat_ns));
+        (request.sent_ns, request.sequence) = (now_ns, sequence);
+        request.sent += 1;
+        self.book.repeats += u64::from(request.sent > 1);
+        self.silent += 1;
+        self.silent_since_ns.get_or_insert(now_ns);
+        let (tick, command, length) = (request.tick, request.command, request.length);
+        Some(self.say(Message::Tick(Tick { tick, command: length.map(|length| &command[..length]) })))
+    }
+
+    /// The frame that ends the run for the device.
+    pub fn stop(&mut self) -> &[u8] {
+        self.say(Message::Stop)
+    }
+
+    /// Takes a byte that has arrived, and tells what it completes.
+    pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<Heard<'_>> {
+        let Self { terms, decoder, heard, book, .. } = self;
+        let (sequence, message) = match parse(decoder.push(byte)?) {
+            Ok(said) => said,
+            Err(ParseError::Version(version)) => return Some(Heard::OtherVersion(version)),
+            Err(ParseError::Malformed) => {
+                book.malformed += 1;
+                return None;
+            }
+        };
+        match message {
+            Message::Hello(_) | Message::Tick(_) | Message::Stop => book.echoes += 1,
+            Message::Welcome(welcome) if welcome.run == terms.run => {
+                // A greeted device that welcomes again has heard two greetings; one that began anew counts from 0.
+                *heard = Some(sequence);
+                if !self.greeted {
+                    book.handshakes += 1;
+                    self.greeted = true;
+                    self.silent = 0;
+                    if let Some(request) = &mut self.request {
+                        (request.due_ns, request.sent) = (now_ns, 0);
+                    }
+                    return Some(Heard::Welcome(welcome));
+                }
+            }
+            // Of another run: it was on its way for long.
+            Message::Welcome(_) => book.late += 1,
+            Message::Refuse(Refuse { reason: Reason::NotGreeted, .. }) => {
+                note(heard, book, sequence);
+                self.greeted = false;
+            }
+            Message::Refuse(refusal) => return Some(Heard::Refused(refusal)),
+            Message::Answer(answer) => {
+                note(heard, book, sequence);
+                let lengths = (answer.measurement.len(), answer.truth.len());
+                if lengths != (terms.measurement_length, terms.truth_length) && lengths != (terms.measurement_length, 0)
+                {
+                    book.malformed += 1;
+                    return None;
+                }
+                self.silent = 0;
+                self.silent_since_ns = None;
+                match self.request.take_if(|request| request.tick == answer.tick) {
+                    Some(request) => {
+                        self.answered = Some(answer.tick);
+                        if request.sequence == answer.echo {
+                            smooth(&mut self.round_trip_ns, now_ns.saturating_sub(request.sent_ns));
+                        }
+                        return Some(Heard::Answer(answer));
+                    }
+                    None if self.answered.is_some_and(|tick| answer.tick == tick) => book.duplicates += 1,
+                    None => book.late += 1,
+                }
+            }
+        }
+        None
+    }
+
+    /// The line was cut: what was on its way is lost, and nobody knows who is there when it is whole again.
+    pub fn cut(&mut self, now_ns: u64) {
+        self.decoder.cut();
+        self.greet_anew(now_ns);
+    }
+
+    /// The line was opened again.
+    pub fn reopened(&mut self) {
+        self.book.reopened += 1;
+    }
+
+    /// The line did not take a frame.
+    pub fn unsent(&mut self) {
+        self.book.unsent += 1;
+    }
+
+    /// For how long the device has not answered, ns; 0 if nothing is waited for.
+    pub fn silent_ns(&self, now_ns: u64) -> u64 {
+        self.silent_since_ns.map_or(0, |since_ns| now_ns.saturating_sub(since_ns))
+    }
+
+    /// Something is waited for, at the latest since now.
+    pub fn wait_since(&mut self, now_ns: u64) {
+        self.silent_since_ns.get_or_insert(now_ns);
+    }
+
+    /// Begins to wait anew.
+    pub fn wait_anew(&mut self) {
+        self.silent_since_ns = None;
+    }
+
+    /// The books.
+    pub fn book(&self) -> LineBook {
+        let frames = self.decoder.book();
+        LineBook {
+            frames_received: frames.frames,
+            bytes_received: frames.bytes,
+            crc_errors: frames.crc_errors,
+            malformed: self.book.malformed + frames.malformed,
+            dropped_bytes: frames.dropped_bytes,
+            resyncs: frames.resyncs,
+            ..self.book
+        }
+    }
+
+    fn greet_anew(&mut self, now_ns: u64) {
+        self.greeted = false;
+        self.silent = 0;
+        self.greet_due_ns = now_ns;
+    }
+
+    fn repeat_ns(&self) -> u64 {
+        let shortest_ns = self.terms.period_ns.map_or(SHORTEST_REPEAT_NS, |period_ns| period_ns / 4);
+        shortest_ns.max(PATIENT_ROUND_TRIPS * self.round_trip_ns)
+    }
+
+    fn say(&mut self, message: Message<'_>) -> &[u8] {
+        let mut payload = [0; MAX_PAYLOAD];
+        let frame = write(self.sequence, message, &mut payload)
+            .and_then(|payload| encode(payload, &mut self.frame))
+            .expect("every message whose texts and contents are within their limits fits into a frame");
+        self.sequence = self.sequence.wrapping_add(1);
+        self.book.frames_sent += 1;
+        self.book.bytes_sent += frame.len() as u64;
+        frame
+    }
+}
+
+/// Counts the frames between the last one heard and this one. A device that begins anew counts from 0.
+fn note(heard: &mut Option<u32>, book: &mut LineBook, sequence: u32) {
+    let gap = heard.map_or(0, |last| sequence.wrapping_sub(last).wrapping_sub(1));
+    if gap <= u32::MAX / 2 {
+        book.sequence_gaps += u64::from(gap);
+    }
+    *heard = Some(sequence);
+}
+
+fn smooth(mean_ns: &mut u64, value_ns: u64) {
+    *mean_ns = if *mean_ns == 0 { value_ns } else { *mean_ns - (*mean_ns >> SMOOTHING) + (value_ns >> SMOOTHING) };
+}

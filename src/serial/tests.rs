@@ -1,0 +1,475 @@
+//! Both ends together over a line in memory, in virtual time: clean, faulty, cut, and misunderstood.
+
+use super::*;
+use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
+use crate::sample::{RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
+use proptest::prelude::*;
+use rand_pcg::Pcg64;
+use rand_pcg::rand_core::{Rng, SeedableRng};
+
+const PERIOD_NS: u64 = 10_000_000;
+const TIMEOUT_TICKS: u64 = 4;
+const STEP_NS: u64 = 100_000;
+
+/// A body that integrates what it is told, about the first axis.
+#[derive(Debug, Clone, PartialEq)]
+struct Spinner {
+    rate: f64,
+    applied: f64,
+}
+
+impl Body for Spinner {
+    type Truth = RateTruth;
+    type Measurement = RateMeasurement;
+    type Command = RateCommand;
+
+    fn apply(&mut self, command: &RateCommand) -> bool {
+        self.applied = command.acceleration_rad_s2[0];
+        self.applied.is_finite()
+    }
+    fn apply_safe(&mut self) {
+        self.applied = 0.0;
+    }
+    fn truth(&self, status: u64, out: &mut RateTruth) {
+        (out.omega_rad_s[0], out.applied_rad_s2[0], out.status) = (self.rate, self.applied, status);
+    }
+    fn status_of(truth: &RateTruth) -> u64 {
+        truth.status
+    }
+    fn resume(&mut self, truth: &RateTruth, _measured: u64) {
+        (self.rate, self.applied) = (truth.omega_rad_s[0], truth.applied_rad_s2[0]);
+    }
+    fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
+        (out.omega_rad_s[0], out.applied_rad_s2[0], out.status) = (self.rate, self.applied, status);
+    }
+    fn flow(&mut self, dt_s: f64) {
+        self.rate += self.applied * dt_s;
+    }
+}
+
+fn spinner() -> Spinner {
+    Spinner { rate: 1.0, applied: 0.0 }
+}
+
+fn hello(run: u64, realtime: bool) -> Hello<'static> {
+    Hello {
+        run,
+        realtime,
+        period_ns: PERIOD_NS,
+        last_tick: 1000,
+        timeout_ticks: TIMEOUT_TICKS,
+        manual_rearm: false,
+        body: "follower",
+        command: RateCommand::TYPE_NAME,
+        measurement: RateMeasurement::TYPE_NAME,
+        truth: RateTruth::TYPE_NAME,
+    }
+}
+
+fn command(value: f64) -> RateCommand {
+    RateCommand { acceleration_rad_s2: [value, 0.0, 0.0], ..RateCommand::default() }
+}
+
+type Make = fn(&Hello<'_>) -> Option<Spinner>;
+
+fn device() -> Device<Spinner, Make> {
+    Device::new("spinner 1", |_| Some(spinner()))
+}
+
+/// What befalls the bytes of a line, per byte.
+#[derive(Debug, Clone, Copy)]
+struct Faults {
+    drop: f64,
+    corrupt: f64,
+    garbage: f64,
+}
+
+const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0 };
+
+/// Both ends, the line between them, and a clock that somebody else moves.
+struct Rig {
+    host: Host,
+    device: Device<Spinner, Make>,
+    hello: Hello<'static>,
+    faults: Faults,
+    random: Pcg64,
+    now_ns: u64,
+    cut: bool,
+}
+
+/// What the host heard, with the contents copied out.
+#[derive(Debug, Clone, PartialEq)]
+enum Event {
+    Welcome(u64),
+    Refused(Reason, String),
+    OtherVersion(u8),
+    Answer(u64, CommandEvent, RateMeasurement, RateTruth),
+}
+
+impl Rig {
+    fn new(hello: Hello<'static>, faults: Faults, seed: u64) -> Self {
+        let terms = Terms {
+            run: hello.run,
+            period_ns: hello.realtime.then_some(PERIOD_NS),
+            measurement_length: content_length::<RateMeasurement>(),
+            truth_length: content_length::<RateTruth>(),
+        };
+        let random = Pcg64::seed_from_u64(seed);
+        Self { host: Host::new(terms), device: device(), hello, faults, random, now_ns: 1, cut: false }
+    }
+
+    fn damage(&mut self, bytes: &[u8]) -> Vec<u8> {
+        let mut out = Vec::new();
+        if self.cut {
+            return out;
+        }
+        for &byte in bytes {
+            let draw = self.random.next_u64() as f64 / u64::MAX as f64;
+            let Faults { drop, corrupt, garbage } = self.faults;
+            match draw {
+                draw if draw < drop => {}
+                draw if draw < drop + corrupt => out.push(byte ^ (1 << (out.len() % 8))),
+                draw if draw < drop + corrupt + garbage => out.extend([byte, 0x55, 0, 0xaa]),
+                _ => out.push(byte),
+            }
+        }
+        out
+    }
+
+    /// One step of time: what is due goes out, is answered, and comes back.
+    fn step(&mut self) -> Vec<Event> {
+        self.now_ns += STEP_NS;
+        let mut up = Vec::new();
+        while let Some(frame) = self.host.due(self.now_ns, &self.hello) {
+            up.extend_from_slice(frame);
+        }
+        let (up, mut down) = (self.damage(&up), Vec::new());
+        self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame));
+        self.device.elapse(self.now_ns);
+        let down = self.damage(&down);
+        self.hear(&down)
+    }
+
+    fn hear(&mut self, bytes: &[u8]) -> Vec<Event> {
+        let mut events = Vec::new();
+        for &byte in bytes {
+            let Some(heard) = self.host.push(byte, self.now_ns) else { continue };
+            events.push(match heard {
+                Heard::Welcome(welcome) => Event::Welcome(welcome.next_tick),
+                Heard::Refused(refuse) => Event::Refused(refuse.reason, refuse.detail.to_owned()),
+                Heard::OtherVersion(version) => Event::OtherVersion(version),
+                Heard::Answer(answer) => {
+                    let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
+                    assert!(measurement.set_content(answer.measurement) && truth.set_content(answer.truth));
+                    Event::Answer(answer.tick, answer.event, measurement, truth)
+                }
+            });
+        }
+        events
+    }
+
+    /// Steps until the host has heard something, or for `ns`.
+    fn until(&mut self, ns: u64) -> Option<Event> {
+        let end_ns = self.now_ns + ns;
+        while self.now_ns < end_ns {
+            if let Some(event) = self.step().into_iter().next() {
+                return Some(event);
+            }
+        }
+        None
+    }
+
+    fn greet(&mut self) {
+        assert!(matches!(self.until(PERIOD_NS), Some(Event::Welcome(_))));
+    }
+
+    /// Asks for a tick and gives the answer.
+    fn ask(&mut self, tick: u64, value: Option<f64>, ns: u64) -> Option<Event> {
+        let command = value.map(command);
+        self.host.request(tick, command.as_ref().map(Sample::content), self.now_ns);
+        let end_ns = self.now_ns + ns;
+        while self.now_ns < end_ns {
+            let events = self.step();
+            if let Some(event) = events.into_iter().find(|event| !matches!(event, Event::Welcome(_))) {
+                return Some(event);
+            }
+        }
+        self.host.give_up();
+        None
+    }
+}
+
+fn value(tick: u64) -> f64 {
+    (tick as f64 * 0.7).sin()
+}
+
+/// The answers of a plant that sits in the host's own process.
+fn built_in(ticks: u64) -> Vec<Event> {
+    let actuation = Actuation { driven: true, timeout_ticks: TIMEOUT_TICKS, rearm: Rearm::Auto };
+    let mut plant = Plant::new(spinner(), actuation, PERIOD_NS as f64 / 1e9);
+    let answer = |tick: u64| {
+        let mut command = command(value(tick));
+        command.stamp.tick = tick.saturating_sub(1);
+        let event = plant.command(tick, (tick > 0).then_some(&command));
+        let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
+        plant.measure(&Stamp::default(), &mut measurement);
+        plant.truth(&Stamp::default(), &mut truth);
+        plant.advance(1);
+        Event::Answer(tick, event, measurement, truth)
+    };
+    (0..ticks).map(answer).collect()
+}
+
+#[test]
+fn a_device_answers_as_the_built_in_plant_does() {
+    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
+    for (tick, expected) in (0..).zip(built_in(50)) {
+        assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 1_000_000_000), Some(expected));
+    }
+    let book = rig.host.book();
+    assert_eq!((book.handshakes, book.repeats, book.duplicates, book.late, book.sequence_gaps), (1, 0, 0, 0, 0));
+    assert_eq!((book.frames_sent, book.frames_received, book.crc_errors, book.dropped_bytes), (51, 51, 0, 0));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    /// Without a clock every request is repeated until it is answered: no fault of the line is seen in the answers.
+    #[test]
+    fn no_fault_of_the_line_changes_an_answer(seed: u64, drop in 0.0..0.004, corrupt in 0.0..0.004, garbage in 0.0..0.004) {
+        let mut rig = Rig::new(hello(1, false), Faults { drop, corrupt, garbage }, seed);
+        for (tick, expected) in (0..).zip(built_in(100)) {
+            prop_assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 3_600_000_000_000), Some(expected));
+        }
+        let book = rig.host.book();
+        prop_assert!(book.frames_received + book.crc_errors + book.malformed + book.sequence_gaps >= 101);
+    }
+}
+
+/// The faults above are not so rare that the test tests nothing.
+#[test]
+fn a_faulty_line_is_seen_in_the_books() {
+    let mut rig = Rig::new(hello(1, false), Faults { drop: 0.002, corrupt: 0.002, garbage: 0.002 }, 5);
+    for tick in 0..300 {
+        assert!(rig.ask(tick, Some(0.0), 3_600_000_000_000).is_some());
+    }
+    let book = rig.host.book();
+    assert!(book.crc_errors > 10 && book.repeats > 30 && book.resyncs > 10 && book.dropped_bytes > 500, "{book:?}");
+    assert!(book.sequence_gaps > 10 && book.frames_sent > 330 && book.late == 0, "{book:?}");
+}
+
+#[test]
+fn a_tick_asked_twice_is_executed_once() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    let first = rig.ask(0, None, PERIOD_NS);
+    let moved = rig.ask(1, Some(2.0), PERIOD_NS);
+    assert!(first.is_some() && moved.is_some());
+    assert_eq!(rig.ask(1, Some(77.0), PERIOD_NS), moved, "the same answer, the other command unheard");
+    assert_eq!(rig.ask(0, None, PERIOD_NS), None, "older than that it says nothing");
+    let Some(Event::Answer(2, CommandEvent::Applied, measurement, _)) = rig.ask(2, Some(2.0), PERIOD_NS) else {
+        panic!()
+    };
+    assert_eq!(measurement.omega_rad_s[0], 1.0 + 2.0 * 0.01);
+}
+
+/// Ticks that never came are missing commands: held, then safe.
+#[test]
+fn ticks_that_were_lost_expire_like_commands() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(1.0), PERIOD_NS);
+    // Ticks 2 to 4 are lost, 5 comes without a command: the fourth in a row.
+    let Some(Event::Answer(5, CommandEvent::Expired, measurement, _)) = rig.ask(5, None, PERIOD_NS) else { panic!() };
+    assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15 && measurement.applied_rad_s2[0] == 0.0);
+    let Some(Event::Answer(6, CommandEvent::Applied, ..)) = rig.ask(6, Some(1.0), PERIOD_NS) else { panic!() };
+}
+
+#[test]
+fn a_device_that_hears_nothing_goes_safe_by_its_own_clock_and_comes_back() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(1.0), PERIOD_NS);
+    assert!(!rig.device.is_safe());
+    let heard_ns = rig.now_ns;
+    rig.device.elapse(heard_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2 - STEP_NS);
+    assert!(!rig.device.is_safe());
+    rig.device.elapse(heard_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2);
+    assert!(rig.device.is_safe());
+    assert_eq!(rig.ask(5, Some(1.0), PERIOD_NS), None, "it has lived through that tick");
+    let Some(Event::Answer(6, CommandEvent::Applied, measurement, _)) = rig.ask(6, Some(1.0), PERIOD_NS) else {
+        panic!()
+    };
+    assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15, "{measurement:?}");
+}
+
+#[test]
+fn without_a_clock_silence_means_nothing() {
+    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(1.0), PERIOD_NS);
+    rig.device.elapse(rig.now_ns + 1000 * PERIOD_NS);
+    assert!(!rig.device.is_safe());
+}
+
+#[test]
+fn stop_is_safe_at_once_and_the_run_can_go_on() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    assert!(rig.device.is_safe());
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(1.0), PERIOD_NS);
+    let stop = rig.host.stop().to_vec();
+    rig.device.receive(&stop, rig.now_ns, |_| panic!("nothing to say to that"));
+    assert!(rig.device.is_safe());
+    let Some(Event::Answer(2, CommandEvent::Applied, ..)) = rig.ask(2, Some(1.0), PERIOD_NS) else { panic!() };
+    assert!(!rig.device.is_safe());
+}
+
+/// A device that was replaced in the middle of a run is asked in vain, then greeted, and begins at its initial state.
+#[test]
+fn a_device_that_began_anew_is_greeted_at_once() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(50.0), PERIOD_NS);
+    rig.device = device();
+    let Some(Event::Answer(2, CommandEvent::Applied, measurement, _)) = rig.ask(2, Some(1.0), 20 * PERIOD_NS) else {
+        panic!()
+    };
+    assert_eq!((measurement.omega_rad_s[0], rig.host.book().handshakes), (1.0, 2));
+}
+
+#[test]
+fn a_silent_device_is_greeted_anew_and_goes_on_where_it_was() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(1.0), PERIOD_NS);
+    rig.cut = true;
+    for tick in 2..20 {
+        assert_eq!(rig.ask(tick, Some(1.0), PERIOD_NS), None);
+    }
+    assert!(!rig.host.greeted() && rig.host.book().unanswered == 18 && rig.host.silent_ns(rig.now_ns) > 10 * PERIOD_NS);
+    rig.cut = false;
+    let Some(Event::Answer(20, CommandEvent::Applied, measurement, _)) = rig.ask(20, Some(1.0), 20 * PERIOD_NS) else {
+        panic!()
+    };
+    assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15, "it was safe meanwhile, not reset: {measurement:?}");
+    assert_eq!((rig.host.book().handshakes, rig.host.silent_ns(rig.now_ns)), (2, 0));
+}
+
+#[test]
+fn another_run_begins_at_the_initial_state() {
+    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
+    rig.ask(0, None, PERIOD_NS);
+    rig.ask(1, Some(50.0), PERIOD_NS);
+    let mut next = Rig::new(hello(2, false), CLEAN, 1);
+    next.device = rig.device;
+    let Some(Event::Answer(0, CommandEvent::NotDue, measurement, _)) = next.ask(0, None, PERIOD_NS) else { panic!() };
+    assert_eq!(measurement.omega_rad_s[0], 1.0);
+}
+
+#[test]
+fn who_does_not_fit_is_refused_by_name() {
+    let mut other = hello(1, true);
+    other.command = "corotate/rigid-body/command/v0";
+    let mut rig = Rig::new(other, CLEAN, 1);
+    let refused = Event::Refused(Reason::Samples, RateCommand::TYPE_NAME.to_owned());
+    assert_eq!(rig.until(PERIOD_NS), Some(refused));
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.device = Device::new("none", |_| None);
+    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Body, _))));
+    let mut rig = Rig::new(Hello { timeout_ticks: 0, ..hello(1, true) }, CLEAN, 1);
+    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Body, _))));
+}
+
+/// The bytes of a Stop in the words of another version.
+fn foreign(version: u8) -> Vec<u8> {
+    encode(&[version, 0, 5], &mut [0; MAX_FRAME]).unwrap().to_vec()
+}
+
+#[test]
+fn another_version_is_refused_by_both_ends() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    assert_eq!(rig.hear(&foreign(9)), [Event::OtherVersion(9)]);
+    let mut reply = Vec::new();
+    rig.device.receive(&foreign(9), 1, |frame| reply.extend_from_slice(frame));
+    assert!(matches!(&rig.hear(&reply)[..], [Event::Refused(Reason::Version, _)]));
+}
+
+#[test]
+fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.host.request(0, None, rig.now_ns);
+    let asked = rig.host.due(rig.now_ns, &rig.hello).unwrap().to_vec();
+    let mut answer = Vec::new();
+    rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
+    rig.host.give_up();
+    assert!(rig.hear(&answer).is_empty());
+    rig.ask(1, Some(1.0), PERIOD_NS).unwrap();
+    rig.host.request(2, None, rig.now_ns);
+    let asked = rig.host.due(rig.now_ns, &rig.hello).unwrap().to_vec();
+    let mut answer = Vec::new();
+    rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
+    assert_eq!(rig.hear(&answer).len(), 1);
+    assert!(rig.hear(&answer).is_empty() && rig.hear(&asked).is_empty());
+    let book = rig.host.book();
+    assert_eq!((book.late, book.duplicates, book.echoes, book.unanswered), (1, 1, 1, 1));
+}
+
+/// Samples of another length than agreed are no answer.
+#[test]
+fn an_answer_of_another_length_is_none() {
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    rig.host.request(0, None, rig.now_ns);
+    let mut payload = [0; MAX_PAYLOAD];
+    let (good, bad) = ([0; content_length::<RateMeasurement>()], [0; 8]);
+    for (measurement, truth, expected) in [(&bad[..], &bad[..], 0), (&good, &bad, 0), (&good, &[], 1)] {
+        let answer = Answer { echo: 0, tick: 0, event: CommandEvent::NotDue, measurement, truth };
+        let payload = write(0, Message::Answer(answer), &mut payload).unwrap();
+        let frame = encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec();
+        let mut heard = 0;
+        frame.iter().for_each(|byte| heard += usize::from(rig.host.push(*byte, rig.now_ns).is_some()));
+        assert_eq!(heard, expected);
+    }
+    assert_eq!(rig.host.book().malformed, 2);
+}
+
+#[test]
+fn a_real_device_tells_no_truth() {
+    let mut device = device().without_truth();
+    let mut payload = [0; MAX_PAYLOAD];
+    let mut lengths = Vec::new();
+    for (sequence, message) in
+        [(0, Message::Hello(hello(1, true))), (1, Message::Tick(Tick { tick: 3, command: None }))]
+    {
+        let payload = write(sequence, message, &mut payload).unwrap();
+        device.receive(encode(payload, &mut [0; MAX_FRAME]).unwrap(), 0, |frame| {
+            decode(frame, |message| {
+                if let Ok((_, Message::Answer(answer))) = message {
+                    lengths.push((answer.tick, answer.measurement.len(), answer.truth.len()));
+                }
+            });
+        });
+    }
+    assert_eq!(lengths, [(3, content_length::<RateMeasurement>(), 0)]);
+}
+
+proptest! {
+    /// Neither end fails on any bytes, in whatever state it is; no tick is executed that nobody asked for.
+    #[test]
+    fn no_bytes_make_an_end_fail(bytes in prop::collection::vec(any::<u8>(), 0..2000), payloads in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..60), 0..20)) {
+        let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+        rig.greet();
+        let frames = payloads.iter().flat_map(|payload| encode(&[&[VERSION][..], payload].concat(), &mut [0; MAX_FRAME]).unwrap().to_vec());
+        let bytes = [bytes, frames.collect()].concat();
+        rig.hear(&bytes);
+        rig.device.receive(&bytes, 0, |_| {});
+        rig.device.elapse(u64::MAX);
+    }
+}

@@ -1,0 +1,558 @@
+//! A device behind a serial line in the follower's seat: the real program, a device in a thread, and between them a cable
+//! of two ptys that can be faulty, cut, and joined again.
+
+mod common;
+#[path = "../examples/serial_device.rs"]
+mod serial_device;
+
+use common::{Bench, Done, Running, await_some, shipped};
+use corotate::config::Scenario;
+use corotate::role::Body;
+use corotate::runtime::Line;
+use corotate::serial::{Decoder, Device, Hello, MAX_FRAME, encode};
+use corotate::with_rig;
+use rand_pcg::Pcg64;
+use rand_pcg::rand_core::{Rng, SeedableRng};
+use rustix::fd::OwnedFd;
+use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl, open};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use serde_json::Value;
+use serial_device::{Follower, NAME, serve};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+const NAP: Duration = Duration::from_micros(50);
+
+/// One end of a cable: a pty whose near end stands for a serial port. It stays raw and open while nobody uses it.
+struct Port {
+    far: OwnedFd,
+    _near: OwnedFd,
+    path: PathBuf,
+}
+
+impl Port {
+    fn new() -> Self {
+        let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+        grantpt(&far).unwrap();
+        unlockpt(&far).unwrap();
+        let path = PathBuf::from(ptsname(&far, Vec::new()).unwrap().to_str().unwrap());
+        let near = open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty()).unwrap();
+        let mut settings = tcgetattr(&near).unwrap();
+        settings.make_raw();
+        tcsetattr(&near, OptionalActions::Now, &settings).unwrap();
+        fcntl_setfl(&far, fcntl_getfl(&far).unwrap() | OFlags::NONBLOCK).unwrap();
+        Self { far, _near: near, path }
+    }
+
+    fn read(&self, bytes: &mut [u8]) -> usize {
+        rustix::io::read(&self.far, bytes).unwrap_or(0)
+    }
+
+    /// What a full line does not take is lost, as it is on a real one. Tells how much it took.
+    fn write(&self, bytes: &[u8]) -> usize {
+        rustix::io::write(&self.far, bytes).unwrap_or(0)
+    }
+}
+
+/// What befalls bytes on their way: probabilities per byte, and the longest delay of a read's worth of them.
+#[derive(Clone, Copy)]
+struct Faults {
+    drop: f64,
+    corrupt: f64,
+    garbage: f64,
+    delay: Duration,
+    /// Whether the bytes are cut into pieces and joined at random.
+    pieces: bool,
+}
+
+const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0, delay: Duration::ZERO, pieces: false };
+
+/// A cable between the bridge's port and the device's.
+struct Cable {
+    host: Arc<Port>,
+    device: Arc<Port>,
+    whole: Arc<AtomicBool>,
+    /// Bytes that came to the device's end.
+    carried: Arc<AtomicUsize>,
+    pumps: Vec<JoinHandle<()>>,
+}
+
+impl Cable {
+    fn new(faults: Faults) -> Self {
+        let (host, device) = (Arc::new(Port::new()), Arc::new(Port::new()));
+        let whole = Arc::new(AtomicBool::new(true));
+        let carried = Arc::new(AtomicUsize::new(0));
+        let pump = |from: &Arc<Port>, to: &Arc<Port>, seed, carried: Option<&Arc<AtomicUsize>>| {
+            let (from, to, whole, carried) = (from.clone(), to.clone(), whole.clone(), carried.cloned());
+            std::thread::spawn(move || pump(&from, &to, faults, seed, &whole, carried.as_deref()))
+        };
+        let pumps = vec![pump(&host, &device, 1, Some(&carried)), pump(&device, &host, 2, None)];
+        Self { host, device, whole, carried, pumps }
+    }
+
+    /// Waits until ticks run over it: some hundred of them have.
+    fn await_ticks(&self) {
+        await_some(|| (self.carried.load(Ordering::Relaxed) > 10_000).then_some(()));
+    }
+}
+
+impl Drop for Cable {
+    fn drop(&mut self) {
+        self.whole.store(false, Ordering::Relaxed);
+        self.pumps.drain(..).for_each(|pump| pump.join().unwrap());
+    }
+}
+
+fn pump(from: &Port, to: &Port, faults: Faults, seed: u64, whole: &AtomicBool, carried: Option<&AtomicUsize>) {
+    let (mut random, mut bytes) = (Pcg64::seed_from_u64(seed), [0; 4096]);
+    let mut uniform = move || random.next_u64() as f64 / u64::MAX as f64;
+    while whole.load(Ordering::Relaxed) {
+        let count = from.read(&mut bytes);
+        if count == 0 {
+            std::thread::sleep(NAP);
+            continue;
+        }
+        if let Some(carried) = carried {
+            carried.fetch_add(count, Ordering::Relaxed);
+        }
+        let mut out = Vec::new();
+        for &byte in &bytes[..count] {
+            match uniform() {
+                draw if draw < faults.drop => {}
+                draw if draw < faults.drop + faults.corrupt => out.push(byte ^ (1 << ((8.0 * uniform()) as u32 % 8))),
+                draw if draw < faults.drop + faults.corrupt + faults.garbage => {
+                    out.push(byte);
+                    out.extend((0..(40.0 * uniform()) as usize).map(|_| (256.0 * uniform()) as u8));
+                }
+                _ => out.push(byte),
+            }
+        }
+        std::thread::sleep(faults.delay.mul_f64(uniform()));
+        let mut rest = &out[..];
+        while faults.pieces && rest.len() > 1 {
+            let (piece, more) = rest.split_at(1 + (uniform() * (rest.len() - 1) as f64) as usize);
+            to.write(piece);
+            std::thread::sleep(NAP);
+            rest = more;
+        }
+        to.write(rest);
+    }
+}
+
+/// A device that runs until it is dropped.
+struct Powered {
+    on: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Powered {
+    /// Runs `life` in a thread; it ends when the flag it is given is cleared.
+    fn new(life: impl FnOnce(&AtomicBool) + Send + 'static) -> Self {
+        let on = Arc::new(AtomicBool::new(true));
+        let flag = on.clone();
+        Self { on, thread: Some(std::thread::spawn(move || life(&flag))) }
+    }
+
+    /// The reference device: `examples/serial_device.rs`.
+    fn reference(path: &Path) -> Self {
+        let path = path.to_owned();
+        Self::new(move |on| live(&path, &mut Device::new(NAME, Follower::asked_for), on))
+    }
+
+    /// A device that is a body of any rig.
+    fn of_rig(path: &Path, scenario: Scenario, body: usize) -> Self {
+        let path = path.to_owned();
+        Self::new(move |on| {
+            with_rig!(&scenario.rig, rig => {
+                live(&path, &mut Device::new("any", |_: &Hello<'_>| Some(corotate::rig::Rig::body(rig, body))), on)
+            })
+        })
+    }
+}
+
+impl Drop for Powered {
+    fn drop(&mut self) {
+        self.on.store(false, Ordering::Relaxed);
+        let ended = self.thread.take().map(JoinHandle::join);
+        assert!(std::thread::panicking() || matches!(ended, Some(Ok(()))), "the device failed");
+    }
+}
+
+/// A device keeps its state while its line is cut and joined again.
+fn live<B: Body, M: FnMut(&Hello<'_>) -> Option<B>>(path: &Path, device: &mut Device<B, M>, on: &AtomicBool) {
+    while on.load(Ordering::Relaxed) {
+        match Line::open(path, None) {
+            Ok(mut line) => serve(&mut line, device, on),
+            Err(_) => std::thread::sleep(Duration::from_millis(5)),
+        }
+    }
+}
+
+/// Starts a run whose follower somebody else is; gives its domain too.
+fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--external", "follower"];
+    let running = bench.start(&[&common[..], arguments].concat());
+    bench.await_role("controller");
+    (running, bench.domains().remove(0))
+}
+
+fn bridge(bench: &Bench, path: &Path, domain: &Path, arguments: &[&str]) -> Running {
+    let (path, domain) = (path.to_str().unwrap(), domain.to_str().unwrap());
+    let common = ["bridge", "--serial", path, "--body", "follower", "--domain", domain];
+    bench.start(&[&common[..], arguments].concat())
+}
+
+fn summary(run: &Done) -> Value {
+    assert_eq!(run.code, Some(0), "{run:?}");
+    serde_json::from_str(&run.stdout).unwrap()
+}
+
+/// Runs a shipped scenario with the device at `path` in the follower's seat.
+fn run_with(bench: &Bench, scenario: &str, path: &Path, arguments: &[&str]) -> Value {
+    let (run, domain) = start(bench, &shipped(scenario), arguments);
+    let bridge = bridge(bench, path, &domain, &[]);
+    let (run, bridge) = (run.wait(), bridge.wait());
+    assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
+    assert!(bridge.stderr.contains("line of follower: "), "{bridge:?}");
+    bench.assert_clean(&[domain]);
+    summary(&run)
+}
+
+fn number(value: &Value) -> u64 {
+    value.as_u64().unwrap_or_else(|| panic!("{value} is no count"))
+}
+
+/// The error of the first metric at the end of a run.
+fn sync_error(summary: &Value) -> f64 {
+    assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+    summary["score"]["metrics"][0]["last"].as_f64().unwrap()
+}
+
+const LOCKSTEP: [&str; 6] = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "10"];
+const REALTIME: [&str; 8] = ["--clock", "realtime", "--tick-hz", "100", "--duration", "8", "--set", "accept={}"];
+
+/// The device computes with the same pure plant: nothing of the run tells that it sits behind a line.
+#[test]
+fn in_lockstep_a_device_gives_the_bits_of_the_built_in_follower() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let device = Powered::reference(&cable.device.path);
+    let with_device = run_with(&bench, "rigid-pair", &cable.host.path, &LOCKSTEP);
+    let built_in = bench.summary("rigid-pair", &LOCKSTEP);
+    assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"]);
+    assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"]);
+    let line = &with_device["lines"]["follower"];
+    assert_eq!((number(&line["handshakes"]), number(&line["crc_errors"]), number(&line["malformed"])), (1, 0, 0));
+    assert!(number(&line["frames_received"]) >= 1002, "{line}");
+    drop(device);
+}
+
+/// Every request is repeated until it is answered, and no tick is executed twice: no fault reaches the bits.
+#[test]
+fn in_lockstep_a_faulty_line_gives_the_same_bits() {
+    let bench = Bench::new();
+    let faults = Faults { drop: 3e-4, corrupt: 3e-4, garbage: 3e-4, delay: Duration::from_millis(2), pieces: true };
+    let cable = Cable::new(faults);
+    let _device = Powered::reference(&cable.device.path);
+    let with_device = run_with(&bench, "rigid-pair", &cable.host.path, &LOCKSTEP);
+    assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &LOCKSTEP)["state"]["hash"]);
+    let line = &with_device["lines"]["follower"];
+    println!("{line}");
+    assert!(number(&line["repeats"]) > 20 && number(&line["crc_errors"]) > 5 && number(&line["resyncs"]) > 5, "{line}");
+    assert_eq!(number(&line["unanswered"]), 0, "{line}");
+}
+
+/// The protocol knows no rig.
+#[test]
+fn a_device_may_be_the_body_of_any_rig() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let arguments = ["--clock", "lockstep", "--duration", "5", "--set", "accept={}"];
+    let scenario = Scenario::load(&shipped("orbit-rendezvous"), &[]).unwrap();
+    let scenario = Scenario::parse(&scenario.to_toml(), "test", &["duration_s=5".to_owned(), "accept={}".to_owned()]);
+    let _device = Powered::of_rig(&cable.device.path, scenario.unwrap(), 1);
+    let with_device = run_with(&bench, "orbit-rendezvous", &cable.host.path, &arguments);
+    assert_eq!(with_device["state"]["hash"], bench.summary("orbit-rendezvous", &arguments)["state"]["hash"]);
+}
+
+#[test]
+fn in_real_time_a_device_synchronises() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let _device = Powered::reference(&cable.device.path);
+    let summary = run_with(&bench, "rigid-pair", &cable.host.path, &REALTIME);
+    let (error, ticks) = (sync_error(&summary), &summary["books"]["roles"]["follower"]);
+    let line = &summary["lines"]["follower"];
+    println!("{error:e} rad/s; follower {ticks}; line {line}");
+    assert_eq!(number(&ticks["executed"]) + number(&ticks["missed"]), 801);
+    // A machine that withholds the processor gives a slower loop, and says so.
+    let limit = if number(&summary["books"]["missed_ticks"]) < 200 { 1e-6 } else { 1.0 };
+    assert!(error < limit, "{error:e}: {summary:#}");
+    let serial = summary["latencies"].as_array().unwrap().iter().find(|stage| stage["stage"] == "serial").unwrap();
+    println!("round trip {serial}");
+    assert_eq!((&serial["role"], number(&serial["count"])), (&Value::from("follower"), number(&ticks["executed"])));
+    assert!(bench.path("out/latency/follower.serial.hgrm").is_file());
+}
+
+/// What is lost is counted as missed; the bodies synchronise all the same.
+#[test]
+fn in_real_time_a_faulty_line_costs_ticks_and_not_the_goal() {
+    let bench = Bench::new();
+    let faults = Faults { drop: 3e-4, corrupt: 3e-4, garbage: 3e-4, delay: Duration::from_millis(2), pieces: true };
+    let cable = Cable::new(faults);
+    let _device = Powered::reference(&cable.device.path);
+    let summary = run_with(&bench, "rigid-pair", &cable.host.path, &REALTIME);
+    let (error, ticks) = (sync_error(&summary), &summary["books"]["roles"]["follower"]);
+    let line = &summary["lines"]["follower"];
+    println!("{error:e} rad/s; follower {ticks}; line {line}");
+    assert_eq!(number(&ticks["executed"]) + number(&ticks["missed"]), 801);
+    assert!(number(&line["resyncs"]) > 5 && number(&line["crc_errors"]) > 0, "{line}");
+    assert!(number(&line["unanswered"]) <= number(&ticks["missed"]), "{line}");
+    let limit = if number(&summary["books"]["missed_ticks"]) < 300 { 1e-3 } else { 1.0 };
+    assert!(error < limit, "{error:e}: {summary:#}");
+}
+
+/// Noise on the line before anybody says anything, more than any buffer holds.
+#[test]
+fn garbage_before_the_handshake_is_dropped_and_counted() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let _device = Powered::reference(&cable.device.path);
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &LOCKSTEP);
+    let (host, mut random) = (cable.host.clone(), Pcg64::seed_from_u64(3));
+    // More than the system keeps for a reader that has not come yet.
+    let noise = std::thread::spawn(move || {
+        let mut taken = 0;
+        while taken < 400_000 {
+            let garbage: Vec<u8> = (0..100).map(|_| random.next_u64() as u8).collect();
+            taken += host.write(&garbage);
+            std::thread::sleep(NAP);
+        }
+    });
+    let bridge = bridge(&bench, &cable.host.path, &domain, &[]);
+    noise.join().unwrap();
+    let (run, bridge) = (run.wait(), bridge.wait());
+    assert_eq!(bridge.code, Some(0), "{bridge:?}");
+    let line = &summary(&run)["lines"]["follower"];
+    println!("{line}");
+    assert!(number(&line["dropped_bytes"]) > 100_000 && number(&line["malformed"]) > 100, "{line}");
+}
+
+/// A cable under names of its own, which go when it is unplugged, as those of a USB adapter do: the numbers of ptys are used
+/// again at once, by whoever comes next.
+struct Adapter {
+    names: [PathBuf; 2],
+    cable: Cable,
+}
+
+impl Adapter {
+    fn plug_in(bench: &Bench) -> Self {
+        let (cable, names) = (Cable::new(CLEAN), ["tty-host", "tty-device"].map(|name| bench.path(name)));
+        for (name, port) in names.iter().zip([&cable.host, &cable.device]) {
+            std::os::unix::fs::symlink(&port.path, name).unwrap();
+        }
+        Self { names, cable }
+    }
+}
+
+impl Drop for Adapter {
+    fn drop(&mut self) {
+        self.names.iter().for_each(|name| std::fs::remove_file(name).unwrap());
+    }
+}
+
+#[test]
+fn a_device_that_is_unplugged_and_plugged_in_again_goes_on() {
+    let bench = Bench::new();
+    let adapter = Adapter::plug_in(&bench);
+    let _device = Powered::reference(&bench.path("tty-device"));
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &REALTIME);
+    let bridge = bridge(&bench, &bench.path("tty-host"), &domain, &["--patience", "60"]);
+    adapter.cable.await_ticks();
+    drop(adapter);
+    std::thread::sleep(Duration::from_millis(500));
+    let _adapter = Adapter::plug_in(&bench);
+    let (run, bridge) = (run.wait(), bridge.wait());
+    assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
+    let summary = summary(&run);
+    let (error, ticks) = (sync_error(&summary), &summary["books"]["roles"]["follower"]);
+    let line = &summary["lines"]["follower"];
+    println!("{error:e} rad/s; follower {ticks}; line {line}");
+    assert!(number(&line["reopened"]) >= 1 && number(&line["handshakes"]) >= 2, "{line}");
+    assert!(number(&ticks["missed"]) >= 30 && number(&ticks["executed"]) > 0, "{ticks}");
+    let limit = if number(&summary["books"]["missed_ticks"]) < 300 { 1e-3 } else { 1.0 };
+    assert!(error < limit, "{error:e}: {summary:#}");
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn a_device_that_does_not_come_back_ends_the_bridge_with_the_reason() {
+    let bench = Bench::new();
+    let adapter = Adapter::plug_in(&bench);
+    let _device = Powered::reference(&bench.path("tty-device"));
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &["--clock", "lockstep", "--duration", "100000"]);
+    let bridge = bridge(&bench, &bench.path("tty-host"), &domain, &["--patience", "0.5"]);
+    adapter.cable.await_ticks();
+    drop(adapter);
+    let bridge = bridge.wait();
+    assert_eq!(bridge.code, Some(1), "{bridge:?}");
+    assert!(bridge.stderr.contains("has not answered for") && bridge.stderr.contains("plugged in"), "{bridge:?}");
+    run.signal(2);
+    run.wait();
+}
+
+/// Answers every frame with the bytes that `reply` makes of its payload.
+fn impostor(path: &Path, reply: fn(&[u8]) -> Vec<u8>) -> Powered {
+    let path = path.to_owned();
+    Powered::new(move |on| {
+        let (mut line, mut decoder, mut bytes) = (Line::open(&path, None).unwrap(), Decoder::default(), [0; 512]);
+        while on.load(Ordering::Relaxed) {
+            let count = line.read(&mut bytes);
+            decoder.feed(&bytes[..count], |payload| {
+                line.write(&reply(payload));
+            });
+            std::thread::sleep(NAP);
+        }
+    })
+}
+
+fn framed(payload: &[u8]) -> Vec<u8> {
+    encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec()
+}
+
+/// A bridge to `device` must end by itself with this code, and say all of these.
+fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], code: i32, words: &[&str]) {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let _device = device(&cable.device.path);
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &REALTIME);
+    let done = bridge(&bench, &cable.host.path, &domain, arguments).wait();
+    assert_eq!(done.code, Some(code), "{done:?}");
+    for word in words {
+        assert!(done.stderr.contains(word), "{word}: {done:?}");
+    }
+    run.signal(2);
+    run.wait();
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn a_device_of_another_version_is_refused_by_both_versions() {
+    let other = |path: &Path| Some(impostor(path, |_| framed(&[9, 0, 2, 0, 0])));
+    refused(other, &[], 2, &["protocol version 9", "this program version 1", "update the older"]);
+}
+
+#[test]
+fn a_device_of_another_rig_is_refused_by_both_types() {
+    let orbit = |path: &Path| {
+        let scenario = Scenario::load(&shipped("orbit-rendezvous"), &[]).unwrap();
+        Some(Powered::of_rig(path, scenario, 1))
+    };
+    refused(orbit, &[], 2, &["corotate/orbit/command/v1", "corotate/rigid-body/command/v2"]);
+}
+
+#[test]
+fn a_device_that_never_answers_is_given_up() {
+    refused(|_| None, &["--patience", "0.5"], 1, &["has not answered for", "powered, wired"]);
+}
+
+#[test]
+fn a_looped_line_is_told_from_a_silent_one() {
+    let echo = |path: &Path| Some(impostor(path, framed));
+    refused(echo, &["--patience", "5"], 1, &["has not answered", "own frames came back"]);
+}
+
+#[test]
+fn a_line_at_another_speed_is_told_from_a_silent_one() {
+    let noise = |path: &Path| Some(impostor(path, |payload| vec![0x55; payload.len()]));
+    refused(noise, &["--patience", "5"], 1, &["has not answered", "no frame was among them", "--baud"]);
+}
+
+#[test]
+fn a_line_too_slow_for_the_tick_is_refused_with_the_least_speed() {
+    refused(|_| None, &["--baud", "9600"], 2, &["at 9600 baud", "give --baud", "tick_hz"]);
+}
+
+#[test]
+fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
+    let bench = Bench::new();
+    let port = Port::new();
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &REALTIME);
+    let file = bench.path("file");
+    std::fs::write(&file, "no line").unwrap();
+    let ask = |path: &Path, body: &str, domain: &Path| {
+        let (path, domain) = (path.to_str().unwrap(), domain.to_str().unwrap());
+        let done = bench.run(&["bridge", "--serial", path, "--body", body, "--domain", domain]);
+        assert_eq!(done.code, Some(2), "{done:?}");
+        done.stderr
+    };
+    for path in [&file, &domain, Path::new("/dev/null")] {
+        assert!(ask(path, "follower", &domain).contains("not a terminal device"));
+    }
+    assert!(ask(&bench.path("none"), "follower", &domain).contains("plugged in"));
+    assert!(ask(&port.path, "leader", &domain).contains("a driven body only"));
+    assert!(ask(&port.path, "nobody", &domain).contains("there is no role `nobody`"));
+    assert!(ask(&port.path, "follower", &bench.path("none")).contains("not the domain of a run"));
+    let _held = Line::open(&port.path, None).unwrap();
+    assert!(ask(&port.path, "follower", &domain).contains("in use by another program"));
+    run.signal(2);
+    run.wait();
+}
+
+/// A bridge that dies takes nothing with it: the next one finds the books where they were, and a device that knows the run.
+#[test]
+fn a_bridge_that_was_killed_can_be_started_again() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let _device = Powered::reference(&cable.device.path);
+    let arguments = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "60", "--set", "accept={}"];
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &arguments);
+    let first = bridge(&bench, &cable.host.path, &domain, &[]);
+    cable.await_ticks();
+    first.signal(9);
+    assert_eq!(first.wait().signal, Some(9));
+    let second = bridge(&bench, &cable.host.path, &domain, &[]);
+    let (run, second) = (run.wait(), second.wait());
+    assert_eq!(second.code, Some(0), "{second:?} {run:?}");
+    let with_device = summary(&run);
+    assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
+    assert_eq!(number(&with_device["books"]["roles"]["follower"]["executed"]), 6001);
+    bench.assert_clean(&[domain]);
+}
+
+/// The device hears of the end, and is safe at once.
+#[test]
+fn a_bridge_that_is_interrupted_leaves_its_device_safe() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let path = cable.device.path.clone();
+    let safe = Arc::new(AtomicBool::new(true));
+    let told = safe.clone();
+    let _device = Powered::new(move |on| {
+        let mut device = Device::new(NAME, Follower::asked_for);
+        let mut line = Line::open(&path, None).unwrap();
+        let mut bytes = [0; 512];
+        while on.load(Ordering::Relaxed) {
+            let count = line.read(&mut bytes);
+            // No clock: it is the word of the bridge that makes it safe, not silence.
+            device.receive(&bytes[..count], 0, |frame| {
+                line.write(frame);
+            });
+            told.store(device.is_safe(), Ordering::Relaxed);
+            std::thread::sleep(NAP);
+        }
+    });
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &["--clock", "lockstep", "--duration", "100000"]);
+    let bridge = bridge(&bench, &cable.host.path, &domain, &[]);
+    await_some(|| (!safe.load(Ordering::Relaxed)).then_some(()));
+    bridge.signal(2);
+    let done = bridge.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    await_some(|| safe.load(Ordering::Relaxed).then_some(()));
+    run.signal(2);
+    run.wait();
+}
