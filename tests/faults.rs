@@ -463,3 +463,24 @@ fn a_killed_role_leaves_the_same_bits_in_one_thread_as_among_processes() {
         bench.assert_clean(&[]);
     }
 }
+
+/// The worst reaction to silence, in ticks: the safe command acts at the `command_timeout_ticks`th tick without a command.
+#[test]
+fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
+    for timeout in [1, 5, 20] {
+        let bench = Bench::new();
+        let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
+        let fault = "\n[[fault]]\nkind = \"drop\"\nrole = \"controller\"\nfrom_tick = 5000\nticks = 50\n";
+        std::fs::write(bench.path("silence.toml"), text + fault).unwrap();
+        let timeout_key = format!("actuator.command_timeout_ticks={timeout}");
+        for clock in ["in-process", "lockstep"] {
+            let done =
+                bench.run(&["run", "silence.toml", "--json", "--out=out", "--clock", clock, "--set", &timeout_key]);
+            assert_eq!(done.code, Some(0), "{done:?}");
+            let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+            let follower = &summary["books"]["roles"]["follower"];
+            let counts = (follower["starved"].as_u64(), follower["safe"].as_u64());
+            assert_eq!(counts, (Some(50), Some(50 - timeout + 1)), "{clock}, {timeout} ticks: {follower}");
+        }
+    }
+}
