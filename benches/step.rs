@@ -100,7 +100,7 @@ fn in_process(criterion: &mut Criterion) {
                     .map(|role| with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &private_ledger(&scenario, role))))
                     .collect::<Result<_, _>>()
                     .expect("links in memory open");
-                in_turn(&mut nodes, scenario.last_tick, |_| true)
+                in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), |_| true)
             });
         });
     }

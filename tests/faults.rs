@@ -400,7 +400,6 @@ fn a_fault_that_makes_no_sense_is_refused_with_place_and_remedy() {
         ),
         (("\"drop\"", "\"noise-burst\"\ndeviation = -1.0"), "not above zero"),
         (("\"drop\"", "\"stall\"\nstall_ms = 0.0"), "0 ms is no stall"),
-        (("\"drop\"", "\"kill\"\n"), "in-process roles have none of their own"),
     ] {
         let file = bench.path("case.toml");
         let fault = good.replace(change.0, change.1);
@@ -436,5 +435,31 @@ fn limits_and_watchdog_that_make_no_sense_are_refused() {
         let done = bench.run(&["check", shipped(scenario).to_str().unwrap(), "--set", set]);
         assert_eq!(done.code, Some(2), "{set}: {done:?}");
         assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+    }
+}
+
+/// A scripted kill is the same event under both clocks that look at no time: the same books, the same bits.
+#[test]
+fn a_killed_role_leaves_the_same_bits_in_one_thread_as_among_processes() {
+    for role in ["leader", "follower", "observer", "controller"] {
+        let bench = Bench::new();
+        let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
+        let fault = format!("\n[[fault]]\nkind = \"kill\"\nrole = \"{role}\"\nfrom_tick = 2345\n");
+        std::fs::write(bench.path("kill.toml"), text + &fault).unwrap();
+        let summaries = ["in-process", "lockstep"].map(|clock| {
+            let done = bench.run(&["run", "kill.toml", "--clock", clock, "--json", "--out", clock]);
+            assert_eq!(done.code, Some(0), "{role} {clock}: {done:?}");
+            serde_json::from_str::<serde_json::Value>(&done.stdout).unwrap()
+        });
+        let [one, other] = &summaries;
+        assert_eq!(one["state"]["hash"], other["state"]["hash"], "{role}");
+        assert_eq!(one["books"]["roles"], other["books"]["roles"], "{role}");
+        for summary in &summaries {
+            let incident = &summary["incidents"][0];
+            assert_eq!((incident["role"].as_str(), incident["tick"].as_u64()), (Some(role), Some(2345)), "{incident}");
+            assert_eq!(summary["books"]["balanced"], true, "{role}");
+        }
+        assert_eq!(one["incidents"][0]["recovery_s"], other["incidents"][0]["recovery_s"], "{role}");
+        bench.assert_clean(&[]);
     }
 }

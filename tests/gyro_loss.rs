@@ -56,15 +56,20 @@ fn rows(overrides: &[&str]) -> Vec<Row> {
     let mut estimate: Input<MemoryBus, RateEstimate> =
         Input::watch(&bus, &topic(&scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
-    in_turn(&mut nodes, scenario.last_tick, |_| {
-        assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
-        rows.push(Row {
-            leader: leader.sample().unwrap().omega_rad_s,
-            follower: follower.sample().unwrap().omega_rad_s,
-            estimate: *estimate.sample().unwrap(),
-        });
-        true
-    })
+    in_turn(
+        &mut nodes,
+        scenario.last_tick,
+        |_| Ok(None),
+        |_| {
+            assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
+            rows.push(Row {
+                leader: leader.sample().unwrap().omega_rad_s,
+                follower: follower.sample().unwrap().omega_rad_s,
+                estimate: *estimate.sample().unwrap(),
+            });
+            true
+        },
+    )
     .unwrap();
     rows
 }

@@ -155,12 +155,17 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
     let mut truth = reader(&bus, &scenario, Signal::Truth);
     let mut command = reader(&bus, &scenario, Signal::Command);
     let mut seen = (Vec::new(), Vec::new(), Vec::new());
-    in_turn(&mut nodes, scenario.last_tick, |_| {
-        seen.0.push(next(&mut measurement));
-        seen.1.push(next(&mut truth));
-        seen.2.push(next(&mut command));
-        true
-    })
+    in_turn(
+        &mut nodes,
+        scenario.last_tick,
+        |_| Ok(None),
+        |_| {
+            seen.0.push(next(&mut measurement));
+            seen.1.push(next(&mut truth));
+            seen.2.push(next(&mut command));
+            true
+        },
+    )
     .unwrap();
     seen
 }

@@ -159,16 +159,21 @@ fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> 
     let mut estimate: Input<MemoryBus, OrbitEstimate> =
         Input::watch(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
-    in_turn(&mut nodes, scenario.last_tick, |_| {
-        let mut take = |truth: &mut Input<MemoryBus, OrbitTruth>| {
-            assert!(truth.advance().unwrap());
-            *truth.sample().unwrap()
-        };
-        let truths = truths.iter_mut().map(&mut take).collect();
-        assert!(estimate.advance().unwrap());
-        rows.push((truths, *estimate.sample().unwrap()));
-        true
-    })
+    in_turn(
+        &mut nodes,
+        scenario.last_tick,
+        |_| Ok(None),
+        |_| {
+            let mut take = |truth: &mut Input<MemoryBus, OrbitTruth>| {
+                assert!(truth.advance().unwrap());
+                *truth.sample().unwrap()
+            };
+            let truths = truths.iter_mut().map(&mut take).collect();
+            assert!(estimate.advance().unwrap());
+            rows.push((truths, *estimate.sample().unwrap()));
+            true
+        },
+    )
     .unwrap();
     rows
 }

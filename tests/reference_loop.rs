@@ -46,14 +46,19 @@ fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
     let mut estimate: Input<MemoryBus, RateEstimate> =
         Input::watch(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
-    in_turn(&mut nodes, scenario.last_tick, |tick| {
-        assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
-        let (leader, follower) = (leader.sample().unwrap(), follower.sample().unwrap());
-        let hidden = estimate.sample().unwrap().omega_rad_s[2];
-        let row = [&leader.omega_rad_s[..], &follower.omega_rad_s, &[hidden], &follower.applied_rad_s2].concat();
-        rows.push([&[tick as f64, scenario.time_s(tick)][..], &row].concat());
-        true
-    })
+    in_turn(
+        &mut nodes,
+        scenario.last_tick,
+        |_| Ok(None),
+        |tick| {
+            assert!(leader.advance().unwrap() && follower.advance().unwrap() && estimate.advance().unwrap());
+            let (leader, follower) = (leader.sample().unwrap(), follower.sample().unwrap());
+            let hidden = estimate.sample().unwrap().omega_rad_s[2];
+            let row = [&leader.omega_rad_s[..], &follower.omega_rad_s, &[hidden], &follower.applied_rad_s2].concat();
+            rows.push([&[tick as f64, scenario.time_s(tick)][..], &row].concat());
+            true
+        },
+    )
     .unwrap();
     rows
 }

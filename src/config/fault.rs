@@ -2,8 +2,8 @@
 //!
 //! Must refuse a fault that would do nothing, or something else than its author meant.
 
+use super::nearest;
 use super::scenario::{Checks, finite_positive};
-use super::{ClockKind, nearest};
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
 use crate::rig::{AnyRig, Command, Estimate, Measurement, Rig};
 use crate::sample::FieldKind;
@@ -88,7 +88,6 @@ fn always() -> f64 {
 /// What faults are checked against.
 pub(super) struct Setting<'a> {
     pub rig: &'a AnyRig,
-    pub clock: ClockKind,
     pub last_tick: u64,
     pub seed: u64,
 }
@@ -172,11 +171,6 @@ impl One<'_, '_, '_> {
         if raw.kind == Kind::Freeze {
             self.require(raw.from_tick >= 1, "from_tick", || {
                 "at tick 0 there is nothing to stay at; give 1 or more".into()
-            });
-        }
-        if raw.kind == Kind::Kill {
-            self.require(self.setting.clock != ClockKind::InProcess, "kind", || {
-                "kills a process, and in-process roles have none of their own; use clock = \"lockstep\"".to_owned()
             });
         }
     }

@@ -104,7 +104,9 @@ impl Scenario {
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
-            let setting = fault::Setting { rig, clock: raw.clock, last_tick, seed: raw.seed };
+            // Of a tick that is refused nothing is concluded.
+            let last_tick = if tick_possible(raw.tick_hz) { last_tick } else { u64::MAX };
+            let setting = fault::Setting { rig, last_tick, seed: raw.seed };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             watch = watchdog::resolve(&raw.watchdog, rig, tick_s, raw.duration_s, &mut checks);
         }

@@ -1,12 +1,14 @@
 //! A run in one thread: the same roles over links in memory. No iceoryx2, no files, no clock.
 
 use super::score::{self, Scorer};
-use super::{Launch, LaunchError, Outcome, Progress};
+use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
-use crate::config::Scenario;
+use crate::clock::Grid;
+use crate::config::{OnFailure, Scenario};
 use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
 use crate::telemetry::Ledger;
 use crate::with_rig;
+use std::cell::RefCell;
 use std::sync::atomic::Ordering;
 
 /// Ticks between two looks at signals and progress.
@@ -15,37 +17,60 @@ const TURN_TICKS: u64 = 1024;
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     let bus = MemoryBus::new(depths(scenario));
-    let mut scorer = score::open(scenario, &bus)?;
-    let roles = RoleId::all(scenario);
-    let ledgers: Vec<Ledger> = roles.iter().map(|role| private_ledger(scenario, *role)).collect();
+    let scorer = RefCell::new(score::open(scenario, &bus)?);
+    let seats: Vec<(RoleId, Ledger)> =
+        RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
     let node =
-        |(role, ledger): (&RoleId, &Ledger)| with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, ledger));
-    let mut nodes = roles.iter().zip(&ledgers).map(node).collect::<Result<Vec<_>, _>>()?;
+        |(role, ledger): &(RoleId, Ledger)| with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, ledger));
+    let mut nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
+    let mut incidents = Vec::new();
+    let revive = |index: usize| {
+        let incident = incident(scenario, &seats[index]);
+        scorer.borrow_mut().incident(incident.tick);
+        let (tick, action) = (incident.tick, incident.action);
+        incidents.push(incident);
+        if action == Action::Stopped {
+            return Ok(None);
+        }
+        let mut successor = node(&seats[index])?;
+        successor.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, tick);
+        Ok(Some(successor))
+    };
     let mut failure = None;
-    let ended = in_turn(&mut nodes, scenario.last_tick, |tick| match scorer.poll(1) {
-        Ok(_) => proceed(&*scorer, scenario, launch, tick),
-        Err(error) => {
-            failure = Some(error);
-            false
+    let ended = in_turn(&mut nodes, scenario.last_tick, revive, |tick| {
+        let mut scorer = scorer.borrow_mut();
+        match scorer.poll(1) {
+            Ok(_) => proceed(&**scorer, scenario, launch, tick),
+            Err(error) => {
+                failure = Some(error);
+                false
+            }
         }
     })?;
     if let Some(error) = failure {
         return Err(error.into());
     }
+    let score = scorer.borrow_mut().finish()?;
+    for (incident, recovery_s) in incidents.iter_mut().zip(&score.recoveries_s) {
+        incident.recovery_s = *recovery_s;
+    }
     Ok(Outcome {
-        reports: roles
-            .iter()
-            .zip(&ledgers)
-            .map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()))
-            .collect(),
+        reports: seats.iter().map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new())).collect(),
         unbooked: Vec::new(),
         problems: Vec::new(),
-        score: scorer.finish()?,
-        incidents: Vec::new(),
+        score,
+        incidents,
         grants: Vec::new(),
         domain: None,
         signal: if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 },
     })
+}
+
+/// A role was killed by the scenario: what is done about it, by the policy that processes have.
+fn incident(scenario: &Scenario, (role, ledger): &(RoleId, Ledger)) -> Incident {
+    let (name, supervision) = (role.name(scenario), &scenario.supervision);
+    let again = supervision.of(name) == OnFailure::Restart && ledger.generation() <= supervision.restarts_max;
+    Incident::without_process(name, ledger, if again { Action::Restarted } else { Action::Stopped })
 }
 
 fn proceed(scorer: &dyn Scorer, scenario: &Scenario, launch: &mut Launch<'_>, tick: u64) -> bool {

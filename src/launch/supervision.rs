@@ -68,6 +68,22 @@ impl fmt::Display for Incident {
     }
 }
 
+impl Incident {
+    /// The scripted end of a role that has no process of its own: its successor is there at once.
+    pub(super) fn without_process(role: &str, ledger: &Ledger, action: Action) -> Self {
+        Self {
+            role: role.to_owned(),
+            generation: ledger.generation(),
+            tick: crate::runtime::next_tick(ledger),
+            cause: "it was killed by the scenario".to_owned(),
+            last_words: String::new(),
+            action,
+            outage_s: None,
+            recovery_s: None,
+        }
+    }
+}
+
 /// How a role failed, in words.
 pub(super) struct Failure {
     pub cause: String,

@@ -3,7 +3,7 @@
 //! Must cost an undisturbed role nothing but one look whether there is anything to do.
 
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{Scenario, ScriptedFault};
+use crate::config::{ClockKind, Scenario, ScriptedFault};
 use crate::fault::{Action, Change, Fault, Interruption, Transport};
 use crate::sample::Sample;
 
@@ -69,11 +69,22 @@ pub fn extra_samples(scenario: &Scenario) -> usize {
     scenario.faults.iter().filter(extra).count()
 }
 
+/// What a role has suffered before a tick.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Suffered {
+    /// So many stalls.
+    pub stalls: u64,
+    /// Its life is over, where it has no process that could be killed: whoever drives it builds it anew.
+    pub killed: bool,
+}
+
 /// What happens to a role before its ticks.
 #[derive(Debug)]
 pub struct Interruptions {
     faults: Vec<Fault>,
     first_life: bool,
+    /// Whether the role is a process, which can be killed.
+    process: bool,
     /// Ticks before this one have been looked at.
     next: u64,
 }
@@ -83,30 +94,36 @@ impl Interruptions {
     pub fn of(scenario: &Scenario, role: &str, generation: u64) -> Self {
         let here = |fault: &&ScriptedFault| fault.role == role && fault.body.is_none();
         let faults = scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect();
-        Self { faults, first_life: generation == 1, next: 0 }
+        let process = scenario.clock != ClockKind::InProcess;
+        Self { faults, first_life: generation == 1, process, next: 0 }
     }
 
-    /// Acts before `tick`, once, and tells how many stalls there were.
+    /// Acts before `tick`, once, and tells what it did.
     #[inline]
-    pub fn before(&mut self, tick: u64) -> u64 {
-        if self.faults.is_empty() || tick < self.next { 0 } else { self.act(tick) }
+    pub fn before(&mut self, tick: u64) -> Suffered {
+        if self.faults.is_empty() || tick < self.next { Suffered::default() } else { self.act(tick) }
     }
 
     #[cold]
-    fn act(&mut self, tick: u64) -> u64 {
+    fn act(&mut self, tick: u64) -> Suffered {
         self.next = tick + 1;
-        let mut stalls = 0;
+        let mut suffered = Suffered::default();
         for fault in self.faults.iter().filter(|fault| fault.acts(tick)) {
             match fault.action {
                 Action::Role(Interruption::Stall { ns }) => {
                     stall(ns);
-                    stalls += 1;
+                    suffered.stalls += 1;
                 }
-                Action::Role(Interruption::Kill) if self.first_life => kill(),
+                Action::Role(Interruption::Kill) if self.first_life => {
+                    if self.process {
+                        kill();
+                    }
+                    suffered.killed = true;
+                }
                 _ => {}
             }
         }
-        stalls
+        suffered
     }
 }
 
@@ -163,16 +180,19 @@ mod tests {
     #[test]
     fn a_stall_holds_the_role_up_once_per_tick() {
         let faults = vec![fault(3, 2, Action::Role(Interruption::Stall { ns: 2_000_000 }))];
-        let mut interruptions = Interruptions { faults, first_life: false, next: 0 };
+        let mut interruptions = Interruptions { faults, first_life: false, process: true, next: 0 };
         let begun = monotonic_ns();
-        let stalls = [0, 1, 3, 3, 4, 5].map(|tick| interruptions.before(tick));
+        let stalls = [0, 1, 3, 3, 4, 5].map(|tick| interruptions.before(tick).stalls);
         assert_eq!(stalls, [0, 0, 1, 0, 1, 0]);
         assert!(monotonic_ns() - begun >= 4_000_000);
     }
 
     #[test]
-    fn a_successor_is_not_killed_again() {
-        let faults = vec![fault(3, 1, Action::Role(Interruption::Kill))];
-        assert_eq!(Interruptions { faults, first_life: false, next: 0 }.before(3), 0, "and lives to say so");
+    fn whoever_has_no_process_is_told_of_its_end_and_its_successor_is_spared() {
+        let kill = || vec![fault(3, 1, Action::Role(Interruption::Kill))];
+        let mut first = Interruptions { faults: kill(), first_life: true, process: false, next: 0 };
+        assert_eq!([2, 3].map(|tick| first.before(tick).killed), [false, true]);
+        let mut second = Interruptions { faults: kill(), first_life: false, process: true, next: 0 };
+        assert!(!second.before(3).killed, "and lives to say so");
     }
 }

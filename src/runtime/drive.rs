@@ -247,18 +247,26 @@ impl Backoff {
     }
 }
 
-/// Drives all nodes in one thread, each tick through all of them in the order given.
+/// Drives all nodes in one thread, each tick through all of them in the order given. `revive` gives a role whose life is over
+/// (its index) its successor, or ends the run.
 ///
 /// # Errors
 /// [`BusError`] if a link failed, or if the roles wait for one another in a circle.
 pub fn in_turn(
-    nodes: &mut [ReadyNode],
+    nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
+    mut revive: impl FnMut(usize) -> Result<Option<ReadyNode>, BusError>,
     mut after_tick: impl FnMut(u64) -> bool,
 ) -> Result<Ended, BusError> {
     for tick in 0..=last_tick {
-        for node in nodes.iter_mut() {
-            node.before_tick();
+        for index in 0..nodes.len() {
+            if nodes[index].before_tick() {
+                // The seat is left before it is taken again, as between processes.
+                drop(nodes.remove(index));
+                let Some(successor) = revive(index)? else { return Ok(Ended::Stopped) };
+                nodes.insert(index, successor);
+            }
+            let node = &mut nodes[index];
             if node.poll(Gate::Inputs { up_to: tick })? == Poll::Executed {
                 node.settle()?;
             }

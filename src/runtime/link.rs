@@ -79,6 +79,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
             (disturbance.tamper(stamp.tick, &mut sample, &self.sent), disturbance.way(stamp.tick));
         injected |= way.is_some();
         while let Some(late) = disturbance.due(stamp.tick) {
+            self.port.prepare()?;
             self.port.send(|slot| *slot = late)?;
             self.book.extra();
         }
@@ -95,6 +96,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
             None => 1,
         };
         for _ in 0..copies {
+            self.port.prepare()?;
             self.port.send(|slot| {
                 *slot = sample;
                 hooks::at(Place::Loaned);
@@ -131,6 +133,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
         if !self.voids {
             return Ok(());
         }
+        self.port.prepare()?;
         self.port.send(|slot| {
             *slot = S::default();
             *slot.stamp_mut() = Stamp { generation: stamp.generation | VOID, ..*stamp };

@@ -134,7 +134,7 @@ pub trait Node {
     /// before that counts as missed.
     fn start(&mut self, grid: Grid, first_tick: u64);
     /// Lets scripted interruptions of this role act: before every tick, once.
-    fn before_tick(&mut self);
+    fn before_tick(&mut self) -> bool;
     /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
     ///
     /// # Errors

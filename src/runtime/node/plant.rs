@@ -137,8 +137,10 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
     }
 
     #[inline]
-    fn before_tick(&mut self) {
-        self.book.stalled(self.interruptions.before(self.book.next()));
+    fn before_tick(&mut self) -> bool {
+        let suffered = self.interruptions.before(self.book.next());
+        self.book.stalled(suffered.stalls);
+        suffered.killed
     }
 
     #[inline]

@@ -1,0 +1,16 @@
+//! Any lines as `--set` arguments of a shipped scenario; the first byte says which.
+#![no_main]
+
+use corotate::config::{SHIPPED, Scenario};
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|input: (u8, &str)| {
+    let (name, text) = SHIPPED[usize::from(input.0) % SHIPPED.len()];
+    let arguments: Vec<String> = input.1.lines().map(str::to_owned).collect();
+    match Scenario::parse(text, name, &arguments) {
+        Ok(scenario) => {
+            Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
+        }
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+});

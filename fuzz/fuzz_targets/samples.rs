@@ -1,0 +1,76 @@
+//! Any bytes as the samples of a loop's signals: whatever a role reads, what it says is finite.
+#![no_main]
+
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Bus, Reader, Signal, Write};
+use corotate::clock::Grid;
+use corotate::config::{SHIPPED, Scenario};
+use corotate::runtime::{Gate, Input, Poll, ReadyNode, RoleId, build, depths, private_ledger, topic};
+use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample};
+use libfuzzer_sys::fuzz_target;
+use std::cell::OnceCell;
+
+thread_local! {
+    static PAIR: OnceCell<Scenario> = const { OnceCell::new() };
+}
+
+/// Sends raw words as a sample. A first byte below 192 keeps the stamp what it should be, so that more than stamps is met.
+fn send<S: Sample>(writer: &mut impl Write<S>, tick: u64, raw: &[u8]) {
+    let Some((honest, raw)) = raw.split_first() else { return };
+    let mut sample = S::default();
+    let bytes = bytemuck::bytes_of_mut(&mut sample);
+    let count = raw.len().min(bytes.len());
+    bytes[..count].copy_from_slice(&raw[..count]);
+    if *honest < 192 {
+        (sample.stamp_mut().tick, sample.stamp_mut().generation) = (tick, 1);
+    }
+    writer.send(|out| *out = sample).unwrap();
+}
+
+fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
+    let bus = MemoryBus::new(depths(scenario));
+    let of = |body: &str, signal| topic(scenario, body, signal);
+    let role = |role: RoleId| -> ReadyNode {
+        let ledger = private_ledger(scenario, role);
+        let mut node = corotate::with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &ledger)).unwrap();
+        node.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, 0);
+        node
+    };
+    let mut nodes = [role(RoleId::Observer), role(RoleId::Controller), role(RoleId::Plant(1))];
+    let mut measurement = bus.writer::<RateMeasurement>(&of("leader", Signal::Measurement)).unwrap();
+    let mut estimate = bus.writer::<RateEstimate>(&of("leader", Signal::Estimate)).unwrap();
+    let mut command = bus.writer::<RateCommand>(&of("follower", Signal::Command)).unwrap();
+    let mut estimates = Input::<_, RateEstimate>::watch(&bus, &of("leader", Signal::Estimate), Reader::Role).unwrap();
+    let mut commands = Input::<_, RateCommand>::watch(&bus, &of("follower", Signal::Command), Reader::Role).unwrap();
+    for (index, (which, raw)) in pieces.iter().enumerate() {
+        let (tick, foreign) = (index as u64 / 4, which % 4);
+        match foreign {
+            0 => send(&mut measurement, tick, raw),
+            1 => send(&mut estimate, tick, raw),
+            2 => send(&mut command, tick, raw),
+            _ => {}
+        }
+        for node in &mut nodes {
+            if node.poll(Gate::Inputs { up_to: scenario.last_tick }).unwrap() == Poll::Executed {
+                node.settle().unwrap();
+            }
+        }
+        // Only what the roles themselves say: a foreign estimate or command may be anything.
+        while estimates.advance().unwrap() {
+            let said = estimates.sample().filter(|_| foreign != 1);
+            assert!(said.is_none_or(|said| said.omega_rad_s.iter().all(|value| value.is_finite())), "{said:?}");
+        }
+        while commands.advance().unwrap() {
+            let said = commands.sample().filter(|_| foreign != 2);
+            assert!(said.is_none_or(|said| said.acceleration_rad_s2.iter().all(|value| value.is_finite())), "{said:?}");
+        }
+    }
+}
+
+fuzz_target!(|pieces: Vec<(u8, &[u8])>| {
+    PAIR.with(|pair| {
+        let short = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
+        let scenario = pair.get_or_init(|| Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).unwrap());
+        loop_of(scenario, &pieces);
+    });
+});

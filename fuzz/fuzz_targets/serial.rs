@@ -1,0 +1,42 @@
+//! Any bytes on the line, to both ends: as they are, and as the payloads of good frames, which no random bytes would be.
+#![no_main]
+
+use corotate::config::{SHIPPED, Scenario};
+use corotate::rig::{AnyRig, Rig};
+use corotate::serial::{Device, Hello, Host, MAX_FRAME, Terms, decode, encode};
+use libfuzzer_sys::fuzz_target;
+use std::cell::OnceCell;
+
+thread_local! {
+    static PAIR: OnceCell<Scenario> = const { OnceCell::new() };
+}
+
+fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
+    let AnyRig::RigidBody(rig) = &scenario.rig else { unreachable!("the first shipped scenario is of rigid bodies") };
+    let mut device = Device::new("fuzz", |_: &Hello<'_>| Some(rig.body(1)));
+    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), measurement_length: 64, truth_length: 56 });
+    let mut frame = [0; MAX_FRAME];
+    for (index, piece) in pieces.iter().enumerate() {
+        let now_ns = index as u64 * 1_000_000;
+        let bytes = match (framed, encode(piece, &mut frame)) {
+            (true, Ok(frame)) => frame,
+            _ => piece,
+        };
+        decode(bytes, |message| drop(message));
+        // What the device says to that, its host hears too.
+        let mut said = Vec::new();
+        device.receive(bytes, now_ns, |frame| said.extend_from_slice(frame));
+        device.elapse(now_ns);
+        for &byte in bytes.iter().chain(&said) {
+            let _ = host.push(byte, now_ns);
+        }
+        host.request(index as u64, None, now_ns);
+    }
+}
+
+fuzz_target!(|input: (bool, Vec<&[u8]>)| {
+    PAIR.with(|pair| {
+        let scenario = pair.get_or_init(|| Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &[]).unwrap());
+        feed(scenario, &input.1, input.0);
+    });
+});
