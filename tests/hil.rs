@@ -13,7 +13,7 @@ use corotate::runtime::{
     Gate, Input, Poll, RoleId, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
 };
 use corotate::sample::{
-    FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
+    FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
 };
 use corotate::with_rig;
 use serde_json::Value;
@@ -207,7 +207,7 @@ fn deviation<S: Sample>(seen: &[S], expected: &[S]) -> f64 {
     worst
 }
 
-/// The last tick of the runs that this process conducts itself: everything that is sent fits into one link.
+/// The last tick of the runs that this process conducts itself.
 const CONDUCTED_TICKS: u64 = 100;
 
 /// A scenario for a foreign body without any other role: this process leads it and commands it.
@@ -219,17 +219,17 @@ fn conducted(rearm: &str) -> Scenario {
     scenario
 }
 
-/// Commands with everything that can be wrong: one missing, some fewer than the timeout, more than it, one not finite.
-fn commands() -> Vec<RateCommand> {
-    let missing = |tick: &u64| matches!(tick, 10 | 20..24 | 40..50);
-    let command = |tick: u64| {
-        let mut command = RateCommand::default();
-        (command.stamp.tick, command.stamp.generation) = (tick, 1);
+/// The command of a tick, with everything that can be wrong: one missing, some fewer than the timeout, more than it, one not
+/// finite. In lockstep a void stands where one is missing.
+fn command(tick: u64) -> RateCommand {
+    let mut command = RateCommand::default();
+    let missing = matches!(tick, 10 | 20..24 | 40..50);
+    (command.stamp.tick, command.stamp.generation) = (tick, if missing { 1 | VOID } else { 1 });
+    if !missing {
         let third = if tick == 60 { f64::NAN } else { 0.25 };
         command.acceleration_rad_s2 = [0.1 + 0.01 * tick as f64, -0.005 * tick as f64, third];
-        command
-    };
-    (0..CONDUCTED_TICKS).filter(|tick| !missing(tick)).map(command).collect()
+    }
+    command
 }
 
 /// What the built-in body makes of the commands.
@@ -240,34 +240,42 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, &ledger)).unwrap();
     let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
-    commands().iter().for_each(|command| writer.send(|sample| *sample = *command).unwrap());
     let mut seen = Vec::new();
     for tick in 0..=CONDUCTED_TICKS {
         assert_eq!(node.poll(Gate::Inputs { up_to: tick }).unwrap(), Poll::Executed);
         node.settle().unwrap();
         seen.push(next(&mut truth));
+        writer.send(|sample| *sample = command(tick)).unwrap();
     }
     seen
 }
 
-/// Leads the foreign body through a run as the launcher does, and sends it the commands before its first tick.
+/// Leads the foreign body through a run as the launcher does, and answers its measurements as a controller does.
 fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
     let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
     let mut health = bus.reader::<Health>(&topic(scenario, "follower", Signal::Health), Reader::Role).unwrap();
-    let mut command = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    let measurement = topic(scenario, "follower", Signal::Measurement);
+    let mut measurement = Input::<IoxBus, RateMeasurement>::watch(&bus, &measurement, Reader::Role).unwrap();
+    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    let mut asked = 0;
     let mut lead = |phase: Phase, until: RoleState| {
         await_some(|| {
             schedule.send(|word| (word.phase, word.credit_tick) = (phase as u64, scenario.last_tick)).unwrap();
+            while measurement.advance().unwrap() {
+                assert_eq!(measurement.sample().unwrap().stamp.tick, asked);
+                writer.send(|sample| *sample = command(asked)).unwrap();
+                asked += 1;
+            }
             while health.advance().unwrap() {}
             health.current().filter(|health| RoleState::from_number(health.state) >= until).map(|_| ())
         });
     };
     lead(Phase::Gather, RoleState::Open);
     lead(Phase::WarmUp, RoleState::Ready);
-    commands().iter().for_each(|sample| command.send(|slot| *slot = *sample).unwrap());
     lead(Phase::Run, RoleState::Done);
     lead(Phase::Stop, RoleState::Absent);
+    assert_eq!(asked, scenario.last_tick + 1);
 }
 
 /// Late, missing and unusable commands: held, safe after the timeout, re-armed or not, tick by tick as our own body does.
@@ -289,6 +297,7 @@ fn the_foreign_follower_treats_its_commands_as_ours_does() {
         let count = |bit: u64| seen.iter().filter(|truth| truth.status & bit != 0).count();
         assert_eq!(count(status::SAFE), safe_ticks, "{rearm}: the commands were such that it goes safe");
         assert!(count(status::HOLDING) >= 9, "{rearm}: and holds before");
+        assert_eq!(count(status::REJECTED), 1, "{rearm}: one was no number");
     }
 }
 

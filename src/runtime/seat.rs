@@ -10,7 +10,7 @@ use crate::bus::iox::{self, Qos};
 use crate::bus::{Depths, Reader};
 use crate::config::Scenario;
 use crate::role::Rearm;
-use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, status};
+use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, VOID, status};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -50,6 +50,8 @@ pub struct SeatDescription {
     states: BTreeMap<&'static str, u64>,
     /// The bits of every sample's `status`.
     status: BTreeMap<&'static str, u64>,
+    /// The bit of a sample's `generation` that makes it a void: its tick has no sample.
+    void_bit: u32,
     warm_up: WarmUp,
     /// Where the role may leave its books, and where this description lies while a run waits; none without a domain.
     report: Option<PathBuf>,
@@ -132,6 +134,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         phases: Phase::NAMES.into_iter().map(|(name, phase)| (name, phase as u64)).collect(),
         states: RoleState::NAMES.into_iter().map(|(name, state)| (name, state as u64)).collect(),
         status: status::NAMES.into_iter().collect(),
+        void_bit: VOID.trailing_zeros(),
         warm_up: WarmUp { samples: WARM_UP_SAMPLES, pause_ns: WARM_UP_PAUSE_NS },
         report: domain.map(|domain| report_path(domain.root(), name)),
         scenario: scenario.resolved.clone(),
@@ -250,6 +253,7 @@ mod tests {
         assert_eq!(seat["phases"]["warm_up"], 1);
         assert_eq!(seat["states"]["done"], 4);
         assert_eq!(seat["status"]["fault"], 512);
+        assert_eq!(1 << seat["void_bit"].as_u64().unwrap(), VOID);
         assert_eq!(seat["scenario"]["leader"]["inertia_kg_m2"][2], 2.5);
         assert_eq!(seat["scenario"]["follower"][0]["inertia_factor"][0], 1.0);
     }

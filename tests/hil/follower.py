@@ -30,8 +30,6 @@ NAP_S = 50e-6
 WAKE_LEAD_NS = 150_000
 #: Ticks in lockstep between two words to the launcher.
 TURN_TICKS = 256
-#: In a generation: of this tick there is no sample.
-VOID = 1 << 63
 
 
 class SeatError(Exception):
@@ -114,8 +112,10 @@ class Writer:
 class Reader:
     """The reading end of a signal, with its books."""
 
-    def __init__(self, transport, described):
+    def __init__(self, transport, described, void_bit):
         self.service = described["service"]
+        #: In a generation: of this tick there is no sample.
+        self.void_mark = 1 << void_bit
         self.type = structure(described)
         factory = transport.service(described, self.type).subscriber_builder()
         self.subscriber = factory.buffer_size(described["buffer_size"]).create()
@@ -147,24 +147,24 @@ class Reader:
             if sample is None:
                 return None
             real = sample.generation != 0 and self.account(sample)
-            self.sample = sample if real and not sample.generation & VOID else None
+            self.sample = sample if real and not sample.generation & self.void_mark else None
         return self.last_tick == tick and self.sample is not None
 
     def account(self, sample):
         """Enters a sample into the books; False if it is not newer than the one before."""
         expected = 0
         if self.last_tick is not None:
-            known = sample.generation & ~VOID == self.last_generation
+            known = sample.generation & ~self.void_mark == self.last_generation
             expected = self.last_tick + 1 if known else sample.tick
         if sample.tick < expected:
             self.stale += 1
             return False
-        if sample.generation & VOID:
+        if sample.generation & self.void_mark:
             self.void += 1
         else:
             self.received += 1
         self.gaps += sample.tick - expected
-        self.last_tick, self.last_generation = sample.tick, sample.generation & ~VOID
+        self.last_tick, self.last_generation = sample.tick, sample.generation & ~self.void_mark
         if self.record is not None:
             self.record += bytes(sample)
         return True
@@ -222,25 +222,25 @@ class Actuator:
         self.latches = seat["rearm"] == "manual"
         self.status_bits = seat["status"]
         self.silent_ticks = 0
-        self.safe = False
+        self.safe, self.rejected = False, False
 
     def take(self, command):
-        """Decides the input of a tick: its command, or none. True if one was due and did not come."""
-        if command is not None and self.safe and self.latches:
-            return False
-        asked = None if command is None else tuple(command.acceleration_rad_s2)
-        if asked is not None and all(map(math.isfinite, asked)):
-            self.body.asked, self.silent_ticks, self.safe = asked, 0, False
-            return False
-        self.silent_ticks += 1
-        if not self.safe and self.silent_ticks >= self.timeout_ticks:
-            self.safe, self.body.asked = True, (0.0, 0.0, 0.0)
-        return True
+        """Decides the input of a tick: its command, or none. True if one was due and did not come, or is not believed."""
+        self.rejected = command is not None and not all(map(math.isfinite, command.acceleration_rad_s2))
+        if command is None or self.rejected:
+            self.silent_ticks += 1
+            if not self.safe and self.silent_ticks >= self.timeout_ticks:
+                self.safe, self.body.asked = True, (0.0, 0.0, 0.0)
+            return True
+        if not (self.safe and self.latches):
+            self.body.asked, self.silent_ticks, self.safe = tuple(command.acceleration_rad_s2), 0, False
+        return False
 
     def status(self):
+        bits = self.status_bits["rejected"] if self.rejected else 0
         if self.safe:
-            return self.status_bits["safe"]
-        return self.status_bits["holding"] if self.silent_ticks > 0 else 0
+            return bits | self.status_bits["safe"]
+        return bits | (self.status_bits["holding"] if self.silent_ticks > 0 else 0)
 
 
 class Follower:
@@ -270,8 +270,9 @@ class Follower:
         # Before the signals of the loop: whoever has those open and not this one is judged by its samples alone.
         self.health = None if self.silent else Writer(self.transport, self.seat["health"])
         self.measurement, self.truth = (Writer(self.transport, described) for described in self.seat["writes"])
-        (self.command,) = (Reader(self.transport, described) for described in self.seat["reads"])
-        self.schedule = Reader(self.transport, self.seat["schedule"])
+        void_bit = self.seat["void_bit"]
+        (self.command,) = (Reader(self.transport, described, void_bit) for described in self.seat["reads"])
+        self.schedule = Reader(self.transport, self.seat["schedule"], void_bit)
 
     def run(self):
         """From open links to the end of the run."""
