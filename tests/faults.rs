@@ -484,3 +484,23 @@ fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
         }
     }
 }
+
+/// A tick that is not due yet is nobody's, for the scorer too: one flipped bit must not end the judging of a run.
+#[test]
+fn a_tick_from_the_future_does_not_blind_the_scorer() {
+    let bench = Bench::new();
+    let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
+    let fault = |role: &str, tick: u64| {
+        format!("\n[[fault]]\nkind = \"bit-flip\"\nrole = \"{role}\"\nfield = \"tick\"\nbit = 40\nfrom_tick = {tick}\n")
+    };
+    let faults = fault("observer", 300) + &fault("controller", 350);
+    std::fs::write(bench.path("future.toml"), text + &faults).unwrap();
+    let run = ["run", "future.toml", "--json", "--out=out", "--duration=2", "--set=accept={}", "--clock=realtime"];
+    let done = bench.run(&run);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+    let missed = summary["books"]["missed_ticks"].as_u64().unwrap();
+    let unscored = summary["score"]["unscored_ticks"].as_u64().unwrap();
+    assert!((1..=missed + 2).contains(&unscored), "{unscored} unscored, {missed} missed: {:#}", summary["books"]);
+    bench.assert_clean(&[]);
+}

@@ -9,7 +9,7 @@ use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
-use crate::clock::monotonic_ns;
+use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
@@ -150,10 +150,10 @@ impl<'a> Crew<'a> {
             return Err(self.denied(grants));
         }
         self.word.phase = Phase::Run as u64;
-        self.word.epoch_ns = match self.scenario.clock {
-            ClockKind::Realtime => monotonic_ns() + EPOCH_LEAD_NS,
-            _ => 0,
-        };
+        if self.scenario.clock == ClockKind::Realtime {
+            self.word.epoch_ns = monotonic_ns() + EPOCH_LEAD_NS;
+            scorer.start(Grid { epoch_ns: self.word.epoch_ns, period_ns: self.scenario.period_ns });
+        }
         self.announce()?;
         self.follow(scorer, launch)
     }

@@ -3,10 +3,11 @@
 //! Must not hold the loop up, except by the credit it gives in lockstep.
 
 use crate::bus::{Bus, BusError, Reader, Signal};
+use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Command, Estimate, Rig, Truth};
 use crate::role::Guard;
-use crate::runtime::{Input, Seek, topic};
+use crate::runtime::{Horizon, Input, Seek, topic};
 use crate::sample::Sample;
 use crate::with_rig;
 use serde::Serialize;
@@ -79,6 +80,8 @@ pub trait Scorer {
     fn next_tick(&self) -> u64;
     /// The latest value of the first metric.
     fn latest(&self) -> f64;
+    /// Hands over the time grid, once the epoch is known: no sample is of a tick that is not due.
+    fn start(&mut self, grid: Grid);
     /// Notes that a role failed at a tick.
     fn incident(&mut self, tick: u64);
     /// Scores what is there, complete or not, and closes the account.
@@ -299,6 +302,13 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
 
     fn latest(&self) -> f64 {
         self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
+    }
+
+    fn start(&mut self, grid: Grid) {
+        let horizon = Horizon::Due(grid);
+        self.truths.iter_mut().for_each(|truth| truth.expect(horizon));
+        self.estimate.expect(horizon);
+        self.commands.iter_mut().for_each(|driven| driven.command.expect(horizon));
     }
 
     fn incident(&mut self, tick: u64) {

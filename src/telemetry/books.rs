@@ -248,7 +248,7 @@ impl ReadBook {
         if tick >= covered {
             self.words.add(Self::GAPS, tick - covered);
             self.words.add(counter, 1);
-            self.words.set(Self::COVERED, tick + 1);
+            self.words.set(Self::COVERED, tick.saturating_add(1));
         }
     }
 
