@@ -120,9 +120,6 @@ impl<B: Body> Plant<B> {
     /// The command due at tick `tick` was there and is not believed: as if it were not.
     #[inline]
     pub fn reject(&mut self, tick: u64) -> CommandEvent {
-        if self.driven() && self.safe && self.actuation.rearm == Rearm::Manual {
-            return CommandEvent::Refused;
-        }
         let event = self.command(tick, None);
         self.rejected = event.missed();
         event
