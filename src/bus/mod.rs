@@ -1,11 +1,12 @@
 //! Links between roles: one writer and some readers per signal, samples loaned, written in place and sent.
 //!
-//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
+//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2 (and `raw`, which measures it bare); [`memory`] is its twin within one thread.
 
 pub mod domain;
 pub mod iox;
 pub mod memory;
 mod names;
+pub(crate) mod raw;
 
 pub use names::{Signal, Topic};
 
