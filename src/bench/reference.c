@@ -9,6 +9,12 @@
 #include <string.h>
 
 #define EXPORT __attribute__((visibility("default")))
+/* Packing neighbouring scalars costs more here than it saves: what one step stores singly the next would load in pairs. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define STEP EXPORT __attribute__((optimize("no-tree-slp-vectorize")))
+#else
+#define STEP EXPORT
+#endif
 #define RARE(x) __builtin_expect(!!(x), 0)
 
 enum { INITIAL = 1 << 2, UNOBSERVABLE = 1 << 3, LEARNING = 1 << 5, NOT_EXCITED = 1 << 8, FAULT = 1 << 9 };
@@ -40,15 +46,17 @@ struct hidden_parameters {
 };
 
 struct hidden {
-    double a[3], gain[3], limit, h, inverse_h;
-    double closure, ratios[2];
-    /* The relation: om = sqrt(-a1 a2). */
-    double om_om, ai_ai, om_ai, inverse_om, floor_square, turn_limit;
+    double a1, a2, a3, gain1, gain2, gain3, limit;
+    /* What the estimate says of the body, in its order: coefficients, closure, ratios, excitation. */
+    double body[7];
+    /* The relation, in x = om i and y = a1 j with om = sqrt(-a1 a2): products of constants. */
+    double om, scale, product, bend, floor_square, turn_limit;
+    double h, h6, h2, hh12, moment[4];
     /* Filters: what is left of the error; or the two gains. */
     double left, gain_potential, gain_unknown;
-    double slopes[3], hidden_slope;
-    /* Memory. */
-    double i, j, square, product, residual, w, u1, u2, u3;
+    double slope1, slope2, slope3, hidden_slope;
+    /* Memory: of the last sample, and of the filter. */
+    double x, y, square, drift, turning, u1, u2, u3, w, residual;
     uint64_t tick;
     int started, second, judged;
 };
@@ -58,35 +66,33 @@ EXPORT uint64_t hidden_size(void) { return sizeof(struct hidden); }
 EXPORT void hidden_start(struct hidden *s, const struct hidden_parameters *p) {
     memset(s, 0, sizeof *s);
     const double *I = p->inertia;
-    s->a[0] = (I[1] - I[2]) / I[0];
-    s->a[1] = (I[2] - I[0]) / I[1];
-    s->a[2] = (I[0] - I[1]) / I[2];
-    memcpy(s->gain, p->gain, sizeof s->gain);
+    double h = p->tick, a1 = (I[1] - I[2]) / I[0], a2 = (I[2] - I[0]) / I[1], a3 = (I[0] - I[1]) / I[2];
+    double om = sqrt(-a1 * a2);
+    s->a1 = a1, s->a2 = a2, s->a3 = a3;
+    s->gain1 = p->gain[0], s->gain2 = p->gain[1], s->gain3 = p->gain[2];
     s->limit = p->acceleration_max;
-    s->h = p->tick;
-    s->inverse_h = 1 / p->tick;
-    s->closure = s->a[0] + s->a[1] + s->a[2] + s->a[0] * s->a[1] * s->a[2];
-    s->ratios[0] = I[1] / I[0];
-    s->ratios[1] = I[2] / I[0];
-    double om = sqrt(-s->a[0] * s->a[1]);
-    s->om_om = om * om;
-    s->ai_ai = s->a[0] * s->a[0];
-    s->om_ai = om * s->a[0];
-    s->inverse_om = 1 / om;
-    s->floor_square = square(p->floor * larger(om, fabs(s->a[0])));
-    s->turn_limit = 3 / (om * p->tick);
+    double body[7] = { a1, a2, a3, a1 + a2 + a3 + a1 * a2 * a3, I[1] / I[0], I[2] / I[0], 0 };
+    memcpy(s->body, body, sizeof body);
+    s->om = om;
+    s->scale = 1 / (om * h);
+    s->product = a3 / (om * a1);
+    s->bend = a3 / a1;
+    s->floor_square = square(p->floor * larger(om, fabs(a1)));
+    s->turn_limit = 3 / (om * h);
+    s->h = h, s->h6 = h / 6, s->h2 = h / 2, s->hh12 = h * h / 12;
+    s->moment[0] = 0.35 * h, s->moment[1] = 0.15 * h, s->moment[2] = h * h / 20, s->moment[3] = h * h / 30;
     s->second = p->bandwidth > 0;
     s->judged = !s->second;
-    s->left = exp(-p->decay * p->tick);
-    double damping = sqrt(0.5), x = p->bandwidth * p->tick, root = x * sqrt(1 - damping * damping);
-    double fall = expm1(-damping * x), half = sin(0.5 * root);
-    s->gain_potential = -expm1(-2 * damping * x);
-    s->gain_unknown = (fall * fall + 4 * (1 + fall) * half * half) / p->tick;
-    double pull[2] = { fabs(s->a[0]) * p->rate_bound, fabs(s->a[1]) * p->rate_bound };
-    s->slopes[0] = p->gain[0] - pull[0];
-    s->slopes[1] = p->gain[1] - pull[1];
-    s->slopes[2] = p->gain[2] / 2;
-    s->hidden_slope = p->decay - pull[0] - pull[1] - p->gain[2] / 2;
+    s->left = exp(-p->decay * h);
+    double damping = sqrt(0.5), turn = p->bandwidth * h, root = turn * sqrt(1 - damping * damping);
+    double fall = expm1(-damping * turn), half = sin(0.5 * root);
+    s->gain_potential = -expm1(-2 * damping * turn);
+    s->gain_unknown = (fall * fall + 4 * (1 + fall) * half * half) / h;
+    double pull1 = fabs(a1) * p->rate_bound, pull2 = fabs(a2) * p->rate_bound;
+    s->slope1 = p->gain[0] - pull1;
+    s->slope2 = p->gain[1] - pull2;
+    s->slope3 = p->gain[2] / 2;
+    s->hidden_slope = p->decay - pull1 - pull2 - p->gain[2] / 2;
     s->w = p->guess;
 }
 
@@ -99,85 +105,74 @@ static inline double turn(double cross, double dot) {
     return t + t * z * (-1.0 / 3 + z * (1.0 / 5 + z * (-1.0 / 7 + z * (1.0 / 9 - z * (1.0 / 11)))));
 }
 
-EXPORT int hidden_step(struct hidden *s, const struct rate_measurement *m, const struct rate_measurement *own,
-                       struct rate_estimate *e, struct rate_command *c) {
-    double i = m->omega[0], j = m->omega[1];
-    double finite = (i + j + m->omega[2] + m->applied[0] + m->applied[1] + m->applied[2]) * 0;
+STEP int hidden_step(struct hidden *s, const struct rate_measurement *m, const struct rate_measurement *own,
+                     struct rate_estimate *e, struct rate_command *c) {
+    double i = m->omega[0], j = m->omega[1], u1 = m->applied[0], u2 = m->applied[1], u3 = m->applied[2];
+    double finite = ((i + j) + (m->omega[2] + u1) + (u2 + u3)) * 0;
     if (RARE((m->valid & 3) != 3 || finite != 0))
         return 0;
-    double squares = s->om_om * i * i + s->ai_ai * j * j;
-    /* The torque of the last sample is held over the step. */
-    double product = s->a[2] * i * j, g = product + s->u3, g0 = s->product + s->u3;
-    double innovation = 0;
+    double x = s->om * i, y = s->a1 * j, xx = x * x, yy = y * y, squares = xx + yy;
+    double drifting = s->product * x * y, turning = s->bend * (yy - xx);
+    double w = s->w, innovation = 0;
     uint64_t status = INITIAL, valid = 3;
     if (__builtin_expect(s->started, 1)) {
         int ordinary = m->stamp.tick == s->tick + 1 && smaller(squares, s->square) > s->floor_square &&
-                       fabs(s->w) <= s->turn_limit && s->u1 == 0 && s->u2 == 0;
+                       fabs(w) <= s->turn_limit && s->u1 == 0 && s->u2 == 0;
         if (RARE(!ordinary))
             return 0;
-        double h = s->h;
-        double cross = s->om_ai * (s->j * i - s->i * j);
-        double dot = s->om_om * s->i * i + s->ai_ai * s->j * j;
-        double mean = turn(cross, dot) * s->inverse_om * s->inverse_h;
-        double hidden0 = mean - h * (g0 * (1.0 / 3) + g * (1.0 / 6));
-        double hidden1 = mean + h * (g0 * (1.0 / 6) + g * (1.0 / 3));
-        double slope0 = s->a[2] * hidden0 * (s->a[0] * s->j * s->j + s->a[1] * s->i * s->i);
-        double slope1 = s->a[2] * hidden1 * (s->a[0] * j * j + s->a[1] * i * i);
-        double drift = 0.5 * h * (g0 + g) + h * h * (1.0 / 12) * (slope0 - slope1);
-        /* Over h already. */
-        double moment = h * (0.35 * g0 + 0.15 * g) + h * h * (0.05 * slope0 - (1.0 / 30) * slope1);
-        double start = mean - moment;
+        /* The torque of the last sample is held over the step. */
+        double g0 = s->drift + s->u3, g1 = drifting + s->u3;
+        double mean = turn(s->y * x - s->x * y, s->x * x + s->y * y) * s->scale;
+        double bend0 = (mean - s->h6 * (2 * g0 + g1)) * s->turning;
+        double bend1 = (mean + s->h6 * (g0 + 2 * g1)) * turning;
+        double drift = s->h2 * (g0 + g1) + s->hh12 * (bend0 - bend1);
+        double moment = (s->moment[0] * g0 + s->moment[1] * g1) + (s->moment[2] * bend0 - s->moment[3] * bend1);
+        double start = mean - moment, end = start + drift;
         if (s->second) {
-            double off = s->residual + (start - s->w) * h;
-            s->w += drift + s->gain_unknown * off;
+            double off = s->residual + (start - w) * s->h;
+            w += drift + s->gain_unknown * off;
             s->residual = off - s->gain_potential * off;
         } else {
-            s->w = start + drift + s->left * (s->w - start);
+            w = end + s->left * (w - start);
         }
-        innovation = start + drift - s->w;
+        innovation = end - w;
         status = 0;
         valid = 7;
     }
     s->started = 1;
     s->tick = m->stamp.tick;
-    s->i = i;
-    s->j = j;
-    s->square = squares;
-    s->u1 = m->applied[0];
-    s->u2 = m->applied[1];
-    s->u3 = m->applied[2];
-    s->product = product;
+    s->x = x, s->y = y, s->square = squares, s->drift = drifting, s->turning = turning;
+    s->u1 = u1, s->u2 = u2, s->u3 = u3;
+    s->w = w;
 
-    double w[3] = { i, j, s->w };
     e->stamp.tick = c->stamp.tick = m->stamp.tick;
     e->stamp.origin_ns = c->stamp.origin_ns = m->stamp.origin_ns;
-    memcpy(e->omega, w, sizeof w);
+    e->omega[0] = i, e->omega[1] = j, e->omega[2] = w;
     e->innovation = innovation;
-    memcpy(e->coefficients, s->a, sizeof s->a);
-    e->closure = s->closure;
-    memcpy(e->ratios, s->ratios, sizeof s->ratios);
-    e->excitation = 0;
+    memcpy(e->coefficients, s->body, sizeof s->body);
     e->valid = valid;
     e->status = status;
 
-    const double *p = own->omega;
-    double d[3] = { p[0] - w[0], p[1] - w[1], p[2] - w[2] };
-    double u[3] = { s->a[0] * (w[1] * w[2] - p[1] * p[2]) - s->gain[0] * d[0],
-                    s->a[1] * (w[2] * w[0] - p[2] * p[0]) - s->gain[1] * d[1],
-                    s->a[2] * (w[0] * w[1] - p[0] * p[1]) - s->gain[2] * d[2] };
-    double largest = larger(fabs(u[0]), larger(fabs(u[1]), fabs(u[2])));
-    if (RARE(largest > s->limit))
-        for (int axis = 0; axis < 3; axis++)
-            u[axis] *= s->limit / largest;
-    memcpy(c->acceleration, u, sizeof u);
-    if (s->judged) {
-        d[2] -= innovation;
-        double q[3] = { d[0] * d[0], d[1] * d[1], d[2] * d[2] }, hidden = innovation * innovation;
-        c->lyapunov = 0.5 * (q[0] + q[1] + q[2] + hidden);
-        c->lyapunov_rate = -(s->slopes[0] * q[0] + s->slopes[1] * q[1] + s->slopes[2] * q[2]) - s->hidden_slope * hidden;
-    } else {
-        c->lyapunov = c->lyapunov_rate = 0;
+    double p1 = own->omega[0], p2 = own->omega[1], p3 = own->omega[2];
+    double d1 = p1 - i, d2 = p2 - j, d3 = p3 - w;
+    double c1 = s->a1 * (j * w - p2 * p3) - s->gain1 * d1;
+    double c2 = s->a2 * (w * i - p3 * p1) - s->gain2 * d2;
+    double c3 = s->a3 * (i * j - p1 * p2) - s->gain3 * d3;
+    double largest = larger(fabs(c1), larger(fabs(c2), fabs(c3)));
+    if (RARE(largest > s->limit)) {
+        double scale = s->limit / largest;
+        c1 *= scale, c2 *= scale, c3 *= scale;
     }
+    c->acceleration[0] = c1, c->acceleration[1] = c2, c->acceleration[2] = c3;
+    double lyapunov = 0, rate = 0;
+    if (s->judged) {
+        d3 -= innovation;
+        double q1 = d1 * d1, q2 = d2 * d2, q3 = d3 * d3, hidden = innovation * innovation;
+        lyapunov = 0.5 * ((q1 + q2) + (q3 + hidden));
+        rate = -((s->slope1 * q1 + s->slope2 * q2) + (s->slope3 * q3 + s->hidden_slope * hidden));
+    }
+    c->lyapunov = lyapunov;
+    c->lyapunov_rate = rate;
     return 1;
 }
 
@@ -435,8 +430,8 @@ EXPORT void orbit_start(struct orbit *s, const struct orbit_parameters *p) {
     s->limit = p->thrust_max;
 }
 
-EXPORT int orbit_step(struct orbit *s, const struct orbit_measurement *m, const struct orbit_measurement *own,
-                      struct orbit_estimate *e, struct orbit_command *c) {
+STEP int orbit_step(struct orbit *s, const struct orbit_measurement *m, const struct orbit_measurement *own,
+                    struct orbit_estimate *e, struct orbit_command *c) {
     double r = m->r, theta = m->theta;
     double finite = (r + theta + m->applied[0] + m->applied[1]) * 0;
     if (RARE((m->valid & 3) != 3 || (m->status & FAULT) || !(r > 0) || finite != 0))
