@@ -5,6 +5,7 @@ use crate::run::{catch_signals, make_directory};
 use crate::{Exit, fail, print};
 use corotate::bench::{Bench, BenchError, PeerSeat, Results, Row, run, serve_peer, table, write_results};
 use indicatif::ProgressBar;
+use std::cell::RefCell;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -67,18 +68,22 @@ fn attempt(arguments: &Arguments) -> Result<Results, (Exit, String)> {
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner();
     spinner.enable_steady_tick(Duration::from_millis(200));
+    let last = RefCell::new(String::new());
     let mut bench = Bench {
         rows,
         quick: arguments.quick,
         program,
         signal: &signal,
-        progress: &mut |what| spinner.set_message(what.to_owned()),
+        progress: &mut |what| {
+            spinner.set_message(what.to_owned());
+            last.replace(what.to_owned());
+        },
     };
     let measured = run(&mut bench);
     spinner.finish_and_clear();
     let (board, privileges) = measured.map_err(|error| match error {
         BenchError::Interrupted(signal) => (Exit::Signal(signal), error.to_string()),
-        error => broken(error.to_string()),
+        error => broken(format!("{}: {error}", last.borrow())),
     })?;
     let results = Results::new(&bench, board, privileges, started);
     write_results(&directory, &results).map_err(|error| broken(format!("cannot write the results: {error}")))?;

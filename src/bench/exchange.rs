@@ -455,12 +455,12 @@ impl Receiver {
         self.wake
     }
 
-    /// Waits for the next sample: polls until `spin_end_ns`, then as it does.
+    /// Waits for the next sample: polls until `spin_end_ns`, then as it does. `None` if there is none by `end_ns`.
     ///
     /// # Errors
     /// [`BusError`]; also if a sample is torn.
     #[inline]
-    pub fn receive(&mut self, spin_end_ns: u64) -> Result<Content, BusError> {
+    pub fn receive(&mut self, spin_end_ns: u64, end_ns: u64) -> Result<Option<Content>, BusError> {
         let mut words = [0; MAX_WORDS];
         let words = &mut words[..self.words];
         let mut polled = 0_u32;
@@ -472,7 +472,7 @@ impl Receiver {
             if self.carry.receive(words)? {
                 let whole = words[3..].iter().all(|word| *word == words[0]);
                 let content = Content { number: words[0], due_ns: words[1], sent_ns: words[2] };
-                return if whole { Ok(content) } else { Err(system("receive", "a sample is torn")) };
+                return if whole { Ok(Some(content)) } else { Err(system("receive", "a sample is torn")) };
             }
             polled += 1;
             let polls = match self.wake {
@@ -480,7 +480,13 @@ impl Receiver {
                 Wake::Event => false,
                 Wake::Hybrid => monotonic_ns() < spin_end_ns,
             };
-            if polls { std::hint::spin_loop() } else { self.sleep(rung)? }
+            if polls {
+                std::hint::spin_loop();
+            } else if monotonic_ns() > end_ns {
+                return Ok(None);
+            } else {
+                self.sleep(rung)?;
+            }
         }
     }
 

@@ -4,12 +4,13 @@
 //! anyone: same cores, same privileges, same samples, same waits.
 
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
-use super::peer::{Descriptors, LEAD_NS, Peer};
+use super::peer::{Descriptors, LEAD_NS, LOST_NS, Peer};
 use super::{Bench, BenchError, Board, Row};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use crate::config::Realtime;
 use crate::runtime::{RoleId, release_priority, take_privileges};
+use crate::telemetry::Latency;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fd::OwnedFd;
 use rustix::thread::{sched_getaffinity, sched_setaffinity};
@@ -80,10 +81,13 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
             let (name, floor) = (pair.name.clone(), pair.floor.clone());
             bench.next(&format!("hop: {name}"))?;
             let measured = in_the_leaders_place(board, || {
-                let [due, sent] = pair.paced(paced)?;
-                Ok((due, sent, pair.back_to_back(exchanges)?))
+                let paced = pair.paced(paced)?;
+                Ok((paced, pair.back_to_back(exchanges)?))
             });
-            let (due, sent, one_way_us) = measured?;
+            let (([due, sent], lost), one_way_us) = measured?;
+            if lost > 0 {
+                board.remark(format!("{name}: the receiver was late and {lost} samples of a round were overtaken"));
+            }
             board.record(Row::Hop, &name, floor.as_deref(), &due);
             let suffixed =
                 |suffix: &str| (format!("{name}, {suffix}"), floor.as_ref().map(|f| format!("{f}, {suffix}")));
@@ -141,9 +145,9 @@ impl Pair {
     }
 
     /// So many samples, each sent when it is due; what the receiver measured, from due and from sent.
-    fn paced(&mut self, count: u64) -> Result<[crate::telemetry::Latency; 2], BenchError> {
+    fn paced(&mut self, count: u64) -> Result<([Latency; 2], u64), BenchError> {
         let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: PERIOD_NS };
-        self.peer.receive(grid, count)?;
+        self.peer.receive(grid, self.number + 1, count, false)?;
         send_paced(&mut self.sender, grid, count, &mut self.number)?;
         self.peer.received()
     }
@@ -156,7 +160,9 @@ impl Pair {
             self.number += 1;
             self.sender.send(self.number, 0)?;
             self.sender.prepare()?;
-            self.back.receive(u64::MAX / 2)?;
+            if self.back.receive(0, monotonic_ns() + LOST_NS)?.is_none() {
+                return Err(BenchError::Peer(format!("{}: it did not echo", self.name)));
+            }
         }
         let one_way_us = (monotonic_ns() - began_ns) as f64 / 2e3 / count as f64;
         self.peer.echoed()?;

@@ -24,6 +24,8 @@ use std::time::Duration;
 pub(super) const LEAD_NS: u64 = 60_000;
 /// How long one who spins and then sleeps spins after the sample was due, ns.
 const SPIN_NS: u64 = 50_000;
+/// A sample that has not come for so long is lost, ns.
+pub(super) const LOST_NS: u64 = 1_000_000_000;
 /// A peer that has said nothing for so long hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
@@ -41,8 +43,8 @@ pub struct PeerSeat {
 enum Order {
     /// Open these ends: one to read from, one to write to.
     Open { inlet: Opening, outlet: Option<Opening> },
-    /// Receive samples that are due on a grid, and pass them on if there is an outlet.
-    Receive { epoch_ns: u64, period_ns: u64, count: u64 },
+    /// Receive so many samples that are due on a grid, the first of this number; if so told, pass them on.
+    Receive { epoch_ns: u64, period_ns: u64, first: u64, count: u64, pass_on: bool },
     /// Send every one of so many samples back at once.
     Echo { count: u64 },
 }
@@ -54,8 +56,8 @@ enum Answer {
     Here(Vec<Grant>),
     /// The ends are open.
     Open,
-    /// Received: from when due, from when sent.
-    Received { due: StageReport, sent: StageReport },
+    /// Received: from when due, from when sent; and how many were overtaken by the next.
+    Received { due: StageReport, sent: StageReport, lost: u64 },
     /// All are echoed.
     Echoed,
 }
@@ -93,12 +95,15 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
             *ends = Some((receiver, sender));
             Ok(Answer::Open)
         }
-        (Order::Receive { epoch_ns, period_ns, count }, Some((receiver, sender))) => {
-            receive(Grid { epoch_ns: *epoch_ns, period_ns: *period_ns }, *count, receiver, sender.as_mut())
+        (Order::Receive { epoch_ns, period_ns, first, count, pass_on }, Some((receiver, sender))) => {
+            let grid = Grid { epoch_ns: *epoch_ns, period_ns: *period_ns };
+            receive(grid, *first, *count, receiver, sender.as_mut().filter(|_| *pass_on))
         }
         (Order::Echo { count }, Some((receiver, Some(sender)))) => {
             for _ in 0..*count {
-                let content = receiver.receive(u64::MAX / 2)?;
+                let Some(content) = receiver.receive(0, monotonic_ns() + LOST_NS)? else {
+                    return Err(BusError::Device { reason: "a sample is lost that nothing could overtake".to_owned() });
+                };
                 sender.send(content.number, content.due_ns)?;
                 sender.prepare()?;
             }
@@ -115,33 +120,42 @@ fn descriptor(opening: &Opening, index: usize) -> Option<OwnedFd> {
     opening.descriptors.map(|numbers| unsafe { OwnedFd::from_raw_fd(numbers[index]) })
 }
 
-/// Receives what is due on a grid.
+/// Receives what is due on a grid. A link of the newest sample alone may lose some: to a receiver that is late.
 fn receive(
     grid: Grid,
+    first: u64,
     count: u64,
     receiver: &mut Receiver,
     mut sender: Option<&mut Sender>,
 ) -> Result<Answer, BusError> {
-    let (mut due, mut sent) = (Latency::default(), Latency::default());
-    for tick in 1..=count {
-        let due_ns = grid.due_ns(tick);
+    let (mut due, mut sent, mut lost, mut tick) = (Latency::default(), Latency::default(), 0, 0);
+    while tick < count {
+        let due_ns = grid.due_ns(tick + 1);
         if receiver.wake() != Wake::Event {
             sleep_until(due_ns - LEAD_NS);
         }
-        let content = receiver.receive(due_ns + SPIN_NS)?;
+        let Some(content) = receiver.receive(due_ns + SPIN_NS, grid.due_ns(count) + LOST_NS)? else {
+            lost += count - tick;
+            break;
+        };
         let now_ns = monotonic_ns();
+        if content.number < first {
+            continue;
+        }
         if let Some(sender) = &mut sender {
             sender.send(content.number, content.due_ns)?;
             sender.prepare()?;
         }
         due.record(content.due_ns, now_ns);
         sent.record(content.sent_ns, now_ns);
+        lost += content.number - first - tick;
+        tick = content.number - first + 1;
     }
     let report = |stage: &str, latency: &Latency| {
         let (histogram, clipped) = latency.encode();
         StageReport { stage: stage.to_owned(), histogram, clipped }
     };
-    Ok(Answer::Received { due: report("due", &due), sent: report("sent", &sent) })
+    Ok(Answer::Received { due: report("due", &due), sent: report("sent", &sent), lost })
 }
 
 /// A peer as its parent sees it.
@@ -199,15 +213,16 @@ impl Peer {
         }
     }
 
-    /// Lets it receive what is due on a grid from tick 1 to `count`; the answer comes later.
-    pub fn receive(&mut self, grid: Grid, count: u64) -> Result<(), BenchError> {
-        self.tell(&Order::Receive { epoch_ns: grid.epoch_ns, period_ns: grid.period_ns, count })
+    /// Lets it receive what is due on a grid from tick 1 to `count`, from number `first` on, and pass it on; the answer
+    /// comes later.
+    pub fn receive(&mut self, grid: Grid, first: u64, count: u64, pass_on: bool) -> Result<(), BenchError> {
+        self.tell(&Order::Receive { epoch_ns: grid.epoch_ns, period_ns: grid.period_ns, first, count, pass_on })
     }
 
-    /// What it received: latencies from when due, and from when sent.
-    pub fn received(&mut self) -> Result<[Latency; 2], BenchError> {
+    /// What it received: latencies from when due, and from when sent; how many samples were lost.
+    pub fn received(&mut self) -> Result<([Latency; 2], u64), BenchError> {
         match self.answer()? {
-            Answer::Received { due, sent } => Ok([due.latency(), sent.latency()]),
+            Answer::Received { due, sent, lost } => Ok(([due.latency(), sent.latency()], lost)),
             other => Err(unexpected(&other)),
         }
     }
