@@ -43,9 +43,9 @@ pub struct PeerArguments {
     /// Die with this process
     #[arg(long)]
     parent: i32,
-    /// Take the controller's place, not the observer's
+    /// Take the observer's place, not the controller's
     #[arg(long)]
-    last: bool,
+    observer: bool,
 }
 
 /// Measures what was asked for.
@@ -103,7 +103,7 @@ pub fn peer(arguments: &PeerArguments) -> Exit {
     if let Err(exit) = die_with(arguments.parent) {
         return exit;
     }
-    match serve_peer(&PeerSeat { domain: arguments.domain.clone(), last: arguments.last }) {
+    match serve_peer(&PeerSeat { domain: arguments.domain.clone(), observer: arguments.observer }) {
         Ok(()) => Exit::Ok,
         Err(reason) => fail(Exit::Failure, &reason),
     }

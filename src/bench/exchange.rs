@@ -14,8 +14,10 @@ use std::time::Duration;
 
 /// The most words of a sample.
 const MAX_WORDS: usize = 32;
-/// How long a role naps between two looks, ns.
+/// How long one who spun for too long sleeps between two looks, ns.
 const NAP_NS: u64 = 50_000;
+/// How long a sleeper sleeps at most before it looks whether it is to give up, ns.
+const SLEEP_NS: u64 = 1_000_000_000;
 /// How often one who spins looks at the clock: a partner that is gone must not leave a real-time process spinning.
 const POLLS: u32 = 1024;
 /// How long after the end of its spin one who only spins goes on, ns.
@@ -122,14 +124,16 @@ pub(super) struct Receiver {
     bell: Bell,
     words: usize,
     wake: Wake,
+    /// Whether the sender needs the core on which this one polls.
+    gives_way: bool,
 }
 
 /// What wakes a sleeper.
 enum Bell {
     /// Nobody sleeps, or what carries the sample wakes too.
     None,
-    /// The receiver naps between looks.
-    Nap,
+    /// That of our links.
+    Ours,
     Futex(Page, usize),
     EventFd(OwnedFd),
     Notifier(RawNotifier),
@@ -152,6 +156,10 @@ trait Out {
 trait In {
     /// Takes the next words, if they are there. What blocks by itself waits for them.
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError>;
+    /// Sleeps until there may be some, if it knows how to.
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
+    }
 }
 
 /// The node or bus of a process, one per exchange.
@@ -215,6 +223,10 @@ impl<S: Sample> In for IoxReader<S> {
             words.copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(sample)));
         }
         Ok(there)
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        Read::sleep(self, until_ns)
     }
 }
 
@@ -387,7 +399,7 @@ impl Station<'_> {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
                 if sleeps {
-                    bell = Bell::Nap;
+                    bell = Bell::Ours;
                 }
                 match words {
                     8 => Box::new(bus.reader::<Probe64>(&topic, Reader::Role)?),
@@ -419,7 +431,7 @@ impl Station<'_> {
                 Box::new(Descriptor(descriptor.ok_or_else(|| system("open a descriptor", "none was given"))?))
             }
         };
-        Ok(Receiver { carry, bell, words, wake })
+        Ok(Receiver { carry, bell, words, wake, gives_way: false })
     }
 }
 
@@ -434,7 +446,7 @@ impl Sender {
             Bell::Futex(page, direction) => page.ring(*direction).map_err(|error| system("wake", error)),
             Bell::EventFd(fd) => rustix::io::write(fd, &1_u64.to_ne_bytes()).map(|_| ()).map_err(|e| system("wake", e)),
             Bell::Notifier(notifier) => notifier.ring(),
-            Bell::None | Bell::Nap | Bell::Listener(_) => Ok(()),
+            Bell::None | Bell::Ours | Bell::Listener(_) => Ok(()),
         }
     }
 
@@ -450,6 +462,11 @@ impl Sender {
 }
 
 impl Receiver {
+    /// Gives way to others of the same priority on the same core while it polls.
+    pub fn give_way(&mut self) {
+        self.gives_way = true;
+    }
+
     /// How it waits.
     pub fn wake(&self) -> Wake {
         self.wake
@@ -480,7 +497,9 @@ impl Receiver {
                 Wake::Event => false,
                 Wake::Hybrid => monotonic_ns() < spin_end_ns,
             };
-            if polls {
+            if polls && self.gives_way {
+                std::thread::yield_now();
+            } else if polls {
                 std::hint::spin_loop();
             } else if monotonic_ns() > end_ns {
                 return Ok(None);
@@ -496,8 +515,8 @@ impl Receiver {
             Bell::EventFd(fd) => {
                 rustix::io::read(fd, &mut [0; 8]).map_err(|error| system("wait", error))?;
             }
-            Bell::Listener(listener) => listener.wait(Duration::from_secs(1))?,
-            Bell::Nap => sleep_until(monotonic_ns() + NAP_NS),
+            Bell::Listener(listener) => listener.wait(Duration::from_nanos(SLEEP_NS))?,
+            Bell::Ours => self.carry.sleep(monotonic_ns() + SLEEP_NS)?,
             // What carries the sample blocks by itself, or the partner keeps a spinner waiting for too long.
             Bell::None | Bell::Notifier(_) if self.wake == Wake::Spin => sleep_until(monotonic_ns() + NAP_NS),
             Bell::None | Bell::Notifier(_) => {}

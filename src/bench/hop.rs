@@ -1,15 +1,14 @@
 //! One hop between two processes on two cores, by every mechanism in turn: paced and from when due; back to back besides.
 //!
-//! The sender is this process in the leader's place, the receiver a peer in the observer's. Must not favour
+//! The sender is this process in the leader's place, the receiver a peer in the controller's. Must not favour
 //! anyone: same cores, same privileges, same samples, same waits.
 
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
-use super::peer::{Descriptors, LEAD_NS, LOST_NS, Peer};
+use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns, pair};
 use super::{Bench, BenchError, Board, Row};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
-use crate::config::Realtime;
-use crate::runtime::{RoleId, release_priority, take_privileges};
+use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::Latency;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fd::OwnedFd;
@@ -39,7 +38,7 @@ const SLEEPERS: [Mechanism; 7] = [
 const HYBRIDS: [Mechanism; 3] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory];
 
 /// One way of one size with both of its ends.
-struct Pair {
+pub(super) struct Pair {
     name: String,
     floor: Option<String>,
     sender: Sender,
@@ -80,7 +79,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
         for pair in &mut *pairs {
             let (name, floor) = (pair.name.clone(), pair.floor.clone());
             bench.next(&format!("hop: {name}"))?;
-            let measured = in_the_leaders_place(board, || {
+            let measured = in_the_leaders_place(board, |_| {
                 let paced = pair.paced(paced)?;
                 Ok((paced, pair.back_to_back(exchanges)?))
             });
@@ -100,14 +99,15 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
     Ok(())
 }
 
-/// Does something with what the leader asks for, and gives it back.
+/// Does something with what the leader asks for, and gives it back; told whether others need the leader's core.
 pub(super) fn in_the_leaders_place<T>(
     board: &mut Board,
-    work: impl FnOnce() -> Result<T, BenchError>,
+    work: impl FnOnce(&[RoleId]) -> Result<T, BenchError>,
 ) -> Result<T, BenchError> {
     let cores = sched_getaffinity(None).ok();
-    board.granted(take_privileges(&Realtime::default(), RoleId::Plant(0)));
-    let done = work();
+    let Privileges { grants, beside, .. } = take_privileges(&pair(), RoleId::Plant(0));
+    board.granted(grants);
+    let done = work(&beside);
     release_priority();
     // Where it cannot be had back the rest of the suite stays on the leader's core.
     let _ = cores.map(|cores| sched_setaffinity(None, &cores));
@@ -148,19 +148,19 @@ impl Pair {
     fn paced(&mut self, count: u64) -> Result<([Latency; 2], u64), BenchError> {
         let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: PERIOD_NS };
         self.peer.receive(grid, self.number + 1, count, false)?;
-        send_paced(&mut self.sender, grid, count, &mut self.number)?;
+        send_paced(&mut self.sender, grid, count, &mut self.number, false)?;
         self.peer.received()
     }
 
     /// So many samples there and back without a pause: half of the mean round trip, µs.
-    fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
+    pub fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
         self.peer.echo(count)?;
         let began_ns = monotonic_ns();
         for _ in 0..count {
             self.number += 1;
             self.sender.send(self.number, 0)?;
             self.sender.prepare()?;
-            if self.back.receive(0, monotonic_ns() + LOST_NS)?.is_none() {
+            if self.back.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)?.is_none() {
                 return Err(BenchError::Peer(format!("{}: it did not echo", self.name)));
             }
         }
@@ -170,13 +170,23 @@ impl Pair {
     }
 }
 
-/// Sends the samples of a grid from tick 1 to `count`, each when it is due.
-pub(super) fn send_paced(sender: &mut Sender, grid: Grid, count: u64, number: &mut u64) -> Result<(), BenchError> {
+/// Sends the samples of a grid from tick 1 to `count`, each when it is due, and gives way after each if so told.
+pub(super) fn send_paced(
+    sender: &mut Sender,
+    grid: Grid,
+    count: u64,
+    number: &mut u64,
+    give_way: bool,
+) -> Result<(), BenchError> {
     for tick in 1..=count {
         let due_ns = grid.due_ns(tick);
-        wait_until(due_ns, LEAD_NS);
+        wait_until(due_ns, lead_ns(grid));
         *number += 1;
         sender.send(*number, due_ns)?;
+        if give_way {
+            // Who waits for it waits for this core too.
+            std::thread::yield_now();
+        }
         sender.prepare()?;
     }
     Ok(())

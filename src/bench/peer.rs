@@ -8,8 +8,8 @@ use super::{Bench, BenchError};
 use crate::bus::BusError;
 use crate::bus::domain::Domain;
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::Realtime;
-use crate::runtime::{RoleId, take_privileges};
+use crate::config::{SHIPPED, Scenario};
+use crate::runtime::{Privileges, RoleId, take_privileges};
 use crate::telemetry::{Grant, Latency, StageReport};
 use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
 use serde::{Deserialize, Serialize};
@@ -21,21 +21,27 @@ use std::sync::mpsc::{Receiver as Lines, channel};
 use std::time::Duration;
 
 /// How long before a sample is due both ends wake, as roles do, ns.
-pub(super) const LEAD_NS: u64 = 60_000;
+const LEAD_NS: u64 = 60_000;
 /// How long one who spins and then sleeps spins after the sample was due, ns.
-const SPIN_NS: u64 = 50_000;
+pub(super) const SPIN_NS: u64 = 50_000;
 /// A sample that has not come for so long is lost, ns.
 pub(super) const LOST_NS: u64 = 1_000_000_000;
 /// A peer that has said nothing for so long hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
+
+/// The scenario whose roles' places the measuring processes take.
+pub(super) fn pair() -> Scenario {
+    let (name, text) = SHIPPED[0];
+    Scenario::parse(text, name, &[]).expect("shipped scenarios are valid")
+}
 
 /// What the command line of a peer says.
 #[derive(Debug, Clone)]
 pub struct PeerSeat {
     /// The domain's directory.
     pub domain: PathBuf,
-    /// Whether it has the controller's place, not the observer's.
-    pub last: bool,
+    /// Whether it has the observer's place, beside the leader where cores are few; else the controller's.
+    pub observer: bool,
 }
 
 /// What a peer is asked to do.
@@ -68,13 +74,20 @@ enum Answer {
 /// Why it cannot, in words.
 pub fn serve_peer(seat: &PeerSeat) -> Result<(), String> {
     let domain = Domain::join(&seat.domain).map_err(|error| error.to_string())?;
-    let role = if seat.last { RoleId::Controller } else { RoleId::Observer };
-    say(&Answer::Here(take_privileges(&Realtime::default(), role)))?;
+    let (role, waits_for) = match seat.observer {
+        true => (RoleId::Observer, RoleId::Plant(0)),
+        false => (RoleId::Controller, RoleId::Observer),
+    };
+    let Privileges { grants, beside, .. } = take_privileges(&pair(), role);
+    say(&Answer::Here(grants))?;
     let mut ends = None;
     for line in std::io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
         let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
         let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
+        if let (Some((receiver, _)), true) = (&mut ends, beside.contains(&waits_for)) {
+            receiver.give_way();
+        }
         say(&answer)?;
     }
     Ok(())
@@ -101,7 +114,7 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
         }
         (Order::Echo { count }, Some((receiver, Some(sender)))) => {
             for _ in 0..*count {
-                let Some(content) = receiver.receive(0, monotonic_ns() + LOST_NS)? else {
+                let Some(content) = receiver.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)? else {
                     return Err(BusError::Device { reason: "a sample is lost that nothing could overtake".to_owned() });
                 };
                 sender.send(content.number, content.due_ns)?;
@@ -120,6 +133,11 @@ fn descriptor(opening: &Opening, index: usize) -> Option<OwnedFd> {
     opening.descriptors.map(|numbers| unsafe { OwnedFd::from_raw_fd(numbers[index]) })
 }
 
+/// How long before a sample is due both ends wake: at a short period there must be some sleep left.
+pub(super) fn lead_ns(grid: Grid) -> u64 {
+    LEAD_NS.min(grid.period_ns / 2)
+}
+
 /// Receives what is due on a grid. A link of the newest sample alone may lose some: to a receiver that is late.
 fn receive(
     grid: Grid,
@@ -132,7 +150,7 @@ fn receive(
     while tick < count {
         let due_ns = grid.due_ns(tick + 1);
         if receiver.wake() != Wake::Event {
-            sleep_until(due_ns - LEAD_NS);
+            sleep_until(due_ns - lead_ns(grid));
         }
         let Some(content) = receiver.receive(due_ns + SPIN_NS, grid.due_ns(count) + LOST_NS)? else {
             lost += count - tick;
@@ -169,7 +187,7 @@ pub(super) struct Peer {
 
 impl Peer {
     /// Starts a peer; it inherits `theirs`, which are of no more use here then.
-    pub fn start(bench: &Bench<'_>, domain: &Domain, last: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
+    pub fn start(bench: &Bench<'_>, domain: &Domain, observer: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
         for fd in &theirs {
             rustix::io::fcntl_setfd(fd, rustix::io::FdFlags::empty())
                 .map_err(|error| BenchError::system("hand a descriptor on")(error.into()))?;
@@ -177,8 +195,8 @@ impl Peer {
         let mut command = Command::new(&bench.program);
         command.arg("bench-peer").arg("--domain").arg(domain.root());
         command.arg("--parent").arg(std::process::id().to_string());
-        if last {
-            command.arg("--last");
+        if observer {
+            command.arg("--observer");
         }
         let mut child = command
             .process_group(0)

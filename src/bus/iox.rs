@@ -3,6 +3,7 @@
 //! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
 //! by the loop itself (lockstep), not by a writer that waits.
 
+use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
 use crate::sample::Sample;
@@ -41,6 +42,9 @@ pub fn footprint(depths: Depths, signal: Signal, size: usize) -> usize {
     let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
     (MAX_READERS * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
 }
+
+/// What a run takes of shared memory besides its signals, bytes.
+pub const COMMON_BYTES: usize = BELLS_BYTES;
 
 /// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -115,6 +119,7 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
 /// A node in a run's domain.
 pub struct IoxBus {
     node: Node<Ipc>,
+    bells: Bells,
     depths: Depths,
 }
 
@@ -126,9 +131,10 @@ impl IoxBus {
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
         // iceoryx2 reports to the console on its own; what matters comes back as an error.
         set_log_level(LogLevel::Fatal);
-        let node = enter(domain, name)
-            .map_err(|reason| BusError::Domain { domain: domain.root().display().to_string(), reason })?;
-        Ok(Self { node, depths })
+        let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
+        let bells = Bells::open(domain).map_err(|error| failed(error.to_string()))?;
+        let node = enter(domain, name).map_err(failed)?;
+        Ok(Self { node, bells, depths })
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
@@ -193,7 +199,7 @@ impl Bus for IoxBus {
                 end: "writer",
                 reason: format!("{error:?}"),
             })?;
-        Ok(IoxWriter { publisher, loan: None, topic: topic.clone() })
+        Ok(IoxWriter { publisher, loan: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
@@ -204,7 +210,7 @@ impl Bus for IoxBus {
             end: "reader",
             reason: format!("{error:?}"),
         })?;
-        Ok(IoxReader { service, subscriber, current: None, topic: topic.clone() })
+        Ok(IoxReader { service, subscriber, current: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 }
 
@@ -212,6 +218,7 @@ impl Bus for IoxBus {
 pub struct IoxWriter<S: Sample> {
     publisher: Publisher<Ipc, Wire<S>, ()>,
     loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -235,7 +242,9 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
             None => self.loan()?,
         };
         fill(&mut sample.payload_mut().0);
-        sample.send().map(|_| ()).map_err(|error| self.failed(format!("{error:?}")))
+        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        self.bell.ring();
+        Ok(())
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
@@ -257,6 +266,7 @@ pub struct IoxReader<S: Sample> {
     service: PortFactory<Ipc, Wire<S>, ()>,
     subscriber: Subscriber<Ipc, Wire<S>, ()>,
     current: Option<Received<Ipc, Wire<S>, ()>>,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -264,6 +274,11 @@ impl<S: Sample> IoxReader<S> {
     /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
     pub fn written(&self) -> bool {
         self.service.dynamic_config().number_of_publishers() > 0
+    }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Receive { service: self.topic.to_string(), reason }
     }
 }
 
@@ -276,13 +291,18 @@ impl<S: Sample> Read<S> for IoxReader<S> {
                 Ok(true)
             }
             Ok(None) => Ok(false),
-            Err(error) => Err(BusError::Receive { service: self.topic.to_string(), reason: format!("{error:?}") }),
+            Err(error) => Err(self.failed(format!("{error:?}"))),
         }
     }
 
     #[inline]
     fn current(&self) -> Option<&S> {
         self.current.as_ref().map(|sample| &sample.payload().0)
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
+        self.bell.sleep(until_ns, news)
     }
 }
 

@@ -114,6 +114,10 @@ impl<S: Sample> Read<S> for MemoryReader<S> {
     fn current(&self) -> Option<&S> {
         self.current.as_ref()
     }
+
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
+    }
 }
 
 #[cfg(test)]
