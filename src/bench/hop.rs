@@ -9,7 +9,7 @@ use super::{Bench, BenchError, Board, Row};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
-use crate::telemetry::Latency;
+use crate::telemetry::{Grant, Latency};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fd::OwnedFd;
 use rustix::thread::{sched_getaffinity, sched_setaffinity};
@@ -60,7 +60,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
                 .collect();
             let mut pairs = pairs?;
             for pair in &mut pairs {
-                board.granted(std::mem::take(&mut pair.peer.grants));
+                board.granted(pair.grants());
             }
             take_turns(bench, board, &mut pairs, wake)?;
         }
@@ -115,7 +115,8 @@ pub(super) fn in_the_leaders_place<T>(
 }
 
 impl Pair {
-    fn open(
+    /// Opens both ends.
+    pub fn open(
         bench: &Bench<'_>,
         domain: &Domain,
         mechanism: Mechanism,
@@ -142,6 +143,11 @@ impl Pair {
         let back = station.receiver(&opening(1), read)?;
         sender.refresh()?;
         Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0 })
+    }
+
+    /// What the peer asked of the machine.
+    pub fn grants(&mut self) -> Vec<Grant> {
+        std::mem::take(&mut self.peer.grants)
     }
 
     /// So many samples, each sent when it is due; what the receiver measured, from due and from sent.

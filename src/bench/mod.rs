@@ -6,17 +6,23 @@
 //! result is (`targets.rs` does), and must not judge by anything that this run has not measured.
 
 mod board;
+mod chain;
 mod compiled;
 pub mod ekf;
 mod exchange;
 mod hop;
+mod lockstep;
 
 mod page;
 mod peer;
 pub mod recording;
 mod report;
+mod run;
 mod step;
 mod targets;
+mod tick;
+mod toll;
+mod watch;
 
 pub use board::{Beside, Board, Figure, Row};
 pub use compiled::Compiled;
@@ -93,7 +99,11 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
         match row {
             Row::Step => step::measure(bench, &mut board)?,
             Row::Hop => hop::measure(bench, &mut board)?,
-            _ => {}
+            Row::Chain => chain::measure(bench, &mut board)?,
+            Row::Tick => tick::measure(bench, &mut board)?,
+            Row::Lockstep => lockstep::measure(bench, &mut board)?,
+            Row::Run => run::measure(bench, &mut board)?,
+            Row::Toll => toll::measure(bench, &mut board)?,
         }
     }
     let taken = board.take_grants();
@@ -103,11 +113,15 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
 impl Bench<'_> {
     /// Says what comes next; an error if the run is to end.
     fn next(&mut self, what: &str) -> Result<(), BenchError> {
+        self.interrupted()?;
+        (self.progress)(what);
+        Ok(())
+    }
+
+    /// An error if the run is to end.
+    fn interrupted(&self) -> Result<(), BenchError> {
         match self.signal.load(Ordering::Relaxed) {
-            0 => {
-                (self.progress)(what);
-                Ok(())
-            }
+            0 => Ok(()),
             signal => Err(BenchError::Interrupted(signal)),
         }
     }
