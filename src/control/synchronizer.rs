@@ -40,11 +40,26 @@ impl Synchronizer {
         applied: &Vector3<f64>,
     ) -> (Vector3<f64>, Vector3<f64>) {
         if self.lead_s > 0.0 {
-            let reference = self.body.flow(reference, &Vector3::zeros(), self.lead_s);
-            (reference, self.body.flow(follower, applied, self.lead_s))
+            (self.reference_ahead(reference), self.body.flow(follower, applied, self.lead_s))
         } else {
             (*reference, *follower)
         }
+    }
+
+    /// The reference alone, rad/s.
+    #[inline]
+    pub fn reference_ahead(&self, reference: &Vector3<f64>) -> Vector3<f64> {
+        if self.lead_s > 0.0 { self.body.flow(reference, &Vector3::zeros(), self.lead_s) } else { *reference }
+    }
+
+    /// The body that reference and follower are like.
+    pub fn body(&self) -> &RigidBody {
+        &self.body
+    }
+
+    /// How far both are predicted, s.
+    pub fn lead_s(&self) -> f64 {
+        self.lead_s
     }
 
     /// The control acceleration, rad/s², from the reference ω or ω̂ and the follower's p, rad/s.
@@ -53,6 +68,13 @@ impl Synchronizer {
         let gyroscopic = Vector3::new(w.y * w.z - p.y * p.z, w.z * w.x - p.z * p.x, w.x * w.y - p.x * p.y);
         self.body.coefficients().component_mul(&gyroscopic) - self.gain_per_s.component_mul(&(p - w))
     }
+}
+
+/// A command shortened to what the actuators can do in each component, its direction kept; rad/s².
+#[inline]
+pub fn limited(asked: Vector3<f64>, acceleration_max_rad_s2: f64) -> Vector3<f64> {
+    let largest = asked.amax();
+    if largest > acceleration_max_rad_s2 { asked * (acceleration_max_rad_s2 / largest) } else { asked }
 }
 
 #[cfg(test)]

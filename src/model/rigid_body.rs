@@ -122,11 +122,16 @@ impl RigidBody {
     ///
     /// The number of integration steps follows from the state alone, so equal inputs give equal bits.
     pub fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
-        let fastest_rad_s = rate.amax() + torque.amax() * dt_s;
-        // A body that turns slowly is limited by its torque history, not by its rate: never above 10 ms.
-        let max_step_s = (MAX_STEP_RAD / fastest_rad_s).min(0.01);
-        integrate::flow(|x| euler(&self.coefficients, x, torque), rate, dt_s, max_step_s)
+        integrate::flow(|x| euler(&self.coefficients, x, torque), rate, dt_s, max_step_s(rate, torque, dt_s))
     }
+}
+
+/// The longest integration step from a state under a held torque, s.
+#[inline]
+pub(super) fn max_step_s(rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> f64 {
+    let fastest_rad_s = rate.amax() + torque.amax() * dt_s;
+    // A body that turns slowly is limited by its torque history, not by its rate: never above 10 ms.
+    (MAX_STEP_RAD / fastest_rad_s).min(0.01)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! The synchronising law of one follower, with its certificate computed live.
 
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use nalgebra::Vector3;
@@ -21,15 +21,6 @@ pub struct RateLaw {
     pub(super) tick_s: f64,
 }
 
-impl RateLaw {
-    /// Shortened to what the actuators can do, its direction kept.
-    #[inline]
-    fn limited(&self, asked: Vector3<f64>) -> Vector3<f64> {
-        let largest = asked.amax();
-        if largest > self.acceleration_max_rad_s2 { asked * (self.acceleration_max_rad_s2 / largest) } else { asked }
-    }
-}
-
 impl Law for RateLaw {
     type Estimate = RateEstimate;
     type Measurement = RateMeasurement;
@@ -42,7 +33,7 @@ impl Law for RateLaw {
         }
         let (w, p) = self.law.ahead(&reference, &follower, &measurement.applied_rad_s2.into());
         let correction = self.adaptation.correction(&w, &p, self.tick_s);
-        out.acceleration_rad_s2 = self.limited(self.law.command(&w, &p) + correction).into();
+        out.acceleration_rad_s2 = limited(self.law.command(&w, &p) + correction, self.acceleration_max_rad_s2).into();
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
         let mut error = follower - reference;
         error[self.supplied] -= estimate.innovation_rad_s;

@@ -1,0 +1,300 @@
+//! A fleet of rigid bodies: many followers that are like the leader, simulated, driven and guarded as one.
+//!
+//! Each of them gets the bits that it would get alone. Must not treat bodies differently: what is missing, late or impossible
+//! for one is so for all.
+
+use super::RigidBodyRig;
+use crate::control::FleetLaw;
+use crate::model::{RigidBody, flow_all, uniform};
+use crate::rig::Fleet;
+use crate::role::{Body, Bounds, Guard, Law};
+use crate::sample::{
+    CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
+};
+use nalgebra::Vector3;
+
+/// Where a vector lies in its samples.
+const OMEGA: usize = 0;
+const APPLIED: usize = 1;
+const ACCELERATION: usize = 0;
+/// After a gap of so many ticks in what was believed, a sample must also continue what came just before it, as that of a
+/// single body.
+const SHORT_GAP_TICKS: u64 = 2;
+/// The draws of fleets are not those of sensors.
+const STREAMS: u64 = 1 << 32;
+
+/// One number per body, for each component.
+type Arrays = [Vec<f64>; 3];
+
+fn zeros(count: usize) -> Arrays {
+    [(); 3].map(|()| vec![0.0; count])
+}
+
+fn all(arrays: &Arrays) -> [&[f64]; 3] {
+    arrays.each_ref().map(|array| &**array)
+}
+
+fn all_mut(arrays: &mut Arrays) -> [&mut [f64]; 3] {
+    arrays.each_mut().map(|array| &mut **array)
+}
+
+fn assign(to: [&mut [f64]; 3], from: [&[f64]; 3]) {
+    to.into_iter().zip(from).for_each(|(to, from)| to.copy_from_slice(from));
+}
+
+/// The largest |rate − reference| of all bodies, rad/s; not a number if one of them is none.
+pub(super) fn farthest(rates: [&[f64]; 3], reference: &Vector3<f64>) -> f64 {
+    let [r1, r2, r3] = rates;
+    let errors = r1.iter().zip(r2).zip(r3).map(|((r1, r2), r3)| (Vector3::new(*r1, *r2, *r3) - reference).norm());
+    errors.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst })
+}
+
+/// A fleet as a scenario has it.
+#[derive(Debug)]
+pub struct RateFleet {
+    body: RigidBody,
+    initial: Arrays,
+    law: FleetLaw,
+    learned: bool,
+    bounds: Bounds<3>,
+    acceleration_max_rad_s2: f64,
+}
+
+impl RateFleet {
+    /// The fleet of `count` bodies in the place of the body with this index.
+    pub(super) fn new(rig: &RigidBodyRig, index: usize, count: usize) -> Self {
+        let (law, controller) = rig.synchronizer();
+        let acceleration_max_rad_s2 = rig.limits.acceleration_rad_s2;
+        let mut draw = uniform(rig.seed, STREAMS | index as u64);
+        let (centre, spread) = (rig.initial_rates[index], rig.spreads[index]);
+        let mut initial = zeros(count);
+        // Body by body, so that the first ones of a larger fleet are those of a smaller one.
+        for n in 0..count {
+            for axis in 0..3 {
+                initial[axis][n] = centre[axis] + spread[axis] * (2.0 * draw() - 1.0);
+            }
+        }
+        Self {
+            body: RigidBody::new(&rig.inertia),
+            initial,
+            law: FleetLaw::new(law, acceleration_max_rad_s2),
+            learned: controller.learned,
+            bounds: rig.limits.bounds(&rig.sensed(index), rig.tick_s),
+            acceleration_max_rad_s2,
+        }
+    }
+
+    fn count(&self) -> usize {
+        self.initial[0].len()
+    }
+}
+
+impl Fleet<RateEstimate> for RateFleet {
+    type Truth = TruthLayout;
+    type Measurement = MeasurementLayout;
+    type Command = CommandLayout;
+    type Body = FleetPlant;
+    type Law = FleetRateLaw;
+    type MeasurementGuard = FleetMeasurementGuard;
+    type CommandGuard = FleetCommandGuard;
+
+    fn body(&self) -> FleetPlant {
+        FleetPlant { body: self.body, rates: self.initial.clone(), asked: zeros(self.count()) }
+    }
+
+    fn law(&self) -> FleetRateLaw {
+        let ahead = if self.law.predicts() { zeros(self.count()) } else { Arrays::default() };
+        FleetRateLaw { law: self.law, learned: self.learned, ahead }
+    }
+
+    fn measurement_guard(&self) -> FleetMeasurementGuard {
+        FleetMeasurementGuard {
+            bounds: self.bounds,
+            acceleration_max_rad_s2: self.acceleration_max_rad_s2,
+            generation: 0,
+            believed: zeros(self.count()),
+            believed_tick: None,
+            doubted: zeros(self.count()),
+            doubted_tick: None,
+        }
+    }
+
+    fn command_guard(&self) -> FleetCommandGuard {
+        FleetCommandGuard { count: self.count() as u64, acceleration_max_rad_s2: self.acceleration_max_rad_s2 }
+    }
+}
+
+/// Many rigid bodies with perfect rate gyros and torquers.
+#[derive(Debug)]
+pub struct FleetPlant {
+    body: RigidBody,
+    rates: Arrays,
+    asked: Arrays,
+}
+
+impl Body for FleetPlant {
+    type Truth = FleetTruth;
+    type Measurement = FleetMeasurement;
+    type Command = FleetCommand;
+
+    fn apply(&mut self, command: &FleetCommand) -> bool {
+        let asked = command.vector(ACCELERATION);
+        let usable = asked.into_iter().all(|asked| within(asked, f64::MAX));
+        if usable {
+            assign(all_mut(&mut self.asked), asked);
+        }
+        usable
+    }
+
+    fn apply_safe(&mut self) {
+        self.asked.iter_mut().for_each(|asked| asked.fill(0.0));
+    }
+
+    fn truth(&self, status: u64, out: &mut FleetTruth) {
+        out.set_status(status);
+        assign(out.vector_mut(OMEGA), all(&self.rates));
+        assign(out.vector_mut(APPLIED), all(&self.asked));
+    }
+
+    fn status_of(truth: &FleetTruth) -> u64 {
+        truth.status()
+    }
+
+    fn measure(&mut self, status: u64, out: &mut FleetMeasurement) {
+        out.set_status(status);
+        assign(out.vector_mut(OMEGA), all(&self.rates));
+        assign(out.vector_mut(APPLIED), all(&self.asked));
+    }
+
+    fn resume(&mut self, truth: &FleetTruth, _measured: u64) {
+        assign(all_mut(&mut self.rates), truth.vector(OMEGA));
+        assign(all_mut(&mut self.asked), truth.vector(APPLIED));
+    }
+
+    fn flow(&mut self, dt_s: f64) {
+        flow_all(&self.body, all_mut(&mut self.rates), all(&self.asked), dt_s);
+    }
+}
+
+/// The synchronising law of all followers of a fleet. No V is published.
+#[derive(Debug)]
+pub struct FleetRateLaw {
+    law: FleetLaw,
+    /// Whether the law works with the coefficients that the observer has learned.
+    learned: bool,
+    /// Room for the predicted rates, if there is a prediction.
+    ahead: Arrays,
+}
+
+impl Law for FleetRateLaw {
+    type Estimate = RateEstimate;
+    type Measurement = FleetMeasurement;
+    type Command = FleetCommand;
+
+    fn command(&mut self, estimate: &RateEstimate, measurement: &FleetMeasurement, out: &mut FleetCommand) {
+        if self.learned {
+            self.law.learn(estimate.coefficients.into());
+        }
+        let reference = Vector3::from(estimate.omega_rad_s);
+        let rates = measurement.vector(OMEGA);
+        out.set_status(0);
+        if self.law.predicts() {
+            assign(all_mut(&mut self.ahead), rates);
+            let reference = self.law.ahead(&reference, all_mut(&mut self.ahead), measurement.vector(APPLIED));
+            self.law.command(&reference, all(&self.ahead), out.vector_mut(ACCELERATION));
+        } else {
+            self.law.command(&reference, rates, out.vector_mut(ACCELERATION));
+        }
+    }
+}
+
+/// Guards measurements of a fleet as [`Plausible`](crate::role::Plausible) does those of a body: a sample is believed for all
+/// bodies or for none.
+#[derive(Debug)]
+pub struct FleetMeasurementGuard {
+    bounds: Bounds<3>,
+    acceleration_max_rad_s2: f64,
+    generation: u64,
+    /// The last rates that were believed, and their tick.
+    believed: Arrays,
+    believed_tick: Option<u64>,
+    /// The rates of the sample before, if that was not believed.
+    doubted: Arrays,
+    doubted_tick: Option<u64>,
+}
+
+impl FleetMeasurementGuard {
+    /// Whether all rates are in range and can have come from these by now.
+    fn reached(&self, rates: [&[f64]; 3], from: &Arrays, since: u64, tick: u64) -> bool {
+        let ticks = tick.saturating_sub(since).max(1) as f64;
+        (0..3).all(|axis| {
+            let change = self.bounds.allowance[axis] + self.bounds.slew_per_tick[axis] * ticks;
+            near(rates[axis], &from[axis], change)
+        })
+    }
+
+    fn possible(&self, rates: [&[f64]; 3], tick: u64) -> bool {
+        let in_range = rates.into_iter().zip(self.bounds.magnitude).all(|(rates, limit)| within(rates, limit));
+        let Some(since) = self.believed_tick.filter(|_| in_range) else { return in_range };
+        let smooth = match self.doubted_tick {
+            Some(doubted) if tick.saturating_sub(since) > SHORT_GAP_TICKS => {
+                self.reached(rates, &self.doubted, doubted, tick)
+            }
+            _ => true,
+        };
+        smooth && self.reached(rates, &self.believed, since, tick)
+    }
+}
+
+impl Guard<FleetMeasurement> for FleetMeasurementGuard {
+    fn accepts(&mut self, sample: &FleetMeasurement) -> bool {
+        let limit = self.acceleration_max_rad_s2;
+        let whole = sample.told_bodies() == self.believed[0].len() as u64;
+        if !(whole && sample.vector(APPLIED).into_iter().all(|applied| within(applied, limit))) {
+            return false;
+        }
+        let stamp = sample.stamp();
+        if stamp.generation != self.generation {
+            (self.generation, self.believed_tick, self.doubted_tick) = (stamp.generation, None, None);
+        }
+        let rates = sample.vector(OMEGA);
+        let believed = self.possible(rates, stamp.tick);
+        if believed {
+            assign(all_mut(&mut self.believed), rates);
+            (self.believed_tick, self.doubted_tick) = (Some(stamp.tick), None);
+        } else {
+            assign(all_mut(&mut self.doubted), rates);
+            self.doubted_tick = Some(stamp.tick);
+        }
+        believed
+    }
+}
+
+/// Guards commands of a fleet: the actuators can do all that is asked.
+#[derive(Debug)]
+pub struct FleetCommandGuard {
+    count: u64,
+    acceleration_max_rad_s2: f64,
+}
+
+impl Guard<FleetCommand> for FleetCommandGuard {
+    fn accepts(&mut self, sample: &FleetCommand) -> bool {
+        let asked = sample.vector(ACCELERATION);
+        sample.told_bodies() == self.count && asked.into_iter().all(|asked| within(asked, self.acceleration_max_rad_s2))
+    }
+}
+
+/// Whether all values are at most so large; what is no number is not.
+#[multiversion::multiversion(targets = "simd")]
+#[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
+fn within(values: &[f64], limit: f64) -> bool {
+    values.iter().fold(0_u64, |beyond, value| beyond | u64::from(!(value.abs() <= limit))) == 0
+}
+
+/// Whether all values are at most so far from these; what is no number is not.
+#[multiversion::multiversion(targets = "simd")]
+#[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
+fn near(values: &[f64], from: &[f64], change: f64) -> bool {
+    let far = values.iter().zip(from).map(|(value, from)| u64::from(!((value - from).abs() <= change)));
+    far.fold(0, |beyond, far| beyond | far) == 0
+}
