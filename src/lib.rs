@@ -15,6 +15,7 @@
 //! | `config` | scenario files: as typed, then as resolved | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
 //! | `clock` | the time grid and how to wait on it | no |
+//! | `shared` | words of memory that processes share | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
@@ -47,5 +48,7 @@ pub mod launch;
 pub mod rig;
 #[cfg(feature = "runtime")]
 pub mod runtime;
+#[cfg(feature = "runtime")]
+pub mod shared;
 #[cfg(feature = "runtime")]
 pub mod telemetry;

@@ -6,7 +6,7 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
-use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, RoleId, depths, private_ledger, serve, topic};
+use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, depths, private_ledger, serve, topic};
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::serial::{Device, Hello};
 use corotate::telemetry::RoleReport;
@@ -143,7 +143,7 @@ fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &Owned
     let terminated = AtomicBool::new(false);
     let mut result = None;
     let ledger = private_ledger(scenario, role);
-    serve(scenario, occupant, &bus, &ledger, &terminated, Vec::new(), |report| {
+    serve(scenario, occupant, &bus, &ledger, &terminated, Privileges::default(), |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })

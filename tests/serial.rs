@@ -7,7 +7,7 @@ mod serial_device;
 
 use common::{Bench, Done, Running, await_some, shipped};
 use corotate::config::Scenario;
-use corotate::role::{Body, SingleBody};
+use corotate::role::SingleBody;
 use corotate::runtime::Line;
 use corotate::serial::{Decoder, Device, Hello, MAX_FRAME, encode};
 use corotate::with_rig;

@@ -7,6 +7,7 @@ mod fleet;
 
 pub use fleet::{IoxFleetReader, IoxFleetWriter};
 
+use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
 use crate::sample::{FleetLayout, Sample};
@@ -48,6 +49,9 @@ pub fn footprint(qos: &Qos, size: usize) -> usize {
     let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
     (qos.max_subscribers * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
 }
+
+/// What a run takes of shared memory besides its signals, bytes.
+pub const COMMON_BYTES: usize = BELLS_BYTES;
 
 /// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -127,6 +131,7 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
 /// A node in a run's domain.
 pub struct IoxBus {
     node: Node<Ipc>,
+    bells: Bells,
     depths: Depths,
 }
 
@@ -138,9 +143,10 @@ impl IoxBus {
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
         // iceoryx2 reports to the console on its own; what matters comes back as an error.
         set_log_level(LogLevel::Fatal);
-        let node = enter(domain, name)
-            .map_err(|reason| BusError::Domain { domain: domain.root().display().to_string(), reason })?;
-        Ok(Self { node, depths })
+        let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
+        let bells = Bells::open(domain).map_err(|error| failed(error.to_string()))?;
+        let node = enter(domain, name).map_err(failed)?;
+        Ok(Self { node, bells, depths })
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
@@ -234,7 +240,7 @@ impl Bus for IoxBus {
                 end: "writer",
                 reason: format!("{error:?}"),
             })?;
-        Ok(IoxWriter { publisher, loan: None, topic: topic.clone() })
+        Ok(IoxWriter { publisher, loan: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
@@ -245,11 +251,11 @@ impl Bus for IoxBus {
             end: "reader",
             reason: format!("{error:?}"),
         })?;
-        Ok(IoxReader { service, subscriber, current: None, topic: topic.clone() })
+        Ok(IoxReader { service, subscriber, current: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {
-        IoxFleetWriter::open(&self.fleet_service::<L>(topic, "writer")?, topic, bodies)
+        IoxFleetWriter::open(self, &self.fleet_service::<L>(topic, "writer")?, topic, bodies)
     }
 
     fn fleet_reader<L: FleetLayout>(
@@ -266,6 +272,7 @@ impl Bus for IoxBus {
 pub struct IoxWriter<S: Sample> {
     publisher: Publisher<Ipc, Wire<S>, ()>,
     loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -289,7 +296,9 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
             None => self.loan()?,
         };
         fill(&mut sample.payload_mut().0);
-        sample.send().map(|_| ()).map_err(|error| self.failed(format!("{error:?}")))
+        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        self.bell.ring();
+        Ok(())
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
@@ -311,6 +320,7 @@ pub struct IoxReader<S: Sample> {
     service: PortFactory<Ipc, Wire<S>, ()>,
     subscriber: Subscriber<Ipc, Wire<S>, ()>,
     current: Option<Received<Ipc, Wire<S>, ()>>,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -318,6 +328,11 @@ impl<S: Sample> IoxReader<S> {
     /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
     pub fn written(&self) -> bool {
         is_written(&self.service)
+    }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Receive { service: self.topic.to_string(), reason }
     }
 }
 
@@ -330,13 +345,18 @@ impl<S: Sample> Read<S> for IoxReader<S> {
                 Ok(true)
             }
             Ok(None) => Ok(false),
-            Err(error) => Err(BusError::Receive { service: self.topic.to_string(), reason: format!("{error:?}") }),
+            Err(error) => Err(self.failed(format!("{error:?}"))),
         }
     }
 
     #[inline]
     fn current(&self) -> Option<&S> {
         self.current.as_ref().map(|sample| &sample.payload().0)
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
+        self.bell.sleep(until_ns, news)
     }
 }
 

@@ -177,6 +177,10 @@ impl<S: Sample> Read<S> for MemoryReader<S> {
     fn current(&self) -> Option<&S> {
         self.current.as_ref()
     }
+
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
+    }
 }
 
 impl<L: FleetLayout> Read<FleetSample<L>> for MemoryReader<Rc<FleetBuffer<L>>> {
@@ -186,6 +190,10 @@ impl<L: FleetLayout> Read<FleetSample<L>> for MemoryReader<Rc<FleetBuffer<L>>> {
 
     fn current(&self) -> Option<&FleetSample<L>> {
         self.current.as_deref().map(FleetBuffer::sample)
+    }
+
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
 
+mod bell;
 mod carried;
 pub mod domain;
 pub mod iox;
@@ -159,4 +160,10 @@ pub trait Read<S: ?Sized> {
     fn advance(&mut self) -> Result<bool, BusError>;
     /// The sample at hand, in place; none before the first.
     fn current(&self) -> Option<&S>;
+    /// Sleeps until there may be a next sample, at most until `until_ns` on the monotonic clock. Where nobody else could
+    /// bring one meanwhile it does not sleep.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
 }

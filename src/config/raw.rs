@@ -126,7 +126,7 @@ impl Default for Realtime {
 pub enum Cores {
     /// `"auto"` or `"any"`.
     Named(NamedCores),
-    /// These, in turn: plants from the first on, observer and controller together on the last.
+    /// These: plants in turn; observer and controller on the next, or beside the leader and the first follower.
     List(Vec<usize>),
 }
 

@@ -44,7 +44,7 @@ impl FleetLaw {
         if self.predicts() {
             flow_all(self.law.body(), rates, applied, self.law.lead_s());
         }
-        self.law.reference_ahead(reference)
+        self.law.reference_ahead(*reference)
     }
 
     /// Writes the control accelerations, rad/s², of all followers from the reference ω or ω̂ and their own rates p, rad/s.

@@ -3,8 +3,8 @@
 //! Every body gets the bits of [`RigidBody::flow`]: the same operations in the same order, none of them fused. Bodies of one
 //! block that need the same number of integration steps take them side by side. Must not allocate.
 
-use super::integrate::{in_one_step, rk4_step, steps};
-use super::rigid_body::{RigidBody, euler, max_step_s};
+use super::integrate::{rk4_step, steps};
+use super::rigid_body::{RigidBody, euler, fastest_rad_s, in_one_step, max_step_s};
 use nalgebra::Vector3;
 
 /// Bodies that go on together, if they can.
@@ -32,8 +32,12 @@ fn flow_block(body: &RigidBody, r1: &mut [f64], r2: &mut [f64], r3: &mut [f64], 
     if all_in_one_step(r1, r2, r3, t1, t2, t3, dt_s) {
         return step_all(body, r1, r2, r3, t1, t2, t3, dt_s);
     }
-    let longest = |r1, r2, r3, t1, t2, t3| max_step_s(&Vector3::new(r1, r2, r3), &Vector3::new(t1, t2, t3), dt_s);
-    let needed = |n: usize| steps(dt_s, longest(r1[n], r2[n], r3[n], t1[n], t2[n], t3[n]));
+    let rate = |n: usize| Vector3::new(r1[n], r2[n], r3[n]);
+    let torque = |n: usize| Vector3::new(t1[n], t2[n], t3[n]);
+    let needed = |n: usize| match fastest_rad_s(&rate(n), &torque(n), dt_s) {
+        fastest if in_one_step(fastest, dt_s) => 1.0,
+        fastest => steps(dt_s, max_step_s(fastest)),
+    };
     let first = needed(0);
     if (1..r1.len()).all(|n| needed(n) == first) {
         for _ in 0..first as u64 {
@@ -53,8 +57,8 @@ fn flow_block(body: &RigidBody, r1: &mut [f64], r2: &mut [f64], r3: &mut [f64], 
 fn all_in_one_step(r1: &[f64], r2: &[f64], r3: &[f64], t1: &[f64], t2: &[f64], t3: &[f64], dt_s: f64) -> bool {
     let mut more = 0_u64;
     for (((((r1, r2), r3), t1), t2), t3) in r1.iter().zip(r2).zip(r3).zip(t1).zip(t2).zip(t3) {
-        let longest = max_step_s(&Vector3::new(*r1, *r2, *r3), &Vector3::new(*t1, *t2, *t3), dt_s);
-        more |= u64::from(!in_one_step(dt_s, longest));
+        let fastest_rad_s = fastest_rad_s(&Vector3::new(*r1, *r2, *r3), &Vector3::new(*t1, *t2, *t3), dt_s);
+        more |= u64::from(!in_one_step(fastest_rad_s, dt_s));
     }
     more == 0
 }

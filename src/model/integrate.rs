@@ -24,19 +24,12 @@ pub fn rk4_step<const N: usize>(
 /// How many equal steps of at most `max_step_s` make up `dt_s`.
 #[inline]
 pub(super) fn steps(dt_s: f64, max_step_s: f64) -> f64 {
-    libm::ceil(excess(dt_s, max_step_s)).clamp(1.0, MAX_STEPS)
-}
-
-/// Whether one step does, without a division being rounded up: what vectors can tell at once.
-#[inline]
-pub(super) fn in_one_step(dt_s: f64, max_step_s: f64) -> bool {
-    excess(dt_s, max_step_s) <= 1.0
-}
-
-/// The slack keeps a tick that equals the bound up to rounding at one step.
-#[inline]
-fn excess(dt_s: f64, max_step_s: f64) -> f64 {
-    dt_s / max_step_s - 1e-6
+    // Most ticks are one step.
+    if dt_s <= max_step_s {
+        return 1.0;
+    }
+    // The slack keeps a tick that equals the bound up to rounding at one step.
+    libm::ceil(dt_s / max_step_s - 1e-6).clamp(1.0, MAX_STEPS)
 }
 
 /// Moves `x` along `x' = f(x)` by `dt_s` seconds in equal Runge-Kutta steps of at most `max_step_s`.

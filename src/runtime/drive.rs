@@ -4,7 +4,7 @@
 //! and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
 use super::hooks::{self, Place};
-use super::node::{Gate, Node, Poll, ReadyNode};
+use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::config::Realtime;
@@ -13,8 +13,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How often a role looks at the schedule and says how it is, ns.
 const TURN_NS: u64 = 20_000_000;
-/// How long a role naps between two looks for a sample that did not come within the spin, ns.
+/// How long a role naps between two looks where no bell rings, ns.
 const NAP_NS: u64 = 50_000;
+/// How long a role sleeps on the bell of the input that it lacks before it looks around, ns.
+const SLEEP_NS: u64 = 20_000_000;
 /// How long after its last tick a role still waits for inputs, ns and periods.
 const GRACE_NS: u64 = 1_000_000_000;
 const GRACE_PERIODS: u64 = 5;
@@ -95,15 +97,18 @@ impl<'a, B: Bus> Control<'a, B> {
 /// What a driver needs besides its node.
 pub struct Drive<'a, 'b, B: Bus> {
     control: &'a mut Control<'b, B>,
+    /// The roles of the same priority on the same core.
+    beside: &'a [RoleId],
     last_tick: u64,
     window_ticks: u64,
     next_turn_ns: u64,
 }
 
 impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
-    /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
-    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
-        Self { control, last_tick, window_ticks, next_turn_ns: 0 }
+    /// A drive up to `last_tick`, with these other roles on the same core and of the same priority; in lockstep at most
+    /// `window_ticks` ahead of the slowest consumer.
+    pub fn new(control: &'a mut Control<'b, B>, beside: &'a [RoleId], last_tick: u64, window_ticks: u64) -> Self {
+        Self { control, beside, last_tick, window_ticks, next_turn_ns: 0 }
     }
 
     /// Drives a node on the time grid.
@@ -122,7 +127,13 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
             let executed = if waits { self.on_arrival(node, grid, settings)? } else { Some(begun) };
             match executed {
-                Some(Poll::Executed) => node.settle()?,
+                Some(Poll::Executed) => {
+                    if begun == Poll::Executed && !self.beside.is_empty() {
+                        // What it sent is what the others wait for, and they wait for its core too.
+                        std::thread::yield_now();
+                    }
+                    node.settle()?;
+                }
                 Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
             }
@@ -154,16 +165,27 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             }
             hooks::at(Place::Waiting);
             if now_ns < spin_end_ns {
-                std::hint::spin_loop();
+                self.spin(node);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
             } else {
-                sleep_until(now_ns + NAP_NS);
+                if !node.sleep(overdue_ns.min(now_ns + SLEEP_NS).max(now_ns + NAP_NS))? {
+                    sleep_until(now_ns + NAP_NS);
+                }
                 if self.turn(node)? {
                     return Ok(None);
                 }
             }
+        }
+    }
+
+    /// One round of waiting for a sample that is due: whoever is to send it may need this core.
+    fn spin(&self, node: &dyn Node) {
+        if node.awaits().is_some_and(|role| self.beside.contains(&role)) {
+            std::thread::yield_now();
+        } else {
+            std::hint::spin_loop();
         }
     }
 
@@ -197,6 +219,18 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         due
     }
 
+    /// Waits for the input that a node lacks, or for credit.
+    fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), BusError> {
+        if backoff.brief() {
+            return Ok(());
+        }
+        let until_ns = monotonic_ns() + SLEEP_NS;
+        if node.next_tick() > up_to || !node.sleep(until_ns)? {
+            self.control.schedule.sleep(until_ns)?;
+        }
+        Ok(())
+    }
+
     /// Drives a node by its inputs alone, at most its window ahead of the slowest consumer.
     ///
     /// # Errors
@@ -214,7 +248,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 }
             } else {
                 hooks::at(Place::Waiting);
-                backoff.wait();
+                self.rest(node, up_to, &mut backoff)?;
             }
             if self.turn_is_due() {
                 self.control.announce(RoleState::Running, node)?;
@@ -229,20 +263,32 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 }
 
-/// Waits longer the longer there is nothing to do: spins, then yields, then naps.
+/// Looks that are worth a spin, and those worth a system call that lets others run.
+const SPIN_ROUNDS: u32 = 50;
+const YIELD_ROUNDS: u32 = 60;
+
+/// Waits longer the longer there is nothing to do: spins, then yields, then sleeps.
 #[derive(Default)]
 pub struct Backoff {
     rounds: u32,
 }
 
 impl Backoff {
-    /// One round of waiting.
-    pub fn wait(&mut self) {
+    /// One round of waiting that is no sleep; false if it is time for one.
+    fn brief(&mut self) -> bool {
         self.rounds = self.rounds.saturating_add(1);
         match self.rounds {
-            0..50 => std::hint::spin_loop(),
-            50..250 => std::thread::yield_now(),
-            _ => sleep_until(monotonic_ns() + NAP_NS),
+            0..SPIN_ROUNDS => std::hint::spin_loop(),
+            SPIN_ROUNDS..YIELD_ROUNDS => std::thread::yield_now(),
+            _ => return false,
+        }
+        true
+    }
+
+    /// One round of waiting, for those whom nobody wakes.
+    pub fn wait(&mut self) {
+        if !self.brief() {
+            sleep_until(monotonic_ns() + NAP_NS);
         }
     }
 }

@@ -387,6 +387,20 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             }
     }
 
+    /// Sleeps until there may be something new, at most until `until_ns`.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        self.port.sleep(until_ns)
+    }
+
+    /// Whether something is known of this tick or of a later one: it is of no use to wait for it.
+    #[inline]
+    pub fn knows(&self, tick: u64) -> bool {
+        self.last.is_some_and(|(last, _)| last >= tick)
+    }
+
     /// The newest tick of which something is known: there was a sample, believed or not, or a void.
     #[inline]
     pub fn last_tick(&self) -> Option<u64> {

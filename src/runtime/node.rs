@@ -13,7 +13,7 @@ pub use ports::{Port, Ports, Visit, ports, visit_writes};
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
 use super::link::{Horizon, Input, Output};
-use crate::bus::iox::footprint;
+use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
@@ -140,6 +140,13 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError>;
+    /// Whose sample the next tick lacks, as far as it is known.
+    fn awaits(&self) -> Option<RoleId>;
+    /// Sleeps until the input that the next tick lacks may be there, at most until `until_ns`; false if it lacks none.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError>;
     /// Does what the executed tick left to be done: integrates, counts, prepares the next sample.
     ///
     /// # Errors
@@ -250,7 +257,9 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
         let Ports { writes, health, .. } = ports(scenario, role);
         writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
     };
-    port(&ports(scenario, RoleId::Observer).schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    COMMON_BYTES
+        + port(&ports(scenario, RoleId::Observer).schedule)
+        + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.

@@ -6,6 +6,7 @@ use super::bridge::DeviceError;
 use super::drive::{Control, Drive, Ended};
 use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
+use super::privileges::Privileges;
 use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
@@ -13,7 +14,7 @@ use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario};
 use crate::sample::{Phase, RoleState, Schedule};
-use crate::telemetry::{Grant, Latency, Ledger, LedgerError, RoleReport, StageReport};
+use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use crate::with_rig;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -142,12 +143,12 @@ pub(super) fn in_domain(
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
-    let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
+    let privileges = if realtime { privileges::take(scenario, role) } else { Privileges::default() };
     let ledger = Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))?;
     hooks::enter(role.name(scenario), ledger.generation() + 1);
     hooks::at(Place::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
-    serve(scenario, occupant, &bus, &ledger, terminated, grants, |report| {
+    serve(scenario, occupant, &bus, &ledger, terminated, privileges, |report| {
         reported(report);
         write_report(domain, report)
     })
@@ -176,7 +177,7 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a seat on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken, and
+/// Serves a seat on a bus: the phases of a run, from open links to the report. `privileges` are what the caller has taken, and
 /// `ledger` the books, new or a predecessor's.
 ///
 /// # Errors
@@ -187,7 +188,7 @@ pub fn serve<B: Bus + 'static>(
     bus: &B,
     ledger: &Ledger,
     terminated: &AtomicBool,
-    grants: Vec<Grant>,
+    privileges: Privileges,
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let occupant = occupant.into();
@@ -200,19 +201,19 @@ pub fn serve<B: Bus + 'static>(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         health,
         ledger.generation(),
-        grants.iter().filter(|grant| !grant.granted).count() as u64,
+        privileges.grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,
     );
     let mut stages = Vec::new();
     let ended = match begin(scenario, role, &mut node, &mut control, &mut stages)? {
-        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, privileges::first_served(&grants))?,
+        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
     if scenario.clock == ClockKind::Realtime {
         privileges::release();
     }
     stages.extend(node.stages());
-    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, grants) })?;
+    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, privileges.grants) })?;
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
         let leave_ns = monotonic_ns() + LEAVE_NS;
@@ -289,7 +290,7 @@ fn drive<B: Bus>(
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     schedule: &Schedule,
-    first_served: bool,
+    privileges: &Privileges,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
     // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
@@ -297,9 +298,9 @@ fn drive<B: Bus>(
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1));
     // Among equals, a role that spins for a sample holds up the one it waits for.
-    let spin_us = if first_served { scenario.realtime.spin_us } else { 0.0 };
+    let spin_us = if privileges.first_served { scenario.realtime.spin_us } else { 0.0 };
     let settings = Realtime { spin_us, ..scenario.realtime.clone() };
-    let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
+    let mut drive = Drive::new(control, &privileges.beside, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
         ClockKind::Realtime => drive.realtime(&mut **node, grid, &settings),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),

@@ -1,6 +1,7 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
 use super::{IoxBus, Ipc, buffer_size};
+use crate::bus::bell::Bell;
 use crate::bus::{BusError, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample};
 use bytemuck::TransparentWrapper;
@@ -38,11 +39,12 @@ pub struct IoxFleetWriter<L: FleetLayout> {
     publisher: Publisher<Ipc, [Word<L>], ()>,
     loan: Option<SampleMut<Ipc, [Word<L>], ()>>,
     length: usize,
+    bell: Bell,
     topic: Topic,
 }
 
 impl<L: FleetLayout> IoxFleetWriter<L> {
-    pub(super) fn open(service: &Service<L>, topic: &Topic, bodies: usize) -> Result<Self, BusError> {
+    pub(super) fn open(bus: &IoxBus, service: &Service<L>, topic: &Topic, bodies: usize) -> Result<Self, BusError> {
         let length = FleetSample::<L>::length(bodies);
         let publisher = service
             .publisher_builder()
@@ -55,7 +57,7 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
                 end: "writer",
                 reason: format!("{error:?}"),
             })?;
-        Ok(Self { publisher, loan: None, length, topic: topic.clone() })
+        Ok(Self { publisher, loan: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, [Word<L>], ()>, BusError> {
@@ -77,7 +79,9 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
             None => self.loan()?,
         };
         fill(FleetSample::over_mut(Word::peel_slice_mut(sample.payload_mut())));
-        sample.send().map(|_| ()).map_err(|error| self.failed(format!("{error:?}")))
+        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        self.bell.ring();
+        Ok(())
     }
 
     /// Takes the next sample's memory and clears it, off the critical path.
@@ -100,6 +104,7 @@ pub struct IoxFleetReader<L: FleetLayout> {
     subscriber: Subscriber<Ipc, [Word<L>], ()>,
     current: Option<Received<Ipc, [Word<L>], ()>>,
     length: usize,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -118,12 +123,17 @@ impl<L: FleetLayout> IoxFleetReader<L> {
             reason: format!("{error:?}"),
         })?;
         let length = FleetSample::<L>::length(bodies);
-        Ok(Self { service, subscriber, current: None, length, topic: topic.clone() })
+        Ok(Self { service, subscriber, current: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
 
     /// Whether somebody has the writing end open.
     pub fn written(&self) -> bool {
         super::is_written(&self.service)
+    }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Receive { service: self.topic.to_string(), reason }
     }
 }
 
@@ -138,9 +148,7 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
                 }
                 Ok(Some(_)) => {}
                 Ok(None) => return Ok(false),
-                Err(error) => {
-                    return Err(BusError::Receive { service: self.topic.to_string(), reason: format!("{error:?}") });
-                }
+                Err(error) => return Err(self.failed(format!("{error:?}"))),
             }
         }
     }
@@ -148,5 +156,10 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     #[inline]
     fn current(&self) -> Option<&FleetSample<L>> {
         self.current.as_ref().map(|sample| FleetSample::over(Word::peel_slice(sample.payload())))
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
+        self.bell.sleep(until_ns, news)
     }
 }

@@ -3,7 +3,7 @@
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
 use super::plant::StateBook;
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns};
 use crate::rig::{Command, Measurement, Rig, Truth};
@@ -212,6 +212,15 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         let polled = if self.asked { self.look()? } else { Poll::Waiting };
         let overdue = self.asked && gate == Gate::Overdue;
         Ok(if overdue { self.give_up() } else { polled })
+    }
+
+    fn awaits(&self) -> Option<RoleId> {
+        None
+    }
+
+    /// What it waits for comes over the line.
+    fn sleep(&mut self, _until_ns: u64) -> Result<bool, BusError> {
+        Ok(false)
     }
 
     #[inline]

@@ -1,7 +1,7 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
 use super::ports::driven;
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::{Watchdog, Watched};
@@ -23,6 +23,8 @@ type Many<R, B> = Channel<
 
 /// One driven body, or a fleet, seen from the controller.
 struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
+    /// The body's index.
+    body: usize,
     controller: Controller<L>,
     measurement: Input<B, L::Measurement, G>,
     command: Output<B, L::Command>,
@@ -35,13 +37,15 @@ struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
 
 impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> Channel<L, G, B> {
     fn open(
+        index: usize,
         (body, command): (&BodyInfo, Output<B, L::Command>),
         law: L,
         guard: G,
         seat: &Seat<'_, B>,
     ) -> Result<Self, BusError> {
         let measurement = seat.input(body, Signal::Measurement, guard)?;
-        Ok(Self { controller: Controller::new(law), measurement, command, ready: false, began_ns: 0, sent_ns: 0 })
+        let controller = Controller::new(law);
+        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0 })
     }
 
     /// Looks for the measurement of a tick; whether it is known what has become of it.
@@ -50,6 +54,21 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         let found = self.measurement.seek(tick)?;
         self.ready = found == Seek::Found;
         Ok(found != Seek::NotYet)
+    }
+
+    /// The body's index, as long as nothing is known of its measurement of this tick.
+    #[inline]
+    fn late(&self, tick: u64) -> Option<usize> {
+        (!self.measurement.knows(tick)).then_some(self.body)
+    }
+
+    /// Takes the measurement of a tick as soon as it comes.
+    #[inline]
+    fn look_ahead(&mut self, tick: u64) -> Result<(), BusError> {
+        if !self.measurement.knows(tick) {
+            self.measurement.seek(tick)?;
+        }
+        Ok(())
     }
 
     /// There is no estimate for this tick, and so there is no command.
@@ -135,12 +154,12 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let fleet_commands: Vec<Output<B, FleetCommand<R>>> = bodies(true).map(written).collect::<Result<_, _>>()?;
         let estimate = seat.input(&rig.bodies()[0], Signal::Estimate, rig.estimate_guard())?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
-            Channel::open((body, command), rig.law(index), rig.measurement_guard(index, true), seat)
+            Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), seat)
         };
         let channels = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             let fleet = rig.fleet(index)?;
-            Some(Channel::open((body, command), fleet.law(), fleet.measurement_guard(), seat))
+            Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), seat))
         };
         let fleets = bodies(true).zip(fleet_commands).filter_map(channel).collect::<Result<_, BusError>>()?;
         let watch_book = WatchBook::open(seat.ledger);
@@ -167,7 +186,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
-            return Ok(false);
+            // Meanwhile the others, so that they are there when the estimate comes, which is the last as a rule.
+            return self.look_ahead();
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
             self.pass_over()?;
@@ -181,6 +201,14 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             complete &= fleet.gather(tick)?;
         }
         Ok(complete || overdue)
+    }
+
+    #[inline]
+    fn look_ahead(&mut self) -> Result<bool, BusError> {
+        let next = self.book.next();
+        self.channels.iter_mut().try_for_each(|channel| channel.look_ahead(next))?;
+        self.fleets.iter_mut().try_for_each(|fleet| fleet.look_ahead(next))?;
+        Ok(false)
     }
 
     /// There is no estimate for the next tick that could be used, and so there are no commands.
@@ -266,6 +294,28 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
         let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
         if allowed && self.gather(gate == Gate::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
+    }
+
+    fn awaits(&self) -> Option<RoleId> {
+        let next = self.book.next();
+        let single = || self.channels.iter().find_map(|channel| channel.late(next));
+        let late = single().or_else(|| self.fleets.iter().find_map(|fleet| fleet.late(next)));
+        Some(late.map_or(RoleId::Observer, RoleId::Plant))
+    }
+
+    /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        let tick = self.book.next();
+        if !self.estimate.knows(tick) {
+            self.estimate.sleep(until_ns)?;
+        } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
+            late.measurement.sleep(until_ns)?;
+        } else if let Some(late) = self.fleets.iter_mut().find(|fleet| fleet.late(tick).is_some()) {
+            late.measurement.sleep(until_ns)?;
+        } else {
+            return Ok(false);
+        }
+        Ok(true)
     }
 
     #[inline]

@@ -1,6 +1,6 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
@@ -112,6 +112,15 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
         let there = allowed && self.measurement.seek(self.book.next())? != Seek::NotYet;
         if there { self.execute() } else { Ok(Poll::Waiting) }
+    }
+
+    fn awaits(&self) -> Option<RoleId> {
+        Some(RoleId::Plant(0))
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        self.measurement.sleep(until_ns)?;
+        Ok(true)
     }
 
     #[inline]

@@ -1,6 +1,6 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::BodyInfo;
@@ -162,6 +162,18 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
             }
             Gate::Inputs { .. } | Gate::Arrived | Gate::Overdue => Ok(Poll::Waiting),
         }
+    }
+
+    fn awaits(&self) -> Option<RoleId> {
+        None
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        let Some(last) = self.book.next().checked_sub(1) else { return Ok(false) };
+        let lacking = self.command.as_mut().filter(|command| !command.knows(last));
+        let lacks = lacking.is_some();
+        lacking.map_or(Ok(()), |command| command.sleep(until_ns))?;
+        Ok(lacks)
     }
 
     #[inline]
