@@ -7,7 +7,7 @@ use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Command, Estimate, Measurement, Rig};
 use corotate::role::{Body, Controller, Guard, Observer};
 use corotate::runtime::{RoleId, build, depths, in_turn, private_ledger};
-use corotate::sample::Sample;
+use corotate::sample::Message;
 use corotate::with_rig;
 use criterion::{Bencher, Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;

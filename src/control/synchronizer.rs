@@ -82,15 +82,16 @@ impl Synchronizer {
 pub fn limited(asked: Vector3<f64>, acceleration_max_rad_s2: f64) -> Vector3<f64> {
     let largest = asked.amax();
     if largest > acceleration_max_rad_s2 {
-        return shortened(asked, acceleration_max_rad_s2 / largest);
+        return shortened(asked, acceleration_max_rad_s2, acceleration_max_rad_s2 / largest);
     }
     asked
 }
 
-/// Seldom, and apart, so that the division is not made where nobody needs it.
+/// Seldom, and apart, so that the division is not made where nobody needs it. The product may be rounded up beyond the
+/// limit, and an actuator would refuse it for that.
 #[cold]
-fn shortened(asked: Vector3<f64>, factor: f64) -> Vector3<f64> {
-    asked * factor
+fn shortened(asked: Vector3<f64>, limit: f64, factor: f64) -> Vector3<f64> {
+    asked.map(|component| (component * factor).clamp(-limit, limit))
 }
 
 #[cfg(test)]
@@ -120,6 +121,18 @@ mod tests {
         assert_eq!(law(0.0).command(&w, &w), Vector3::zeros());
         let (reference, follower) = law(0.01).ahead(w, w, Vector3::zeros());
         assert_eq!(reference, follower);
+    }
+
+    /// A command that is shortened is one that the actuators' guard believes, to the last bit.
+    #[test]
+    fn a_shortened_command_is_within_the_limit() {
+        let mut draw = crate::model::uniform(1, 0);
+        for _ in 0..100_000 {
+            let (asked, limit) = (Vector3::from_fn(|_, _| 20.0 * draw() - 10.0), 5.0 * draw());
+            let command = limited(asked, limit);
+            assert!(command.amax() <= limit.min(asked.amax()), "{asked} {limit} {command}");
+            assert!((command.cross(&asked)).norm() <= 1e-14 * asked.norm_squared(), "its direction is kept");
+        }
     }
 
     /// Held input and one tick of delay: the prediction is worth about one tick of the error's decay.

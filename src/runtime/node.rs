@@ -332,6 +332,8 @@ pub fn build<R: Rig, B: Bus + 'static>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::bus::iox::IoxBus;
     use crate::config::SHIPPED;
 
     #[test]
@@ -340,6 +342,34 @@ mod tests {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
             let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
             assert_eq!(names, scenario.rig.roles(), "{name}");
+        }
+    }
+
+    /// What is asked for before a run is more than it takes, and not much more, whatever the size of a fleet.
+    #[test]
+    fn the_room_that_a_fleet_needs_is_known_beforehand() {
+        for (clock, count) in [("lockstep", 1), ("lockstep", 1000), ("realtime", 1000), ("realtime", 20_000)] {
+            let overrides = [format!("clock={clock}"), format!("follower.0.count={count}")];
+            let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-fleet").unwrap().1;
+            let scenario = Scenario::parse(text, "test", &overrides).unwrap();
+            let domain = OwnedDomain::create(0).unwrap();
+            let bus = IoxBus::enter(domain.domain(), "test", crate::runtime::depths(&scenario)).unwrap();
+            let node = |role| {
+                let ledger = private_ledger(&scenario, role);
+                with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+            };
+            let mut nodes: Vec<ReadyNode> = RoleId::all(&scenario).into_iter().map(node).collect();
+            nodes.iter_mut().for_each(|node| node.warm_up().unwrap());
+            let prefix = domain.domain().prefix();
+            let ours = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(&prefix);
+            let files = std::fs::read_dir("/dev/shm").unwrap().filter_map(Result::ok).filter(ours);
+            let signals: u64 = files.map(|file| file.metadata().unwrap().len()).sum();
+            let words: usize = RoleId::all(&scenario).into_iter().map(|role| ledger_words(&scenario, role)).sum();
+            let (taken, asked) = (signals as usize + 8 * words, shared_memory_bytes(&scenario));
+            println!("{clock} {count}: {taken} bytes of {asked}");
+            assert!(taken <= asked, "{clock} {count}: {taken} bytes of {asked}");
+            assert!(count == 1 || asked < 2 * taken, "{clock} {count}: {taken} bytes of {asked}");
+            assert!(signals > 100 * count, "{clock} {count}: the samples are among them, {signals} bytes");
         }
     }
 }

@@ -69,10 +69,9 @@ impl RateFleet {
         let (centre, spread) = (rig.initial_rates[index], rig.spreads[index]);
         let mut initial = zeros(count);
         // Body by body, so that the first ones of a larger fleet are those of a smaller one.
-        for n in 0..count {
-            for axis in 0..3 {
-                initial[axis][n] = centre[axis] + spread[axis] * (2.0 * draw() - 1.0);
-            }
+        let [r1, r2, r3] = &mut initial;
+        for ((r1, r2), r3) in r1.iter_mut().zip(r2).zip(r3) {
+            [*r1, *r2, *r3] = (centre + spread.map(|spread| spread * (2.0 * draw() - 1.0))).into();
         }
         Self {
             body: RigidBody::new(&rig.inertia),
@@ -288,13 +287,101 @@ impl Guard<FleetCommand> for FleetCommandGuard {
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
 fn within(values: &[f64], limit: f64) -> bool {
-    values.iter().fold(0_u64, |beyond, value| beyond | u64::from(!(value.abs() <= limit))) == 0
+    // Bits, not a branch: they are gathered in any order, and so in vectors.
+    values.iter().fold(1, |all, value| all & u64::from(value.abs() <= limit)) == 1
 }
 
 /// Whether all values are at most so far from these; what is no number is not.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
 fn near(values: &[f64], from: &[f64], change: f64) -> bool {
-    let far = values.iter().zip(from).map(|(value, from)| u64::from(!((value - from).abs() <= change)));
-    far.fold(0, |beyond, far| beyond | far) == 0
+    values.iter().zip(from).fold(1, |all, (value, from)| all & u64::from((value - from).abs() <= change)) == 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::FleetBuffer;
+    use crate::config::{SHIPPED, Scenario};
+    use crate::rig::{AnyRig, Rig};
+    use crate::sample::{RateMeasurement, Stamp};
+
+    fn rig(overrides: &[&str]) -> RigidBodyRig {
+        let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
+        match Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap().rig {
+            AnyRig::RigidBody(rig) => rig,
+            AnyRig::Orbit(_) => unreachable!("the first scenario is of rigid bodies"),
+        }
+    }
+
+    /// Over whatever comes: steady motion, jumps, gaps, numbers that are none, new lives of the sender.
+    #[test]
+    fn a_fleet_s_guard_judges_as_that_of_a_single_body() {
+        let mut single = rig(&[]).measurement_guard(1, true);
+        let mut many = rig(&["follower.0.count=5"]).fleet(1).unwrap().measurement_guard();
+        let (mut draw, mut sample) = (uniform(3, 0), FleetBuffer::<MeasurementLayout>::new(5));
+        let (mut rate, mut stamp, mut verdicts) = ([0.0; 3], Stamp { generation: 1, ..Stamp::default() }, [0, 0]);
+        for _ in 0..20_000 {
+            let event = (draw() * 100.0) as u64;
+            stamp.tick += if event < 3 { 1 + (draw() * 60.0) as u64 } else { 1 };
+            stamp.generation += u64::from(event == 4);
+            let reach = if (5..8).contains(&event) { 1.0 } else { 2e-3 };
+            rate = rate.map(|rate| (rate + reach * (draw() - 0.5)).clamp(-2.5, 2.5));
+            let (mut told, mut applied) = (rate, [0.1; 3]);
+            match event {
+                10 => told[1] = f64::NAN,
+                11 => told[2] = f64::INFINITY,
+                12 => applied[0] = f64::NAN,
+                13 => told[0] = 1e3,
+                _ => {}
+            }
+            let one =
+                RateMeasurement { stamp, omega_rad_s: told, applied_rad_s2: applied, valid: 7, ..Default::default() };
+            let all = sample.sample_mut();
+            all.set_status(0);
+            *all.stamp_mut() = stamp;
+            for axis in 0..3 {
+                // The others stay where they are: they are always possible.
+                all.vector_mut(OMEGA)[axis][3] = told[axis];
+                all.vector_mut(APPLIED)[axis][3] = applied[axis];
+            }
+            let believed = single.accepts(&one);
+            assert_eq!(believed, many.accepts(sample.sample()), "{one:?}");
+            verdicts[usize::from(believed)] += 1;
+        }
+        assert!(verdicts.iter().all(|count| *count > 1000), "{verdicts:?}");
+    }
+
+    #[test]
+    fn a_sample_for_another_number_of_bodies_is_none() {
+        let fleet = rig(&["follower.0.count=5"]).fleet(1).unwrap();
+        let (mut measurement, mut command) =
+            (FleetBuffer::<MeasurementLayout>::new(5), FleetBuffer::<CommandLayout>::new(5));
+        assert!(!fleet.measurement_guard().accepts(measurement.sample()), "it says that it is for none");
+        assert!(!fleet.command_guard().accepts(command.sample()));
+        measurement.sample_mut().set_status(0);
+        command.sample_mut().set_status(0);
+        assert!(fleet.measurement_guard().accepts(measurement.sample()));
+        assert!(fleet.command_guard().accepts(command.sample()));
+        command.sample_mut().vector_mut(ACCELERATION)[2][4] = f64::NAN;
+        assert!(!fleet.command_guard().accepts(command.sample()));
+    }
+
+    #[test]
+    fn initial_rates_follow_from_the_seed_and_stay_within_their_spread() {
+        let initial = |count: usize, seed: u64| {
+            let overrides = [
+                format!("follower.0.count={count}"),
+                format!("seed={seed}"),
+                "follower.0.initial_rate_rad_s=[0.5, 0.0, -1.0]".to_owned(),
+                "follower.0.initial_rate_spread_rad_s=[0.25, 0.0, 2.0]".to_owned(),
+            ];
+            rig(&overrides.each_ref().map(|text| &**text)).fleet(1).unwrap().initial
+        };
+        let (few, many, other) = (initial(10, 1), initial(1000, 1), initial(10, 2));
+        assert!(few[0] == many[0][..10] && few[0] != other[0], "a larger fleet begins as a smaller one");
+        assert!(many[0].iter().all(|rate| (rate - 0.5).abs() <= 0.25) && many[1].iter().all(|rate| *rate == 0.0));
+        let mean = many[2].iter().sum::<f64>() / 1000.0;
+        assert!(many[2].iter().all(|rate| (rate + 1.0).abs() <= 2.0) && (mean + 1.0).abs() < 0.1, "{mean}");
+    }
 }
