@@ -12,7 +12,7 @@ use std::time::Duration;
 /// Options of `corotate bench`.
 #[derive(clap::Args)]
 pub struct Arguments {
-    /// Rows to measure: step, hop, chain, tick, lockstep, run, toll [default: all]
+    /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll [default: all]
     #[arg(value_name = "ROW", value_parser = row)]
     rows: Vec<Row>,
     /// A smoke run of a few seconds, whose figures mean nothing

@@ -10,6 +10,8 @@ use crate::telemetry::{Grant, Latency, Percentiles};
 pub enum Row {
     /// The estimate-and-control step.
     Step,
+    /// The control law of many followers at once.
+    Fleet,
     /// One hop between two processes.
     Hop,
     /// Leader, observer, controller: from the tick to the command.
@@ -26,8 +28,9 @@ pub enum Row {
 
 impl Row {
     /// Every row with its name and what it is.
-    pub const ALL: [(Self, &str, &str); 7] = [
+    pub const ALL: [(Self, &str, &str); 8] = [
         (Self::Step, "step", "estimate-and-control step: samples in, command out"),
+        (Self::Fleet, "fleet", "the law of N followers in one controller's step, per follower"),
         (Self::Hop, "hop", "one hop between two processes on two cores"),
         (Self::Chain, "chain", "leader -> observer -> controller: from the leader's tick until the command is sent"),
         (Self::Tick, "tick", "how late a tick begins"),

@@ -11,7 +11,7 @@ use crate::launch::{Launch, Progress};
 use crate::rig::{Command, Estimate, Measurement, Rig};
 use crate::role::{Body, Controller, Observer};
 use crate::runtime::{RoleId, build, depths, in_turn, private_ledger};
-use crate::sample::Sample;
+use crate::sample::Message;
 use crate::with_rig;
 use std::hint::black_box;
 use std::time::Instant;

@@ -10,6 +10,7 @@ mod chain;
 mod compiled;
 pub mod ekf;
 mod exchange;
+mod fleet;
 mod hop;
 mod lockstep;
 
@@ -98,6 +99,7 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
     for row in bench.rows.clone() {
         match row {
             Row::Step => step::measure(bench, &mut board)?,
+            Row::Fleet => fleet::measure(bench, &mut board)?,
             Row::Hop => hop::measure(bench, &mut board)?,
             Row::Chain => chain::measure(bench, &mut board)?,
             Row::Tick => tick::measure(bench, &mut board)?,

@@ -13,7 +13,7 @@ use crate::observe::{
 };
 use crate::rig::{AnyRig, Command, Estimate, Measurement, RateLaw, Rig};
 use crate::role::{Body, Controller, Guard, Observer};
-use crate::sample::{RateEstimate, RateMeasurement, Sample, status};
+use crate::sample::{Message, RateEstimate, RateMeasurement, Sample, status};
 use crate::with_rig;
 use nalgebra::{Vector1, Vector3};
 use std::hint::black_box;

@@ -55,6 +55,8 @@ pub const TARGETS: &[Target] = &[
     target(Row::Step, "first order", None, Median, AtMost(15.0)),
     target(Row::Step, "first order by an EKF", Some("first order"), Median, AtLeast(3.0)),
     target(Row::Step, "second order", Some("first order"), Median, AtMost(1.3)),
+    target(Row::Fleet, "law, N = 1000", Some("copy, N = 1000"), Median, AtMost(1.3)),
+    target(Row::Fleet, "law, N = 1000", None, Median, AtMost(0.7)),
     target(Row::Hop, "ours, spin, 64 B", Some("iceoryx2, spin, 64 B"), P50, AtMost(1.1)),
     target(Row::Hop, "ours, spin, 128 B", Some("iceoryx2, spin, 128 B"), P50, AtMost(1.1)),
     target(Row::Hop, "ours, spin, 256 B", Some("iceoryx2, spin, 256 B"), P50, AtMost(1.1)),

@@ -80,8 +80,11 @@ fn cyclictest(board: &mut Board, ticks: u64) -> Result<Result<Latency, String>, 
     if granted("locked memory").is_some() {
         command.arg("--mlockall");
     }
-    granted("SCHED_FIFO").into_iter().for_each(|grant| drop(command.arg(format!("--priority={}", grant.asked))));
-    granted("core").into_iter().for_each(|grant| drop(command.arg(format!("--affinity={}", grant.asked))));
+    for (privilege, option) in [("SCHED_FIFO", "--priority"), ("core", "--affinity")] {
+        if let Some(grant) = granted(privilege) {
+            command.arg(format!("{option}={}", grant.asked));
+        }
+    }
     let done = match command.stdin(Stdio::null()).output() {
         Ok(done) => done,
         Err(error) => return Ok(Err(format!("{error}; install it (Debian: apt install rt-tests)"))),

@@ -58,7 +58,7 @@ pub(super) struct Watch<'a> {
     pub overrides: &'a [&'a str],
     /// Environment of all its processes.
     pub environment: Vec<(&'static str, OsString)>,
-    /// Called once, a quarter of the run after the first tick, with its processes and its period, ns.
+    /// Called once, a sixth of the run after the first tick, with its processes and its period, ns.
     pub midway: &'a mut dyn FnMut(&[Process], u64),
 }
 
@@ -138,7 +138,7 @@ impl Watch<'_> {
                     line.look_at_leader()?;
                 }
             }
-            let due = epoch_ns.is_some_and(|epoch_ns| monotonic_ns() > epoch_ns + length_ns / 4);
+            let due = epoch_ns.is_some_and(|epoch_ns| monotonic_ns() > epoch_ns + length_ns / 6);
             if due && !midway_done {
                 midway_done = true;
                 processes.extend(roles(scenario, child.id() as i32));
