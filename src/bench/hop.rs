@@ -52,7 +52,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let domain = OwnedDomain::create(0)?;
     let ways = [(Wake::Spin, &SPINNERS[..]), (Wake::Event, &SLEEPERS[..]), (Wake::Hybrid, &HYBRIDS[..])];
     for (wake, mechanisms) in ways {
-        for words in SIZES {
+        for words in bench.size(&SIZES[..], &SIZES[..1]).iter().copied() {
             bench.next(&format!("hop: {}, {} bytes", wake.name(), 8 * words))?;
             let pairs: Result<Vec<_>, _> = mechanisms
                 .iter()

@@ -29,7 +29,7 @@ pub use board::{Beside, Board, Figure, Row};
 pub use compiled::Compiled;
 pub use peer::{PeerSeat, serve_peer};
 pub use report::{Results, table, write_results};
-pub use step::{Agreement, agreements};
+pub use step::{Agreement, STEP_KINDS, agreements, repeat_step};
 pub use targets::{TARGETS, Target, Verdict};
 
 use crate::bus::BusError;

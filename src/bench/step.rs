@@ -62,6 +62,21 @@ const IN_C: [(&str, &str); 4] = [
     ("orbit", "orbit in C"),
 ];
 
+/// The names of the four steps.
+pub const STEP_KINDS: [&str; 4] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0];
+
+/// Does the product's step of one kind again and again, so many times for each of a second of samples; nothing for a kind
+/// that there is not. For whoever counts instructions.
+pub fn repeat_step(kind: &str, passes: u64) {
+    if let Some((_, name, overrides)) = KINDS.iter().find(|(known, ..)| *known == kind) {
+        let scenario = scenario(name, overrides);
+        let mut ours = ours(kind, None, &scenario);
+        for _ in 0..passes {
+            (ours.pass)();
+        }
+    }
+}
+
 fn scenario(name: &str, overrides: &[&str]) -> Scenario {
     let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).expect("the scenario ships");
     // What is judged at the end of a run is of no concern here, and some overrides would leave nothing to judge.

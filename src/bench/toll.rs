@@ -63,7 +63,7 @@ fn watch(
     environment: Vec<(&'static str, OsString)>,
     midway: &mut dyn FnMut(&[Process], u64),
 ) -> Result<(), BenchError> {
-    let duration = format!("duration_s={:?}", window.as_secs_f64() + 4.0);
+    let duration = format!("duration_s={:?}", window.as_secs_f64() + bench.size(4.0, 2.0));
     Watch { overrides: &[&duration, "clock=realtime"], environment, midway }.run(bench).map(|_| ())
 }
 
