@@ -2,11 +2,9 @@
 //!
 //! Every access is atomic; nobody locks. Must not outlive its domain: the file is one of the domain's.
 
-use memmap2::MmapRaw;
+use crate::shared::SharedWords;
 use rustix::thread::futex;
-use std::fs::OpenOptions;
 use std::io;
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering, fence};
 
@@ -19,33 +17,23 @@ const CONTENT: usize = 16;
 
 /// The mapped page.
 #[derive(Debug)]
-pub(super) struct Page {
-    map: MmapRaw,
-}
+pub(super) struct Page(SharedWords);
 
 impl Page {
     /// Maps the page at a path, made if it is not there.
     pub fn open(path: &Path) -> io::Result<Self> {
-        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
-        file.set_len(2 * 8 * BOX_WORDS as u64)?;
-        Ok(Self { map: MmapRaw::map_raw(&file)? })
+        SharedWords::open(path, 2 * BOX_WORDS).map(Self)
     }
 
     #[inline]
-    #[allow(unsafe_code)]
     fn word(&self, direction: usize, index: usize) -> &AtomicU64 {
-        let index = (direction & 1) * BOX_WORDS + index;
-        assert!(index < 2 * BOX_WORDS);
-        // SAFETY: the mapping is writable, page-aligned and `2 * BOX_WORDS` words long, which the index was just held
-        // against; it lives as long as `self`, and every access to it, in any process, is atomic.
-        unsafe { &*self.map.as_ptr().cast::<AtomicU64>().add(index) }
+        &self.0.words()[(direction & 1) * BOX_WORDS + index]
     }
 
+    /// Half of a word of which nobody uses the whole.
     #[inline]
-    #[allow(unsafe_code)]
     fn bell(&self, direction: usize) -> &AtomicU32 {
-        // SAFETY: the first half of a word that nobody uses as a whole; see `word`.
-        unsafe { &*std::ptr::from_ref(self.word(direction, BELL)).cast::<AtomicU32>() }
+        &self.0.halves()[2 * ((direction & 1) * BOX_WORDS + BELL)]
     }
 
     /// Puts words into the mailbox of a direction.
