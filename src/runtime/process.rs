@@ -67,7 +67,7 @@ pub enum RoleError {
         scenario: PathBuf,
     },
     /// The role is no body that a device could be.
-    #[error("a device can be a single driven body only, and `{role}` is none; this scenario has: {driven}")]
+    #[error("a device can be a driven body only, no fleet, and `{role}` is none; this scenario has: {driven}")]
     NotDriven {
         /// As given.
         role: String,
