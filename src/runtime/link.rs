@@ -33,7 +33,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
     /// [`BusError::Open`].
     pub fn open(bus: &B, topic: &Topic, generation: u64, ledger: &Ledger, last_tick: u64) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
-        let port = bus.writer(topic)?;
+        let port = bus.writer(topic, generation)?;
         Ok(Self { port, generation, sent: S::default(), delivered: true, voids: false, disturbance: None, book })
     }
 
@@ -406,8 +406,14 @@ impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
     /// # Errors
     /// [`BusError::Receive`].
     pub fn warm_up(&mut self) -> Result<(), BusError> {
+        self.port.refresh();
         while self.port.advance()? {}
         Ok(())
+    }
+
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    pub fn refresh(&mut self) {
+        self.port.refresh();
     }
 }
 

@@ -87,8 +87,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
-            // Meanwhile the others, so that they are there when the estimate comes, which is the last as a rule.
-            return self.look_ahead();
+            if self.clock == Clock::Monotonic {
+                // Meanwhile the others, so that the newest are at hand when the estimate comes, which is the last as a rule.
+                self.channels.iter_mut().try_for_each(|channel| channel.measurement.seek(u64::MAX).map(drop))?;
+            }
+            return Ok(false);
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
             self.pass_over()?;
@@ -101,17 +104,6 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             complete &= found != Seek::NotYet;
         }
         Ok(complete || overdue)
-    }
-
-    #[inline]
-    fn look_ahead(&mut self) -> Result<bool, BusError> {
-        let next = self.book.next();
-        for channel in &mut self.channels {
-            if !channel.measurement.knows(next) {
-                channel.measurement.seek(next)?;
-            }
-        }
-        Ok(false)
     }
 
     /// There is no estimate for the next tick that could be used, and so there are no commands.
@@ -261,7 +253,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.channels.iter_mut().try_for_each(|channel| channel.command.refresh())
+        self.estimate.refresh();
+        self.channels.iter_mut().try_for_each(|channel| {
+            channel.measurement.refresh();
+            channel.command.refresh()
+        })
     }
 
     fn ticks(&self) -> Ticks {

@@ -204,6 +204,9 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        if let Some(command) = &mut self.command {
+            command.refresh();
+        }
         self.measurement.refresh()?;
         self.truth.refresh()
     }
