@@ -85,8 +85,8 @@ impl Bus for CountedBus {
     type FleetWriter<L: FleetLayout> = CountedWriter<<IoxBus as Bus>::FleetWriter<L>>;
     type FleetReader<L: FleetLayout> = <IoxBus as Bus>::FleetReader<L>;
 
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
-        self.0.writer(topic).map(CountedWriter)
+    fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<Self::Writer<S>, BusError> {
+        self.0.writer(topic, generation).map(CountedWriter)
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
@@ -154,7 +154,7 @@ fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &Owned
 /// Leads the roles through a real-time run as the launcher does.
 fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
-    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
+    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule), 1).unwrap();
     let mut health: Vec<_> = RoleId::all(scenario)
         .iter()
         .map(|role| bus.reader::<Health>(&topic(scenario, role.name(scenario), Signal::Health), Reader::Role).unwrap())

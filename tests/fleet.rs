@@ -184,7 +184,7 @@ fn what_no_fleet_can_be_is_refused_with_its_reason() {
         ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "has no meaning for a fleet"),
         ("controller.adaptation_gain=1.0", "learns the inertia of single followers"),
         ("limits.repeats=10", "is not counted for the bodies of a fleet"),
-        ("watchdog.lyapunov_max=1.0", "is not published for a fleet"),
+        ("watchdog.lyapunov_rad2_s2_max=1.0", "is not published for a fleet"),
         (
             "follower=[{name=\"a\", initial_rate_rad_s=[0,0,0], initial_rate_spread_rad_s=[1,1,1]}]",
             "give count, or remove it",

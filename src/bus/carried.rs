@@ -27,11 +27,11 @@ pub trait Carried: Message + 'static {
     fn length(bodies: usize) -> usize;
     /// Becomes as another one.
     fn assign(&mut self, from: &Self);
-    /// Opens a signal for writing.
+    /// Opens a signal for writing, in this life of the writer.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    fn writer<B: Bus>(bus: &B, topic: &Topic, bodies: usize) -> Result<Self::Writer<B>, BusError>;
+    fn writer<B: Bus>(bus: &B, topic: &Topic, bodies: usize, generation: u64) -> Result<Self::Writer<B>, BusError>;
     /// Opens a signal for reading.
     ///
     /// # Errors
@@ -65,8 +65,8 @@ impl<S: Sample> Carried for S {
         *self = *from;
     }
 
-    fn writer<B: Bus>(bus: &B, topic: &Topic, _bodies: usize) -> Result<B::Writer<S>, BusError> {
-        bus.writer(topic)
+    fn writer<B: Bus>(bus: &B, topic: &Topic, _bodies: usize, generation: u64) -> Result<B::Writer<S>, BusError> {
+        bus.writer(topic, generation)
     }
 
     fn reader<B: Bus>(bus: &B, topic: &Topic, reader: Reader, _bodies: usize) -> Result<B::Reader<S>, BusError> {
@@ -100,7 +100,7 @@ impl<L: FleetLayout> Carried for FleetSample<L> {
         self.words_mut().copy_from_slice(from.words());
     }
 
-    fn writer<B: Bus>(bus: &B, topic: &Topic, bodies: usize) -> Result<B::FleetWriter<L>, BusError> {
+    fn writer<B: Bus>(bus: &B, topic: &Topic, bodies: usize, _generation: u64) -> Result<B::FleetWriter<L>, BusError> {
         bus.fleet_writer(topic, bodies)
     }
 

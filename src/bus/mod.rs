@@ -106,11 +106,11 @@ pub trait Bus {
     /// The reading end of a fleet's signal.
     type FleetReader<L: FleetLayout>: Read<FleetSample<L>>;
 
-    /// Opens a signal for writing; there is one writer per signal.
+    /// Opens a signal for writing; there is one writer per signal. `generation` is the one that its stamps will have.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError>;
+    fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<Self::Writer<S>, BusError>;
     /// Opens a signal for reading.
     ///
     /// # Errors
@@ -167,4 +167,6 @@ pub trait Read<S: ?Sized> {
     /// # Errors
     /// [`BusError::Receive`].
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    fn refresh(&mut self);
 }

@@ -190,7 +190,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
-    fn idle_until(&mut self, until_ns: u64, node: &dyn Node) -> Result<bool, BusError> {
+    fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, BusError> {
         while monotonic_ns() < until_ns {
             hooks::at(Place::Waiting);
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
@@ -202,11 +202,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Now and then: how this role is, and whether the run is over.
-    fn turn(&mut self, node: &dyn Node) -> Result<bool, BusError> {
+    fn turn(&mut self, node: &mut dyn Node) -> Result<bool, BusError> {
         if !self.turn_is_due() {
             return Ok(false);
         }
         self.control.announce(RoleState::Running, node)?;
+        node.refresh()?;
         self.control.stopped()
     }
 
@@ -275,7 +276,7 @@ pub struct Backoff {
 
 impl Backoff {
     /// One round of waiting that is no sleep; false if it is time for one.
-    fn brief(&mut self) -> bool {
+    pub fn brief(&mut self) -> bool {
         self.rounds = self.rounds.saturating_add(1);
         match self.rounds {
             0..SPIN_ROUNDS => std::hint::spin_loop(),
@@ -283,13 +284,6 @@ impl Backoff {
             _ => return false,
         }
         true
-    }
-
-    /// One round of waiting, for those whom nobody wakes.
-    pub fn wait(&mut self) {
-        if !self.brief() {
-            sleep_until(monotonic_ns() + NAP_NS);
-        }
     }
 }
 

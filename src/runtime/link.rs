@@ -41,7 +41,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         last_tick: u64,
     ) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
-        let (port, sent) = (S::writer(bus, topic, bodies)?, S::blank(bodies));
+        let (port, sent) = (S::writer(bus, topic, bodies, generation)?, S::blank(bodies));
         Ok(Self { port, generation, sent, delivered: true, voids: false, disturbance: None, book })
     }
 
@@ -424,8 +424,14 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// # Errors
     /// [`BusError::Receive`].
     pub fn warm_up(&mut self) -> Result<(), BusError> {
+        self.port.refresh();
         while self.port.advance()? {}
         Ok(())
+    }
+
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    pub fn refresh(&mut self) {
+        self.port.refresh();
     }
 }
 

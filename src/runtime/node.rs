@@ -159,7 +159,8 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn warm_up(&mut self) -> Result<(), BusError>;
-    /// Lets readers that have come later know of this role's signals. Off the critical path.
+    /// Lets readers that have come later know of this role's signals, and finds the writers that have. Off the critical
+    /// path.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.

@@ -23,12 +23,12 @@ use std::sync::atomic::AtomicBool;
 /// How often a role looks for the next phase before its ticks, ns.
 const LOOK_NS: u64 = 1_000_000;
 /// Samples that every link carries before the first tick.
-pub(super) const WARM_UP_SAMPLES: usize = 200;
+pub(super) const WARM_UP_SAMPLES: usize = 100;
 /// The pause between them, ns.
-pub(super) const WARM_UP_PAUSE_NS: u64 = 100_000;
+pub(super) const WARM_UP_PAUSE_NS: u64 = 50_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
-const BASELINE_PERIOD_NS: u64 = 1_000_000;
+const BASELINE_PERIOD_NS: u64 = 300_000;
 /// How long a role that is done waits for the launcher's leave, ns: longer than any machine keeps a launcher waiting.
 const LEAVE_NS: u64 = 120_000_000_000;
 
@@ -67,7 +67,7 @@ pub enum RoleError {
         scenario: PathBuf,
     },
     /// The role is no body that a device could be.
-    #[error("a device can be a single driven body only, and `{role}` is none; this scenario has: {driven}")]
+    #[error("a device can be a driven body only, no fleet, and `{role}` is none; this scenario has: {driven}")]
     NotDriven {
         /// As given.
         role: String,
@@ -195,7 +195,7 @@ pub fn serve<B: Bus + 'static>(
     let role = occupant.role();
     let name = role.name(scenario);
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
-    let health = bus.writer(&topic(scenario, name, Signal::Health))?;
+    let health = bus.writer(&topic(scenario, name, Signal::Health), ledger.generation() + 1)?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,

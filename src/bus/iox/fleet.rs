@@ -162,4 +162,6 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
         let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
         self.bell.sleep(until_ns, news)
     }
+
+    fn refresh(&mut self) {}
 }

@@ -62,15 +62,6 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         (!self.measurement.knows(tick)).then_some(self.body)
     }
 
-    /// Takes the measurement of a tick as soon as it comes.
-    #[inline]
-    fn look_ahead(&mut self, tick: u64) -> Result<(), BusError> {
-        if !self.measurement.knows(tick) {
-            self.measurement.seek(tick)?;
-        }
-        Ok(())
-    }
-
     /// There is no estimate for this tick, and so there is no command.
     fn pass_over(&mut self, tick: u64) -> Result<(), BusError> {
         // What is not used now will never be, and must not fill the link.
@@ -120,6 +111,11 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     fn warm_up(&mut self) -> Result<(), BusError> {
         self.measurement.warm_up()?;
         self.command.warm_up()
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh();
+        self.command.refresh()
     }
 }
 
@@ -186,8 +182,12 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
-            // Meanwhile the others, so that they are there when the estimate comes, which is the last as a rule.
-            return self.look_ahead();
+            if self.clock == Clock::Monotonic {
+                // Meanwhile the others, so that the newest are at hand when the estimate comes, which is the last as a rule.
+                self.channels.iter_mut().try_for_each(|channel| channel.measurement.seek(u64::MAX).map(drop))?;
+                self.fleets.iter_mut().try_for_each(|fleet| fleet.measurement.seek(u64::MAX).map(drop))?;
+            }
+            return Ok(false);
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
             self.pass_over()?;
@@ -201,14 +201,6 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             complete &= fleet.gather(tick)?;
         }
         Ok(complete || overdue)
-    }
-
-    #[inline]
-    fn look_ahead(&mut self) -> Result<bool, BusError> {
-        let next = self.book.next();
-        self.channels.iter_mut().try_for_each(|channel| channel.look_ahead(next))?;
-        self.fleets.iter_mut().try_for_each(|fleet| fleet.look_ahead(next))?;
-        Ok(false)
     }
 
     /// There is no estimate for the next tick that could be used, and so there are no commands.
@@ -348,8 +340,9 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.channels.iter_mut().try_for_each(|channel| channel.command.refresh())?;
-        self.fleets.iter_mut().try_for_each(|fleet| fleet.command.refresh())
+        self.estimate.refresh();
+        self.channels.iter_mut().try_for_each(Channel::refresh)?;
+        self.fleets.iter_mut().try_for_each(Channel::refresh)
     }
 
     fn ticks(&self) -> Ticks {

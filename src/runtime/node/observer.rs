@@ -146,6 +146,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh();
         self.estimate.refresh()
     }
 

@@ -209,6 +209,9 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        if let Some(command) = &mut self.command {
+            command.refresh();
+        }
         self.measurement.refresh()?;
         self.truth.refresh()
     }

@@ -192,9 +192,9 @@ mod tests {
         type FleetWriter<L: FleetLayout> = <MemoryBus as Bus>::FleetWriter<L>;
         type FleetReader<L: FleetLayout> = <MemoryBus as Bus>::FleetReader<L>;
 
-        fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
+        fn writer<S: Sample>(&self, topic: &Topic, _generation: u64) -> Result<Self::Writer<S>, BusError> {
             self.written.borrow_mut().push((topic.clone(), S::TYPE_NAME));
-            self.bus.writer(topic)
+            self.bus.writer(topic, 1)
         }
 
         fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
