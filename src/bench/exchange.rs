@@ -14,6 +14,10 @@ use std::time::Duration;
 
 /// The most words of a sample.
 const MAX_WORDS: usize = 32;
+/// Words of a sample that are its stamp.
+const STAMP: usize = 4;
+/// The generation of all samples.
+const GENERATION: u64 = 1;
 /// How long one who spun for too long sleeps between two looks, ns.
 const NAP_NS: u64 = 50_000;
 /// How long a sleeper sleeps at most before it looks whether it is to give up, ns.
@@ -86,7 +90,8 @@ impl Mechanism {
     }
 }
 
-/// What a sample says. Its other words repeat the number, so that a torn one is seen.
+/// What a sample says, where our samples have their stamp: number, generation, when due, when sent. The other words repeat
+/// the number, so that a torn one is seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Content {
     /// From 1.
@@ -156,6 +161,8 @@ trait Out {
 trait In {
     /// Takes the next words, if they are there. What blocks by itself waits for them.
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError>;
+    /// Finds the shortest way to a writer that has come.
+    fn refresh(&mut self) {}
     /// Sleeps until there may be some, if it knows how to.
     fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
         Ok(())
@@ -223,6 +230,10 @@ impl<S: Sample> In for IoxReader<S> {
             words.copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(sample)));
         }
         Ok(there)
+    }
+
+    fn refresh(&mut self) {
+        Read::refresh(self);
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
@@ -357,9 +368,9 @@ impl Station<'_> {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
                 match words {
-                    8 => Box::new(bus.writer::<Probe64>(&topic)?),
-                    16 => Box::new(bus.writer::<Probe128>(&topic)?),
-                    _ => Box::new(bus.writer::<Probe256>(&topic)?),
+                    8 => Box::new(bus.writer::<Probe64>(&topic, GENERATION)?),
+                    16 => Box::new(bus.writer::<Probe128>(&topic, GENERATION)?),
+                    _ => Box::new(bus.writer::<Probe256>(&topic, GENERATION)?),
                 }
             }
             Mechanism::Iceoryx => {
@@ -440,7 +451,7 @@ impl Sender {
     #[inline]
     pub fn send(&mut self, number: u64, due_ns: u64) -> Result<(), BusError> {
         let mut words = [number; MAX_WORDS];
-        (words[1], words[2]) = (due_ns, monotonic_ns());
+        (words[1], words[2], words[3]) = (GENERATION, due_ns, monotonic_ns());
         self.carry.send(&words[..self.words])?;
         match &self.bell {
             Bell::Futex(page, direction) => page.ring(*direction).map_err(|error| system("wake", error)),
@@ -462,6 +473,11 @@ impl Sender {
 }
 
 impl Receiver {
+    /// Finds the shortest way to a sender that has come, off the critical path.
+    pub fn refresh(&mut self) {
+        self.carry.refresh();
+    }
+
     /// Gives way to others of the same priority on the same core while it polls.
     pub fn give_way(&mut self) {
         self.gives_way = true;
@@ -487,8 +503,8 @@ impl Receiver {
                 _ => 0,
             };
             if self.carry.receive(words)? {
-                let whole = words[3..].iter().all(|word| *word == words[0]);
-                let content = Content { number: words[0], due_ns: words[1], sent_ns: words[2] };
+                let whole = words[STAMP..].iter().all(|word| *word == words[0]);
+                let content = Content { number: words[0], due_ns: words[2], sent_ns: words[3] };
                 return if whole { Ok(Some(content)) } else { Err(system("receive", "a sample is torn")) };
             }
             polled += 1;

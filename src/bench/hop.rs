@@ -161,6 +161,7 @@ impl Pair {
     /// So many samples there and back without a pause: half of the mean round trip, µs.
     pub fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
         self.peer.echo(count)?;
+        self.back.refresh();
         let began_ns = monotonic_ns();
         for _ in 0..count {
             self.number += 1;

@@ -84,6 +84,7 @@ pub fn serve_peer(seat: &PeerSeat) -> Result<(), String> {
     for line in std::io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
         let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
+        ends.iter_mut().for_each(|(receiver, _): &mut (Receiver, _)| receiver.refresh());
         let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
         if let (Some((receiver, _)), true) = (&mut ends, beside.contains(&waits_for)) {
             receiver.give_way();
@@ -135,7 +136,7 @@ fn descriptor(opening: &Opening, index: usize) -> Option<OwnedFd> {
 
 /// How long before a sample is due both ends wake: at a short period there must be some sleep left.
 pub(super) fn lead_ns(grid: Grid) -> u64 {
-    LEAD_NS.min(grid.period_ns / 2)
+    LEAD_NS.min(grid.period_ns / 4)
 }
 
 /// Receives what is due on a grid. A link of the newest sample alone may lose some: to a receiver that is late.
