@@ -1,5 +1,6 @@
 //! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
 
+mod bench;
 mod bridge;
 mod check;
 mod init;
@@ -33,7 +34,8 @@ Examples:
   corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
   corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
-                                                 a device as the follower of a run --external follower";
+                                                 a device as the follower of a run --external follower
+  corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
 enum Command {
@@ -53,6 +55,11 @@ enum Command {
     Controller(role::Arguments),
     /// Put a device behind a serial line into a driven body's seat in a run
     Bridge(bridge::Arguments),
+    /// Measure what everything costs beside its floors, on this machine
+    Bench(bench::Arguments),
+    /// Take the other end of a hop that is measured
+    #[command(hide = true)]
+    BenchPeer(bench::PeerArguments),
     /// Clean up after a launcher that was killed
     #[command(hide = true)]
     Janitor,
@@ -118,6 +125,8 @@ fn main() -> ExitCode {
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
+        Some(Command::Bench(arguments)) => bench::bench(&arguments),
+        Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {
             corotate::launch::janitor(std::io::stdin());
             Exit::Ok

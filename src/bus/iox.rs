@@ -45,7 +45,7 @@ const HEADER_BYTES: usize = 64;
 /// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
 const SIGNAL_BYTES: usize = 64 << 10;
 
-type Ipc = ipc::Service;
+pub(super) type Ipc = ipc::Service;
 
 /// An upper bound on the shared memory that one signal with samples of `size` bytes takes, bytes.
 pub fn footprint(qos: &Qos, size: usize) -> usize {
@@ -221,7 +221,7 @@ fn config(domain: &Domain) -> Result<Config, String> {
     Ok(config)
 }
 
-fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
     let config = config(domain)?;
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)

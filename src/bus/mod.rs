@@ -1,6 +1,6 @@
 //! Links between roles: one writer and some readers per signal, samples loaned, written in place and sent.
 //!
-//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
+//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2 (and `raw`, which measures it bare); [`memory`] is its twin within one thread.
 
 mod bell;
 mod carried;
@@ -8,6 +8,7 @@ pub mod domain;
 pub mod iox;
 pub mod memory;
 mod names;
+pub(crate) mod raw;
 
 pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};

@@ -14,9 +14,11 @@ mod trace;
 
 pub use children::janitor;
 pub use junit::junit;
+pub(crate) use outcome::Host;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
+pub(crate) use table::plain;
 pub use table::{line_words, table};
 
 use crate::bus::BusError;

@@ -188,11 +188,11 @@ pub struct RoleGrant {
 }
 
 #[derive(Debug, Serialize)]
-struct Host {
-    name: String,
-    kernel: String,
-    cores: usize,
-    cpu: String,
+pub(crate) struct Host {
+    pub name: String,
+    pub kernel: String,
+    pub cores: usize,
+    pub cpu: String,
 }
 
 impl Summary {
@@ -417,7 +417,7 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
 }
 
 impl Host {
-    fn this() -> Self {
+    pub(crate) fn this() -> Self {
         let system = rustix::system::uname();
         let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));

@@ -9,7 +9,7 @@ mod rigid_body;
 
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
-pub use rigid_body::RigidBodyRig;
+pub use rigid_body::{RateLaw, RigidBodyRig};
 
 use crate::config::{Checks, ConfigError, Document, finite_positive, nearest};
 use crate::control::Watched;

@@ -7,7 +7,6 @@ use super::hooks::{self, Place};
 use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
-use crate::config::Realtime;
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -94,41 +93,51 @@ impl<'a, B: Bus> Control<'a, B> {
     }
 }
 
+/// How a role waits in real time.
+#[derive(Debug, Clone, Copy)]
+pub struct Waiting<'a> {
+    /// It wakes so long before the tick and spins the rest, ns.
+    pub lead_ns: u64,
+    /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
+    pub spin_ns: u64,
+    /// For samples of these roles it does not spin but gives way: they need its core.
+    pub give_way: &'a [RoleId],
+    /// The part of the period after which it goes on without what is missing.
+    pub cutoff: f64,
+}
+
 /// What a driver needs besides its node.
 pub struct Drive<'a, 'b, B: Bus> {
     control: &'a mut Control<'b, B>,
-    /// The roles of the same priority on the same core.
-    beside: &'a [RoleId],
     last_tick: u64,
     window_ticks: u64,
     next_turn_ns: u64,
 }
 
 impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
-    /// A drive up to `last_tick`, with these other roles on the same core and of the same priority; in lockstep at most
-    /// `window_ticks` ahead of the slowest consumer.
-    pub fn new(control: &'a mut Control<'b, B>, beside: &'a [RoleId], last_tick: u64, window_ticks: u64) -> Self {
-        Self { control, beside, last_tick, window_ticks, next_turn_ns: 0 }
+    /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
+    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
+        Self { control, last_tick, window_ticks, next_turn_ns: 0 }
     }
 
     /// Drives a node on the time grid.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
-    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Ended, BusError> {
-        let lead_ns = (settings.wake_lead_us * 1e3) as u64;
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, BusError> {
         while node.next_tick() <= self.last_tick {
             let due_ns = grid.due_ns(node.next_tick());
-            if self.idle_until(due_ns.saturating_sub(lead_ns), node)? {
+            let timed = node.time_triggered() || waiting.spin_ns > 0;
+            if timed && self.idle_until(due_ns.saturating_sub(waiting.lead_ns), node)? {
                 return Ok(Ended::Stopped);
             }
             node.before_tick();
-            let begun = if node.time_triggered() { self.on_time(node, grid, lead_ns)? } else { Poll::Waiting };
+            let begun = if node.time_triggered() { self.on_time(node, grid, waiting.lead_ns)? } else { Poll::Waiting };
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
-            let executed = if waits { self.on_arrival(node, grid, settings)? } else { Some(begun) };
+            let executed = if waits { self.on_arrival(node, grid, waiting)? } else { Some(begun) };
             match executed {
                 Some(Poll::Executed) => {
-                    if begun == Poll::Executed && !self.beside.is_empty() {
+                    if begun == Poll::Executed && !waiting.give_way.is_empty() {
                         // What it sent is what the others wait for, and they wait for its core too.
                         std::thread::yield_now();
                     }
@@ -151,11 +160,11 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then naps between looks.
-    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Option<Poll>, BusError> {
+    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Option<Poll>, BusError> {
         let tick = node.next_tick();
-        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * settings.cutoff) as u64;
+        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;
         let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
-        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + (settings.spin_us * 1e3) as u64;
+        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + waiting.spin_ns;
         loop {
             let now_ns = monotonic_ns();
             let gate = if now_ns >= overdue_ns { Gate::Overdue } else { Gate::Arrived };
@@ -164,8 +173,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 done => return Ok(Some(done)),
             }
             hooks::at(Place::Waiting);
-            if now_ns < spin_end_ns {
-                self.spin(node);
+            if waiting.spin_ns > 0 && now_ns < spin_end_ns {
+                spin(node, waiting.give_way);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
@@ -177,15 +186,6 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                     return Ok(None);
                 }
             }
-        }
-    }
-
-    /// One round of waiting for a sample that is due: whoever is to send it may need this core.
-    fn spin(&self, node: &dyn Node) {
-        if node.awaits().is_some_and(|role| self.beside.contains(&role)) {
-            std::thread::yield_now();
-        } else {
-            std::hint::spin_loop();
         }
     }
 
@@ -261,6 +261,15 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             up_to = (self.control.schedule()?.credit_tick + self.window_ticks).min(self.last_tick);
         }
         Ok(Ended::Finished)
+    }
+}
+
+/// One round of waiting for a sample that is due: whoever is to send it may need this core.
+fn spin(node: &dyn Node, give_way: &[RoleId]) {
+    if node.awaits().is_some_and(|role| give_way.contains(&role)) {
+        std::thread::yield_now();
+    } else {
+        std::hint::spin_loop();
     }
 }
 

@@ -3,7 +3,7 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::bridge::DeviceError;
-use super::drive::{Control, Drive, Ended};
+use super::drive::{Control, Drive, Ended, Waiting};
 use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
 use super::privileges::Privileges;
@@ -12,7 +12,7 @@ use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::{ClockKind, ConfigError, Realtime, Scenario};
+use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use crate::with_rig;
@@ -285,6 +285,18 @@ fn await_phase<B: Bus>(
     Err(RoleError::NoLauncher { waited_s })
 }
 
+/// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
+fn waiting<'a>(scenario: &Scenario, privileges: &'a Privileges) -> Waiting<'a> {
+    let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
+    let [lead_ns, spin_ns] = [wake_lead_us, spin_us].map(|us| ((us * 1e3) as u64).min(scenario.period_ns / 4));
+    let (spin_ns, give_way) = match wake {
+        Wake::Auto if privileges.first_served => (spin_ns, &privileges.beside[..]),
+        Wake::Spin => (spin_ns, &[][..]),
+        Wake::Auto | Wake::Event => (0, &[][..]),
+    };
+    Waiting { lead_ns, spin_ns, give_way, cutoff }
+}
+
 fn drive<B: Bus>(
     scenario: &Scenario,
     node: &mut ReadyNode,
@@ -297,12 +309,9 @@ fn drive<B: Bus>(
     let late = scenario.clock == ClockKind::Realtime && !control.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1));
-    // Among equals, a role that spins for a sample holds up the one it waits for.
-    let spin_us = if privileges.first_served { scenario.realtime.spin_us } else { 0.0 };
-    let settings = Realtime { spin_us, ..scenario.realtime.clone() };
-    let mut drive = Drive::new(control, &privileges.beside, scenario.last_tick, window_ticks(scenario));
+    let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
-        ClockKind::Realtime => drive.realtime(&mut **node, grid, &settings),
+        ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, privileges)),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
     };
     Ok(ended?)
