@@ -17,6 +17,7 @@
 //! | `clock` | the time grid and how to wait on it | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
+//! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
@@ -43,6 +44,8 @@ pub mod clock;
 pub mod config;
 #[cfg(feature = "runtime")]
 pub mod launch;
+#[cfg(feature = "runtime")]
+pub mod record;
 #[cfg(feature = "runtime")]
 pub mod rig;
 #[cfg(feature = "runtime")]

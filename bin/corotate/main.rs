@@ -2,7 +2,10 @@
 
 mod bridge;
 mod check;
+mod diff;
+mod export;
 mod init;
+mod record;
 mod role;
 mod run;
 mod seat;
@@ -53,6 +56,12 @@ enum Command {
     Controller(role::Arguments),
     /// Put a device behind a serial line into a driven body's seat in a run
     Bridge(bridge::Arguments),
+    /// Record every sample of a running loop to a file
+    Record(record::Arguments),
+    /// Compare two recordings
+    Diff(diff::Arguments),
+    /// Write a recording as tables
+    Export(export::Arguments),
     /// Clean up after a launcher that was killed
     #[command(hide = true)]
     Janitor,
@@ -118,6 +127,9 @@ fn main() -> ExitCode {
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
+        Some(Command::Record(arguments)) => record::record(&arguments),
+        Some(Command::Diff(arguments)) => diff::diff(&arguments),
+        Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Janitor) => {
             corotate::launch::janitor(std::io::stdin());
             Exit::Ok

@@ -243,7 +243,9 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
         let Ports { writes, health, .. } = ports(scenario, role);
         writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
     };
-    port(&ports(scenario, RoleId::Observer).schedule) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
+    // The recorder says how it is, as the roles do.
+    port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.
