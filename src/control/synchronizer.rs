@@ -32,19 +32,26 @@ impl Synchronizer {
     /// Reference and follower, rad/s, when the command will begin to act: predicted over the lead, if there is one.
     ///
     /// `applied` is the control acceleration acting on the follower until then, rad/s².
-    #[inline]
+    #[inline(always)]
     pub fn ahead(
         &self,
-        reference: &Vector3<f64>,
-        follower: &Vector3<f64>,
-        applied: &Vector3<f64>,
+        reference: Vector3<f64>,
+        follower: Vector3<f64>,
+        applied: Vector3<f64>,
     ) -> (Vector3<f64>, Vector3<f64>) {
-        if self.lead_s > 0.0 {
-            let reference = self.body.flow(reference, &Vector3::zeros(), self.lead_s);
-            (reference, self.body.flow(follower, applied, self.lead_s))
-        } else {
-            (*reference, *follower)
-        }
+        // By value, and the rest apart: without prediction nothing goes through memory.
+        if self.lead_s > 0.0 { self.predicted(reference, follower, applied) } else { (reference, follower) }
+    }
+
+    #[inline(never)]
+    fn predicted(
+        &self,
+        reference: Vector3<f64>,
+        follower: Vector3<f64>,
+        applied: Vector3<f64>,
+    ) -> (Vector3<f64>, Vector3<f64>) {
+        let reference = self.body.flow(&reference, &Vector3::zeros(), self.lead_s);
+        (reference, self.body.flow(&follower, &applied, self.lead_s))
     }
 
     /// The control acceleration, rad/s², from the reference ω or ω̂ and the follower's p, rad/s.
@@ -80,7 +87,7 @@ mod tests {
     fn a_synchronised_follower_needs_no_command() {
         let w = Vector3::new(0.6, -0.4, 0.8);
         assert_eq!(law(0.0).command(&w, &w), Vector3::zeros());
-        let (reference, follower) = law(0.01).ahead(&w, &w, &Vector3::zeros());
+        let (reference, follower) = law(0.01).ahead(w, w, Vector3::zeros());
         assert_eq!(reference, follower);
     }
 
@@ -93,7 +100,7 @@ mod tests {
             let (mut w, mut p) = (Vector3::new(0.6, -0.4, 0.8), Vector3::new(-0.3, 0.5, 0.2));
             let mut applied = Vector3::zeros();
             for _ in 0..20 {
-                let (reference, follower) = law.ahead(&w, &p, &applied);
+                let (reference, follower) = law.ahead(w, p, applied);
                 let next = law.command(&reference, &follower);
                 w = law.body.flow(&w, &Vector3::zeros(), h);
                 p = law.body.flow(&p, &applied, h);

@@ -5,6 +5,8 @@ use nalgebra::Vector3;
 
 /// How far the body may turn in one integration step, rad. One step then errs by less than a rounding.
 const MAX_STEP_RAD: f64 = 2e-3;
+/// A body that turns slowly is limited by its torque history, not by its rate.
+const LONGEST_STEP_S: f64 = 0.01;
 
 /// Principal moments of inertia that a physical body can have.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -121,11 +123,14 @@ impl RigidBody {
     /// The angular velocity `dt_s` seconds after `rate` (rad/s) under a held `torque` (rad/s²).
     ///
     /// The number of integration steps follows from the state alone, so equal inputs give equal bits.
+    #[inline]
     pub fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
         let fastest_rad_s = rate.amax() + torque.amax() * dt_s;
-        // A body that turns slowly is limited by its torque history, not by its rate: never above 10 ms.
-        let max_step_s = (MAX_STEP_RAD / fastest_rad_s).min(0.01);
-        integrate::flow(|x| euler(&self.coefficients, x, torque), rate, dt_s, max_step_s)
+        let derivative = |x: &Vector3<f64>| euler(&self.coefficients, x, torque);
+        if fastest_rad_s * dt_s <= MAX_STEP_RAD && dt_s <= LONGEST_STEP_S {
+            return integrate::rk4_step(derivative, rate, dt_s);
+        }
+        integrate::flow(derivative, rate, dt_s, (MAX_STEP_RAD / fastest_rad_s).min(LONGEST_STEP_S))
     }
 }
 

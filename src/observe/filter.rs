@@ -14,6 +14,8 @@ pub struct Increment<const N: usize> {
     pub potential: SVector<f64, N>,
     /// W = ∫ρ dt, never negative. Zero: the step tells nothing about w.
     pub weight: f64,
+    /// 1/W, so that equal ticks pay for one division only.
+    pub inverse_weight: f64,
     /// G(h) = ∫g dt: how far w drifted by what is known.
     pub drift: SVector<f64, N>,
     /// ∫ρ G dt: the part of the potential that the drift explains.
@@ -29,9 +31,64 @@ pub struct Increment<const N: usize> {
 impl<const N: usize> Increment<N> {
     /// An increment without noise, from its four integrals.
     #[inline]
-    pub fn exact(potential: SVector<f64, N>, weight: f64, drift: SVector<f64, N>, moment: SVector<f64, N>) -> Self {
+    pub fn exact(
+        potential: SVector<f64, N>,
+        weight: impl Into<Span>,
+        drift: SVector<f64, N>,
+        moment: SVector<f64, N>,
+    ) -> Self {
         let [variance, drift_variance, drift_covariance] = [SVector::zeros(); 3];
-        Self { potential, weight, drift, drift_moment: moment, variance, drift_variance, drift_covariance }
+        let Span { length: weight, inverse: inverse_weight } = weight.into();
+        Self {
+            potential,
+            weight,
+            inverse_weight,
+            drift,
+            drift_moment: moment,
+            variance,
+            drift_variance,
+            drift_covariance,
+        }
+    }
+
+    /// w at the end of the step as this step alone has it: what a filter that forgot everything else would say.
+    #[inline]
+    pub fn reconstruction(&self) -> SVector<f64, N> {
+        self.start() + self.drift
+    }
+
+    /// The same at the start of the step.
+    #[inline]
+    fn start(&self) -> SVector<f64, N> {
+        (self.potential - self.drift_moment) * self.inverse_weight
+    }
+}
+
+/// The length of a step, in time or in W, with its inverse: a division that equal steps pay for once.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Span {
+    length: f64,
+    inverse: f64,
+}
+
+impl Span {
+    /// The length.
+    #[inline]
+    pub fn length(&self) -> f64 {
+        self.length
+    }
+
+    /// One over the length.
+    #[inline]
+    pub fn inverse(&self) -> f64 {
+        self.inverse
+    }
+}
+
+impl From<f64> for Span {
+    #[inline]
+    fn from(length: f64) -> Self {
+        Self { length, inverse: 1.0 / length }
     }
 }
 
@@ -84,7 +141,7 @@ impl<const N: usize> InvariantFilter<N> {
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
-            let start = (increment.potential - increment.drift_moment) / increment.weight;
+            let start = increment.start();
             let left = self.decay.apply(increment.weight, self.estimate - start);
             self.estimate = start + increment.drift + left;
         } else {
@@ -106,13 +163,19 @@ impl<const N: usize> Decay<N> {
         match self {
             Self::Diagonal { rate, factor } => {
                 if factor.0 != weight {
-                    *factor = (weight, rate.map(|rate| libm::exp(-rate * weight)));
+                    *factor = (weight, remainder(rate, weight));
                 }
                 factor.1.component_mul(&error)
             }
             Self::Matrix(matrix) => matrix.exp(weight) * error,
         }
     }
+}
+
+/// e^{−rate·W}.
+#[cold]
+fn remainder<const N: usize>(rate: &SVector<f64, N>, weight: f64) -> SVector<f64, N> {
+    rate.map(|rate| libm::exp(-rate * weight))
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 //! motion. Its level curves depend on the signs of a_i and a_j: three conics, three functions, of which only the increment
 //! between two samples is ever formed. Must not choose a branch, unwrap an angle, or divide by what may vanish unasked.
 
-use super::Increment;
+use super::{Increment, Span, series};
 use nalgebra::{Vector1, Vector3};
 
 /// How the measured components move in their plane, and thereby φ.
@@ -85,6 +85,26 @@ pub struct HiddenRate {
     floor_rad_s: f64,
     /// Variances of the two measured components, (rad/s)².
     variance: [f64; 2],
+    constants: Constants,
+}
+
+/// What is the same at every step: for the conics with an Ω.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Constants {
+    inverse_omega: f64,
+    /// Ω a_i.
+    cross: f64,
+    /// Ω² and a_i².
+    square: [f64; 2],
+    /// The least Ω²ω_i² + a_i²ω_j² that carries information.
+    floor: f64,
+}
+
+impl Constants {
+    fn new(omega: f64, ai: f64, floor_rad_s: f64) -> Self {
+        let floor = floor_rad_s * omega.max(ai.abs());
+        Self { inverse_omega: 1.0 / omega, cross: omega * ai, square: [omega * omega, ai * ai], floor: floor * floor }
+    }
 }
 
 /// The two measured components at one instant, rad/s.
@@ -114,7 +134,12 @@ impl HiddenRate {
             (false, false) if a[0] * a[1] < 0.0 => Conic::Elliptic { omega: libm::sqrt(-a[0] * a[1]) },
             (false, false) => Conic::Hyperbolic { omega: libm::sqrt(a[0] * a[1]) },
         };
-        Ok(Self { axes, a, conic, floor_rad_s, variance: [0.0; 2] })
+        let omega = match conic {
+            Conic::Elliptic { omega } | Conic::Hyperbolic { omega } => omega,
+            Conic::ParabolicFirst | Conic::ParabolicSecond => 1.0,
+        };
+        let constants = Constants::new(omega, a[0], floor_rad_s);
+        Ok(Self { axes, a, conic, floor_rad_s, variance: [0.0; 2], constants })
     }
 
     /// The same relation, telling with every increment how uncertain white measurement noise makes it.
@@ -152,90 +177,91 @@ impl HiddenRate {
     ///
     /// `dt_s` is positive and every input finite.
     #[inline]
-    pub fn observe(&self, from: &RateSample, to: &RateSample, dt_s: f64, estimate: f64) -> Observation {
-        let torque = self.axes.map(|index| from.torque_rad_s2[index]);
+    pub fn observe(&self, from: &RateSample, to: &RateSample, dt_s: impl Into<Span>, estimate: f64) -> Observation {
+        let span = dt_s.into();
+        let dt_s = span.length();
+        let [i, j, k] = self.axes;
+        let torque = [from.torque_rad_s2[i], from.torque_rad_s2[j], from.torque_rad_s2[k]];
         let ends = [self.measured(from), self.measured(to)];
-        match self.growth(&ends, dt_s, estimate) {
+        match self.growth(ends, dt_s, estimate) {
             Some((growth, share)) => {
-                let mut potential = growth;
-                if torque[0] != 0.0 || torque[1] != 0.0 {
-                    let rough = growth - dt_s * self.torque_share(ends.map(|end| self.gradient(&end, share)), &torque);
-                    potential = growth - self.torque_growth(&ends, share, &torque, dt_s, rough / dt_s);
-                }
-                let exact = self.increment(&ends, &torque, dt_s, potential);
+                let driven = torque[0] != 0.0 || torque[1] != 0.0;
+                let potential = if driven { self.undriven(ends, share, torque, span, growth) } else { growth };
+                let exact = self.increment(&ends, &torque, span, potential);
                 Observation::Seen(if self.variance == [0.0; 2] { exact } else { self.noisy(exact, &ends[1], share) })
             }
             None => {
-                let hidden = self.hidden_at_ends(&ends, &torque, dt_s, estimate * dt_s);
+                let hidden = self.hidden_at_ends(&ends, &torque, dt_s, estimate);
                 let (drift, _) = self.drift(&ends, &torque, dt_s, hidden);
                 Observation::Unobservable { drift: Vector1::new(drift) }
             }
         }
     }
 
-    #[inline]
+    #[inline(always)]
     fn measured(&self, sample: &RateSample) -> Pair {
         Pair { i: sample.rate_rad_s[self.axes[0]], j: sample.rate_rad_s[self.axes[1]] }
     }
 
     /// Δφ between the ends and the share of the hyperbola's branch z₊ in it; `None` where the relation does not hold.
-    #[inline]
-    fn growth(&self, [from, to]: &[Pair; 2], dt_s: f64, estimate: f64) -> Option<(f64, f64)> {
-        let [ai, aj, _] = self.a;
+    #[inline(always)]
+    fn growth(&self, [from, to]: [Pair; 2], dt_s: f64, estimate: f64) -> Option<(f64, f64)> {
         match self.conic {
             Conic::Elliptic { omega } => {
-                let square = |p: &Pair| omega * omega * p.i * p.i + ai * ai * p.j * p.j;
-                let floor = self.floor_rad_s * omega.max(ai.abs());
-                if square(from).min(square(to)) <= floor * floor || omega * estimate.abs() * dt_s > MAX_TURN_RAD {
+                let Constants { inverse_omega, cross, square, floor } = self.constants;
+                let dot = |p: Pair, q: Pair| square[0] * (p.i * q.i) + square[1] * (p.j * q.j);
+                let dark = dot(from, from) <= floor || dot(to, to) <= floor;
+                if dark || omega * estimate.abs() * dt_s > MAX_TURN_RAD {
                     return None;
                 }
-                let cross = omega * ai * (from.j * to.i - from.i * to.j);
-                let dot = omega * omega * from.i * to.i + ai * ai * from.j * to.j;
-                Some((libm::atan2(cross, dot) / omega, 1.0))
+                let cross = cross * (from.j * to.i - from.i * to.j);
+                Some((series::atan2(cross, dot(from, to)) * inverse_omega, 1.0))
             }
-            Conic::Hyperbolic { omega } => {
-                let z = |p: &Pair, sign: f64| omega * p.i + sign * ai * p.j;
-                let [plus, minus] = [1.0, -1.0].map(|sign| z(from, sign).abs().min(z(to, sign).abs()));
-                if plus.max(minus) <= self.floor_rad_s * omega.max(ai.abs()) {
-                    return None;
-                }
-                // A branch that a torque takes through zero is not to be integrated over: it has no share.
-                let share = if minus < plus * WEAKEST_BRANCH {
-                    1.0
-                } else if plus < minus * WEAKEST_BRANCH {
-                    0.0
-                } else {
-                    self.branch_share(from, to, omega)
-                };
-                let log = |share: f64, sign: f64| {
-                    // From the differences, not as z'/z: the small change is what carries the information.
-                    let change = (omega * (to.i - from.i) + sign * ai * (to.j - from.j)) / z(from, sign);
-                    // z never changes its sign along a free motion; if noise made it, there is no logarithm to take.
-                    if share == 0.0 { Some(0.0) } else { (change > -1.0).then(|| share * sign * libm::log1p(change)) }
-                };
-                Some(((log(share, 1.0)? + log(1.0 - share, -1.0)?) / omega, share))
-            }
-            Conic::ParabolicFirst => self.quotient_growth(from.j, to.j, from.i, to.i, ai),
-            Conic::ParabolicSecond => self.quotient_growth(from.i, to.i, from.j, to.j, aj),
+            Conic::Hyperbolic { omega } => self.logarithmic_growth(from, to, omega),
+            Conic::ParabolicFirst => self.quotient_growth(from.j, to.j, from.i, to.i, self.a[0]),
+            Conic::ParabolicSecond => self.quotient_growth(from.i, to.i, from.j, to.j, self.a[1]),
         }
     }
 
-    /// The share of the branch z₊ in φ for which a disturbed measurement moves φ least; the branch z₋ has the rest.
-    ///
-    /// Either branch alone loses all its digits as Ω vanishes, their best mean none.
-    #[inline]
-    fn branch_share(&self, from: &Pair, to: &Pair, omega: f64) -> f64 {
+    /// The same on a hyperbola.
+    #[inline(always)]
+    fn logarithmic_growth(&self, from: Pair, to: Pair, omega: f64) -> Option<(f64, f64)> {
         let [ai, aj, _] = self.a;
-        let (x, y) = (omega * (from.i + to.i), ai * (from.j + to.j));
-        let ratio = ai / aj;
-        (x + y) * (x + ratio * y) / (2.0 * (x * x + ratio * y * y))
+        let z = |p: Pair, sign: f64| omega * p.i + sign * ai * p.j;
+        let [plus, minus] = [1.0, -1.0].map(|sign| z(from, sign).abs().min(z(to, sign).abs()));
+        if plus.max(minus) <= self.floor_rad_s * omega.max(ai.abs()) {
+            return None;
+        }
+        // A branch that a torque takes through zero is not to be integrated over: it has no share.
+        let share = if minus < plus * WEAKEST_BRANCH {
+            1.0
+        } else if plus < minus * WEAKEST_BRANCH {
+            0.0
+        } else {
+            branch_share(from, to, omega, ai, aj)
+        };
+        let log = |share: f64, sign: f64| {
+            // From the differences, not as z'/z: the small change is what carries the information.
+            let change = (omega * (to.i - from.i) + sign * ai * (to.j - from.j)) / z(from, sign);
+            // z never changes its sign along a free motion; if noise made it, there is no logarithm to take.
+            if share == 0.0 { Some(0.0) } else { (change > -1.0).then(|| share * sign * series::ln_1p(change)) }
+        };
+        Some(((log(share, 1.0)? + log(1.0 - share, -1.0)?) * self.constants.inverse_omega, share))
     }
 
     /// Growth of top/(a·bottom), for the parabola.
-    #[inline]
+    #[inline(always)]
     fn quotient_growth(&self, bottom: f64, bottom_to: f64, top: f64, top_to: f64, a: f64) -> Option<(f64, f64)> {
         let seen = bottom.abs().min(bottom_to.abs()) > self.floor_rad_s && bottom * bottom_to > 0.0;
         seen.then(|| ((top_to * bottom - top * bottom_to) / (a * bottom * bottom_to), 1.0))
+    }
+
+    /// The part of Δφ that is not the torque's.
+    #[cold]
+    fn undriven(&self, ends: [Pair; 2], share: f64, torque: [f64; 3], span: Span, growth: f64) -> f64 {
+        let gradients = ends.map(|end| self.gradient(&end, share));
+        let rough = growth - span.length() * self.torque_share(gradients, &torque);
+        growth - self.torque_growth(&ends, share, &torque, span, rough)
     }
 
     /// (∂φ/∂ω_i, ∂φ/∂ω_j) at one instant, s.
@@ -268,8 +294,9 @@ impl HiddenRate {
 
     /// ∫(φ_i u_i + φ_j u_j) dt by Simpson's rule, the middle of the path by its cubic Hermite interpolation.
     #[inline]
-    fn torque_growth(&self, ends: &[Pair; 2], share: f64, torque: &[f64; 3], dt_s: f64, mean_hidden: f64) -> f64 {
-        let hidden = self.hidden_at_ends(ends, torque, dt_s, mean_hidden * dt_s);
+    fn torque_growth(&self, ends: &[Pair; 2], share: f64, torque: &[f64; 3], span: Span, rough: f64) -> f64 {
+        let dt_s = span.length();
+        let hidden = self.hidden_at_ends(ends, torque, dt_s, rough * span.inverse());
         let [from, to] = ends;
         let [v0, v1] = [self.velocity(from, torque, hidden[0]), self.velocity(to, torque, hidden[1])];
         let middle = Pair {
@@ -278,25 +305,25 @@ impl HiddenRate {
         };
         let ends_mean = self.torque_share(ends.map(|end| self.gradient(&end, share)), torque);
         let centre = self.torque_share([self.gradient(&middle, share); 2], torque);
-        dt_s * (ends_mean + 2.0 * centre) / 3.0
+        dt_s * (ends_mean + 2.0 * centre) * (1.0 / 3.0)
     }
 
     /// (ω̇_i, ω̇_j), rad/s², with the hidden component at `hidden`.
-    #[inline]
+    #[inline(always)]
     fn velocity(&self, p: &Pair, torque: &[f64; 3], hidden: f64) -> Pair {
         Pair { i: self.a[0] * p.j * hidden + torque[0], j: self.a[1] * hidden * p.i + torque[1] }
     }
 
-    /// The hidden component at the two ends from its integral over the step, its drift taken as linear.
-    #[inline]
-    fn hidden_at_ends(&self, [from, to]: &[Pair; 2], torque: &[f64; 3], dt_s: f64, integral: f64) -> [f64; 2] {
+    /// The hidden component at the two ends from its mean over the step, its drift taken as linear.
+    #[inline(always)]
+    fn hidden_at_ends(&self, [from, to]: &[Pair; 2], torque: &[f64; 3], dt_s: f64, mean: f64) -> [f64; 2] {
         let g = |p: &Pair| self.a[2] * p.i * p.j + torque[2];
-        let mean = integral / dt_s;
-        [mean - dt_s * (g(from) / 3.0 + g(to) / 6.0), mean + dt_s * (g(from) / 6.0 + g(to) / 3.0)]
+        let (sixth, g) = (dt_s * (1.0 / 6.0), [g(from), g(to)]);
+        [mean - sixth * (2.0 * g[0] + g[1]), mean + sixth * (g[0] + 2.0 * g[1])]
     }
 
     /// ∫g and ∫∫g over the step: g = a_k ω_i ω_j + u_k by its cubic Hermite polynomial through both ends.
-    #[inline]
+    #[inline(always)]
     fn drift(&self, ends: &[Pair; 2], torque: &[f64; 3], h: f64, hidden: [f64; 2]) -> (f64, f64) {
         let value = |p: &Pair| self.a[2] * p.i * p.j + torque[2];
         let slope = |p: &Pair, hidden: f64| {
@@ -305,16 +332,18 @@ impl HiddenRate {
         };
         let (g0, g1) = (value(&ends[0]), value(&ends[1]));
         let (s0, s1) = (slope(&ends[0], hidden[0]), slope(&ends[1], hidden[1]));
-        let drift = h / 2.0 * (g0 + g1) + h * h / 12.0 * (s0 - s1);
-        let moment = h * h * (7.0 * g0 + 3.0 * g1) / 20.0 + h * h * h * (s0 / 20.0 - s1 / 30.0);
+        let square = h * h;
+        let drift = 0.5 * h * (g0 + g1) + square * (1.0 / 12.0) * (s0 - s1);
+        let moment = square * (1.0 / 20.0) * (7.0 * g0 + 3.0 * g1) + square * h * (1.0 / 60.0) * (3.0 * s0 - 2.0 * s1);
         (drift, moment)
     }
 
-    #[inline]
-    fn increment(&self, ends: &[Pair; 2], torque: &[f64; 3], dt_s: f64, potential: f64) -> Increment<1> {
-        let hidden = self.hidden_at_ends(ends, torque, dt_s, potential);
+    #[inline(always)]
+    fn increment(&self, ends: &[Pair; 2], torque: &[f64; 3], span: Span, potential: f64) -> Increment<1> {
+        let dt_s = span.length();
+        let hidden = self.hidden_at_ends(ends, torque, dt_s, potential * span.inverse());
         let (drift, moment) = self.drift(ends, torque, dt_s, hidden);
-        Increment::exact(Vector1::new(potential), dt_s, Vector1::new(drift), Vector1::new(moment))
+        Increment::exact(Vector1::new(potential), span, Vector1::new(drift), Vector1::new(moment))
     }
 
     /// The same increment with the covariance of its potential φ and its drift, from that of the measured pair.
@@ -333,6 +362,16 @@ impl HiddenRate {
             ..exact
         }
     }
+}
+
+/// The share of the branch z₊ in φ for which a disturbed measurement moves φ least; the branch z₋ has the rest.
+///
+/// Either branch alone loses all its digits as Ω vanishes, their best mean none.
+#[inline(always)]
+fn branch_share(from: Pair, to: Pair, omega: f64, ai: f64, aj: f64) -> f64 {
+    let (x, y) = (omega * (from.i + to.i), ai * (from.j + to.j));
+    let ratio = ai / aj;
+    (x + y) * (x + ratio * y) / (2.0 * (x * x + ratio * y * y))
 }
 
 #[cfg(test)]

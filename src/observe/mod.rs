@@ -11,9 +11,10 @@ mod inertia;
 mod orbit_velocity;
 mod order;
 mod second_order;
+mod series;
 
 pub use axisymmetric::{Axisymmetric, AxisymmetricError};
-pub use filter::{Increment, InvariantFilter};
+pub use filter::{Increment, InvariantFilter, Span};
 pub use guarded::{GuardedKalman, RateNoise};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Observation, RateSample};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};

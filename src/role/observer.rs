@@ -78,6 +78,8 @@ impl<E: Estimator> Observer<E> {
     fn learn(&mut self, measurement: &E::Measurement) {
         let tick = measurement.stamp().tick;
         match self.last {
+            // Nearly every time; the product is the same.
+            Some(last) if last + 1 == tick => self.estimator.update(measurement, self.tick_s),
             Some(last) if last < tick => self.estimator.update(measurement, (tick - last) as f64 * self.tick_s),
             // The same tick again teaches nothing; an older one cannot come on an ordered link.
             Some(_) => return,

@@ -12,8 +12,8 @@ pub struct RateLaw {
     pub(super) adaptation: InertiaAdaptation,
     /// None where the observer is not the papers' filter: V is published as 0 then.
     pub(super) certificate: Option<Certificate>,
-    /// The component that the observer supplies, 0 to 2.
-    pub(super) supplied: usize,
+    /// 1 for the component that the observer supplies, 0 for the others.
+    pub(super) supplied: Vector3<f64>,
     /// Whether the law works with the coefficients that the observer has learned.
     pub(super) learned: bool,
     /// No component is asked to be larger: the actuators would refuse it.
@@ -26,8 +26,17 @@ impl RateLaw {
     #[inline]
     fn limited(&self, asked: Vector3<f64>) -> Vector3<f64> {
         let largest = asked.amax();
-        if largest > self.acceleration_max_rad_s2 { asked * (self.acceleration_max_rad_s2 / largest) } else { asked }
+        if largest > self.acceleration_max_rad_s2 {
+            return shortened(asked, self.acceleration_max_rad_s2 / largest);
+        }
+        asked
     }
+}
+
+/// Seldom, and apart, so that the division is not made where nobody needs it.
+#[cold]
+fn shortened(asked: Vector3<f64>, factor: f64) -> Vector3<f64> {
+    asked * factor
 }
 
 impl Law for RateLaw {
@@ -35,17 +44,17 @@ impl Law for RateLaw {
     type Measurement = RateMeasurement;
     type Command = RateCommand;
 
+    #[inline]
     fn command(&mut self, estimate: &RateEstimate, measurement: &RateMeasurement, out: &mut RateCommand) {
         let (reference, follower) = (Vector3::from(estimate.omega_rad_s), Vector3::from(measurement.omega_rad_s));
         if self.learned {
             self.law.learn(estimate.coefficients.into());
         }
-        let (w, p) = self.law.ahead(&reference, &follower, &measurement.applied_rad_s2.into());
+        let (w, p) = self.law.ahead(reference, follower, measurement.applied_rad_s2.into());
         let correction = self.adaptation.correction(&w, &p, self.tick_s);
         out.acceleration_rad_s2 = self.limited(self.law.command(&w, &p) + correction).into();
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
-        let mut error = follower - reference;
-        error[self.supplied] -= estimate.innovation_rad_s;
+        let error = follower - reference - self.supplied * estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =
             self.certificate.map_or((0.0, 0.0), |certificate| certificate.lyapunov(&error, estimate.innovation_rad_s));
     }

@@ -224,7 +224,7 @@ impl Rig for RigidBodyRig {
             law: Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s),
             adaptation: InertiaAdaptation::new(controller.adaptation_gain),
             certificate: self.certificate(),
-            supplied: self.supplied(),
+            supplied: Vector3::ith(self.supplied(), 1.0),
             learned: controller.learned,
             acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
             tick_s: self.tick_s,

@@ -3,7 +3,7 @@
 use super::learner::Learner;
 use crate::model::RigidBody;
 use crate::observe::{
-    Filter, GuardedKalman, HiddenRate, InertiaRatios, InvariantFilter, Observation, RateNoise, RateSample,
+    Filter, GuardedKalman, HiddenRate, InertiaRatios, InvariantFilter, Observation, RateNoise, RateSample, Span,
 };
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
@@ -28,8 +28,10 @@ impl Estimator for RateObserver {
     type Measurement = RateMeasurement;
     type Estimate = RateEstimate;
 
+    #[inline]
     fn usable(&self, measurement: &RateMeasurement) -> bool {
-        let finite = |values: &[f64; 3]| values.iter().all(|value| value.is_finite());
+        // 0·x is 0 unless x is not finite; without a branch for every value.
+        let finite = |values: &[f64; 3]| values.iter().map(|value| value * 0.0).sum::<f64>() == 0.0;
         let needed = match self {
             Self::Hidden(observer) => measurement.valid & observer.needed() == observer.needed(),
             Self::Kalman(observer) => measurement.valid & observer.needed() == observer.needed(),
@@ -46,6 +48,7 @@ impl Estimator for RateObserver {
         }
     }
 
+    #[inline]
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         match self {
             Self::Hidden(observer) => observer.update(measurement, dt_s),
@@ -63,6 +66,7 @@ impl Estimator for RateObserver {
         }
     }
 
+    #[inline]
     fn write(&self, status: u64, out: &mut RateEstimate) {
         match self {
             Self::Hidden(observer) => observer.write(status, out),
@@ -73,6 +77,7 @@ impl Estimator for RateObserver {
 }
 
 /// What a measurement tells the relations. Components that are not valid are 0.
+#[inline]
 pub(super) fn seen(measurement: &RateMeasurement) -> RateSample {
     RateSample { rate_rad_s: measurement.omega_rad_s.into(), torque_rad_s2: measurement.applied_rad_s2.into() }
 }
@@ -86,6 +91,8 @@ pub struct HiddenObserver {
     filter: Filter<1>,
     hidden: usize,
     last: RateSample,
+    /// The step of the last update, s: most are equal.
+    span: Span,
     /// Where the model has taken the body since, while no measurement was usable.
     coasted: Option<Vector3<f64>>,
     innovation: f64,
@@ -103,6 +110,7 @@ impl HiddenObserver {
             filter: guess,
             hidden,
             last,
+            span: 1.0.into(),
             coasted: None,
             innovation: 0.0,
             status: status::INITIAL,
@@ -122,13 +130,16 @@ impl HiddenObserver {
         (self.filter, self.last, self.coasted, self.innovation, self.status) = (filter, at, None, 0.0, status);
     }
 
+    #[inline]
     pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let to = seen(measurement);
-        match self.relation.observe(&self.last, &to, dt_s, self.filter.estimate().x) {
+        if self.span.length() != dt_s {
+            self.span = dt_s.into();
+        }
+        match self.relation.observe(&self.last, &to, self.span, self.filter.estimate().x) {
             Observation::Seen(increment) => {
                 self.filter.step(&increment);
-                let start = (increment.potential - increment.drift_moment) / increment.weight;
-                self.innovation = (start + increment.drift - self.filter.estimate()).x;
+                self.innovation = (increment.reconstruction() - self.filter.estimate()).x;
                 self.status = 0;
             }
             Observation::Unobservable { drift } => {
@@ -155,14 +166,20 @@ impl HiddenObserver {
     }
 
     /// The angular velocity with the supplied component in its place, rad/s.
+    #[inline]
     pub(super) fn rate(&self) -> Vector3<f64> {
         self.coasted.unwrap_or_else(|| {
-            let mut rate = self.last.rate_rad_s;
-            rate[self.hidden] = self.filter.estimate().x;
-            rate
+            let (measured, hidden) = (&self.last.rate_rad_s, self.filter.estimate().x);
+            // Chosen bit by bit, not written at an index: three values that stay in registers.
+            let chosen = |axis: usize| if axis == self.hidden { u64::MAX } else { 0 };
+            let component = |axis: usize| {
+                f64::from_bits(hidden.to_bits() & chosen(axis) | measured[axis].to_bits() & !chosen(axis))
+            };
+            Vector3::new(component(0), component(1), component(2))
         })
     }
 
+    #[inline]
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
         self.body.write(&self.rate(), out);
         out.innovation_rad_s = self.innovation;
@@ -194,6 +211,7 @@ impl Knowledge {
     }
 
     /// Writes it beside a motion.
+    #[inline]
     pub fn write(&self, rate: &Vector3<f64>, out: &mut RateEstimate) {
         out.omega_rad_s = (*rate).into();
         out.coefficients = self.coefficients.into();
@@ -252,6 +270,7 @@ impl KalmanObserver {
                 .ok();
     }
 
+    #[inline]
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let to = seen(measurement);
         if let Some(filter) = &mut self.filter {
@@ -270,6 +289,7 @@ impl KalmanObserver {
         self.coasted.unwrap_or_else(filtered)
     }
 
+    #[inline]
     fn write(&self, status: u64, out: &mut RateEstimate) {
         self.body.write(&self.rate(), out);
         out.innovation_rad_s = 0.0;

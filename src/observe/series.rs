@@ -1,0 +1,95 @@
+//! Short series in the place of transcendental functions, where a tick is short enough for them.
+//!
+//! Each is proven to be within 2 units in the last place over the range that it is used in; beyond that range the exact
+//! function answers. Must not be used where the argument is large as a rule: then it only costs a comparison.
+
+/// Up to this magnitude of y/x, and of the argument of the logarithm, a series will do.
+const SHORT: f64 = 1.0 / 128.0;
+
+/// atan2(y, x), rad.
+///
+/// For |y| ≤ x/128 by arctan t = t − t³/3 + t⁵/5 − t⁷/7: what is left out is below t⁹/9, relative to t less than 2⁻⁵⁹; the
+/// rounding of the quotient and of one sum remain.
+#[inline(always)]
+pub fn atan2(y: f64, x: f64) -> f64 {
+    if y.abs() <= x * SHORT {
+        let t = y / x;
+        let s = t * t;
+        // In this order no product waits for the one before.
+        t + t * s * ((s * (1.0 / 5.0) - 1.0 / 3.0) - s * s * (1.0 / 7.0))
+    } else {
+        far_atan2(y, x)
+    }
+}
+
+/// ln(1 + x), for x > −1.
+///
+/// For |x| ≤ 1/128 by 2 artanh s = 2 (s + s³/3 + s⁵/5 + s⁷/7) with s = x/(2 + x), |s| < 1/254: what is left out is below
+/// 2s⁹/9 and more than twice less than that, relative to x less than 2⁻⁶⁶; the rounding of the quotient and of one sum
+/// remain.
+#[inline(always)]
+pub fn ln_1p(x: f64) -> f64 {
+    if x.abs() <= SHORT {
+        // x − x s = 2 s: the leading term is x itself, and so exact.
+        let s = x / (2.0 + x);
+        let z = s * s;
+        let tail = z * ((z * (1.0 / 5.0) + 1.0 / 3.0) + z * z * (1.0 / 7.0));
+        x - s * (x - 2.0 * tail)
+    } else {
+        far_ln_1p(x)
+    }
+}
+
+#[cold]
+fn far_atan2(y: f64, x: f64) -> f64 {
+    libm::atan2(y, x)
+}
+
+#[cold]
+fn far_ln_1p(x: f64) -> f64 {
+    libm::log1p(x)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The distance of two numbers of like magnitude, in units of the last place of `exact`.
+    fn ulps(value: f64, exact: f64) -> f64 {
+        let unit = f64::from_bits(exact.abs().to_bits() + 1) - exact.abs();
+        ((value - exact) / unit).abs()
+    }
+
+    /// Arguments over the range of the series: dense, logarithmic, of either sign, and its ends.
+    fn arguments() -> impl Iterator<Item = f64> {
+        let dense = (1..=200_000).map(|n| SHORT * f64::from(n) / 200_000.0);
+        let small = (0..50_000).map(|n| SHORT * libm::exp2(-f64::from(n) / 1000.0));
+        dense.chain(small).flat_map(|x| [x, -x])
+    }
+
+    /// The system's functions err by less than one unit themselves, so 2 is left for 1 of the series'.
+    #[test]
+    fn the_series_are_within_two_units_in_the_last_place() {
+        let mut worst = [0.0_f64; 2];
+        for (index, x) in arguments().enumerate() {
+            let scale = 1.0 + 1e-3 * (index % 977) as f64;
+            let quotient = (x * scale) / scale;
+            worst[0] = worst[0].max(ulps(atan2(x * scale, scale), libm::atan(quotient)));
+            worst[1] = worst[1].max(ulps(ln_1p(x), libm::log1p(x)));
+        }
+        println!("worst difference: atan2 {:.2}, ln_1p {:.2} units in the last place", worst[0], worst[1]);
+        assert!(worst.iter().all(|worst| *worst <= 2.0), "{worst:?}");
+    }
+
+    #[test]
+    fn beyond_the_range_the_exact_functions_answer() {
+        for (y, x) in [(1.0, 1.0), (0.1, -1.0), (-0.0, -1.0), (1.0, 0.0), (SHORT * 1.01, 1.0), (f64::NAN, 1.0)] {
+            assert_eq!(atan2(y, x).to_bits(), libm::atan2(y, x).to_bits(), "{y} {x}");
+        }
+        for x in [-0.9, 0.04, 7.0, f64::INFINITY] {
+            assert_eq!(ln_1p(x), libm::log1p(x));
+        }
+        assert_eq!((atan2(0.0, 1.0), ln_1p(0.0)), (0.0, 0.0));
+        assert!(ln_1p(f64::NAN).is_nan());
+    }
+}
