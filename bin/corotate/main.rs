@@ -6,6 +6,7 @@ mod diff;
 mod export;
 mod init;
 mod record;
+mod replay;
 mod role;
 mod run;
 mod seat;
@@ -58,6 +59,8 @@ enum Command {
     Bridge(bridge::Arguments),
     /// Record every sample of a running loop to a file
     Record(record::Arguments),
+    /// Feed a recording to the live roles and compare what they say, bit for bit
+    Replay(replay::Arguments),
     /// Compare two recordings
     Diff(diff::Arguments),
     /// Write a recording as tables
@@ -128,6 +131,7 @@ fn main() -> ExitCode {
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
         Some(Command::Record(arguments)) => record::record(&arguments),
+        Some(Command::Replay(arguments)) => replay::replay(&arguments),
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Janitor) => {

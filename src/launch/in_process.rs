@@ -39,7 +39,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     };
     let mut recorder = launch.record.as_deref().map(|file| Recorder::open(scenario, &bus, file)).transpose()?;
     if let Some(recorder) = &mut recorder {
-        recorder.start(0)?;
+        recorder.start(0, true)?;
     }
     let (mut failure, mut unrecorded) = (None, None);
     let ended = in_turn(&mut nodes, scenario.last_tick, revive, |tick| {

@@ -7,6 +7,7 @@
 //! | `recorder` | takes every sample of a run off a bus, and keeps count |
 //! | `process` | the recorder as a process beside a loop |
 //! | `reader` | a recording as data: metadata, signals, samples, columns |
+//! | `script` | what a role did, so that it can do it again |
 //! | `replay` | recorded inputs through the live roles, outputs compared bit for bit |
 //! | `diff` | two recordings beside each other |
 //! | `export` | columns for everyone else |
@@ -20,6 +21,7 @@ mod process;
 mod reader;
 mod recorder;
 mod replay;
+mod script;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
@@ -29,6 +31,8 @@ pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::RECORDER;
 pub use recorder::{Recorder, RecordingReport, SignalReport};
+pub use replay::{Difference, Inlets, Outlets, RoleReplay, replay_in_process};
+pub use script::{InputScript, Item, Limit, Script, Step};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

@@ -78,14 +78,19 @@ fn follow(
     lockstep: bool,
     terminated: &AtomicBool,
 ) -> Result<(), RecordError> {
-    let mut backoff = Backoff::default();
+    let (mut backoff, mut whole) = (Backoff::default(), false);
     loop {
-        recorder.warm_up()?;
         line.say(RoleState::Ready, 0)?;
         let schedule = line.hear()?;
-        match Phase::from_number(schedule.phase) {
+        let phase = Phase::from_number(schedule.phase);
+        // Whoever comes later may find samples already, and forgets none of them.
+        if phase == Phase::WarmUp {
+            whole = true;
+            recorder.warm_up()?;
+        }
+        match phase {
             Phase::Run => {
-                recorder.start(schedule.epoch_ns)?;
+                recorder.start(schedule.epoch_ns, whole)?;
                 break;
             }
             Phase::Stop => return Ok(()),

@@ -51,6 +51,8 @@ pub struct RunInfo {
     pub last_tick: u64,
     /// T_0 on the run's monotonic clock, ns; 0 where there was no time.
     pub epoch_ns: u64,
+    /// Whether it was begun before the first tick.
+    pub whole: bool,
     /// When the recording was begun.
     pub started_utc: String,
     /// The machine, as JSON.
@@ -149,8 +151,20 @@ impl Recording {
     /// # Errors
     /// [`RecordError::Scenario`].
     pub fn scenario(&self) -> Result<Scenario, RecordError> {
+        self.parse(&[])
+    }
+
+    /// The same under the clock by which every recording is replayed, lockstep.
+    ///
+    /// # Errors
+    /// [`RecordError::Scenario`].
+    pub fn scenario_for_replay(&self) -> Result<Scenario, RecordError> {
+        self.parse(&["clock=lockstep".to_owned()])
+    }
+
+    fn parse(&self, overrides: &[String]) -> Result<Scenario, RecordError> {
         let origin = format!("{}:scenario", self.path.display());
-        Scenario::parse(&self.info.scenario, &origin, &[])
+        Scenario::parse(&self.info.scenario, &origin, overrides)
             .map_err(|error| RecordError::Scenario { path: self.path.clone(), source: Box::new(error) })
     }
 
@@ -226,6 +240,12 @@ impl Track {
         self.stamp(index).generation & VOID != 0
     }
 
+    /// One element of a field of unsigned numbers in a sample; none if there is no such field.
+    pub(super) fn unsigned(&self, index: usize, name: &str) -> Option<u64> {
+        let column = self.info.layout.columns.iter().find(|column| column.name == name)?;
+        (column.kind == FieldKind::U64).then(|| u64::from_le_bytes(self.word(index, column.offset)))
+    }
+
     /// One element of a field as it is in a sample: 8 bytes.
     fn word(&self, index: usize, offset: usize) -> [u8; 8] {
         let mut word = [0; 8];
@@ -248,7 +268,7 @@ impl Track {
         let column = &self.info.layout.columns[column];
         let word = self.word(index, column.offset + 8 * element);
         match column.kind {
-            FieldKind::F64 => f64::from_le_bytes(word).to_string(),
+            FieldKind::F64 => format!("{:?}", f64::from_le_bytes(word)),
             FieldKind::U64 => u64::from_le_bytes(word).to_string(),
         }
     }
@@ -297,6 +317,7 @@ impl RunInfo {
             period_ns: number("period_ns")?,
             last_tick: number("last_tick")?,
             epoch_ns: number("epoch_ns")?,
+            whole: text("whole")? == "true",
             started_utc: text("started_utc")?,
             host: text("host")?,
             end: end.map(EndInfo::read),

@@ -256,13 +256,14 @@ impl Recorder {
         Ok(())
     }
 
-    /// Begins the file, once the epoch of the ticks is known: 0 where there is no time.
+    /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. `whole` tells that no tick has run.
     ///
     /// # Errors
     /// [`RecordError::Write`].
-    pub fn start(&mut self, epoch_ns: u64) -> Result<(), RecordError> {
+    pub fn start(&mut self, epoch_ns: u64, whole: bool) -> Result<(), RecordError> {
         self.grid.epoch_ns = epoch_ns;
         self.begun = true;
+        self.run.insert("whole".to_owned(), whole.to_string());
         self.run.insert("epoch_ns".to_owned(), epoch_ns.to_string());
         let run = self.run.clone();
         self.taps.iter_mut().try_for_each(|tap| tap.announce(&mut self.writer))?;
@@ -319,7 +320,7 @@ impl Recorder {
         roles: &[RoleReport],
     ) -> Result<(), RecordError> {
         if !self.begun {
-            self.start(0)?;
+            self.start(0, false)?;
         }
         let text = |value: serde_json::Result<String>| value.unwrap_or_default();
         let grants: BTreeMap<&str, _> = roles.iter().map(|report| (report.role.as_str(), &report.grants)).collect();

@@ -21,7 +21,7 @@ pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
     Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic,
-    visit_writes,
+    visit_reads, visit_writes,
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::hold_low_latency_idle;
