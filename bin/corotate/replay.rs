@@ -3,9 +3,11 @@
 use crate::record::exit_of;
 use crate::{Exit, fail, say};
 use corotate::config::Scenario;
+use corotate::launch::{LaunchError, replay_as_process};
 use corotate::record::{RecordError, Recording, RoleReplay, replay_in_process};
 use corotate::runtime::RoleId;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 
 /// Options of `corotate replay`.
 #[derive(clap::Args)]
@@ -16,6 +18,9 @@ pub struct Arguments {
     /// observer, controller, a body's name, or all
     #[arg(long, value_name = "ROLE", default_value = "all")]
     role: String,
+    /// Replay each role as a process of its own, as it takes part in runs, instead of in one thread
+    #[arg(long)]
+    processes: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -24,7 +29,7 @@ compared with what was recorded. Exit code 3 if anything differs. What cannot be
 
 Examples:
   corotate replay runs/20261121T150000Z-rigid-pair/run.mcap
-  corotate replay run.mcap --role observer";
+  corotate replay run.mcap --role observer --processes";
 
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Exit {
@@ -37,11 +42,12 @@ pub fn replay(arguments: &Arguments) -> Exit {
                 Ok(()) => Exit::Ok,
             }
         }
-        Err(error) => fail(exit_of(&error), &error),
+        Err(LaunchError::Record(error)) => fail(exit_of(&error), &error),
+        Err(error) => fail(crate::run::exit_of(&error), &error),
     }
 }
 
-fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, RecordError> {
+fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, LaunchError> {
     let recording = Recording::open(&arguments.file)?;
     if let Some(damage) = recording.damage() {
         eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
@@ -49,7 +55,23 @@ fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, RecordError> {
     let scenario = recording.scenario_for_replay()?;
     recording.check_layouts(&scenario)?;
     let roles = roles(&arguments.role, &scenario)?;
-    roles.into_iter().map(|role| replay_in_process(&recording, &scenario, role)).collect()
+    if !arguments.processes {
+        return Ok(roles
+            .into_iter()
+            .map(|role| replay_in_process(&recording, &scenario, role))
+            .collect::<Result<_, _>>()?);
+    }
+    let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
+    let program = std::env::current_exe().map_err(spawn)?;
+    let signal = crate::run::catch_signals().map_err(spawn)?;
+    let mut replays = Vec::new();
+    for role in roles {
+        replays.push(replay_as_process(&recording, &scenario, role, &program, &signal)?);
+        if signal.load(Ordering::Relaxed) != 0 {
+            return Err(RecordError::Missing { reason: "ended by a signal before all was replayed".to_owned() }.into());
+        }
+    }
+    Ok(replays)
 }
 
 fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {

@@ -188,7 +188,8 @@ fn verdict(summary: &Summary) -> Exit {
     if summary.accepted { Exit::Ok } else { Exit::NotAccepted }
 }
 
-fn exit_of(error: &LaunchError) -> Exit {
+/// The exit code of a run, or a replay, that failed.
+pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
@@ -202,7 +203,8 @@ fn exit_of(error: &LaunchError) -> Exit {
     }
 }
 
-fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
+/// The signal that asked this process to end; 0 while none has.
+pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
         signal_hook::flag::register_usize(number, signal.clone(), number as usize)?;

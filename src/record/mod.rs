@@ -31,7 +31,7 @@ pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::RECORDER;
 pub use recorder::{Recorder, RecordingReport, SignalReport};
-pub use replay::{Difference, Inlets, Outlets, RoleReplay, replay_in_process};
+pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_process};
 pub use script::{InputScript, Item, Limit, Script, Step};
 
 use crate::bus::BusError;

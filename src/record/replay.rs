@@ -142,8 +142,12 @@ pub struct Comparer<'a> {
     tracks: &'a [Track],
     /// Per output, the next recorded sample to compare with.
     next: Vec<usize>,
+    /// Per output, the tick after the last that has come.
+    come: Vec<u64>,
     realtime: bool,
     limit: Option<u64>,
+    /// The role may go on beyond its script; that is not looked at.
+    end: u64,
     samples: u64,
     difference: Option<Difference>,
 }
@@ -154,6 +158,8 @@ impl<'a> Comparer<'a> {
         Self {
             tracks: &script.outputs,
             next: vec![0; script.outputs.len()],
+            come: vec![0; script.outputs.len()],
+            end: script.steps.last().map_or(0, |step| step.tick + 1),
             realtime: script.realtime,
             limit: script.limit.as_ref().map(|limit| limit.tick),
             samples: 0,
@@ -182,11 +188,19 @@ impl<'a> Comparer<'a> {
     }
 
     fn beyond(&self, tick: u64) -> bool {
-        self.limit.is_some_and(|limit| tick >= limit)
+        tick >= self.end || self.limit.is_some_and(|limit| tick >= limit)
+    }
+
+    /// The tick before which everything has come.
+    pub fn next_tick(&self) -> u64 {
+        self.come.iter().copied().min().unwrap_or(0)
     }
 
     fn compare(&mut self, output: usize, bytes: &[u8]) {
         let stamp: Stamp = bytemuck::pod_read_unaligned(&bytes[..size_of::<Stamp>()]);
+        if stamp.generation != 0 {
+            self.come[output] = self.come[output].max(stamp.tick.saturating_add(1).min(self.end));
+        }
         if !self.counts(&stamp) {
             return;
         }
@@ -308,20 +322,11 @@ impl Stage<'_> {
         if plant {
             node.skip_to(step.tick);
         }
-        let spans: Vec<[usize; 2]> = self.script.inputs.iter().map(|input| input.spans[number]).collect();
-        let rounds = spans.iter().map(|[begin, end]| end - begin).max().unwrap_or(0);
         let mut executed = false;
-        for round in 0..rounds.max(1) {
-            for (input, [begin, end]) in spans.iter().enumerate() {
-                // All inputs reach the step together, however many ticks come before.
-                let Some(item) = (begin + round + (end - begin)).checked_sub(rounds).filter(|item| item >= begin)
-                else {
-                    continue;
-                };
-                if item < *end {
-                    self.script.inputs[input].write(item, &mut self.bytes);
-                    self.inlets.send(input, &self.bytes)?;
-                }
+        for (_, round) in self.script.rounds(number) {
+            for (input, item) in round {
+                self.script.inputs[input].write(item, &mut self.bytes);
+                self.inlets.send(input, &self.bytes)?;
             }
             if !executed && node.poll(Gate::Inputs { up_to: step.tick })? == Poll::Executed {
                 executed = true;

@@ -138,6 +138,26 @@ impl Script {
     }
 }
 
+impl Script {
+    /// What is fed for a step, one tick after the other: the tick, and which item of which input. All inputs reach the step's
+    /// own tick together, however many come before. A body without inputs has one round with nothing in it.
+    pub fn rounds(&self, number: usize) -> impl Iterator<Item = (u64, Vec<(usize, usize)>)> + '_ {
+        let (step, realtime) = (self.steps[number], self.realtime);
+        let rounds = self.inputs.iter().map(|input| input.spans[number]).map(|[begin, end]| end - begin).max();
+        let rounds = rounds.unwrap_or(0).max(1);
+        (0..rounds).map(move |round| {
+            let item = |(input, script): (usize, &InputScript)| {
+                let [begin, end] = script.spans[number];
+                let item = (end + round).checked_sub(rounds).filter(|item| *item >= begin)?;
+                Some((input, item))
+            };
+            // What lockstep has beside one sample per tick belongs to the step.
+            let before = if realtime { (rounds - 1 - round) as u64 } else { 0 };
+            (step.tick.saturating_sub(before), self.inputs.iter().enumerate().filter_map(item).collect())
+        })
+    }
+}
+
 /// One input that is read.
 struct Source {
     track: Track,
