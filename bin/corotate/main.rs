@@ -14,6 +14,7 @@ mod seat;
 use clap::{Parser, Subcommand};
 use std::io::{self, Write};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 /// Bodies move together although not everything about them can be measured.
 ///
@@ -120,6 +121,8 @@ fn say(text: &str) -> Result<(), Exit> {
 }
 
 fn main() -> ExitCode {
+    // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
+    let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
     let exit = match Arguments::parse().command {
         None => run::run(&run::Arguments::default()),
         Some(Command::Run(arguments)) => run::run(&arguments),

@@ -60,7 +60,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let Dismissal { reports, unbooked, problems } = crew.dismiss();
     let score = scorer.finish()?;
     let (incidents, recorder) = crew.incidents(&score.recoveries_s);
-    let recording = recorder.finish(domain);
+    let recording = recorder.finish(domain, &reports);
     let domain = Some(domain.root().to_owned());
     Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal })
 }

@@ -13,6 +13,7 @@ use crate::config::Scenario;
 use crate::record::{RECORDER, RecordingReport};
 use crate::runtime::{report_path, topic};
 use crate::sample::{Health, RoleState};
+use crate::telemetry::RoleReport;
 use std::path::Path;
 use std::process::Command;
 
@@ -114,17 +115,19 @@ impl RecorderWatch {
         self.process.as_mut().is_some_and(|process| process.ended().is_none())
     }
 
-    /// Tells what is in the file. A recorder that has not ended by now is ended.
-    pub fn finish(mut self, domain: &Domain) -> Option<RecordingReport> {
+    /// Tells what is in the file, beside the roles' final books. A recorder that has not ended by now is ended.
+    pub fn finish(mut self, domain: &Domain, roles: &[RoleReport]) -> Option<RecordingReport> {
         let file = self.file.take()?;
         self.process = None;
         let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
         let report = left.and_then(|bytes| serde_json::from_slice(&bytes).ok());
-        Some(report.unwrap_or_else(|| {
+        let mut report: RecordingReport = report.unwrap_or_else(|| {
             let problem = self.problem.unwrap_or_else(|| "it left no report".to_owned());
             let (messages, bytes, signals) = (0, 0, Vec::new());
             RecordingReport { file, complete: false, problem: Some(problem), messages, bytes, signals }
-        }))
+        });
+        report.reconcile(roles);
+        Some(report)
     }
 
     fn state(&self) -> RoleState {

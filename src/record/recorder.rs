@@ -10,7 +10,7 @@ use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{RoleId, Visit, ports, visit_writes};
 use crate::sample::{Sample, Stamp, VOID};
-use crate::telemetry::{Host, LinkWritten, RoleReport};
+use crate::telemetry::{Host, RoleReport};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -58,6 +58,8 @@ pub struct SignalReport {
     pub published: Option<u64>,
     /// Published and not recorded; none if that is not known.
     pub lost: Option<u64>,
+    /// The last tick of which there is something.
+    pub last_tick: Option<u64>,
     /// Ticks, first and last, of which there is nothing: never published, or lost.
     pub gaps: Vec<[u64; 2]>,
     /// Gaps beyond those told.
@@ -98,19 +100,46 @@ impl Book {
         }
     }
 
-    fn report(mut self, service: &str, written: Option<&LinkWritten>) -> SignalReport {
-        self.gap_to(written.and_then(|link| link.last_tick).map_or(self.next, |tick| tick + 1));
-        let published = written.map(|link| link.published);
+    fn report(self, service: &str) -> SignalReport {
         SignalReport {
             service: service.to_owned(),
             recorded: self.recorded,
             void: self.void,
             extra: self.extra,
-            published,
-            lost: published.map(|published| published.saturating_sub(self.recorded)),
+            published: None,
+            lost: None,
+            last_tick: self.next.checked_sub(1),
             gaps: self.gaps,
             more_gaps: self.more_gaps,
         }
+    }
+}
+
+impl SignalReport {
+    /// Holds what was recorded against the books of the roles. Again, if the loop went on after the recording.
+    fn reconcile(&mut self, roles: &[RoleReport]) {
+        let Some(link) = roles.iter().flat_map(|role| &role.written).find(|link| link.service == self.service) else {
+            return;
+        };
+        self.published = Some(link.published);
+        self.lost = Some(link.published.saturating_sub(self.recorded));
+        let from = self.last_tick.map_or(0, |tick| tick + 1);
+        if let Some(to) = link.last_tick.filter(|to| *to >= from) {
+            self.gaps.retain(|gap| gap[0] != from);
+            self.gaps.push([from, to]);
+        }
+    }
+}
+
+impl RecordingReport {
+    /// Holds the recording against the roles' final books.
+    pub fn reconcile(&mut self, roles: &[RoleReport]) {
+        self.signals.iter_mut().for_each(|signal| signal.reconcile(roles));
+        let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
+        if let (None, 1..) = (&self.problem, lost) {
+            self.problem = Some(format!("{lost} samples were published and are not in the recording"));
+        }
+        self.complete = self.problem.is_none();
     }
 }
 
@@ -157,9 +186,9 @@ impl<B: Bus, S: Sample> Tap for SignalTap<B, S> {
                 (false, true) => self.book.next,
                 (false, false) => desk.last_tick,
             };
-            self.book.enter(&stamp, due);
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
             desk.writer.message(self.channel, stamp.tick as u32, due_ns, now_ns, bytemuck::bytes_of(sample))?;
+            self.book.enter(&stamp, due);
             taken += 1;
         }
         Ok(taken)
@@ -218,8 +247,6 @@ pub struct Recorder {
     last_tick: u64,
     realtime: bool,
     begun: bool,
-    messages: u64,
-    bytes: u64,
 }
 
 impl Recorder {
@@ -242,8 +269,6 @@ impl Recorder {
             last_tick: scenario.last_tick,
             realtime: scenario.clock == ClockKind::Realtime,
             begun: false,
-            messages: 0,
-            bytes: 0,
         })
     }
 
@@ -281,7 +306,6 @@ impl Recorder {
         for tap in taps {
             taken += tap.drain(&mut desk)?;
         }
-        self.messages += taken;
         if taken == 0 {
             self.writer.turn(monotonic_ns())?;
         }
@@ -295,47 +319,50 @@ impl Recorder {
 
     /// Ends the file, with the books of the recording beside those of the roles. `problem` is what ended it before its time.
     pub fn finish(mut self, roles: &[RoleReport], problem: Option<&RecordError>) -> RecordingReport {
-        let written =
-            |service: &str| roles.iter().flat_map(|report| &report.written).find(|link| link.service == service);
-        let mut signals = Vec::new();
-        for mut tap in std::mem::take(&mut self.taps) {
+        let signals = std::mem::take(&mut self.taps).into_iter().map(|mut tap| {
             let service = tap.service();
-            signals.push(std::mem::take(tap.book()).report(&service, written(&service)));
+            std::mem::take(tap.book()).report(&service)
+        });
+        let mut report = RecordingReport {
+            file: std::mem::take(&mut self.file),
+            complete: true,
+            problem: problem.map(ToString::to_string),
+            messages: 0,
+            bytes: 0,
+            signals: signals.collect(),
+        };
+        report.messages = report.signals.iter().map(|signal| signal.recorded + signal.void + signal.extra).sum();
+        report.reconcile(roles);
+        match self.end(&report, roles) {
+            Ok(bytes) => report.bytes = bytes,
+            Err(error) => {
+                report.problem.get_or_insert_with(|| error.to_string());
+                report.complete = false;
+            }
         }
-        let lost: u64 = signals.iter().filter_map(|signal| signal.lost).sum();
-        let mut problem = problem.map(ToString::to_string);
-        if let (None, 1..) = (&problem, lost) {
-            problem = Some(format!("{lost} samples were published and are not in the recording"));
-        }
-        let ended = self.end(&signals, problem.as_deref(), roles);
-        let problem = problem.or(ended.err().map(|error| error.to_string()));
-        let complete = problem.is_none();
-        RecordingReport { file: self.file, complete, problem, messages: self.messages, bytes: self.bytes, signals }
+        report
     }
 
-    fn end(
-        &mut self,
-        signals: &[SignalReport],
-        problem: Option<&str>,
-        roles: &[RoleReport],
-    ) -> Result<(), RecordError> {
+    fn end(&mut self, report: &RecordingReport, roles: &[RoleReport]) -> Result<u64, RecordError> {
         if !self.begun {
             self.start(0, false)?;
         }
-        let text = |value: serde_json::Result<String>| value.unwrap_or_default();
-        let grants: BTreeMap<&str, _> = roles.iter().map(|report| (report.role.as_str(), &report.grants)).collect();
-        let ticks: BTreeMap<&str, _> = roles.iter().map(|report| (report.role.as_str(), report.ticks)).collect();
+        let grants: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), &role.grants)).collect();
+        let ticks: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), role.ticks)).collect();
         let entries = [
-            ("complete", problem.is_none().to_string()),
-            ("problem", problem.unwrap_or_default().to_owned()),
-            ("signals", text(serde_json::to_string(signals))),
-            ("ticks", text(serde_json::to_string(&ticks))),
-            ("privileges", text(serde_json::to_string(&grants))),
+            ("complete", report.complete.to_string()),
+            ("problem", report.problem.clone().unwrap_or_default()),
+            ("signals", json(&report.signals)),
+            ("ticks", json(&ticks)),
+            ("privileges", json(&grants)),
         ];
         self.writer.metadata(END, entries.map(|(key, value)| (key.to_owned(), value)).into())?;
-        self.bytes = self.writer.finish()?;
-        Ok(())
+        self.writer.finish()
     }
+}
+
+fn json(value: &impl Serialize) -> String {
+    serde_json::to_string(value).expect("books of plain values are JSON")
 }
 
 /// What the file says of its run.
@@ -353,7 +380,7 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
         ("period_ns", scenario.period_ns.to_string()),
         ("last_tick", scenario.last_tick.to_string()),
         ("started_utc", jiff::Timestamp::now().to_string()),
-        ("host", serde_json::to_string(&host).unwrap_or_default()),
+        ("host", json(&host)),
     ];
     entries.map(|(key, value)| (key.to_owned(), value)).into()
 }
