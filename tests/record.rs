@@ -298,8 +298,9 @@ fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
         let signal = &summary["recording"]["signals"][0];
         assert_eq!(signal["published"], 6001);
         assert_eq!(signal["gaps"][0][1], 6000, "{signal}");
-        let done = replay(&bench, &bench.path(clock).join("run.mcap"), &[]);
-        assert!(done.code == Some(0) && done.stdout.contains("leader: 1"), "{done:?}");
+        let file = bench.path(clock).join("run.mcap");
+        assert!(Recording::open(&file).unwrap().signals()[0].samples > 1000);
+        assert_eq!(replay(&bench, &file, &[]).code, Some(0));
     }
 }
 
@@ -398,7 +399,8 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
             // On a slow machine it came before the first tick.
             continue;
         }
-        assert!(!end.complete && recorded.code == Some(1), "{recorded:?}");
+        assert!(!end.complete && recorded.code == Some(0), "{recorded:?}");
+        assert!(recorded.stdout.contains("from the midst of the run on"), "{recorded:?}");
         let track = recording.tracks(|info| info.signal == "truth").unwrap().swap_remove(0);
         let ticks = track.ticks();
         if clock == "lockstep" {

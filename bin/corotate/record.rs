@@ -43,7 +43,8 @@ pub fn record(arguments: &Arguments) -> Exit {
 }
 
 fn told(report: &RecordingReport, child: bool) -> Exit {
-    let text = format!("{}: {} samples, {} bytes\n", report.file, report.messages, report.bytes);
+    let part = if report.whole { "" } else { ", from the midst of the run on" };
+    let text = format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes);
     if let (false, Err(exit)) = (child, say(&text)) {
         return exit;
     }

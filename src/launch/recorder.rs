@@ -110,9 +110,14 @@ impl RecorderWatch {
         bus.clear_dead();
     }
 
-    /// Whether a recorder of ours has not ended yet.
+    /// Whether it still writes: a process of ours has not ended, or somebody else's has not said that it is done.
     pub fn lingers(&mut self) -> bool {
-        self.process.as_mut().is_some_and(|process| process.ended().is_none())
+        // Nothing is lost but its last words if the link has failed.
+        let _ = self.listen();
+        match &mut self.process {
+            Some(process) => process.ended().is_none(),
+            None => self.problem.is_none() && self.state() == RoleState::Running && self.health.written(),
+        }
     }
 
     /// Tells what is in the file, beside the roles' final books. A recorder that has not ended by now is ended.
@@ -124,7 +129,7 @@ impl RecorderWatch {
         let mut report: RecordingReport = report.unwrap_or_else(|| {
             let problem = self.problem.unwrap_or_else(|| "it left no report".to_owned());
             let (messages, bytes, signals) = (0, 0, Vec::new());
-            RecordingReport { file, complete: false, problem: Some(problem), messages, bytes, signals }
+            RecordingReport { file, complete: false, whole: true, problem: Some(problem), messages, bytes, signals }
         });
         report.reconcile(roles);
         Some(report)

@@ -33,6 +33,8 @@ pub struct RecordingReport {
     pub file: String,
     /// Whether every sample that was published is in it.
     pub complete: bool,
+    /// Whether it was begun before the first tick.
+    pub whole: bool,
     /// What ended it before its time, or kept it from being complete.
     pub problem: Option<String>,
     /// Samples written, of all signals.
@@ -136,10 +138,11 @@ impl RecordingReport {
     pub fn reconcile(&mut self, roles: &[RoleReport]) {
         self.signals.iter_mut().for_each(|signal| signal.reconcile(roles));
         let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
-        if let (None, 1..) = (&self.problem, lost) {
+        // Whoever began in the midst of a run knew that.
+        if let (true, None, 1..) = (self.whole, &self.problem, lost) {
             self.problem = Some(format!("{lost} samples were published and are not in the recording"));
         }
-        self.complete = self.problem.is_none();
+        self.complete = self.whole && self.problem.is_none();
     }
 }
 
@@ -326,6 +329,7 @@ impl Recorder {
         let mut report = RecordingReport {
             file: std::mem::take(&mut self.file),
             complete: true,
+            whole: self.run.get("whole").is_some_and(|whole| whole == "true"),
             problem: problem.map(ToString::to_string),
             messages: 0,
             bytes: 0,

@@ -403,9 +403,18 @@ impl Reading<'_> {
         word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
     }
 
+    /// A file that was cut off ends with each signal at a tick of its own.
+    fn cut_off(&mut self) {
+        let after = |track: &Track| track.regular().last().map_or(0, |index| track.stamp(index).tick + 1);
+        let end = self.outputs.iter().map(after).min().unwrap_or(0);
+        self.limit(end, || "the file was cut off there".to_owned());
+    }
+
     /// What was published and is not in the recording may have been anything.
     fn lost(&mut self) {
-        let Some(end) = &self.recording.info().end else { return };
+        let Some(end) = self.recording.info().end.as_ref().filter(|_| self.recording.damage().is_none()) else {
+            return self.cut_off();
+        };
         let lost = |service: &str| {
             let books = end.signals.iter().find(|books| books.service == service && books.lost.unwrap_or(0) > 0)?;
             Some((books.gaps.first().map_or(0, |gap| gap[0]), books.lost.unwrap_or(0)))
