@@ -15,6 +15,7 @@
 //! | `config` | scenario files: as typed, then as resolved | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
 //! | `clock` | the time grid and how to wait on it | no |
+//! | `shared` | words of memory that processes share | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
@@ -50,5 +51,7 @@ pub mod record;
 pub mod rig;
 #[cfg(feature = "runtime")]
 pub mod runtime;
+#[cfg(feature = "runtime")]
+pub mod shared;
 #[cfg(feature = "runtime")]
 pub mod telemetry;

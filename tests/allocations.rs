@@ -6,7 +6,7 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
-use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, RoleId, depths, private_ledger, serve, topic};
+use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, depths, private_ledger, serve, topic};
 use corotate::sample::{Health, Phase, RoleState, Sample, Schedule};
 use corotate::serial::{Device, Hello};
 use corotate::telemetry::RoleReport;
@@ -83,8 +83,8 @@ impl Bus for CountedBus {
     type Writer<S: Sample> = CountedWriter<<IoxBus as Bus>::Writer<S>>;
     type Reader<S: Sample> = <IoxBus as Bus>::Reader<S>;
 
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
-        self.0.writer(topic).map(CountedWriter)
+    fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<Self::Writer<S>, BusError> {
+        self.0.writer(topic, generation).map(CountedWriter)
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
@@ -128,7 +128,7 @@ fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &Owned
     let terminated = AtomicBool::new(false);
     let mut result = None;
     let ledger = private_ledger(scenario, role);
-    serve(scenario, occupant, &bus, &ledger, &terminated, Vec::new(), |report| {
+    serve(scenario, occupant, &bus, &ledger, &terminated, Privileges::default(), |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })
@@ -139,7 +139,7 @@ fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &Owned
 /// Leads the roles through a real-time run as the launcher does.
 fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
-    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
+    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule), 1).unwrap();
     let mut health: Vec<_> = RoleId::all(scenario)
         .iter()
         .map(|role| bus.reader::<Health>(&topic(scenario, role.name(scenario), Signal::Health), Reader::Role).unwrap())

@@ -239,7 +239,7 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let ledger = private_ledger(scenario, follower);
     let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, &ledger)).unwrap();
     let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
-    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut seen = Vec::new();
     for tick in 0..=CONDUCTED_TICKS {
         assert_eq!(node.poll(Gate::Inputs { up_to: tick }).unwrap(), Poll::Executed);
@@ -253,11 +253,11 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
 /// Leads the foreign body through a run as the launcher does, and answers its measurements as a controller does.
 fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let bus = IoxBus::enter(domain.domain(), "conductor", depths(scenario)).unwrap();
-    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule)).unwrap();
+    let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule), 1).unwrap();
     let mut health = bus.reader::<Health>(&topic(scenario, "follower", Signal::Health), Reader::Role).unwrap();
     let measurement = topic(scenario, "follower", Signal::Measurement);
     let mut measurement = Input::<IoxBus, RateMeasurement>::watch(&bus, &measurement, Reader::Role).unwrap();
-    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command)).unwrap();
+    let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut asked = 0;
     let mut lead = |phase: Phase, until: RoleState| {
         await_some(|| {

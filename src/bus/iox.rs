@@ -3,9 +3,13 @@
 //! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
 //! by the loop itself (lockstep), not by a writer that waits.
 
+mod latest;
+
+use self::latest::{LatestReader, LatestWriter};
+use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
-use crate::sample::Sample;
+use crate::sample::{Sample, VOID};
 use iceoryx2::config::Config;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -15,6 +19,7 @@ use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use std::rc::Rc;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
 const MAX_NODES: usize = 128;
@@ -41,6 +46,9 @@ pub fn footprint(depths: Depths, signal: Signal, size: usize) -> usize {
     let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
     (MAX_READERS * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
 }
+
+/// What a run takes of shared memory besides its signals, bytes.
+pub const COMMON_BYTES: usize = BELLS_BYTES;
 
 /// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -113,7 +121,8 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
 
 /// A node in a run's domain.
 pub struct IoxBus {
-    node: Node<Ipc>,
+    node: Rc<Node<Ipc>>,
+    bells: Bells,
     depths: Depths,
 }
 
@@ -125,9 +134,16 @@ impl IoxBus {
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
         // iceoryx2 reports to the console on its own; what matters comes back as an error.
         set_log_level(LogLevel::Fatal);
-        let node = enter(domain, name)
-            .map_err(|reason| BusError::Domain { domain: domain.root().display().to_string(), reason })?;
-        Ok(Self { node, depths })
+        let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
+        let bells = Bells::open(domain).map_err(|error| failed(error.to_string()))?;
+        let node = Rc::new(enter(domain, name).map_err(failed)?);
+        Ok(Self { node, bells, depths })
+    }
+
+    /// Whether a signal has a fast lane: where only the newest sample counts.
+    fn has_lane(&self, topic: &Topic) -> bool {
+        let for_roles = matches!(topic.signal, Signal::Measurement | Signal::Estimate | Signal::Command);
+        for_roles && self.depths.role == 1
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
@@ -180,7 +196,9 @@ impl Bus for IoxBus {
     type Writer<S: Sample> = IoxWriter<S>;
     type Reader<S: Sample> = IoxReader<S>;
 
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<IoxWriter<S>, BusError> {
+    fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<IoxWriter<S>, BusError> {
+        let latest = self.has_lane(topic).then(|| LatestWriter::create(&self.node, topic, generation)).transpose();
+        let latest = latest.map_err(|reason| BusError::Open { service: topic.to_string(), end: "writer", reason })?;
         let publisher = self
             .service::<S>(topic, "writer")?
             .publisher_builder()
@@ -192,7 +210,7 @@ impl Bus for IoxBus {
                 end: "writer",
                 reason: format!("{error:?}"),
             })?;
-        Ok(IoxWriter { publisher, loan: None, topic: topic.clone() })
+        Ok(IoxWriter { publisher, latest, loan: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
@@ -203,14 +221,22 @@ impl Bus for IoxBus {
             end: "reader",
             reason: format!("{error:?}"),
         })?;
-        Ok(IoxReader { service, subscriber, current: None, topic: topic.clone() })
+        // Who reads every sample has no use for the latest.
+        let lane = match reader {
+            Reader::Role if self.has_lane(topic) => Lane::Wanted { generation: 1 },
+            _ => Lane::None,
+        };
+        let (node, bell, topic) = (self.node.clone(), self.bells.of(topic), topic.clone());
+        Ok(IoxReader { node, service, subscriber, current: Current::None, newest: (0, 0), lane, idle: 0, bell, topic })
     }
 }
 
 /// The writing end.
 pub struct IoxWriter<S: Sample> {
     publisher: Publisher<Ipc, Wire<S>, ()>,
+    latest: Option<LatestWriter<S>>,
     loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    bell: Bell,
     topic: Topic,
 }
 
@@ -234,7 +260,12 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
             None => self.loan()?,
         };
         fill(&mut sample.payload_mut().0);
-        sample.send().map(|_| ()).map_err(|error| self.failed(format!("{error:?}")))
+        if let Some(latest) = &self.latest {
+            latest.put(&sample.payload().0);
+        }
+        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        self.bell.ring();
+        Ok(())
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
@@ -251,12 +282,47 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
     }
 }
 
+/// Looks at the fast lane between two at the queue, where nothing new is as a rule.
+const LOOKS: u32 = 256;
+
 /// The reading end.
 pub struct IoxReader<S: Sample> {
+    node: Rc<Node<Ipc>>,
     service: PortFactory<Ipc, Wire<S>, ()>,
     subscriber: Subscriber<Ipc, Wire<S>, ()>,
-    current: Option<Received<Ipc, Wire<S>, ()>>,
+    lane: Lane<S>,
+    /// Looks at the lane that found nothing.
+    idle: u32,
+    current: Current<S>,
+    /// Generation and tick of the last sample told of.
+    newest: (u64, u64),
+    bell: Bell,
     topic: Topic,
+}
+
+/// A reader's fast lane.
+#[allow(clippy::large_enum_variant, reason = "there is one per reader, and it is looked at at every tick")]
+enum Lane<S: Sample> {
+    /// There is none.
+    None,
+    /// It is to be looked for: that of a writer of this generation.
+    Wanted { generation: u64 },
+    /// It is there.
+    Open(LatestReader<S>),
+}
+
+/// What tells the samples of a signal apart, and orders them: generation and tick.
+#[inline]
+fn key(sample: &impl Sample) -> (u64, u64) {
+    let stamp = sample.stamp();
+    (stamp.generation & !VOID, stamp.tick)
+}
+
+/// Where the sample at hand is.
+enum Current<S: Sample> {
+    None,
+    InLane,
+    Queued(Received<Ipc, Wire<S>, ()>),
 }
 
 impl<S: Sample> IoxReader<S> {
@@ -264,24 +330,74 @@ impl<S: Sample> IoxReader<S> {
     pub fn written(&self) -> bool {
         self.service.dynamic_config().number_of_publishers() > 0
     }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Receive { service: self.topic.to_string(), reason }
+    }
+
+    /// Takes the next sample from the queue, unless the lane has had it.
+    fn receive(&mut self) -> Result<bool, BusError> {
+        let received = match self.subscriber.receive() {
+            Ok(Some(sample)) => sample,
+            Ok(None) => return Ok(false),
+            Err(error) => return Err(self.failed(format!("{error:?}"))),
+        };
+        let key = key(&received.payload().0);
+        let (generation, _) = key;
+        match &mut self.lane {
+            Lane::Open(latest) if key <= self::key(latest.sample()) => return Ok(false),
+            Lane::Open(latest) if generation > latest.generation() => self.lane = Lane::Wanted { generation },
+            // Warm-up tells nothing of its writer.
+            Lane::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
+            _ => {}
+        }
+        self.newest = key;
+        self.current = Current::Queued(received);
+        Ok(true)
+    }
 }
 
 impl<S: Sample> Read<S> for IoxReader<S> {
     #[inline]
     fn advance(&mut self) -> Result<bool, BusError> {
-        match self.subscriber.receive() {
-            Ok(Some(sample)) => {
-                self.current = Some(sample);
-                Ok(true)
+        if let Lane::Open(latest) = &mut self.lane {
+            if latest.advance() {
+                let before = std::mem::replace(&mut self.newest, key(latest.sample()));
+                self.current = Current::InLane;
+                // The queue may have been faster, and the lane may take one sample for two.
+                return Ok(self.newest != before);
             }
-            Ok(None) => Ok(false),
-            Err(error) => Err(BusError::Receive { service: self.topic.to_string(), reason: format!("{error:?}") }),
+            self.idle = self.idle.wrapping_add(1);
+            if !self.idle.is_multiple_of(LOOKS) {
+                return Ok(false);
+            }
         }
+        self.receive()
     }
 
     #[inline]
     fn current(&self) -> Option<&S> {
-        self.current.as_ref().map(|sample| &sample.payload().0)
+        match (&self.current, &self.lane) {
+            (Current::Queued(sample), _) => Some(&sample.payload().0),
+            (Current::InLane, Lane::Open(latest)) => Some(latest.sample()),
+            _ => None,
+        }
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        let news = || match &self.lane {
+            Lane::Open(latest) if latest.has_news() => Ok(true),
+            _ => self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}"))),
+        };
+        self.bell.sleep(until_ns, news)
+    }
+
+    fn refresh(&mut self) {
+        if let Lane::Wanted { generation } = self.lane {
+            // Where there is none there will be none: a lane is made before its signal.
+            self.lane = LatestReader::open(&self.node, &self.topic, generation).map_or(Lane::None, Lane::Open);
+        }
     }
 }
 
@@ -306,7 +422,7 @@ mod tests {
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         assert!(!newest.written());
-        let mut writer = ours.writer::<RateTruth>(&topic()).unwrap();
+        let mut writer = ours.writer::<RateTruth>(&topic(), 1).unwrap();
         assert!(newest.written());
         assert!(!newest.advance().unwrap() && !every.advance().unwrap());
         for tick in 0..5 {
@@ -327,8 +443,8 @@ mod tests {
     fn refuses_a_second_writer_and_another_type() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
-        let _writer = bus.writer::<RateTruth>(&topic()).unwrap();
-        assert!(matches!(bus.writer::<RateTruth>(&topic()), Err(BusError::Open { .. })));
+        let _writer = bus.writer::<RateTruth>(&topic(), 1).unwrap();
+        assert!(matches!(bus.writer::<RateTruth>(&topic(), 1), Err(BusError::Open { .. })));
         let error = bus.reader::<RateCommand>(&topic(), Reader::Role).err().unwrap();
         assert!(error.to_string().contains("IncompatibleTypes"), "{error}");
     }
@@ -350,7 +466,7 @@ mod tests {
     #[test]
     fn two_domains_never_meet() {
         let (one, other) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
-        let mut writer = bus(&one).writer::<RateTruth>(&topic()).unwrap();
+        let mut writer = bus(&one).writer::<RateTruth>(&topic(), 1).unwrap();
         let mut reader = bus(&other).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         reader.advance().unwrap();
         writer.send(|sample| sample.stamp.tick = 1).unwrap();

@@ -46,7 +46,7 @@ impl Bus for MemoryBus {
     type Writer<S: Sample> = MemoryWriter<S>;
     type Reader<S: Sample> = MemoryReader<S>;
 
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<MemoryWriter<S>, BusError> {
+    fn writer<S: Sample>(&self, topic: &Topic, _generation: u64) -> Result<MemoryWriter<S>, BusError> {
         Ok(MemoryWriter { queues: self.queues(topic, "writer")?, slot: S::default() })
     }
 
@@ -114,6 +114,12 @@ impl<S: Sample> Read<S> for MemoryReader<S> {
     fn current(&self) -> Option<&S> {
         self.current.as_ref()
     }
+
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
+    }
+
+    fn refresh(&mut self) {}
 }
 
 #[cfg(test)]
@@ -131,7 +137,7 @@ mod tests {
         let bus = MemoryBus::new(Depths { role: 1, scorer: 8, history: 0 });
         let mut newest = bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
         let mut every = bus.reader::<RateCommand>(&topic(), Reader::Scorer).unwrap();
-        let mut writer = bus.writer::<RateCommand>(&topic()).unwrap();
+        let mut writer = bus.writer::<RateCommand>(&topic(), 1).unwrap();
         assert!(!newest.advance().unwrap() && newest.current().is_none());
         for tick in 0..5 {
             writer.send(|sample| sample.stamp.tick = tick).unwrap();
@@ -150,7 +156,7 @@ mod tests {
     fn a_reader_that_is_opened_anew_finds_what_its_predecessor_left() {
         let bus = MemoryBus::new(Depths { role: 4, scorer: 8, history: 0 });
         let open = || bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
-        let mut writer = bus.writer::<RateCommand>(&topic()).unwrap();
+        let mut writer = bus.writer::<RateCommand>(&topic(), 1).unwrap();
         let mut first = open();
         for tick in 0..3 {
             writer.send(|sample| sample.stamp.tick = tick).unwrap();
@@ -166,7 +172,7 @@ mod tests {
     #[test]
     fn refuses_a_signal_of_another_type() {
         let bus = MemoryBus::new(Depths { role: 1, scorer: 8, history: 0 });
-        bus.writer::<RateCommand>(&topic()).unwrap();
+        bus.writer::<RateCommand>(&topic(), 1).unwrap();
         assert!(matches!(bus.reader::<RateTruth>(&topic(), Reader::Role), Err(BusError::Open { .. })));
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
 
+mod bell;
 pub mod domain;
 pub mod iox;
 pub mod memory;
@@ -98,11 +99,11 @@ pub trait Bus {
     /// The reading end.
     type Reader<S: Sample>: Read<S>;
 
-    /// Opens a signal for writing; there is one writer per signal.
+    /// Opens a signal for writing; there is one writer per signal. `generation` is the one that its stamps will have.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError>;
+    fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<Self::Writer<S>, BusError>;
     /// Opens a signal for reading.
     ///
     /// # Errors
@@ -138,4 +139,12 @@ pub trait Read<S> {
     fn advance(&mut self) -> Result<bool, BusError>;
     /// The sample at hand, in place; none before the first.
     fn current(&self) -> Option<&S>;
+    /// Sleeps until there may be a next sample, at most until `until_ns` on the monotonic clock. Where nobody else could
+    /// bring one meanwhile it does not sleep.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    fn refresh(&mut self);
 }

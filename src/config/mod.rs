@@ -14,7 +14,7 @@ pub use accept::Accept;
 pub use document::Document;
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
-pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision};
+pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use scenario::Scenario;
 
 pub(crate) use document::nearest;

@@ -89,7 +89,7 @@ impl Default for Actuator {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Realtime {
-    /// SCHED_FIFO priority of the leader, 4 to 99; followers, observer and controller get 1, 2, 3 less. 0: do not ask.
+    /// SCHED_FIFO priority of all roles, 1 to 99; 0: do not ask.
     pub priority: i32,
     /// The cores of the roles.
     pub cores: Cores,
@@ -97,9 +97,11 @@ pub struct Realtime {
     pub lock_memory: bool,
     /// Whether the launcher holds `/dev/cpu_dma_latency` at 0, which keeps idle cores from sleeping deeply.
     pub low_latency_idle: bool,
-    /// How long before a tick a role wakes to spin, µs.
+    /// How a role waits for a sample.
+    pub wake: Wake,
+    /// How long before a tick a role wakes to spin, µs; never more than a quarter of the period.
     pub wake_lead_us: f64,
-    /// How long a role spins for a sample that is due before it naps between looks, µs. Only where SCHED_FIFO is granted.
+    /// How long a role spins for a sample that is due before it sleeps, µs; never more than a quarter of the period.
     pub spin_us: f64,
     /// The part of the period after which the controller goes on without samples that are still missing, 0 to 1.
     pub cutoff: f64,
@@ -112,11 +114,25 @@ impl Default for Realtime {
             cores: Cores::Named(NamedCores::Auto),
             lock_memory: true,
             low_latency_idle: true,
+            wake: Wake::Auto,
             wake_lead_us: 60.0,
             spin_us: 200.0,
             cutoff: 0.75,
         }
     }
+}
+
+/// How a role waits for a sample that another role sends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Wake {
+    /// Where SCHED_FIFO is granted: gives way to a sender on the same core, spins for one on another, then sleeps on the
+    /// sender's bell. Elsewhere as `event`: among equals, who spins holds up whom it waits for.
+    Auto,
+    /// Spins, whoever the sender is, then sleeps on its bell.
+    Spin,
+    /// Sleeps on the sender's bell at once.
+    Event,
 }
 
 /// Where the roles run.
@@ -128,7 +144,7 @@ impl Default for Realtime {
 pub enum Cores {
     /// `"auto"` or `"any"`.
     Named(NamedCores),
-    /// These, in turn: plants from the first on, observer and controller together on the last.
+    /// These: plants in turn; observer and controller on the next, or beside the leader and the first follower.
     List(Vec<usize>),
 }
 

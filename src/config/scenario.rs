@@ -278,8 +278,8 @@ fn check_roles(policy: &Policy, rig: &AnyRig, checks: &mut Checks<'_>) {
 
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     let priority = realtime.priority;
-    checks.require(priority == 0 || (4..=99).contains(&priority), "realtime.priority", || {
-        format!("{priority} is no SCHED_FIFO priority; give 4 to 99, or 0 not to ask for it")
+    checks.require(priority == 0 || (1..=99).contains(&priority), "realtime.priority", || {
+        format!("{priority} is no SCHED_FIFO priority; give 1 to 99, or 0 not to ask for it")
     });
     for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
         checks.require((0.0..=100_000.0).contains(&value), key, || {

@@ -2,7 +2,7 @@
 //!
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
-use super::children::{END_LIMIT, Janitor};
+use super::children::{END_LIMIT, Janitor, RoleProcess};
 use super::recorder::RecorderWatch;
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
@@ -28,7 +28,9 @@ const LOOK_NS: u64 = 1_000_000;
 /// In real time, between two looks at the samples to be scored, ns.
 const SCORE_NS: u64 = 10_000_000;
 /// From the word to run to the first tick, ns: time for every role to hear it.
-const EPOCH_LEAD_NS: u64 = 50_000_000;
+const EPOCH_LEAD_NS: u64 = 20_000_000;
+/// In lockstep, between two looks at samples when there are none, ns.
+const LULL_NS: u64 = 50_000;
 /// Ticks scored between two credits in lockstep.
 const CREDIT_TICKS: u64 = 16;
 /// Upper bounds on the files that the process which opens most of them, the launcher, has open.
@@ -120,17 +122,16 @@ impl<'a> Crew<'a> {
         domain: &'a Domain,
         bus: &'a IoxBus,
     ) -> Result<Self, LaunchError> {
-        let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule))?;
+        let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
-        let mut members = Vec::new();
-        for role in RoleId::all(scenario) {
-            let external = is_external(scenario, launch, role.name(scenario));
-            let mut member = Member::new(scenario, role, external, domain, bus)?;
-            if !external {
-                member.start(&launch.program, scenario, domain, monotonic_ns())?;
-            }
-            members.push(member);
-        }
+        // All of them first: they come up while their links are opened here.
+        let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
+            true => Ok((role, None)),
+            false => RoleProcess::start(&launch.program, scenario, role, domain).map(|process| (role, Some(process))),
+        };
+        let started = RoleId::all(scenario).into_iter().map(start).collect::<Result<Vec<_>, _>>()?;
+        let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
+        let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
         Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder })
     }
@@ -206,7 +207,7 @@ impl<'a> Crew<'a> {
         let lockstep = self.scenario.clock != ClockKind::Realtime;
         let mut stall = Stall::new(self.scenario);
         let mut backoff = Backoff::default();
-        let mut next_look_ns = 0;
+        let (mut next_look_ns, mut somebody_ended) = (0, false);
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
             let scored = scorer.poll(CREDIT_TICKS)?;
             let credit = if lockstep { self.recorder.credit(scorer.next_tick())? } else { 0 };
@@ -216,7 +217,8 @@ impl<'a> Crew<'a> {
                 backoff = Backoff::default();
             }
             let now_ns = monotonic_ns();
-            if now_ns >= next_look_ns || self.somebody_ended() {
+            if now_ns >= next_look_ns || somebody_ended {
+                somebody_ended = false;
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
@@ -232,8 +234,9 @@ impl<'a> Crew<'a> {
                 (launch.progress)(&Progress::Running { tick, last_tick, metric: scorer.latest() });
             }
             match (scored, lockstep) {
-                (0, true) => backoff.wait(),
-                (0, false) => self.pause(next_look_ns),
+                (0, true) if backoff.brief() => {}
+                (0, true) => somebody_ended = self.pause(monotonic_ns() + LULL_NS),
+                (0, false) => somebody_ended = self.pause(next_look_ns),
                 _ => {}
             }
         }
@@ -262,18 +265,14 @@ impl<'a> Crew<'a> {
         Ok(go_on)
     }
 
-    /// Waits until `until_ns`, or until a role's process ends.
-    fn pause(&self, until_ns: u64) {
+    /// Waits until `until_ns`, or until a role's process ends: then it is true.
+    fn pause(&self, until_ns: u64) -> bool {
         let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle());
         let mut handles: Vec<PollFd<'_>> = handles.map(|handle| PollFd::new(handle, PollFlags::IN)).collect();
         let wait_ns = until_ns.saturating_sub(monotonic_ns());
         let timeout = Timespec { tv_sec: (wait_ns / 1_000_000_000) as i64, tv_nsec: (wait_ns % 1_000_000_000) as _ };
         // Woken early or not, the caller looks for itself.
-        let _ = poll(&mut handles, Some(&timeout));
-    }
-
-    fn somebody_ended(&mut self) -> bool {
-        self.members.iter_mut().filter_map(|member| member.process.as_mut()).any(|process| process.ended().is_some())
+        poll(&mut handles, Some(&timeout)).is_ok_and(|ended| ended > 0)
     }
 
     /// Says the launcher's word again.

@@ -7,7 +7,7 @@ use super::children::{END_LIMIT, Janitor, RoleProcess};
 use crate::bus::domain::OwnedDomain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
-use crate::clock::monotonic_ns;
+use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::Scenario;
 use crate::record::{Comparer, Inlets, Limit, Outlets, Recording, RoleReplay, Script};
 use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes, topic, write_whole};
@@ -17,6 +17,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// How far the feeding runs ahead of what comes back, ticks: less than the links hold.
 const AHEAD_TICKS: u64 = 48;
+/// Between two looks when nothing has come for a while, ns.
+const LULL_NS: u64 = 50_000;
 /// Without any progress for so long the role counts as hung, ns.
 const HUNG_NS: u64 = 30_000_000_000;
 
@@ -42,7 +44,7 @@ pub fn replay_as_process(
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
     domain.seal()?;
     let mut prompter = Prompter {
-        schedule: bus.writer(&topic(scenario, "run", Signal::Schedule))?,
+        schedule: bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?,
         health: bus.reader(&topic(scenario, &script.name, Signal::Health), Reader::Role)?,
         word: Schedule { epoch_ns: script.grid.epoch_ns, ..Schedule::default() },
         inlets: Inlets::open(scenario, role, &bus)?,
@@ -153,7 +155,9 @@ impl Prompter<'_> {
             if next >= tick || !self.goes_on()? {
                 return Ok(());
             }
-            backoff.wait();
+            if !backoff.brief() {
+                sleep_until(monotonic_ns() + LULL_NS);
+            }
         }
     }
 

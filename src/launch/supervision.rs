@@ -8,6 +8,7 @@ use super::trace::Trace;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
+use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::runtime::{RoleId, open_ledger, topic};
 use crate::sample::{Health, RoleState};
@@ -113,14 +114,15 @@ pub(super) struct Member {
 }
 
 impl Member {
-    /// A role whose process, if it is ours, is not started yet.
+    /// A role with its process, or one that somebody else starts.
     pub fn new(
         scenario: &Scenario,
         role: RoleId,
-        external: bool,
+        process: Option<RoleProcess>,
         domain: &Domain,
         bus: &IoxBus,
     ) -> Result<Self, LaunchError> {
+        let (external, now_ns) = (process.is_none(), monotonic_ns());
         let name = role.name(scenario).to_owned();
         Ok(Self {
             health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
@@ -128,13 +130,13 @@ impl Member {
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
             name,
             role,
-            process: None,
+            process,
             external,
             last: Health::default(),
             generation: 1,
             silent_ns: 0,
-            looked_ns: 0,
-            started_ns: 0,
+            looked_ns: now_ns,
+            started_ns: now_ns,
             restarts: 0,
             restart: None,
         })

@@ -107,9 +107,9 @@ mod tests {
         };
         expect(RoleState::Absent, 0);
         let mut measurement =
-            theirs.writer::<RateMeasurement>(&topic(&scenario, "follower", Signal::Measurement)).unwrap();
+            theirs.writer::<RateMeasurement>(&topic(&scenario, "follower", Signal::Measurement), 1).unwrap();
         expect(RoleState::Absent, 0);
-        let mut truth = theirs.writer::<RateTruth>(&topic(&scenario, "follower", Signal::Truth)).unwrap();
+        let mut truth = theirs.writer::<RateTruth>(&topic(&scenario, "follower", Signal::Truth), 1).unwrap();
         expect(RoleState::Ready, 0);
         measurement.send(|sample| sample.stamp.generation = 0).unwrap();
         truth.send(|sample| sample.stamp.generation = 0).unwrap();

@@ -22,6 +22,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const NICE: i32 = 10;
 /// In real time, between two looks at the samples, ns.
 const LOOK_NS: u64 = 5_000_000;
+/// In lockstep, the same when nothing has come for a while, ns.
+const LULL_NS: u64 = 50_000;
 /// Between two words to the launcher, ns, unless a credit is due.
 const WORD_NS: u64 = 20_000_000;
 /// In lockstep: a word after so many ticks.
@@ -111,7 +113,8 @@ fn follow(
         }
         match (lockstep, taken) {
             (false, _) => sleep_until(now_ns + LOOK_NS),
-            (true, 0) => backoff.wait(),
+            (true, 0) if backoff.brief() => {}
+            (true, 0) => sleep_until(monotonic_ns() + LULL_NS),
             (true, _) => backoff = Backoff::default(),
         }
     }
@@ -157,7 +160,7 @@ struct Line {
 impl Line {
     fn open(scenario: &Scenario, bus: &IoxBus) -> Result<Self, BusError> {
         Ok(Self {
-            health: bus.writer(&topic(scenario, RECORDER, Signal::Health))?,
+            health: bus.writer(&topic(scenario, RECORDER, Signal::Health), 1)?,
             schedule: bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         })
     }

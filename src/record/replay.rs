@@ -89,7 +89,7 @@ impl<B: Bus + 'static> Visit for OpenInlets<'_, B> {
     type Made = Result<Box<dyn Inlet>, BusError>;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Ok(Box::new(InletOf::<_, S>(self.0.writer::<S>(&topic)?, std::marker::PhantomData)))
+        Ok(Box::new(InletOf::<_, S>(self.0.writer::<S>(&topic, 1)?, std::marker::PhantomData)))
     }
 }
 

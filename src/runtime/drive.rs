@@ -5,17 +5,18 @@
 
 use super::WINDOW_TICKS;
 use super::hooks::{self, Place};
-use super::node::{Gate, Node, Poll, ReadyNode};
+use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
-use crate::config::Realtime;
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How often a role looks at the schedule and says how it is, ns.
 const TURN_NS: u64 = 20_000_000;
-/// How long a role naps between two looks for a sample that did not come within the spin, ns.
+/// How long a role naps between two looks where no bell rings, ns.
 const NAP_NS: u64 = 50_000;
+/// How long a role sleeps on the bell of the input that it lacks before it looks around, ns.
+const SLEEP_NS: u64 = 20_000_000;
 /// How long after its last tick a role still waits for inputs, ns and periods.
 const GRACE_NS: u64 = 1_000_000_000;
 const GRACE_PERIODS: u64 = 5;
@@ -93,6 +94,19 @@ impl<'a, B: Bus> Control<'a, B> {
     }
 }
 
+/// How a role waits in real time.
+#[derive(Debug, Clone, Copy)]
+pub struct Waiting<'a> {
+    /// It wakes so long before the tick and spins the rest, ns.
+    pub lead_ns: u64,
+    /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
+    pub spin_ns: u64,
+    /// For samples of these roles it does not spin but gives way: they need its core.
+    pub give_way: &'a [RoleId],
+    /// The part of the period after which it goes on without what is missing.
+    pub cutoff: f64,
+}
+
 /// What a driver needs besides its node.
 pub struct Drive<'a, 'b, B: Bus> {
     control: &'a mut Control<'b, B>,
@@ -110,19 +124,25 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
-    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Ended, BusError> {
-        let lead_ns = (settings.wake_lead_us * 1e3) as u64;
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, BusError> {
         while node.next_tick() <= self.last_tick {
             let due_ns = grid.due_ns(node.next_tick());
-            if self.idle_until(due_ns.saturating_sub(lead_ns), node)? {
+            let timed = node.time_triggered() || waiting.spin_ns > 0;
+            if timed && self.idle_until(due_ns.saturating_sub(waiting.lead_ns), node)? {
                 return Ok(Ended::Stopped);
             }
             node.before_tick();
-            let begun = if node.time_triggered() { self.on_time(node, grid, lead_ns)? } else { Poll::Waiting };
+            let begun = if node.time_triggered() { self.on_time(node, grid, waiting.lead_ns)? } else { Poll::Waiting };
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
-            let executed = if waits { self.on_arrival(node, grid, settings)? } else { Some(begun) };
+            let executed = if waits { self.on_arrival(node, grid, waiting)? } else { Some(begun) };
             match executed {
-                Some(Poll::Executed) => node.settle()?,
+                Some(Poll::Executed) => {
+                    if begun == Poll::Executed && !waiting.give_way.is_empty() {
+                        // What it sent is what the others wait for, and they wait for its core too.
+                        std::thread::yield_now();
+                    }
+                    node.settle()?;
+                }
                 Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
             }
@@ -140,11 +160,11 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then naps between looks.
-    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, settings: &Realtime) -> Result<Option<Poll>, BusError> {
+    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Option<Poll>, BusError> {
         let tick = node.next_tick();
-        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * settings.cutoff) as u64;
+        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;
         let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
-        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + (settings.spin_us * 1e3) as u64;
+        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + waiting.spin_ns;
         loop {
             let now_ns = monotonic_ns();
             let gate = if now_ns >= overdue_ns { Gate::Overdue } else { Gate::Arrived };
@@ -153,13 +173,15 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 done => return Ok(Some(done)),
             }
             hooks::at(Place::Waiting);
-            if now_ns < spin_end_ns {
-                std::hint::spin_loop();
+            if waiting.spin_ns > 0 && now_ns < spin_end_ns {
+                spin(node, waiting.give_way);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
             } else {
-                sleep_until(now_ns + NAP_NS);
+                if !node.sleep(overdue_ns.min(now_ns + SLEEP_NS).max(now_ns + NAP_NS))? {
+                    sleep_until(now_ns + NAP_NS);
+                }
                 if self.turn(node)? {
                     return Ok(None);
                 }
@@ -168,7 +190,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
-    fn idle_until(&mut self, until_ns: u64, node: &dyn Node) -> Result<bool, BusError> {
+    fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, BusError> {
         while monotonic_ns() < until_ns {
             hooks::at(Place::Waiting);
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
@@ -180,11 +202,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Now and then: how this role is, and whether the run is over.
-    fn turn(&mut self, node: &dyn Node) -> Result<bool, BusError> {
+    fn turn(&mut self, node: &mut dyn Node) -> Result<bool, BusError> {
         if !self.turn_is_due() {
             return Ok(false);
         }
         self.control.announce(RoleState::Running, node)?;
+        node.refresh()?;
         self.control.stopped()
     }
 
@@ -195,6 +218,18 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             self.next_turn_ns = now_ns + TURN_NS;
         }
         due
+    }
+
+    /// Waits for the input that a node lacks, or for credit.
+    fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), BusError> {
+        if backoff.brief() {
+            return Ok(());
+        }
+        let until_ns = monotonic_ns() + SLEEP_NS;
+        if node.next_tick() > up_to || !node.sleep(until_ns)? {
+            self.control.schedule.sleep(until_ns)?;
+        }
+        Ok(())
     }
 
     /// Drives a node by its inputs alone, at most [`WINDOW_TICKS`] ahead of the slowest consumer.
@@ -214,7 +249,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 }
             } else {
                 hooks::at(Place::Waiting);
-                backoff.wait();
+                self.rest(node, up_to, &mut backoff)?;
             }
             if self.turn_is_due() {
                 self.control.announce(RoleState::Running, node)?;
@@ -229,21 +264,35 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 }
 
-/// Waits longer the longer there is nothing to do: spins, then yields, then naps.
+/// One round of waiting for a sample that is due: whoever is to send it may need this core.
+fn spin(node: &dyn Node, give_way: &[RoleId]) {
+    if node.awaits().is_some_and(|role| give_way.contains(&role)) {
+        std::thread::yield_now();
+    } else {
+        std::hint::spin_loop();
+    }
+}
+
+/// Looks that are worth a spin, and those worth a system call that lets others run.
+const SPIN_ROUNDS: u32 = 50;
+const YIELD_ROUNDS: u32 = 60;
+
+/// Waits longer the longer there is nothing to do: spins, then yields, then sleeps.
 #[derive(Default)]
 pub struct Backoff {
     rounds: u32,
 }
 
 impl Backoff {
-    /// One round of waiting.
-    pub fn wait(&mut self) {
+    /// One round of waiting that is no sleep; false if it is time for one.
+    pub fn brief(&mut self) -> bool {
         self.rounds = self.rounds.saturating_add(1);
         match self.rounds {
-            0..50 => std::hint::spin_loop(),
-            50..250 => std::thread::yield_now(),
-            _ => sleep_until(monotonic_ns() + NAP_NS),
+            0..SPIN_ROUNDS => std::hint::spin_loop(),
+            SPIN_ROUNDS..YIELD_ROUNDS => std::thread::yield_now(),
+            _ => return false,
         }
+        true
     }
 }
 

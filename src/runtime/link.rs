@@ -33,7 +33,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
     /// [`BusError::Open`].
     pub fn open(bus: &B, topic: &Topic, generation: u64, ledger: &Ledger, last_tick: u64) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
-        let port = bus.writer(topic)?;
+        let port = bus.writer(topic, generation)?;
         Ok(Self { port, generation, sent: S::default(), delivered: true, voids: false, disturbance: None, book })
     }
 
@@ -369,6 +369,20 @@ impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
             }
     }
 
+    /// Sleeps until there may be something new, at most until `until_ns`.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        self.port.sleep(until_ns)
+    }
+
+    /// Whether something is known of this tick or of a later one: it is of no use to wait for it.
+    #[inline]
+    pub fn knows(&self, tick: u64) -> bool {
+        self.last.is_some_and(|(last, _)| last >= tick)
+    }
+
     /// The newest tick of which something is known: there was a sample, believed or not, or a void.
     #[inline]
     pub fn last_tick(&self) -> Option<u64> {
@@ -392,8 +406,14 @@ impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
     /// # Errors
     /// [`BusError::Receive`].
     pub fn warm_up(&mut self) -> Result<(), BusError> {
+        self.port.refresh();
         while self.port.advance()? {}
         Ok(())
+    }
+
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    pub fn refresh(&mut self) {
+        self.port.refresh();
     }
 }
 

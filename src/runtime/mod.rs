@@ -24,7 +24,7 @@ pub use node::{
     visit_reads, visit_writes,
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
-pub use privileges::hold_low_latency_idle;
+pub use privileges::{Privileges, hold_low_latency_idle};
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};

@@ -13,7 +13,7 @@ pub use ports::{Port, Ports, Visit, ports, visit_reads, visit_writes};
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
 use super::link::{Horizon, Input, Output};
-use crate::bus::iox::footprint;
+use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{Bus, BusError, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
@@ -140,6 +140,13 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError>;
+    /// Whose sample the next tick lacks, as far as it is known.
+    fn awaits(&self) -> Option<RoleId>;
+    /// Sleeps until the input that the next tick lacks may be there, at most until `until_ns`; false if it lacks none.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError>;
     /// Does what the executed tick left to be done: integrates, counts, prepares the next sample.
     ///
     /// # Errors
@@ -152,7 +159,8 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn warm_up(&mut self) -> Result<(), BusError>;
-    /// Lets readers that have come later know of this role's signals. Off the critical path.
+    /// Lets readers that have come later know of this role's signals, and finds the writers that have. Off the critical
+    /// path.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
@@ -245,7 +253,7 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
     };
     let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
     // The recorder says how it is, as the roles do.
-    port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    COMMON_BYTES + port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.

@@ -3,7 +3,7 @@
 //! Must not fail a run: whether a missing privilege matters is decided by `--require-rt`.
 
 use super::node::RoleId;
-use crate::config::{Cores, NamedCores, Realtime};
+use crate::config::{Cores, NamedCores, Realtime, Scenario};
 use crate::telemetry::Grant;
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::process::{Resource, getrlimit};
@@ -32,13 +32,21 @@ fn lock_memory() -> io::Result<()> {
     }
 }
 
-/// Whether a role with these grants runs before all ordinary processes.
-pub fn first_served(grants: &[Grant]) -> bool {
-    grants.iter().any(|grant| grant.privilege == FIFO && grant.granted)
+/// What a role has got.
+#[derive(Debug, Default)]
+pub struct Privileges {
+    /// Everything that was asked for, granted or not.
+    pub grants: Vec<Grant>,
+    /// Whether the role runs before all ordinary processes.
+    pub first_served: bool,
+    /// The other roles on the role's core, all of one priority. Among these whoever waits for another's sample gives way to
+    /// it: a switch between equals costs a fraction of what falling asleep does.
+    pub beside: Vec<RoleId>,
 }
 
-/// Takes what a role asks for, for the calling thread.
-pub fn take(settings: &Realtime, role: RoleId) -> Vec<Grant> {
+/// Takes what a role of a scenario asks for, for the calling thread.
+pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
+    let settings = &scenario.realtime;
     // No privilege: without SCHED_FIFO the kernel would let timers run late by 50 us to save power.
     let _ = set_current_timer_slack(NonZero::new(1));
     let mut grants = Vec::new();
@@ -47,18 +55,25 @@ pub fn take(settings: &Realtime, role: RoleId) -> Vec<Grant> {
         grants.push(grant("locked memory", "all".to_owned(), lock_memory(), remedy));
     }
     if settings.priority > 0 {
-        let priority = settings.priority - behind_leader(role);
         let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
-        grants.push(grant(FIFO, priority.to_string(), set_fifo(priority), remedy));
+        grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), remedy));
     }
+    let first_served = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
     // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
-    if let Some(core) = core_of(settings, role, first_served(&grants)) {
+    let cores = cores(settings, first_served);
+    let bodies = scenario.rig.bodies().len();
+    let mut beside = Vec::new();
+    if let Some(core) = core_of(&cores, role, bodies) {
         let mut set = CpuSet::new();
         set.set(core);
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
+        if pinned.is_ok() && first_served {
+            beside = RoleId::all(scenario);
+            beside.retain(|other| *other != role && core_of(&cores, *other, bodies) == Some(core));
+        }
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
-    grants
+    Privileges { grants, first_served, beside }
 }
 
 /// Opens `/dev/cpu_dma_latency` and asks for 0 µs. The request lasts as long as the file is open.
@@ -83,32 +98,27 @@ fn grant(privilege: &str, asked: String, result: io::Result<()>, remedy: &str) -
     Grant { privilege: privilege.to_owned(), asked, granted: result.is_ok(), reason }
 }
 
-/// How far below the leader a role's priority lies: the order in which one tick passes through the roles, so that on a
-/// shared core none that waits by spinning keeps the one it waits for from running.
-fn behind_leader(role: RoleId) -> i32 {
-    match role {
-        RoleId::Plant(0) => 0,
-        RoleId::Plant(_) => 1,
-        RoleId::Observer => 2,
-        RoleId::Controller => 3,
+/// The cores that roles are to be bound to; none if they are not.
+fn cores(settings: &Realtime, first_served: bool) -> Vec<usize> {
+    match &settings.cores {
+        Cores::List(cores) => cores.clone(),
+        Cores::Named(NamedCores::Auto) if first_served => sched_getaffinity(None)
+            .map_or(Vec::new(), |allowed| (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()),
+        Cores::Named(_) => Vec::new(),
     }
 }
 
-/// The core of a role: plants in turn from the first core on, observer and controller together on the last.
-fn core_of(settings: &Realtime, role: RoleId, first_served: bool) -> Option<usize> {
-    let cores = match &settings.cores {
-        Cores::List(cores) => cores.clone(),
-        Cores::Named(NamedCores::Auto) if first_served => {
-            let allowed = sched_getaffinity(None).ok()?;
-            (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()
-        }
-        Cores::Named(_) => return None,
+/// The core of a role of a scenario with so many bodies: plants in turn, for all of them act when the tick is due; observer
+/// and controller on cores of their own if there are any, else beside the leader and beside the first follower, whose
+/// measurements they wait for.
+fn core_of(cores: &[usize], role: RoleId, bodies: usize) -> Option<usize> {
+    let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
+    let place = match role {
+        RoleId::Plant(index) => index,
+        RoleId::Observer => own_or(bodies, 0),
+        RoleId::Controller => own_or(bodies + 1, 1),
     };
-    let (last, plants) = cores.split_last()?;
-    match role {
-        RoleId::Plant(index) if !plants.is_empty() => Some(plants[index % plants.len()]),
-        _ => Some(*last),
-    }
+    cores.get(place % cores.len().max(1)).copied()
 }
 
 fn set_fifo(priority: i32) -> io::Result<()> {
@@ -135,35 +145,31 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    fn settings(cores: &[usize]) -> Realtime {
-        Realtime { cores: Cores::List(cores.to_vec()), ..Realtime::default() }
-    }
-
     #[test]
-    fn plants_share_the_first_cores_and_the_others_the_last() {
-        let core = |cores: &[usize], role| core_of(&settings(cores), role, false);
-        assert_eq!(core(&[4, 5], RoleId::Plant(0)), Some(4));
-        assert_eq!(core(&[4, 5], RoleId::Plant(1)), Some(4));
-        assert_eq!(core(&[4, 5], RoleId::Observer), Some(5));
-        assert_eq!(core(&[4, 5, 6], RoleId::Plant(1)), Some(5));
-        assert_eq!(core(&[4, 5, 6], RoleId::Plant(2)), Some(4));
-        assert_eq!(core(&[7], RoleId::Plant(0)), Some(7));
-        assert_eq!(core(&[7], RoleId::Controller), Some(7));
+    fn whoever_waits_for_a_body_is_beside_it_unless_there_are_cores_for_all() {
+        let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer, RoleId::Controller];
+        let places = |cores: &[usize]| roles.map(|role| core_of(cores, role, 2).unwrap());
+        assert_eq!(places(&[7]), [7, 7, 7, 7]);
+        assert_eq!(places(&[4, 5]), [4, 5, 4, 5]);
+        assert_eq!(places(&[4, 5, 6]), [4, 5, 6, 5]);
+        assert_eq!(places(&[4, 5, 6, 7, 8]), [4, 5, 6, 7]);
+        assert_eq!(core_of(&[4, 5], RoleId::Plant(2), 3), Some(4));
+        assert_eq!(core_of(&[], RoleId::Plant(2), 3), None);
     }
 
     #[test]
     fn nobody_is_bound_to_a_core_without_being_served_first_there() {
-        assert_eq!(core_of(&Realtime::default(), RoleId::Observer, false), None);
-        assert!(core_of(&Realtime::default(), RoleId::Observer, true).is_some());
+        assert!(cores(&Realtime::default(), false).is_empty());
+        assert!(!cores(&Realtime::default(), true).is_empty());
     }
 
     #[test]
     fn what_is_not_granted_is_reported_with_a_remedy() {
-        let grants = take(
-            &Realtime { lock_memory: false, priority: 0, cores: Cores::List(vec![1023]), ..Realtime::default() },
-            RoleId::Observer,
-        );
-        assert_eq!(grants.len(), 1);
+        let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
+        let overrides = overrides.map(str::to_owned);
+        let scenario = Scenario::parse(crate::config::SHIPPED[0].1, "test", &overrides).unwrap();
+        let Privileges { grants, first_served, beside } = take(&scenario, RoleId::Observer);
+        assert_eq!((grants.len(), first_served, beside), (1, false, Vec::new()));
         assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");
     }
 }

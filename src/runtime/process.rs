@@ -3,17 +3,18 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::bridge::DeviceError;
-use super::drive::{Control, Drive, Ended};
+use super::drive::{Control, Drive, Ended, Waiting};
 use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
+use super::privileges::Privileges;
 use super::{depths, privileges};
 use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::{ClockKind, ConfigError, Realtime, Scenario};
+use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
 use crate::sample::{Phase, RoleState, Schedule};
-use crate::telemetry::{Grant, Latency, Ledger, LedgerError, RoleReport, StageReport};
+use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use crate::with_rig;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -22,12 +23,12 @@ use std::sync::atomic::AtomicBool;
 /// How often a role looks for the next phase before its ticks, ns.
 const LOOK_NS: u64 = 1_000_000;
 /// Samples that every link carries before the first tick.
-pub(super) const WARM_UP_SAMPLES: usize = 200;
+pub(super) const WARM_UP_SAMPLES: usize = 100;
 /// The pause between them, ns.
-pub(super) const WARM_UP_PAUSE_NS: u64 = 100_000;
+pub(super) const WARM_UP_PAUSE_NS: u64 = 50_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
-const BASELINE_PERIOD_NS: u64 = 1_000_000;
+const BASELINE_PERIOD_NS: u64 = 300_000;
 /// How long a role that is done waits for the launcher's leave, ns: longer than any machine keeps a launcher waiting.
 const LEAVE_NS: u64 = 120_000_000_000;
 
@@ -142,12 +143,12 @@ pub(super) fn in_domain(
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
-    let grants = if realtime { privileges::take(&scenario.realtime, role) } else { Vec::new() };
+    let privileges = if realtime { privileges::take(scenario, role) } else { Privileges::default() };
     let ledger = Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))?;
     hooks::enter(role.name(scenario), ledger.generation() + 1);
     hooks::at(Place::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
-    serve(scenario, occupant, &bus, &ledger, terminated, grants, |report| {
+    serve(scenario, occupant, &bus, &ledger, terminated, privileges, |report| {
         reported(report);
         write_report(domain, report)
     })
@@ -176,7 +177,7 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a seat on a bus: the phases of a run, from open links to the report. `grants` is what the caller has taken, and
+/// Serves a seat on a bus: the phases of a run, from open links to the report. `privileges` are what the caller has taken, and
 /// `ledger` the books, new or a predecessor's.
 ///
 /// # Errors
@@ -187,32 +188,32 @@ pub fn serve<B: Bus + 'static>(
     bus: &B,
     ledger: &Ledger,
     terminated: &AtomicBool,
-    grants: Vec<Grant>,
+    privileges: Privileges,
     deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let occupant = occupant.into();
     let role = occupant.role();
     let name = role.name(scenario);
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
-    let health = bus.writer(&topic(scenario, name, Signal::Health))?;
+    let health = bus.writer(&topic(scenario, name, Signal::Health), ledger.generation() + 1)?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         health,
         ledger.generation(),
-        grants.iter().filter(|grant| !grant.granted).count() as u64,
+        privileges.grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,
     );
     let mut stages = Vec::new();
     let ended = match begin(scenario, role, &mut node, &mut control, &mut stages)? {
-        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, privileges::first_served(&grants))?,
+        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
     if scenario.clock == ClockKind::Realtime {
         privileges::release();
     }
     stages.extend(node.stages());
-    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, grants) })?;
+    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, privileges.grants) })?;
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
         let leave_ns = monotonic_ns() + LEAVE_NS;
@@ -284,24 +285,33 @@ fn await_phase<B: Bus>(
     Err(RoleError::NoLauncher { waited_s })
 }
 
+/// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
+fn waiting<'a>(scenario: &Scenario, privileges: &'a Privileges) -> Waiting<'a> {
+    let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
+    let [lead_ns, spin_ns] = [wake_lead_us, spin_us].map(|us| ((us * 1e3) as u64).min(scenario.period_ns / 4));
+    let (spin_ns, give_way) = match wake {
+        Wake::Auto if privileges.first_served => (spin_ns, &privileges.beside[..]),
+        Wake::Spin => (spin_ns, &[][..]),
+        Wake::Auto | Wake::Event => (0, &[][..]),
+    };
+    Waiting { lead_ns, spin_ns, give_way, cutoff }
+}
+
 fn drive<B: Bus>(
     scenario: &Scenario,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     schedule: &Schedule,
-    first_served: bool,
+    privileges: &Privileges,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
     // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
     let late = scenario.clock == ClockKind::Realtime && !control.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1));
-    // Among equals, a role that spins for a sample holds up the one it waits for.
-    let spin_us = if first_served { scenario.realtime.spin_us } else { 0.0 };
-    let settings = Realtime { spin_us, ..scenario.realtime.clone() };
     let mut drive = Drive::new(control, scenario.last_tick);
     let ended = match scenario.clock {
-        ClockKind::Realtime => drive.realtime(&mut **node, grid, &settings),
+        ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, privileges)),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
     };
     Ok(ended?)

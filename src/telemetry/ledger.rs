@@ -3,12 +3,10 @@
 //! Words are written one by one and never locked: whoever dies in between leaves each of them whole. Must not know what
 //! is counted.
 
-use memmap2::MmapRaw;
-use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
+use crate::shared::SharedWords;
+use rustix::fs::{FlockOperation, flock};
 use std::cell::Cell;
-use std::fs::{File, OpenOptions};
 use std::io;
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -52,21 +50,15 @@ pub struct Ledger {
 #[derive(Debug)]
 enum Memory {
     Private(Box<[AtomicU64]>),
-    /// The file is kept open for the lock that a writer has on it; the kernel lets go of it when the writer dies.
-    Shared(MmapRaw, File),
+    Shared(SharedWords),
 }
 
 impl Memory {
     #[inline]
-    #[allow(unsafe_code)]
     fn words(&self) -> &[AtomicU64] {
         match self {
             Self::Private(words) => words,
-            // SAFETY: the mapping is writable, page-aligned, at least `len` bytes long (the file was allocated so, and no
-            // process of a run shortens it), and lives as long as `self`; every access to it, in any process, is atomic.
-            Self::Shared(map, _) => unsafe {
-                std::slice::from_raw_parts(map.as_ptr().cast::<AtomicU64>(), map.len() / size_of::<u64>())
-            },
+            Self::Shared(shared) => shared.words(),
         }
     }
 }
@@ -85,21 +77,14 @@ impl Ledger {
     /// # Errors
     /// [`LedgerError`].
     pub fn shared(path: &Path, words: usize) -> Result<Self, LedgerError> {
-        let expected = ((Self::FIRST + words) * size_of::<u64>()) as u64;
-        let open = || {
-            let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
-            if file.metadata()?.len() == 0 {
-                // Really allocated, not merely promised: a page that is missing later would kill the process.
-                fallocate(&file, FallocateFlags::empty(), 0, expected)?;
-            }
-            let found = file.metadata()?.len();
-            Ok((found, Memory::Shared(MmapRaw::map_raw(&file)?, file)))
-        };
-        let (found, memory) = open().map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
+        let words = Self::FIRST + words;
+        let shared =
+            SharedWords::open(path, words).map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
+        let [found, expected] = [shared.words().len(), words].map(|words| (words * size_of::<u64>()) as u64);
         if found != expected {
             return Err(LedgerError::Size { path: path.to_owned(), found, expected });
         }
-        Ok(Self::over(memory))
+        Ok(Self::over(Memory::Shared(shared)))
     }
 
     /// The same, to be written: there is one writer at a time.
@@ -109,7 +94,7 @@ impl Ledger {
     pub fn taken(path: &Path, words: usize) -> Result<Self, LedgerError> {
         let ledger = Self::shared(path, words)?;
         match &*ledger.memory {
-            Memory::Shared(_, file) if flock(file, FlockOperation::NonBlockingLockExclusive).is_err() => {
+            Memory::Shared(shared) if flock(shared.file(), FlockOperation::NonBlockingLockExclusive).is_err() => {
                 Err(LedgerError::Taken { path: path.to_owned() })
             }
             _ => Ok(ledger),

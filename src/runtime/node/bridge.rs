@@ -3,9 +3,9 @@
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
 use super::plant::StateBook;
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
-use crate::clock::{Clock, Grid, monotonic_ns};
+use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::CommandEvent;
 use crate::runtime::bridge::DeviceLink;
@@ -14,6 +14,9 @@ use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::{Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineBook, MAX_CONTENT};
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
+
+/// Between two looks at the line, ns.
+const LOOK_NS: u64 = 50_000;
 
 /// A device with its links and books.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -214,6 +217,20 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         Ok(if overdue { self.give_up() } else { polled })
     }
 
+    fn awaits(&self) -> Option<RoleId> {
+        None
+    }
+
+    /// What it waits for comes over the line, or is a command.
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        if self.asked {
+            sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
+        } else {
+            self.command.sleep(until_ns)?;
+        }
+        Ok(true)
+    }
+
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         let (tick, clock, truth) = (self.book.next(), self.clock, &self.reply.truth);
@@ -243,6 +260,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        self.command.refresh();
         self.measurement.refresh()?;
         self.truth.refresh()
     }

@@ -1,6 +1,6 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::{Watchdog, Watched};
@@ -13,6 +13,8 @@ use crate::telemetry::{Latency, StageReport, TickBook, Ticks, WatchBook};
 
 /// One driven body, seen from the controller.
 struct Channel<R: Rig, B: Bus> {
+    /// The body's index.
+    body: usize,
     controller: Controller<R::Law>,
     measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     command: Output<B, Command<R>>,
@@ -52,6 +54,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let estimate = seat.input(&rig.bodies()[0].name, Signal::Estimate, rig.estimate_guard())?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             Ok(Channel {
+                body: index,
                 controller: Controller::new(rig.law(index)),
                 measurement: seat.input(&body.name, Signal::Measurement, rig.measurement_guard(index, true))?,
                 command,
@@ -84,6 +87,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
+            if self.clock == Clock::Monotonic {
+                // Meanwhile the others, so that the newest are at hand when the estimate comes, which is the last as a rule.
+                self.channels.iter_mut().try_for_each(|channel| channel.measurement.seek(u64::MAX).map(drop))?;
+            }
             return Ok(false);
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
@@ -137,7 +144,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let clock = self.clock;
         let mut began_ns = self.received_ns;
         let mut starved = false;
-        for Channel { controller, measurement, command, ready, began_ns: began, sent_ns } in &mut self.channels {
+        for Channel { controller, measurement, command, ready, began_ns: began, sent_ns, .. } in &mut self.channels {
             starved |= !*ready;
             *ready &= !silent;
             let Some(measurement) = measurement.sample().filter(|_| *ready) else {
@@ -194,6 +201,24 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         if allowed && self.gather(gate == Gate::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
     }
 
+    fn awaits(&self) -> Option<RoleId> {
+        let late = self.channels.iter().find(|channel| !channel.measurement.knows(self.book.next()));
+        Some(late.map_or(RoleId::Observer, |channel| RoleId::Plant(channel.body)))
+    }
+
+    /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        let tick = self.book.next();
+        if !self.estimate.knows(tick) {
+            self.estimate.sleep(until_ns)?;
+        } else if let Some(late) = self.channels.iter_mut().find(|channel| !channel.measurement.knows(tick)) {
+            late.measurement.sleep(until_ns)?;
+        } else {
+            return Ok(false);
+        }
+        Ok(true)
+    }
+
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         let timed = self.clock == Clock::Monotonic;
@@ -228,7 +253,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.channels.iter_mut().try_for_each(|channel| channel.command.refresh())
+        self.estimate.refresh();
+        self.channels.iter_mut().try_for_each(|channel| {
+            channel.measurement.refresh();
+            channel.command.refresh()
+        })
     }
 
     fn ticks(&self) -> Ticks {

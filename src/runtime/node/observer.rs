@@ -1,6 +1,6 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
@@ -114,6 +114,15 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         if there { self.execute() } else { Ok(Poll::Waiting) }
     }
 
+    fn awaits(&self) -> Option<RoleId> {
+        Some(RoleId::Plant(0))
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        self.measurement.sleep(until_ns)?;
+        Ok(true)
+    }
+
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
@@ -137,6 +146,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh();
         self.estimate.refresh()
     }
 

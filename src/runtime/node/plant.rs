@@ -1,6 +1,6 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Gate, Node, Poll, Seat};
+use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Command, Measurement, Rig, Truth};
@@ -159,6 +159,18 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
         }
     }
 
+    fn awaits(&self) -> Option<RoleId> {
+        None
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        let Some(last) = self.book.next().checked_sub(1) else { return Ok(false) };
+        let lacking = self.command.as_mut().filter(|command| !command.knows(last));
+        let lacks = lacking.is_some();
+        lacking.map_or(Ok(()), |command| command.sleep(until_ns))?;
+        Ok(lacks)
+    }
+
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         let (plant, clock) = (&self.plant, self.clock);
@@ -192,6 +204,9 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
+        if let Some(command) = &mut self.command {
+            command.refresh();
+        }
         self.measurement.refresh()?;
         self.truth.refresh()
     }

@@ -131,9 +131,9 @@ mod tests {
         type Writer<S: Sample> = <MemoryBus as Bus>::Writer<S>;
         type Reader<S: Sample> = <MemoryBus as Bus>::Reader<S>;
 
-        fn writer<S: Sample>(&self, topic: &Topic) -> Result<Self::Writer<S>, BusError> {
+        fn writer<S: Sample>(&self, topic: &Topic, _generation: u64) -> Result<Self::Writer<S>, BusError> {
             self.written.borrow_mut().push((topic.clone(), S::TYPE_NAME));
-            self.bus.writer(topic)
+            self.bus.writer(topic, 1)
         }
 
         fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {

@@ -1,0 +1,158 @@
+//! Doorbells: a reader that has nothing to do sleeps on the bell of the signal it lacks, and its writer wakes it.
+//!
+//! A bell is a futex in memory that the processes of a run share. It has no owner, so nobody's death can lock it. A writer
+//! that finds nobody asleep makes no system call. Must not carry anything: who is woken looks at the link.
+
+use super::Topic;
+use super::domain::Domain;
+use crate::clock::monotonic_ns;
+use crate::shared::SharedWords;
+use rustix::thread::futex;
+use rustix::time::Timespec;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io;
+use std::rc::Rc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// Bells of a run. Two signals whose names fall on one bell only wake each other's readers in vain.
+const BELLS: usize = 128;
+/// Bells are a cache line apart: what one writer rings must not slow another down.
+const STRIDE: usize = 16;
+/// Set while somebody is asleep; the count of rings is above it.
+const ASLEEP: u32 = 1;
+const RING: u32 = 2;
+/// A writer that has never rung is perhaps none of ours and never will: its reader looks again after so long, ns.
+const UNRUNG_NS: u64 = 50_000;
+/// One that has may have died: its reader looks again after so long, ns.
+const RUNG_NS: u64 = 1_000_000;
+
+/// Bytes of shared memory for the bells of a run.
+pub const BELLS_BYTES: usize = BELLS * STRIDE * size_of::<u32>();
+
+/// The bells of a run.
+#[derive(Debug, Clone)]
+pub struct Bells {
+    memory: Rc<SharedWords>,
+}
+
+impl Bells {
+    /// Those of a domain.
+    ///
+    /// # Errors
+    /// The system's reason.
+    pub fn open(domain: &Domain) -> io::Result<Self> {
+        let memory = SharedWords::open(&domain.shared("bells"), BELLS_BYTES / size_of::<u64>())?;
+        if memory.halves().len() < BELLS * STRIDE {
+            return Err(io::Error::other("the bells of this run are another version's"));
+        }
+        Ok(Self { memory: Rc::new(memory) })
+    }
+
+    /// The bell of a signal.
+    pub fn of(&self, topic: &Topic) -> Bell {
+        // Keys are fixed, so every process of this program finds the same.
+        let mut hasher = DefaultHasher::new();
+        topic.to_string().hash(&mut hasher);
+        Bell { memory: self.memory.clone(), index: hasher.finish() as usize % BELLS * STRIDE }
+    }
+}
+
+/// The bell of one signal.
+#[derive(Debug)]
+pub struct Bell {
+    memory: Rc<SharedWords>,
+    index: usize,
+}
+
+impl Bell {
+    #[inline]
+    fn word(&self) -> &AtomicU32 {
+        &self.memory.halves()[self.index]
+    }
+
+    /// Wakes whoever sleeps. After the sample is there.
+    #[inline]
+    pub fn ring(&self) {
+        if self.word().fetch_add(RING, Ordering::SeqCst) & ASLEEP != 0 {
+            self.wake();
+        }
+    }
+
+    #[cold]
+    fn wake(&self) {
+        self.word().fetch_and(!ASLEEP, Ordering::SeqCst);
+        // A reader that is not woken looks again by itself.
+        let _ = futex::wake(self.word(), futex::Flags::empty(), i32::MAX as u32);
+    }
+
+    /// Sleeps until the bell rings, at most until `until_ns`, and not at all if `news` says that there is something. May end
+    /// early.
+    #[inline]
+    pub fn sleep<E>(&self, until_ns: u64, news: impl FnOnce() -> Result<bool, E>) -> Result<(), E> {
+        let seen = self.word().fetch_or(ASLEEP, Ordering::SeqCst) | ASLEEP;
+        // Looked at after the mark is set: what arrives from here on rings.
+        if news()? {
+            return Ok(());
+        }
+        let longest_ns = if seen >= RING { RUNG_NS } else { UNRUNG_NS };
+        let wait_ns = until_ns.saturating_sub(monotonic_ns()).min(longest_ns);
+        let timeout = Timespec { tv_sec: 0, tv_nsec: wait_ns as _ };
+        // Rung, interrupted or over: the caller looks for itself.
+        let _ = futex::wait(self.word(), futex::Flags::empty(), seen, Some(&timeout));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Signal;
+    use super::super::domain::OwnedDomain;
+    use super::*;
+    use std::convert::Infallible;
+
+    fn topic(body: &str) -> Topic {
+        Topic { scenario: "s".to_owned(), body: body.to_owned(), signal: Signal::Estimate }
+    }
+
+    const FAR_NS: u64 = 10_000_000_000;
+
+    #[test]
+    fn whoever_sleeps_is_woken_by_the_ring_and_not_by_the_clock() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let (rings, waits) = (domain.domain().clone(), domain.domain().clone());
+        let (said, heard) = std::sync::mpsc::channel();
+        let ringer = std::thread::spawn(move || {
+            let bell = Bells::open(&rings).unwrap().of(&topic("b"));
+            bell.ring();
+            while heard.try_recv().is_err() {
+                bell.ring();
+                std::thread::yield_now();
+            }
+        });
+        let bell = Bells::open(&waits).unwrap().of(&topic("b"));
+        for _ in 0..200 {
+            bell.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(false)).unwrap();
+        }
+        said.send(()).unwrap();
+        ringer.join().unwrap();
+        assert!(bell.word().load(Ordering::SeqCst) >= RING);
+    }
+
+    #[test]
+    fn nobody_sleeps_over_news_or_longer_than_told() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bell = Bells::open(domain.domain()).unwrap().of(&topic("b"));
+        bell.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(true)).unwrap();
+        bell.sleep(0, || Ok::<_, Infallible>(false)).unwrap();
+        assert_eq!(bell.sleep(0, || Err(7)), Err(7));
+    }
+
+    #[test]
+    fn the_bells_of_a_signal_are_one_for_every_process() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let (one, other) = (Bells::open(domain.domain()).unwrap(), Bells::open(domain.domain()).unwrap());
+        let indices: Vec<usize> = (0..50).map(|n| one.of(&topic(&n.to_string())).index).collect();
+        assert_eq!(indices, (0..50).map(|n| other.of(&topic(&n.to_string())).index).collect::<Vec<_>>());
+        assert!(indices.iter().any(|index| *index != indices[0]));
+    }
+}
