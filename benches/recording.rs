@@ -55,7 +55,7 @@ fn run(directory: &Path, seconds: &str, record: bool) -> Value {
 
 fn words(values: &mut [f64]) -> String {
     values.sort_by(f64::total_cmp);
-    match values {
+    match &*values {
         [] => "-".to_owned(),
         [first, .., last] => format!("{:.1} ({first:.1} to {last:.1})", values[values.len() / 2]),
         [one] => format!("{one:.1}"),

@@ -32,8 +32,9 @@ Examples:
 /// Compares.
 pub fn diff(arguments: &Arguments) -> Exit {
     let tolerances = Tolerances { absolute: arguments.absolute, relative: arguments.relative };
-    let bad =
-        [("absolute", arguments.absolute), ("relative", arguments.relative)].into_iter().find(|(_, x)| !(*x >= 0.0));
+    let bad = [("absolute", arguments.absolute), ("relative", arguments.relative)]
+        .into_iter()
+        .find(|(_, x)| !(0.0..).contains(x));
     if let Some((name, value)) = bad {
         return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
     }

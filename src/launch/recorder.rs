@@ -86,8 +86,7 @@ impl RecorderWatch {
     /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder.
     pub fn credit(&mut self, scored: u64) -> Result<u64, BusError> {
         self.listen()?;
-        let waits = self.state() == RoleState::Running && self.problem.is_none() && self.health.written();
-        Ok(if waits { self.last.stamp.tick.min(scored) } else { scored })
+        Ok(if self.active() { self.last.stamp.tick.min(scored) } else { scored })
     }
 
     /// Looks whether it has failed: then the run goes on without.
@@ -96,7 +95,7 @@ impl RecorderWatch {
             return;
         }
         let ended = self.process.as_mut().and_then(|process| process.ended().map(|status| process.failure(status)));
-        let silent = self.state() == RoleState::Running && self.silent_ns > self.limit_ns && self.health.written();
+        let silent = self.active() && self.silent_ns > self.limit_ns;
         let problem = match ended {
             Some(failure) => failure.cause,
             None if silent => {
@@ -116,7 +115,7 @@ impl RecorderWatch {
         let _ = self.listen();
         match &mut self.process {
             Some(process) => process.ended().is_none(),
-            None => self.problem.is_none() && self.state() == RoleState::Running && self.health.written(),
+            None => self.active(),
         }
     }
 
@@ -133,6 +132,12 @@ impl RecorderWatch {
         });
         report.reconcile(roles);
         Some(report)
+    }
+
+    /// Whether there is one that takes samples, or is about to: from its first word on.
+    fn active(&self) -> bool {
+        let records = (RoleState::Ready..RoleState::Done).contains(&self.state());
+        records && self.problem.is_none() && self.health.written()
     }
 
     fn state(&self) -> RoleState {

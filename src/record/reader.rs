@@ -11,6 +11,7 @@ use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::Record;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
@@ -339,6 +340,9 @@ impl EndInfo {
     }
 }
 
+/// A sample as it lies in the file: channel, time of receipt in ns, CDR header and body.
+type Message<'a> = (u16, u64, Cow<'a, [u8]>);
+
 /// What a file has besides samples.
 #[derive(Default)]
 struct Content {
@@ -352,7 +356,7 @@ struct Content {
 
 impl Content {
     /// Takes a record in; gives back what it is if it is a sample: channel, time, bytes.
-    fn take<'a>(&mut self, record: Record<'a>) -> Result<Option<(u16, u64, std::borrow::Cow<'a, [u8]>)>, String> {
+    fn take<'a>(&mut self, record: Record<'a>) -> Result<Option<Message<'a>>, String> {
         match record {
             Record::Schema { header, data } => {
                 let text = String::from_utf8_lossy(&data).into_owned();

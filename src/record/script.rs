@@ -126,12 +126,12 @@ impl Script {
         };
         let steps = if realtime { reading.executed() } else { reading.every_tick() };
         let inputs = if realtime { reading.used(&steps) } else { reading.all(&steps) };
-        reading.lost();
         if !recording.info().whole {
             reading.limit(0, || {
                 "it was begun in the midst of the run, and what the role knew then is not in it".to_owned()
             });
         }
+        reading.lost();
         let Reading { outputs, limit, .. } = reading;
         let name = role.name(scenario).to_owned();
         Ok(Self { role, name, steps, inputs, outputs, limit, grid, realtime })
