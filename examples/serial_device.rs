@@ -12,7 +12,7 @@
 //!     corotate bridge --serial /dev/pts/2 --body follower --domain DIR
 
 use corotate::model::{Inertia, RigidBody};
-use corotate::role::Body;
+use corotate::role::{Body, SingleBody};
 use corotate::runtime::Line;
 use corotate::sample::{RateCommand, RateMeasurement, RateTruth};
 use corotate::serial::{Device, Hello};
@@ -95,7 +95,7 @@ impl Body for Follower {
 }
 
 /// The device's main loop, until it is switched off or unplugged: bytes in, frames out, and a look at the clock.
-pub fn serve<B: Body, M>(line: &mut Line, device: &mut Device<B, M>, on: &AtomicBool)
+pub fn serve<B: SingleBody, M>(line: &mut Line, device: &mut Device<B, M>, on: &AtomicBool)
 where
     M: FnMut(&Hello<'_>) -> Option<B>,
 {

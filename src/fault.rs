@@ -4,10 +4,12 @@
 //! runtime does that with what is decided here.
 
 use crate::model::Noise;
-use crate::sample::{FieldKind, Sample};
+use crate::sample::{Field, FieldKind, Message, Stamp};
 
 /// Bytes of one word: every element of a sample is one.
 const WORD: usize = 8;
+/// Words of the stamp, with which every sample begins.
+const STAMP: usize = size_of::<Stamp>() / WORD;
 
 /// One scripted fault.
 #[derive(Debug, Clone, PartialEq)]
@@ -80,10 +82,9 @@ pub struct Words {
 }
 
 impl Words {
-    /// Everything but the stamp.
-    pub fn content<S: Sample>() -> Self {
-        let stamp = size_of::<crate::sample::Stamp>() / WORD;
-        Self { first: stamp, count: size_of::<S>() / WORD - stamp }
+    /// Everything but the stamp of a sample of so many bytes.
+    pub fn content(size: usize) -> Self {
+        Self { first: STAMP, count: size / WORD - STAMP }
     }
 }
 
@@ -119,10 +120,9 @@ impl Fault {
     }
 
     /// Changes the content of the sample of `tick`, where it is a fault of that kind. `last` is the sample sent before.
-    pub fn tamper<S: Sample>(&self, tick: u64, sample: &mut S, last: &S) {
+    pub fn tamper<S: Message + ?Sized>(&self, tick: u64, sample: &mut S, last: &S) {
         let Action::Content(Tamper { change, words }) = self.action else { return };
-        let last: &[u64] = bytemuck::cast_slice(bytemuck::bytes_of(last));
-        let sample: &mut [u64] = bytemuck::cast_slice_mut(bytemuck::bytes_of_mut(sample));
+        let (last, sample) = (last.words(), sample.words_mut());
         let range = words.first..words.first + words.count;
         match change {
             Change::Freeze => sample[range.clone()].copy_from_slice(&last[range]),
@@ -138,10 +138,9 @@ impl Fault {
                 }
             }
             Change::Lose { valid } => {
-                let stamp = Words::content::<S>().first;
                 for word in range {
                     sample[word] = 0;
-                    sample[valid] &= !(1 << (word - stamp));
+                    sample[valid] &= !(1 << (word - STAMP));
                 }
             }
         }
@@ -154,12 +153,12 @@ impl Fault {
 }
 
 /// The word of a sample at which a field begins, its number of elements and their kind; of the stamp, `tick` and
-/// `generation` are fields too.
-pub fn field<S: Sample>(name: &str) -> Option<(Words, FieldKind)> {
+/// `generation` are fields too. `fields` are those after the stamp.
+pub fn field(fields: &[Field], name: &str) -> Option<(Words, FieldKind)> {
     let stamp = [("tick", 0), ("generation", 1)].into_iter().find(|(known, _)| *known == name);
     let of_stamp = stamp.map(|(_, first)| (Words { first, count: 1 }, FieldKind::U64));
     let of_content = || {
-        let field = S::FIELDS.iter().find(|field| field.name == name)?;
+        let field = fields.iter().find(|field| field.name == name)?;
         Some((Words { first: field.offset / WORD, count: field.count }, field.kind))
     };
     of_stamp.or_else(of_content)
@@ -186,7 +185,7 @@ fn unit(draw: u64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sample::{RateMeasurement, Stamp};
+    use crate::sample::{RateMeasurement, Sample};
 
     fn fault(change: Change, words: Words) -> Fault {
         let action = Action::Content(Tamper { change, words });
@@ -210,7 +209,7 @@ mod tests {
     }
 
     fn omega() -> Words {
-        field::<RateMeasurement>("omega_rad_s").unwrap().0
+        field(RateMeasurement::FIELDS, "omega_rad_s").unwrap().0
     }
 
     #[test]
@@ -233,7 +232,7 @@ mod tests {
         assert_eq!(tampered(&fault(Change::Set(5.0), second), 10).omega_rad_s, [0.1, 5.0, 0.3]);
         assert!(tampered(&fault(Change::Set(f64::NAN), omega()), 10).omega_rad_s.iter().all(|value| value.is_nan()));
         assert_eq!(tampered(&fault(Change::Flip(Some(63)), second), 10).omega_rad_s, [0.1, -0.2, 0.3]);
-        let valid = field::<RateMeasurement>("valid").unwrap().0.first;
+        let valid = field(RateMeasurement::FIELDS, "valid").unwrap().0.first;
         let lost = tampered(&fault(Change::Lose { valid }, second), 10);
         assert_eq!(lost, RateMeasurement { omega_rad_s: [0.1, 0.0, 0.3], valid: 0b101, ..sample() });
         let noisy = tampered(&fault(Change::Noise(1.0), omega()), 10);
@@ -243,7 +242,7 @@ mod tests {
 
     #[test]
     fn draws_follow_from_seed_and_tick_alone() {
-        let flip = fault(Change::Flip(None), Words::content::<RateMeasurement>());
+        let flip = fault(Change::Flip(None), Words::content(size_of::<RateMeasurement>()));
         assert_eq!(tampered(&flip, 10), tampered(&flip, 10));
         let other = Fault { seed: seed(8, 0), ..flip.clone() };
         let differ = |a: &Fault, b: &Fault| (0..64).filter(|tick| tampered(a, *tick) != tampered(b, *tick)).count();
@@ -262,9 +261,12 @@ mod tests {
 
     #[test]
     fn fields_are_found_by_name_those_of_the_stamp_too() {
-        assert_eq!(field::<RateMeasurement>("tick"), Some((Words { first: 0, count: 1 }, FieldKind::U64)));
-        assert_eq!(field::<RateMeasurement>("applied_rad_s2"), Some((Words { first: 7, count: 3 }, FieldKind::F64)));
-        assert_eq!(field::<RateMeasurement>("sent_ns"), None);
-        assert_eq!(Words::content::<RateMeasurement>(), Words { first: 4, count: 8 });
+        assert_eq!(field(RateMeasurement::FIELDS, "tick"), Some((Words { first: 0, count: 1 }, FieldKind::U64)));
+        assert_eq!(
+            field(RateMeasurement::FIELDS, "applied_rad_s2"),
+            Some((Words { first: 7, count: 3 }, FieldKind::F64))
+        );
+        assert_eq!(field(RateMeasurement::FIELDS, "sent_ns"), None);
+        assert_eq!(Words::content(size_of::<RateMeasurement>()), Words { first: 4, count: 8 });
     }
 }

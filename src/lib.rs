@@ -20,6 +20,7 @@
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
+//! | `bench` | what all of it costs beside its floors | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
 //! rigid bodies*; \[SZ\] V. F. Shcherbak, N. V. Zhogoleva, *Identification of the moments of inertia of a rigid body*;
@@ -37,6 +38,8 @@ pub mod sample;
 #[cfg(feature = "serial")]
 pub mod serial;
 
+#[cfg(feature = "runtime")]
+pub mod bench;
 #[cfg(feature = "runtime")]
 pub mod bus;
 #[cfg(feature = "runtime")]

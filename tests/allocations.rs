@@ -3,11 +3,11 @@
 
 use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
-use corotate::bus::{Bus, BusError, Read, Reader, Signal, Topic, Write};
+use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, depths, private_ledger, serve, topic};
-use corotate::sample::{Health, Phase, RoleState, Sample, Schedule};
+use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::serial::{Device, Hello};
 use corotate::telemetry::RoleReport;
 use corotate::with_rig;
@@ -82,6 +82,8 @@ struct CountedWriter<W>(W);
 impl Bus for CountedBus {
     type Writer<S: Sample> = CountedWriter<<IoxBus as Bus>::Writer<S>>;
     type Reader<S: Sample> = <IoxBus as Bus>::Reader<S>;
+    type FleetWriter<L: FleetLayout> = CountedWriter<<IoxBus as Bus>::FleetWriter<L>>;
+    type FleetReader<L: FleetLayout> = <IoxBus as Bus>::FleetReader<L>;
 
     fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<Self::Writer<S>, BusError> {
         self.0.writer(topic, generation).map(CountedWriter)
@@ -90,14 +92,27 @@ impl Bus for CountedBus {
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
         self.0.reader(topic, reader)
     }
+
+    fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<Self::FleetWriter<L>, BusError> {
+        self.0.fleet_writer(topic, bodies).map(CountedWriter)
+    }
+
+    fn fleet_reader<L: FleetLayout>(
+        &self,
+        topic: &Topic,
+        reader: Reader,
+        bodies: usize,
+    ) -> Result<Self::FleetReader<L>, BusError> {
+        self.0.fleet_reader(topic, reader, bodies)
+    }
 }
 
-impl<S: Sample, W: Write<S>> Write<S> for CountedWriter<W> {
+impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
     fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         let mut real = false;
         self.0.send(|sample| {
             fill(sample);
-            real = S::TYPE_NAME != Health::TYPE_NAME && sample.stamp().generation != 0;
+            real = S::type_name() != Health::TYPE_NAME && sample.stamp().generation != 0;
         })?;
         if real {
             update(|count| (count.armed, count.of_ours_in_the_loop) = (true, count.of_ours));

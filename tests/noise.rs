@@ -2,17 +2,12 @@
 //!
 //! `cargo test --release --test noise -- --nocapture` prints every figure.
 
-#[path = "peer/ekf.rs"]
-mod ekf;
-#[path = "peer/recording.rs"]
-mod recording;
-
+use corotate::bench::ekf::Ekf;
+use corotate::bench::recording::{CASES, Case, Recording};
 use corotate::observe::{
     Filter, GuardedKalman, HiddenRate, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
 };
-use ekf::Ekf;
 use nalgebra::Vector1;
-use recording::{CASES, Case, Recording};
 use std::f64::consts::FRAC_1_SQRT_2;
 
 /// After this time the filters' transients are over, s; the recordings are twice as long.
@@ -35,21 +30,19 @@ fn kalman(density: f64, guess: f64, deviation: f64) -> Filter<1> {
     Filter::Kalman(KalmanFilter::new(Vector1::new(density), Vector1::new(guess), Vector1::new(deviation)))
 }
 
-impl Recording {
-    /// ω_k − ω̂_k at each sample by a filter on the invariant relation.
-    pub fn run(&self, mut filter: Filter<1>) -> Vec<f64> {
-        let relation = self.relation();
-        let mut errors = vec![self.truth[0].z - filter.estimate().x];
-        for index in 1..self.truth.len() {
-            let (from, to) = (self.sample(index - 1), self.sample(index));
-            match relation.observe(&from, &to, self.tick_s, filter.estimate().x) {
-                Observation::Seen(increment) => filter.step(&increment),
-                Observation::Unobservable { drift } => filter.predict(&drift, self.tick_s),
-            }
-            errors.push(self.truth[index].z - filter.estimate().x);
+/// ω_k − ω̂_k at each sample by a filter on the invariant relation.
+fn by_relation(recording: &Recording, mut filter: Filter<1>) -> Vec<f64> {
+    let relation = recording.relation();
+    let mut errors = vec![recording.truth[0].z - filter.estimate().x];
+    for index in 1..recording.truth.len() {
+        let (from, to) = (recording.sample(index - 1), recording.sample(index));
+        match relation.observe(&from, &to, recording.tick_s, filter.estimate().x) {
+            Observation::Seen(increment) => filter.step(&increment),
+            Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),
         }
-        errors
+        errors.push(recording.truth[index].z - filter.estimate().x);
     }
+    errors
 }
 
 /// ω_k − ω̂_k at each sample by the extended Kalman filter.
@@ -113,18 +106,18 @@ fn noise_passes_as_the_theory_says() {
         // The range is of two seeds; three others may lie a fifth beside it.
         assert!(value > range[0] / 1.2 && value < range[1] * 1.2, "{name}: {value:e}");
     };
-    within("first order, 5/s", [1.4e-2, 1.4e-2], &|data| data.run(first(5.0, guess)));
+    within("first order, 5/s", [1.4e-2, 1.4e-2], &|data| by_relation(data, first(5.0, guess)));
     // From the truth: a wrong guess would still be felt after 20 s at this rate.
-    within("first order, 0.2/s", [5.6e-4, 5.6e-4], &|data| data.run(first(0.2, ELLIPTIC.start[2])));
-    within("second order, 0.7 rad/s", [4.2e-5, 4.8e-5], &|data| data.run(second(0.7, guess)));
-    within("second order, 2 rad/s", [1.4e-4, 1.6e-4], &|data| data.run(second(2.0, guess)));
+    within("first order, 0.2/s", [5.6e-4, 5.6e-4], &|data| by_relation(data, first(0.2, ELLIPTIC.start[2])));
+    within("second order, 0.7 rad/s", [4.2e-5, 4.8e-5], &|data| by_relation(data, second(0.7, guess)));
+    within("second order, 2 rad/s", [1.4e-4, 1.6e-4], &|data| by_relation(data, second(2.0, guess)));
     for density in [1e-6, 1e-8, 1e-10, 0.0] {
         print!("{:28}", format!("extended Kalman, q {density:e}"));
         all(&|data| by_ekf(data, density, [guess, 1.0]));
         print!("{:28}", format!("guarded Kalman, q {density:e}"));
         all(&|data| by_guarded(data, density, [guess, 1.0]));
         print!("{:28}", format!("Kalman on phi, q {density:e}"));
-        all(&|data| data.run(kalman(density, guess, 1.0)));
+        all(&|data| by_relation(data, kalman(density, guess, 1.0)));
     }
 }
 
@@ -137,7 +130,7 @@ fn compare(case: &Case, recordings: &[Recording], density: f64) -> [f64; 3] {
     [
         pool(&|data| by_ekf(data, density, start)),
         pool(&|data| by_guarded(data, density, start)),
-        pool(&|data| data.run(kalman(density, start[0], start[1]))),
+        pool(&|data| by_relation(data, kalman(density, start[0], start[1]))),
     ]
 }
 
@@ -188,8 +181,8 @@ fn every_guess_converges() {
                     let times = [
                         by_ekf(&recording, density, start),
                         by_guarded(&recording, density, start),
-                        recording.run(kalman(density, start[0], start[1])),
-                        recording.run(second(0.7, guess)),
+                        by_relation(&recording, kalman(density, start[0], start[1])),
+                        by_relation(&recording, second(0.7, guess)),
                     ]
                     .map(|errors| settling_s(&recording, &errors, 2e-2));
                     let setting = format!(
@@ -214,7 +207,7 @@ fn without_noise_the_floor_is_that_of_rounding() {
     for case in &CASES {
         let recording = record(case, 1e-3, 0.0, 1);
         let guess = case.start[2] + GUESS_ERROR;
-        let errors = recording.run(second(4.0, guess));
+        let errors = by_relation(&recording, second(4.0, guess));
         let worst = errors[(SETTLED_S / recording.tick_s) as usize..].iter().fold(0.0_f64, |w, e| w.max(e.abs()));
         println!("{:16} {worst:.1e} rad/s", case.name);
         assert!(worst < 1e-11 && errors.iter().all(|error| error.is_finite()), "{}: {worst:e}", case.name);

@@ -4,11 +4,11 @@ mod common;
 
 use common::{Bench, Done, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Bus, Read, Reader, Topic};
+use corotate::bus::{Carried, Read, Reader, Topic};
 use corotate::config::Scenario;
 use corotate::record::{Recording, topic_of};
 use corotate::runtime::{RoleId, Visit, build, depths, in_turn, private_ledger, visit_writes};
-use corotate::sample::Sample;
+use corotate::sample::{FleetLayout, FleetSample, Sample};
 use corotate::with_rig;
 use serde_json::Value;
 use std::borrow::Cow;
@@ -37,6 +37,16 @@ fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
 
 type Tap = (String, Box<dyn FnMut(&mut Vec<u8>)>);
 
+fn tap<S: Carried + ?Sized>(bus: &MemoryBus, topic: &Topic, bodies: usize) -> Tap {
+    let mut reader = S::reader(bus, topic, Reader::Scorer, bodies).unwrap();
+    let take = move |bytes: &mut Vec<u8>| {
+        while reader.advance().unwrap() {
+            bytes.extend_from_slice(bytemuck::cast_slice(reader.current().unwrap().words()));
+        }
+    };
+    (topic.to_string(), Box::new(take))
+}
+
 /// Opens a signal to take its bytes as they were sent.
 struct Open<'a>(&'a MemoryBus);
 
@@ -44,13 +54,11 @@ impl Visit for Open<'_> {
     type Made = Tap;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Tap {
-        let mut reader = self.0.reader::<S>(&topic, Reader::Scorer).unwrap();
-        let take = move |bytes: &mut Vec<u8>| {
-            while reader.advance().unwrap() {
-                bytes.extend_from_slice(bytemuck::bytes_of(reader.current().unwrap()));
-            }
-        };
-        (topic.to_string(), Box::new(take))
+        tap::<S>(self.0, &topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Tap {
+        tap::<FleetSample<L>>(self.0, &topic, bodies)
     }
 }
 
@@ -159,8 +167,9 @@ fn faults_and_deaths_are_replayed_as_they_were() {
             assert!(done.stdout.contains("in 2 lives") && !done.stdout.contains("nothing can be"), "{out}: {done:?}");
         }
     }
-    for clock in ["in-process", "lockstep"] {
-        let (done, file) = record(&bench, "faults", clock, &["--clock", clock]);
+    for (scenario, clock) in [("faults", "in-process"), ("faults", "lockstep"), ("rigid-fleet", "lockstep")] {
+        let out = format!("{scenario}-{clock}");
+        let (done, file) = record(&bench, scenario, &out, &["--clock", clock]);
         assert_eq!(done.code, Some(0), "{done:?}");
         for options in [&[][..], &["--processes"]] {
             let done = replay(&bench, &file, options);

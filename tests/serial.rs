@@ -7,7 +7,7 @@ mod serial_device;
 
 use common::{Bench, Done, Running, await_some, shipped};
 use corotate::config::Scenario;
-use corotate::role::Body;
+use corotate::role::SingleBody;
 use corotate::runtime::Line;
 use corotate::serial::{Decoder, Device, Hello, MAX_FRAME, encode};
 use corotate::with_rig;
@@ -183,7 +183,7 @@ impl Drop for Powered {
 }
 
 /// A device keeps its state while its line is cut and joined again.
-fn live<B: Body, M: FnMut(&Hello<'_>) -> Option<B>>(path: &Path, device: &mut Device<B, M>, on: &AtomicBool) {
+fn live<B: SingleBody, M: FnMut(&Hello<'_>) -> Option<B>>(path: &Path, device: &mut Device<B, M>, on: &AtomicBool) {
     while on.load(Ordering::Relaxed) {
         match Line::open(path, None) {
             Ok(mut line) => serve(&mut line, device, on),

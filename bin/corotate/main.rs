@@ -1,5 +1,6 @@
 //! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
 
+mod bench;
 mod bridge;
 mod check;
 mod diff;
@@ -38,7 +39,8 @@ Examples:
   corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
   corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
-                                                 a device as the follower of a run --external follower";
+                                                 a device as the follower of a run --external follower
+  corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
 enum Command {
@@ -66,6 +68,11 @@ enum Command {
     Diff(diff::Arguments),
     /// Write a recording as tables
     Export(export::Arguments),
+    /// Measure what everything costs beside its floors, on this machine
+    Bench(bench::Arguments),
+    /// Take the other end of a hop that is measured
+    #[command(hide = true)]
+    BenchPeer(bench::PeerArguments),
     /// Clean up after a launcher that was killed
     #[command(hide = true)]
     Janitor,
@@ -137,6 +144,8 @@ fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::replay(&arguments),
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
+        Some(Command::Bench(arguments)) => bench::bench(&arguments),
+        Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {
             corotate::launch::janitor(std::io::stdin());
             Exit::Ok

@@ -203,7 +203,7 @@ pub fn exit_of(error: &LaunchError) -> Exit {
     }
 }
 
-/// The signal that asked this process to end; 0 while none has.
+/// The number of the signal that asked for the end, once one has.
 pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
@@ -213,7 +213,7 @@ pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
 }
 
 /// The directory for the results: as given, or a new one under `runs/`.
-fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
+pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     if let Some(path) = given {
         return std::fs::create_dir_all(path).map(|()| path.to_owned()).map_err(|error| named(path, error));

@@ -3,13 +3,16 @@
 //! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
 //! by the loop itself (lockstep), not by a writer that waits.
 
+mod fleet;
 mod latest;
+
+pub use fleet::{IoxFleetReader, IoxFleetWriter};
 
 use self::latest::{LatestReader, LatestWriter};
 use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
-use crate::sample::{Sample, VOID};
+use crate::sample::{FleetLayout, Sample, VOID};
 use iceoryx2::config::Config;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -17,8 +20,10 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::builder::publish_subscribe::Builder;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use std::fmt;
 use std::rc::Rc;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
@@ -27,6 +32,8 @@ const MAX_NODES: usize = 128;
 const MAX_SCHEDULE_READERS: usize = 128;
 /// The most readers of any other signal: roles, scorer, recorder, watchers.
 const MAX_READERS: usize = 8;
+/// The most readers of a fleet's signals, of which every sample is large: role, scorer, recorder, a watcher.
+const MAX_FLEET_READERS: usize = 4;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
@@ -38,13 +45,12 @@ const HEADER_BYTES: usize = 64;
 /// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
 const SIGNAL_BYTES: usize = 64 << 10;
 
-type Ipc = ipc::Service;
+pub(super) type Ipc = ipc::Service;
 
 /// An upper bound on the shared memory that one signal with samples of `size` bytes takes, bytes.
-pub fn footprint(depths: Depths, signal: Signal, size: usize) -> usize {
-    let qos = Qos::of(signal, depths);
+pub fn footprint(qos: &Qos, size: usize) -> usize {
     let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
-    (MAX_READERS * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
+    (qos.max_subscribers * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
 }
 
 /// What a run takes of shared memory besides its signals, bytes.
@@ -81,6 +87,11 @@ impl Qos {
             subscriber_max_borrowed_samples: MAX_BORROWED,
             enable_safe_overflow: true,
         }
+    }
+
+    /// That of a fleet's signal.
+    pub fn of_fleet(signal: Signal, depths: Depths) -> Self {
+        Self { max_subscribers: MAX_FLEET_READERS, ..Self::of(signal, depths) }
     }
 }
 
@@ -147,22 +158,40 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        let qos = Qos::of(topic.signal, self.depths);
+        self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?
+            .open_or_create()
+            .map_err(|error| failed_to_open(topic, end, &error))
+    }
+
+    fn fleet_service<L: FleetLayout>(
+        &self,
+        topic: &Topic,
+        end: &'static str,
+    ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
+        self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?
+            .open_or_create()
+            .map_err(|error| failed_to_open(topic, end, &error))
+    }
+
+    fn builder<P: IceoryxSend + fmt::Debug + ?Sized>(
+        &self,
+        topic: &Topic,
+        end: &'static str,
+        qos: &Qos,
+    ) -> Result<Builder<P, (), Ipc>, BusError> {
         let name = topic.to_string();
-        let open = |reason: String| BusError::Open { service: topic.to_string(), end, reason };
-        let name: ServiceName = name.as_str().try_into().map_err(|error| open(format!("{error:?}")))?;
-        self.node
+        let name: ServiceName = name.as_str().try_into().map_err(|error| failed_to_open(topic, end, &error))?;
+        Ok(self
+            .node
             .service_builder(&name)
-            .publish_subscribe::<Wire<S>>()
+            .publish_subscribe::<P>()
             .max_publishers(qos.max_publishers)
             .max_subscribers(qos.max_subscribers)
             .max_nodes(qos.max_nodes)
             .history_size(qos.history_size)
             .subscriber_max_buffer_size(qos.subscriber_max_buffer_size)
             .subscriber_max_borrowed_samples(qos.subscriber_max_borrowed_samples)
-            .enable_safe_overflow(qos.enable_safe_overflow)
-            .open_or_create()
-            .map_err(|error| open(format!("{error:?}")))
+            .enable_safe_overflow(qos.enable_safe_overflow))
     }
 
     /// Puts away what processes of this domain left behind when they died, so that others can take their seats.
@@ -170,6 +199,15 @@ impl IoxBus {
         // What cannot be put away now is so when the successor enters.
         let _ = self.node.try_cleanup_dead_nodes();
     }
+}
+
+fn failed_to_open(topic: &Topic, end: &'static str, error: &impl fmt::Debug) -> BusError {
+    BusError::Open { service: topic.to_string(), end, reason: format!("{error:?}") }
+}
+
+/// Whether a service has a writer. One that was killed is one until its remains are cleared.
+fn is_written<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> bool {
+    service.dynamic_config().number_of_publishers() > 0
 }
 
 /// The transport's configuration by which a process enters a domain.
@@ -182,7 +220,7 @@ fn config(domain: &Domain) -> Result<Config, String> {
     Ok(config)
 }
 
-fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
     let config = config(domain)?;
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
@@ -195,6 +233,8 @@ fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
 impl Bus for IoxBus {
     type Writer<S: Sample> = IoxWriter<S>;
     type Reader<S: Sample> = IoxReader<S>;
+    type FleetWriter<L: FleetLayout> = IoxFleetWriter<L>;
+    type FleetReader<L: FleetLayout> = IoxFleetReader<L>;
 
     fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<IoxWriter<S>, BusError> {
         let latest = self.has_lane(topic).then(|| LatestWriter::create(&self.node, topic, generation)).transpose();
@@ -228,6 +268,19 @@ impl Bus for IoxBus {
         };
         let (node, bell, topic) = (self.node.clone(), self.bells.of(topic), topic.clone());
         Ok(IoxReader { node, service, subscriber, current: Current::None, newest: (0, 0), lane, idle: 0, bell, topic })
+    }
+
+    fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {
+        IoxFleetWriter::open(self, &self.fleet_service::<L>(topic, "writer")?, topic, bodies)
+    }
+
+    fn fleet_reader<L: FleetLayout>(
+        &self,
+        topic: &Topic,
+        reader: Reader,
+        bodies: usize,
+    ) -> Result<IoxFleetReader<L>, BusError> {
+        IoxFleetReader::open(self, self.fleet_service(topic, "reader")?, topic, reader, bodies)
     }
 }
 
@@ -328,7 +381,7 @@ enum Current<S: Sample> {
 impl<S: Sample> IoxReader<S> {
     /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
     pub fn written(&self) -> bool {
-        self.service.dynamic_config().number_of_publishers() > 0
+        is_written(&self.service)
     }
 
     #[cold]

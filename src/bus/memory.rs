@@ -1,7 +1,7 @@
 //! The bus within one thread: the same semantics as [`super::iox`], no shared memory, no files.
 
-use super::{Bus, BusError, Depths, Read, Reader, Topic, Write};
-use crate::sample::Sample;
+use super::{Bus, BusError, Depths, FleetBuffer, Read, Reader, Topic, Write};
+use crate::sample::{FleetLayout, FleetSample, Sample};
 use std::any::Any;
 use std::cell::RefCell;
 use std::collections::{HashMap, VecDeque};
@@ -30,37 +30,68 @@ impl MemoryBus {
         Self { depths, topics: RefCell::new(HashMap::new()) }
     }
 
-    fn queues<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<Queues<S>, BusError> {
+    fn queues<T: 'static>(&self, topic: &Topic, end: &'static str, type_name: &str) -> Result<Queues<T>, BusError> {
         let service = topic.to_string();
         let mut topics = self.topics.borrow_mut();
-        let entry = topics.entry(service.clone()).or_insert_with(|| Box::new(Queues::<S>::default()));
-        entry.downcast_ref::<Queues<S>>().cloned().ok_or_else(|| BusError::Open {
+        let entry = topics.entry(service.clone()).or_insert_with(|| Box::new(Queues::<T>::default()));
+        entry.downcast_ref::<Queues<T>>().cloned().ok_or_else(|| BusError::Open {
             service,
             end,
-            reason: format!("it carries another type than {}", S::TYPE_NAME),
+            reason: format!("it carries another type than {type_name}"),
         })
+    }
+
+    fn read<T: 'static>(&self, topic: &Topic, reader: Reader, type_name: &str) -> Result<MemoryReader<T>, BusError> {
+        let depth = self.depths.of(reader);
+        let queues = self.queues(topic, "reader", type_name)?;
+        let orphan = |queue: &&Queue<T>| Rc::strong_count(queue) == 1 && queue.borrow().depth == depth;
+        let found = queues.borrow().iter().find(orphan).cloned();
+        let queue = found.unwrap_or_else(|| {
+            let queue: Queue<T> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
+            queues.borrow_mut().push(queue.clone());
+            queue
+        });
+        Ok(MemoryReader { queue, current: None })
     }
 }
 
 impl Bus for MemoryBus {
     type Writer<S: Sample> = MemoryWriter<S>;
     type Reader<S: Sample> = MemoryReader<S>;
+    type FleetWriter<L: FleetLayout> = MemoryFleetWriter<L>;
+    type FleetReader<L: FleetLayout> = MemoryReader<Rc<FleetBuffer<L>>>;
 
     fn writer<S: Sample>(&self, topic: &Topic, _generation: u64) -> Result<MemoryWriter<S>, BusError> {
-        Ok(MemoryWriter { queues: self.queues(topic, "writer")?, slot: S::default() })
+        Ok(MemoryWriter { queues: self.queues(topic, "writer", S::TYPE_NAME)?, slot: S::default() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<MemoryReader<S>, BusError> {
-        let depth = self.depths.of(reader);
-        let queues = self.queues(topic, "reader")?;
-        let orphan = |queue: &&Queue<S>| Rc::strong_count(queue) == 1 && queue.borrow().depth == depth;
-        let found = queues.borrow().iter().find(orphan).cloned();
-        let queue = found.unwrap_or_else(|| {
-            let queue: Queue<S> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
-            queues.borrow_mut().push(queue.clone());
-            queue
-        });
-        Ok(MemoryReader { queue, current: None })
+        self.read(topic, reader, S::TYPE_NAME)
+    }
+
+    fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<MemoryFleetWriter<L>, BusError> {
+        Ok(MemoryFleetWriter { queues: self.queues(topic, "writer", L::TYPE_NAME)?, chunks: Vec::new(), bodies })
+    }
+
+    fn fleet_reader<L: FleetLayout>(
+        &self,
+        topic: &Topic,
+        reader: Reader,
+        _bodies: usize,
+    ) -> Result<Self::FleetReader<L>, BusError> {
+        self.read(topic, reader, L::TYPE_NAME)
+    }
+}
+
+/// Hands a sample to every reader.
+#[inline]
+fn hand_out<T: Clone>(queues: &Queues<T>, sample: &T) {
+    for queue in queues.borrow().iter() {
+        let mut queue = queue.borrow_mut();
+        if queue.samples.len() == queue.depth {
+            queue.samples.pop_front();
+        }
+        queue.samples.push_back(sample.clone());
     }
 }
 
@@ -74,13 +105,38 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
     #[inline]
     fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         fill(&mut self.slot);
-        for queue in self.queues.borrow().iter() {
-            let mut queue = queue.borrow_mut();
-            if queue.samples.len() == queue.depth {
-                queue.samples.pop_front();
-            }
-            queue.samples.push_back(self.slot);
+        hand_out(&self.queues, &self.slot);
+        Ok(())
+    }
+
+    fn prepare(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
+}
+
+/// The writing end of a fleet's signal. Readers share what was written; a chunk that nobody reads any more is written again.
+pub struct MemoryFleetWriter<L> {
+    queues: Queues<Rc<FleetBuffer<L>>>,
+    chunks: Vec<Rc<FleetBuffer<L>>>,
+    bodies: usize,
+}
+
+impl<L: FleetLayout> Write<FleetSample<L>> for MemoryFleetWriter<L> {
+    fn send(&mut self, fill: impl FnOnce(&mut FleetSample<L>)) -> Result<(), BusError> {
+        let free = self.chunks.iter().position(|chunk| Rc::strong_count(chunk) == 1);
+        let index = free.unwrap_or(self.chunks.len());
+        if free.is_none() {
+            self.chunks.push(Rc::new(FleetBuffer::new(self.bodies)));
         }
+        let chunk = &mut self.chunks[index];
+        if let Some(chunk) = Rc::get_mut(chunk) {
+            fill(chunk.sample_mut());
+        }
+        hand_out(&self.queues, chunk);
         Ok(())
     }
 
@@ -94,25 +150,48 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
 }
 
 /// The reading end.
-pub struct MemoryReader<S> {
-    queue: Queue<S>,
-    current: Option<S>,
+pub struct MemoryReader<T> {
+    queue: Queue<T>,
+    current: Option<T>,
 }
 
-impl<S: Sample> Read<S> for MemoryReader<S> {
+impl<T> MemoryReader<T> {
     #[inline]
-    fn advance(&mut self) -> Result<bool, BusError> {
+    fn next(&mut self) -> bool {
         let next = self.queue.borrow_mut().samples.pop_front();
         let moved = next.is_some();
         if moved {
             self.current = next;
         }
-        Ok(moved)
+        moved
+    }
+}
+
+impl<S: Sample> Read<S> for MemoryReader<S> {
+    #[inline]
+    fn advance(&mut self) -> Result<bool, BusError> {
+        Ok(self.next())
     }
 
     #[inline]
     fn current(&self) -> Option<&S> {
         self.current.as_ref()
+    }
+
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+        Ok(())
+    }
+
+    fn refresh(&mut self) {}
+}
+
+impl<L: FleetLayout> Read<FleetSample<L>> for MemoryReader<Rc<FleetBuffer<L>>> {
+    fn advance(&mut self) -> Result<bool, BusError> {
+        Ok(self.next())
+    }
+
+    fn current(&self) -> Option<&FleetSample<L>> {
+        self.current.as_deref().map(FleetBuffer::sample)
     }
 
     fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {

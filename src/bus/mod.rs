@@ -1,16 +1,19 @@
 //! Links between roles: one writer and some readers per signal, samples loaned, written in place and sent.
 //!
-//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2; [`memory`] is its twin within one thread.
+//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2 (and `raw`, which measures it bare); [`memory`] is its twin within one thread.
 
 mod bell;
+mod carried;
 pub mod domain;
 pub mod iox;
 pub mod memory;
 mod names;
+pub(crate) mod raw;
 
+pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};
 
-use crate::sample::Sample;
+use crate::sample::{FleetLayout, FleetSample, Sample};
 
 /// Why a link failed. The run cannot go on without it.
 #[derive(Debug, thiserror::Error)]
@@ -98,6 +101,10 @@ pub trait Bus {
     type Writer<S: Sample>: Write<S>;
     /// The reading end.
     type Reader<S: Sample>: Read<S>;
+    /// The writing end of a fleet's signal.
+    type FleetWriter<L: FleetLayout>: Write<FleetSample<L>>;
+    /// The reading end of a fleet's signal.
+    type FleetReader<L: FleetLayout>: Read<FleetSample<L>>;
 
     /// Opens a signal for writing; there is one writer per signal. `generation` is the one that its stamps will have.
     ///
@@ -109,10 +116,25 @@ pub trait Bus {
     /// # Errors
     /// [`BusError::Open`].
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError>;
+    /// Opens the signal of a fleet of so many bodies for writing.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<Self::FleetWriter<L>, BusError>;
+    /// Opens the signal of a fleet of so many bodies for reading.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn fleet_reader<L: FleetLayout>(
+        &self,
+        topic: &Topic,
+        reader: Reader,
+        bodies: usize,
+    ) -> Result<Self::FleetReader<L>, BusError>;
 }
 
 /// The writing end of a link.
-pub trait Write<S> {
+pub trait Write<S: ?Sized> {
     /// Fills a sample in place and sends it. Never waits for a reader.
     ///
     /// # Errors
@@ -131,7 +153,7 @@ pub trait Write<S> {
 }
 
 /// The reading end of a link.
-pub trait Read<S> {
+pub trait Read<S: ?Sized> {
     /// Moves on to the next sample; false, and nothing changed, if there is none. Never waits.
     ///
     /// # Errors

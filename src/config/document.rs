@@ -230,7 +230,7 @@ fn plain(message: &str) -> String {
     let numbers = wanted.strip_prefix("an array of length ").map(|length| format!("a list of {length} numbers"));
     let wanted = match wanted {
         "f64" => "a number",
-        "i32" => "a whole number",
+        "i32" | "i64" => "a whole number",
         "u64" | "usize" => "a whole number, not below 0",
         "a boolean" => "true or false",
         "a string" | "string only" => "a text in quotes",

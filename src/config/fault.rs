@@ -4,8 +4,9 @@
 
 use super::nearest;
 use super::scenario::{Checks, finite_positive};
+use crate::bus::Carried;
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
-use crate::rig::{AnyRig, Command, Estimate, Measurement, Rig};
+use crate::rig::{AnyRig, Command, Estimate, FleetCommand, FleetMeasurement, Measurement, Rig};
 use crate::sample::FieldKind;
 use crate::with_rig;
 use serde::{Deserialize, Serialize};
@@ -128,14 +129,16 @@ impl One<'_, '_, '_> {
         self.check_keys();
         self.check_time();
         let bodies = self.bodies()?;
-        let action = self.action()?;
         let RawFault { from_tick, ticks, probability, .. } = *self.raw;
         let seed = fault::seed(self.setting.seed, self.number as u64);
-        let one = |(index, body)| {
+        let mut faults = Vec::new();
+        for (index, body) in (0..).zip(bodies) {
+            // A fleet's samples have other fields than a single body's.
+            let action = self.action(body.as_deref())?;
             let fault = Fault { from_tick, ticks, probability, seed: fault::seed(seed, index), action };
-            ScriptedFault { role: self.raw.role.clone(), body, fault }
-        };
-        Some((0..).zip(bodies).map(one).collect())
+            faults.push(ScriptedFault { role: self.raw.role.clone(), body, fault });
+        }
+        Some(faults)
     }
 
     /// Keys that mean nothing for the kind, and such that it cannot do without.
@@ -203,8 +206,11 @@ impl One<'_, '_, '_> {
         Some(vec![Some(body.clone())])
     }
 
-    fn action(&mut self) -> Option<Action> {
+    /// What happens to the samples about this body, or to the role itself.
+    fn action(&mut self, body: Option<&str>) -> Option<Action> {
         let raw = self.raw;
+        let info = self.setting.rig.bodies().iter().find(|info| Some(&*info.name) == body);
+        let fleet = info.and_then(|info| info.fleet);
         Some(match raw.kind {
             Kind::Drop => Action::Transport(Transport::Drop),
             Kind::Duplicate => Action::Transport(Transport::Duplicate),
@@ -224,7 +230,7 @@ impl One<'_, '_, '_> {
             }
             Kind::Kill => Action::Role(Interruption::Kill),
             _ => {
-                let fields = with_rig!(self.setting.rig, rig => fields(rig, &raw.role));
+                let fields = with_rig!(self.setting.rig, rig => fields(rig, &raw.role, fleet));
                 Action::Content(self.tamper(&fields)?)
             }
         })
@@ -311,16 +317,21 @@ struct Fields {
     axes: usize,
 }
 
-/// The fields of what a role sends.
-fn fields<R: Rig>(_: &R, role: &str) -> Fields {
-    fn of<S: crate::sample::Sample>(axes: usize) -> Fields {
-        let names = S::FIELDS.iter().map(|field| field.name).chain(["tick", "generation"]);
-        let all = names.filter_map(|name| fault::field::<S>(name).map(|(words, kind)| (name, words, kind)));
-        Fields { all: all.collect(), first: S::FIELDS[0].name, content: Words::content::<S>(), axes }
+/// The fields of what a role sends about a body, or a fleet of so many.
+fn fields<R: Rig>(_: &R, role: &str, fleet: Option<usize>) -> Fields {
+    fn of<S: Carried + ?Sized>(bodies: usize, axes: usize) -> Fields {
+        let fields = S::fields(bodies);
+        // In a fleet's sample what is said of the whole comes before the vectors.
+        let first = fields.iter().find(|field| field.kind == FieldKind::F64).map_or(VALID, |field| field.name);
+        let names = fields.iter().map(|field| field.name).chain(["tick", "generation"]);
+        let all = names.filter_map(|name| fault::field(&fields, name).map(|(words, kind)| (name, words, kind)));
+        Fields { all: all.collect(), first, content: Words::content(8 * S::length(bodies)), axes }
     }
-    match role {
-        "observer" => of::<Estimate<R>>(R::AXES),
-        "controller" => of::<Command<R>>(0),
-        _ => of::<Measurement<R>>(R::AXES),
+    match (role, fleet) {
+        ("observer", _) => of::<Estimate<R>>(1, R::AXES),
+        ("controller", None) => of::<Command<R>>(1, 0),
+        ("controller", Some(bodies)) => of::<FleetCommand<R>>(bodies, 0),
+        (_, None) => of::<Measurement<R>>(1, R::AXES),
+        (_, Some(bodies)) => of::<FleetMeasurement<R>>(bodies, 0),
     }
 }

@@ -21,10 +21,11 @@ pub(crate) use document::nearest;
 pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 11] = [
+pub const SHIPPED: [(&str, &str); 12] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
+    ("rigid-fleet", include_str!("../../config/rigid-fleet.toml")),
     ("noisy-pair", include_str!("../../config/noisy-pair.toml")),
     ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
     ("inertia", include_str!("../../config/inertia.toml")),

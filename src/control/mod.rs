@@ -2,6 +2,7 @@
 
 mod adaptation;
 mod certificate;
+mod fleet;
 mod orbit_certificate;
 mod orbit_hold;
 mod synchronizer;
@@ -9,7 +10,8 @@ mod watchdog;
 
 pub use adaptation::InertiaAdaptation;
 pub use certificate::{Certificate, Condition};
+pub use fleet::FleetLaw;
 pub use orbit_certificate::OrbitCertificate;
 pub use orbit_hold::{OrbitGains, OrbitHold};
-pub use synchronizer::Synchronizer;
+pub use synchronizer::{Synchronizer, limited};
 pub use watchdog::{Breaches, WatchBounds, Watchdog, Watched};

@@ -50,8 +50,23 @@ impl Synchronizer {
         follower: Vector3<f64>,
         applied: Vector3<f64>,
     ) -> (Vector3<f64>, Vector3<f64>) {
-        let reference = self.body.flow(&reference, &Vector3::zeros(), self.lead_s);
-        (reference, self.body.flow(&follower, &applied, self.lead_s))
+        (self.reference_ahead(reference), self.body.flow(&follower, &applied, self.lead_s))
+    }
+
+    /// The reference alone, rad/s.
+    #[inline]
+    pub fn reference_ahead(&self, reference: Vector3<f64>) -> Vector3<f64> {
+        if self.lead_s > 0.0 { self.body.flow(&reference, &Vector3::zeros(), self.lead_s) } else { reference }
+    }
+
+    /// The body that reference and follower are like.
+    pub fn body(&self) -> &RigidBody {
+        &self.body
+    }
+
+    /// How far both are predicted, s.
+    pub fn lead_s(&self) -> f64 {
+        self.lead_s
     }
 
     /// The control acceleration, rad/s², from the reference ω or ω̂ and the follower's p, rad/s.
@@ -60,6 +75,23 @@ impl Synchronizer {
         let gyroscopic = Vector3::new(w.y * w.z - p.y * p.z, w.z * w.x - p.z * p.x, w.x * w.y - p.x * p.y);
         self.body.coefficients().component_mul(&gyroscopic) - self.gain_per_s.component_mul(&(p - w))
     }
+}
+
+/// A command shortened to what the actuators can do in each component, its direction kept; rad/s².
+#[inline]
+pub fn limited(asked: Vector3<f64>, acceleration_max_rad_s2: f64) -> Vector3<f64> {
+    let largest = asked.amax();
+    if largest > acceleration_max_rad_s2 {
+        return shortened(asked, acceleration_max_rad_s2, acceleration_max_rad_s2 / largest);
+    }
+    asked
+}
+
+/// Seldom, and apart, so that the division is not made where nobody needs it. The product may be rounded up beyond the
+/// limit, and an actuator would refuse it for that.
+#[cold]
+fn shortened(asked: Vector3<f64>, limit: f64, factor: f64) -> Vector3<f64> {
+    asked.map(|component| (component * factor).clamp(-limit, limit))
 }
 
 #[cfg(test)]
@@ -89,6 +121,18 @@ mod tests {
         assert_eq!(law(0.0).command(&w, &w), Vector3::zeros());
         let (reference, follower) = law(0.01).ahead(w, w, Vector3::zeros());
         assert_eq!(reference, follower);
+    }
+
+    /// A command that is shortened is one that the actuators' guard believes, to the last bit.
+    #[test]
+    fn a_shortened_command_is_within_the_limit() {
+        let mut draw = crate::model::uniform(1, 0);
+        for _ in 0..100_000 {
+            let (asked, limit) = (Vector3::from_fn(|_, _| 20.0 * draw() - 10.0), 5.0 * draw());
+            let command = limited(asked, limit);
+            assert!(command.amax() <= limit.min(asked.amax()), "{asked} {limit} {command}");
+            assert!((command.cross(&asked)).norm() <= 1e-14 * asked.norm_squared(), "its direction is kept");
+        }
     }
 
     /// Held input and one tick of delay: the prediction is worth about one tick of the error's decay.

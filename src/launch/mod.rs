@@ -20,6 +20,7 @@ pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use replay::replay_as_process;
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
+pub(crate) use table::plain;
 pub use table::{line_words, table};
 
 use crate::bus::BusError;

@@ -10,13 +10,11 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::Scenario;
 use crate::record::{Comparer, Inlets, Limit, Outlets, Recording, RoleReplay, Script};
-use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes, topic, write_whole};
+use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes, topic, window_ticks, write_whole};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// How far the feeding runs ahead of what comes back, ticks: less than the links hold.
-const AHEAD_TICKS: u64 = 48;
 /// Between two looks when nothing has come for a while, ns.
 const LULL_NS: u64 = 50_000;
 /// Without any progress for so long the role counts as hung, ns.
@@ -55,6 +53,8 @@ pub fn replay_as_process(
         script: &script,
         moved_ns: monotonic_ns(),
         next_word_ns: 0,
+        // Less than the links hold, and than the role may be ahead.
+        ahead_ticks: window_ticks(scenario) * 3 / 4,
     };
     prompter.lead()?;
     prompter.dismiss();
@@ -107,6 +107,8 @@ struct Prompter<'a> {
     script: &'a Script,
     moved_ns: u64,
     next_word_ns: u64,
+    /// How far the feeding runs ahead of what comes back.
+    ahead_ticks: u64,
 }
 
 impl Prompter<'_> {
@@ -128,7 +130,7 @@ impl Prompter<'_> {
         let mut bytes = Vec::new();
         for number in 0..self.script.steps.len() {
             for (tick, round) in self.script.rounds(number) {
-                self.await_tick(tick.saturating_sub(AHEAD_TICKS))?;
+                self.await_tick(tick.saturating_sub(self.ahead_ticks))?;
                 for (input, item) in round {
                     self.script.inputs[input].write(item, &mut bytes);
                     self.inlets.send(input, &bytes)?;
@@ -147,7 +149,7 @@ impl Prompter<'_> {
             if some {
                 (self.moved_ns, backoff) = (monotonic_ns(), Backoff::default());
             }
-            if next >= self.word.credit_tick + AHEAD_TICKS / 2 || monotonic_ns() >= self.next_word_ns {
+            if next >= self.word.credit_tick + self.ahead_ticks / 2 || monotonic_ns() >= self.next_word_ns {
                 self.word.credit_tick = next;
                 self.announce()?;
                 self.next_word_ns = monotonic_ns() + 1_000_000;

@@ -2,13 +2,13 @@
 //!
 //! Must not hold the loop up, except by the credit it gives in lockstep.
 
-use crate::bus::{Bus, BusError, Reader, Signal};
+use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
-use crate::rig::{BodyInfo, Command, Estimate, Rig, Truth};
+use crate::rig::{BodyInfo, Command, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{Horizon, Input, Seek, topic};
-use crate::sample::Sample;
+use crate::sample::{Message, Stamp};
 use crate::with_rig;
 use serde::Serialize;
 
@@ -110,11 +110,65 @@ struct DrivenBody<R: Rig, B: Bus> {
     before: Option<(u64, f64, f64)>,
 }
 
+/// The truth of a body, or of a fleet.
+enum TruthInput<R: Rig, B: Bus> {
+    One(Input<B, Truth<R>>),
+    Fleet(Input<B, FleetTruth<R>>),
+}
+
+impl<R: Rig, B: Bus> TruthInput<R, B> {
+    fn open(bus: &B, topic: &Topic, fleet: Option<usize>) -> Result<Self, BusError> {
+        Ok(match fleet {
+            None => Self::One(Input::watch(bus, topic, Reader::Scorer)?),
+            Some(bodies) => Self::Fleet(Input::watch_many(bus, topic, bodies, Reader::Scorer)?),
+        })
+    }
+
+    fn expect(&mut self, horizon: Horizon) {
+        match self {
+            Self::One(input) => input.expect(horizon),
+            Self::Fleet(input) => input.expect(horizon),
+        }
+    }
+
+    fn seek(&mut self, tick: u64) -> Result<Seek, BusError> {
+        match self {
+            Self::One(input) => input.seek(tick),
+            Self::Fleet(input) => input.seek(tick),
+        }
+    }
+
+    fn last_tick(&self) -> Option<u64> {
+        match self {
+            Self::One(input) => input.last_tick(),
+            Self::Fleet(input) => input.last_tick(),
+        }
+    }
+
+    /// That of the sample at hand.
+    fn stamp(&self) -> Option<&Stamp> {
+        match self {
+            Self::One(input) => input.sample().map(Message::stamp),
+            Self::Fleet(input) => input.sample().map(Message::stamp),
+        }
+    }
+
+    /// The sample at hand if it is that tick's and a single body's.
+    fn one(&self, tick: u64) -> Option<&Truth<R>> {
+        if let Self::One(input) = self { at(input, tick) } else { None }
+    }
+
+    /// The sample at hand if it is that tick's and a fleet's.
+    fn fleet(&self, tick: u64) -> Option<&FleetTruth<R>> {
+        if let Self::Fleet(input) = self { at(input, tick) } else { None }
+    }
+}
+
 struct RigScorer<R: Rig, B: Bus> {
     rig: R,
     accept: Accept,
     tick_s: f64,
-    truths: Vec<Input<B, Truth<R>>>,
+    truths: Vec<TruthInput<R, B>>,
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     /// Commands of the driven bodies.
     commands: Vec<DrivenBody<R, B>>,
@@ -132,7 +186,8 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
         let bodies = rig.bodies().iter();
         let horizon = crate::runtime::horizon(scenario, None);
-        let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven);
+        // A fleet's commands say nothing that a scorer could judge.
+        let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
         let command = |(body, info): (usize, &BodyInfo)| {
             let mut command = Input::watch(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
             command.expect(horizon);
@@ -157,7 +212,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
             truths: bodies
-                .map(|body| Input::watch(bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer))
+                .map(|body| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet))
                 .collect::<Result<_, _>>()?,
             estimate,
             commands: driven.map(command).collect::<Result<_, BusError>>()?,
@@ -192,9 +247,11 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn score_tick(&mut self) {
         let tick = self.next_tick;
         let estimate = at(&self.estimate, tick);
-        let complete = estimate.is_some() && self.truths.iter().all(|truth| at(truth, tick).is_some());
+        let complete =
+            estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
-        self.rig.score(|body| at(&self.truths[body], tick), estimate, &mut self.values);
+        let (truth, fleet) = (|body: usize| self.truths[body].one(tick), |body: usize| self.truths[body].fleet(tick));
+        self.rig.score(truth, fleet, estimate, &mut self.values);
         self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
         let time_s = tick as f64 * self.tick_s;
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
@@ -210,7 +267,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         self.generations = generations;
         for driven in &mut self.commands {
             // A follower that held or was safe did not apply what the certificate is about.
-            let undisturbed = at(&self.truths[driven.body], tick).is_some_and(|truth| R::undisturbed(truth));
+            let undisturbed = self.truths[driven.body].one(tick).is_some_and(|truth| R::undisturbed(truth));
             driven.judge(tick, self.tick_s, undisturbed && continued, &mut self.score.certificate);
         }
         self.next_tick += 1;
@@ -227,7 +284,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     /// The sum of everybody's generation, which changes whenever one does: none ever falls.
     fn generations(&self) -> u64 {
         let of = |sample: Option<u64>| sample.unwrap_or(0);
-        let truths: u64 = self.truths.iter().map(|truth| of(truth.sample().map(|s| s.stamp().generation))).sum();
+        let truths: u64 = self.truths.iter().map(|truth| of(truth.stamp().map(|stamp| stamp.generation))).sum();
         let commands: u64 =
             self.commands.iter().map(|driven| of(driven.command.sample().map(|s| s.stamp().generation))).sum();
         truths + commands + of(self.estimate.sample().map(|s| s.stamp().generation))
@@ -265,7 +322,7 @@ impl<R: Rig, B: Bus> DrivenBody<R, B> {
 }
 
 /// The sample at hand if it is that tick's.
-fn at<B: Bus, S: Sample, G: Guard<S>>(input: &Input<B, S, G>, tick: u64) -> Option<&S> {
+fn at<B: Bus, S: Carried + ?Sized, G: Guard<S>>(input: &Input<B, S, G>, tick: u64) -> Option<&S> {
     input.sample().filter(|sample| sample.stamp().tick == tick)
 }
 

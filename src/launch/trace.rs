@@ -3,11 +3,11 @@
 //! Hardware need not know of health. It is there once all its signals have a writer, runs once they carry samples, and is
 //! done when all of them have reached the last tick. Must not judge a role that reports its health.
 
-use crate::bus::iox::{IoxBus, IoxReader};
+use crate::bus::iox::{IoxBus, IoxFleetReader, IoxReader};
 use crate::bus::{Bus, BusError, Read, Reader, Topic};
 use crate::config::Scenario;
 use crate::runtime::{RoleId, Visit, visit_writes};
-use crate::sample::{Health, RoleState, Sample, Stamp};
+use crate::sample::{FleetLayout, Health, Message, RoleState, Sample, Stamp};
 
 /// The signals of an external role, watched.
 pub(super) struct Trace {
@@ -52,25 +52,40 @@ trait End {
     fn next_tick(&mut self) -> Result<u64, BusError>;
 }
 
-struct Watched<S: Sample> {
-    reader: IoxReader<S>,
+struct Watched<T> {
+    reader: T,
     next_tick: u64,
 }
 
-impl<S: Sample> End for Watched<S> {
+impl<S: Sample> End for Watched<IoxReader<S>> {
     fn written(&self) -> bool {
         self.reader.written()
     }
 
     fn next_tick(&mut self) -> Result<u64, BusError> {
-        while self.reader.advance()? {
-            let stamp = self.reader.current().map(Sample::stamp);
-            if let Some(stamp) = stamp.filter(|stamp| stamp.generation != 0) {
-                self.next_tick = self.next_tick.max(stamp.tick + 1);
-            }
-        }
-        Ok(self.next_tick)
+        follow(&mut self.reader, &mut self.next_tick)
     }
+}
+
+impl<L: FleetLayout> End for Watched<IoxFleetReader<L>> {
+    fn written(&self) -> bool {
+        self.reader.written()
+    }
+
+    fn next_tick(&mut self) -> Result<u64, BusError> {
+        follow(&mut self.reader, &mut self.next_tick)
+    }
+}
+
+/// Takes what has come and moves the next tick on accordingly.
+fn follow<S: Message + ?Sized>(reader: &mut impl Read<S>, next_tick: &mut u64) -> Result<u64, BusError> {
+    while reader.advance()? {
+        let stamp = reader.current().map(S::stamp);
+        if let Some(stamp) = stamp.filter(|stamp| stamp.generation != 0) {
+            *next_tick = (*next_tick).max(stamp.tick + 1);
+        }
+    }
+    Ok(*next_tick)
 }
 
 /// Opens signals to watch them.
@@ -81,6 +96,10 @@ impl Visit for Open<'_> {
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
         Ok(Box::new(Watched { reader: self.0.reader::<S>(&topic, Reader::Role)?, next_tick: 0 }))
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        Ok(Box::new(Watched { reader: self.0.fleet_reader::<L>(&topic, Reader::Role, bodies)?, next_tick: 0 }))
     }
 }
 

@@ -21,6 +21,17 @@ pub fn rk4_step<const N: usize>(
     x + (k1 + (k2 + k3) * 2.0 + k4) * (h / 6.0)
 }
 
+/// How many equal steps of at most `max_step_s` make up `dt_s`.
+#[inline]
+pub(super) fn steps(dt_s: f64, max_step_s: f64) -> f64 {
+    // Most ticks are one step.
+    if dt_s <= max_step_s {
+        return 1.0;
+    }
+    // The slack keeps a tick that equals the bound up to rounding at one step.
+    libm::ceil(dt_s / max_step_s - 1e-6).clamp(1.0, MAX_STEPS)
+}
+
 /// Moves `x` along `x' = f(x)` by `dt_s` seconds in equal Runge-Kutta steps of at most `max_step_s`.
 ///
 /// `dt_s` is finite and not negative, `max_step_s` positive; a step of zero returns `x`.
@@ -31,12 +42,7 @@ pub fn flow<const N: usize>(
     dt_s: f64,
     max_step_s: f64,
 ) -> SVector<f64, N> {
-    // Most ticks are one step.
-    if dt_s <= max_step_s {
-        return rk4_step(&f, x, dt_s);
-    }
-    // The slack keeps a tick that equals the bound up to rounding at one step.
-    let steps = libm::ceil(dt_s / max_step_s - 1e-6).clamp(1.0, MAX_STEPS);
+    let steps = steps(dt_s, max_step_s);
     let h = dt_s / steps;
     let mut x = *x;
     for _ in 0..steps as u64 {

@@ -72,6 +72,12 @@ impl<const N: usize> Noise<N> {
     }
 }
 
+/// Independent numbers, uniform in \[0, 1), of a seed and a stream of it.
+pub fn uniform(seed: u64, stream: u64) -> impl FnMut() -> f64 {
+    let mut noise = Noise::<1>::new(seed, stream, [0.0], [0.0]);
+    move || noise.uniform()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -125,13 +125,31 @@ impl RigidBody {
     /// The number of integration steps follows from the state alone, so equal inputs give equal bits.
     #[inline]
     pub fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
-        let fastest_rad_s = rate.amax() + torque.amax() * dt_s;
+        let fastest_rad_s = fastest_rad_s(rate, torque, dt_s);
         let derivative = |x: &Vector3<f64>| euler(&self.coefficients, x, torque);
-        if fastest_rad_s * dt_s <= MAX_STEP_RAD && dt_s <= LONGEST_STEP_S {
+        if in_one_step(fastest_rad_s, dt_s) {
             return integrate::rk4_step(derivative, rate, dt_s);
         }
-        integrate::flow(derivative, rate, dt_s, (MAX_STEP_RAD / fastest_rad_s).min(LONGEST_STEP_S))
+        integrate::flow(derivative, rate, dt_s, max_step_s(fastest_rad_s))
     }
+}
+
+/// How fast a body may turn within `dt_s` under a held torque, rad/s, more or less.
+#[inline]
+pub(super) fn fastest_rad_s(rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> f64 {
+    rate.amax() + torque.amax() * dt_s
+}
+
+/// Whether one integration step does for `dt_s`: most ticks, and told without a division.
+#[inline]
+pub(super) fn in_one_step(fastest_rad_s: f64, dt_s: f64) -> bool {
+    fastest_rad_s * dt_s <= MAX_STEP_RAD && dt_s <= LONGEST_STEP_S
+}
+
+/// The longest integration step of a body that turns so fast, s.
+#[inline]
+pub(super) fn max_step_s(fastest_rad_s: f64) -> f64 {
+    (MAX_STEP_RAD / fastest_rad_s).min(LONGEST_STEP_S)
 }
 
 #[cfg(test)]

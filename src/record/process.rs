@@ -10,7 +10,9 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Cores, Scenario};
-use crate::runtime::{Backoff, RoleError, RoleId, depths, join, open_ledger, report, report_path, topic, write_whole};
+use crate::runtime::{
+    Backoff, RoleError, RoleId, depths, join, open_ledger, report, report_path, topic, window_ticks, write_whole,
+};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::RoleReport;
 use rustix::process::nice;
@@ -52,7 +54,8 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     let mut line = Line::open(&scenario, &bus)?;
     let mut recorder = Recorder::open(&scenario, &bus, &seat.file)?;
     let lockstep = scenario.clock != ClockKind::Realtime;
-    let ended = follow(&mut recorder, &mut line, lockstep, terminated);
+    let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
+    let ended = follow(&mut recorder, &mut line, credit_ticks, terminated);
     let report = recorder.finish(&books(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
     let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");
@@ -77,7 +80,7 @@ fn give_way(scenario: &Scenario) {
 fn follow(
     recorder: &mut Recorder,
     line: &mut Line,
-    lockstep: bool,
+    credit_ticks: Option<u64>,
     terminated: &AtomicBool,
 ) -> Result<(), RecordError> {
     let (mut backoff, mut whole) = (Backoff::default(), false);
@@ -104,14 +107,14 @@ fn follow(
     loop {
         let taken = recorder.poll()?;
         let (now_ns, next_tick) = (monotonic_ns(), recorder.next_tick());
-        if now_ns >= next_word_ns || (lockstep && next_tick >= said + CREDIT_TICKS) {
+        if now_ns >= next_word_ns || credit_ticks.is_some_and(|ticks| next_tick >= said + ticks) {
             line.say(RoleState::Running, next_tick)?;
             (said, next_word_ns) = (next_tick, now_ns + WORD_NS);
         }
         if terminated.load(Ordering::Relaxed) || Phase::from_number(line.hear()?.phase) == Phase::Stop {
             break;
         }
-        match (lockstep, taken) {
+        match (credit_ticks.is_some(), taken) {
             (false, _) => sleep_until(now_ns + LOOK_NS),
             (true, 0) if backoff.brief() => {}
             (true, 0) => sleep_until(monotonic_ns() + LULL_NS),

@@ -5,11 +5,11 @@
 use super::RecordError;
 use super::layout::Layout;
 use super::writer::{Channel, Writer};
-use crate::bus::{Bus, BusError, Read, Reader, Topic};
+use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{RoleId, Visit, ports, visit_writes};
-use crate::sample::{Sample, Stamp, VOID};
+use crate::sample::{FleetLayout, FleetSample, Sample, Stamp, VOID};
 use crate::telemetry::{Host, RoleReport};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -165,15 +165,16 @@ trait Tap {
     fn service(&self) -> String;
 }
 
-struct SignalTap<B: Bus, S: Sample> {
+struct SignalTap<B: Bus, S: Carried + ?Sized> {
     topic: Topic,
     role: String,
-    reader: B::Reader<S>,
+    reader: S::Reader<B>,
+    bodies: usize,
     channel: Channel,
     book: Book,
 }
 
-impl<B: Bus, S: Sample> Tap for SignalTap<B, S> {
+impl<B: Bus, S: Carried + ?Sized> Tap for SignalTap<B, S> {
     fn drain(&mut self, desk: &mut Desk<'_>) -> Result<u64, RecordError> {
         let mut taken = 0;
         while self.reader.advance()? {
@@ -190,7 +191,13 @@ impl<B: Bus, S: Sample> Tap for SignalTap<B, S> {
                 (false, false) => desk.last_tick,
             };
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
-            desk.writer.message(self.channel, stamp.tick as u32, due_ns, now_ns, bytemuck::bytes_of(sample))?;
+            desk.writer.message(
+                self.channel,
+                stamp.tick as u32,
+                due_ns,
+                now_ns,
+                bytemuck::cast_slice(sample.words()),
+            )?;
             self.book.enter(&stamp, due);
             taken += 1;
         }
@@ -205,13 +212,13 @@ impl<B: Bus, S: Sample> Tap for SignalTap<B, S> {
     fn announce(&mut self, writer: &mut Writer) -> Result<(), RecordError> {
         let about = [
             ("service", self.topic.to_string()),
-            ("type_name", S::TYPE_NAME.to_owned()),
+            ("type_name", S::type_name().to_owned()),
             ("role", self.role.clone()),
             ("body", self.topic.body.clone()),
             ("signal", self.topic.signal.name().to_owned()),
         ];
         let about = about.map(|(key, value)| (key.to_owned(), value)).into();
-        self.channel = writer.channel(&self.service(), &Layout::of(S::TYPE_NAME, S::FIELDS), &about)?;
+        self.channel = writer.channel(&self.service(), &Layout::of(S::type_name(), &S::fields(self.bodies)), &about)?;
         Ok(())
     }
 
@@ -230,13 +237,23 @@ struct Open<'a, B> {
     role: &'a str,
 }
 
+impl<B: Bus + 'static> Open<'_, B> {
+    fn tap<S: Carried + ?Sized>(&self, topic: Topic, bodies: usize) -> Result<Box<dyn Tap>, BusError> {
+        let reader = S::reader(self.bus, &topic, Reader::Scorer, bodies)?;
+        let role = self.role.to_owned();
+        Ok(Box::new(SignalTap::<B, S> { topic, role, reader, bodies, channel: 0, book: Book::default() }))
+    }
+}
+
 impl<B: Bus + 'static> Visit for Open<'_, B> {
     type Made = Result<Box<dyn Tap>, BusError>;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        let reader = self.bus.reader::<S>(&topic, Reader::Scorer)?;
-        let role = self.role.to_owned();
-        Ok(Box::new(SignalTap::<B, S> { topic, role, reader, channel: 0, book: Book::default() }))
+        self.tap::<S>(topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        self.tap::<FleetSample<L>>(topic, bodies)
     }
 }
 
@@ -393,5 +410,5 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
 pub(super) fn layouts(scenario: &Scenario) -> Vec<(String, Layout)> {
     let of = |role| ports(scenario, role).writes;
     let written = RoleId::all(scenario).into_iter().flat_map(of);
-    written.map(|port| (port.topic.to_string(), Layout::of(port.type_name, port.fields))).collect()
+    written.map(|port| (port.topic.to_string(), Layout::of(port.type_name, &port.fields))).collect()
 }

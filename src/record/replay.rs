@@ -7,12 +7,13 @@ use super::RecordError;
 use super::reader::{Recording, Track};
 use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
-use crate::bus::{Bus, BusError, Read, Reader, Topic, Write};
+use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic, Write};
 use crate::config::Scenario;
 use crate::runtime::{Gate, Poll, ReadyNode, RoleId, Visit, build, depths, private_ledger, visit_reads, visit_writes};
-use crate::sample::{FieldKind, Sample, Stamp, VOID};
+use crate::sample::{FieldKind, FleetLayout, FleetSample, Sample, Stamp, VOID};
 use crate::telemetry::Ledger;
 use crate::with_rig;
+use std::marker::PhantomData;
 
 /// The column of a sample that tells when it was sent.
 const SENT: &str = "sent_ns";
@@ -63,12 +64,12 @@ trait Outlet {
     fn next(&mut self) -> Result<Option<&[u8]>, BusError>;
 }
 
-struct InletOf<W, S>(W, std::marker::PhantomData<S>);
-struct OutletOf<R, S>(R, std::marker::PhantomData<S>);
+struct InletOf<W, S: ?Sized>(W, PhantomData<S>);
+struct OutletOf<R, S: ?Sized>(R, PhantomData<S>);
 
-impl<W: Write<S>, S: Sample> Inlet for InletOf<W, S> {
+impl<W: Write<S>, S: Carried + ?Sized> Inlet for InletOf<W, S> {
     fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
-        self.0.send(|sample| *sample = bytemuck::pod_read_unaligned(bytes))
+        self.0.send(|sample| bytemuck::cast_slice_mut(sample.words_mut()).copy_from_slice(bytes))
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
@@ -76,20 +77,36 @@ impl<W: Write<S>, S: Sample> Inlet for InletOf<W, S> {
     }
 }
 
-impl<R: Read<S>, S: Sample> Outlet for OutletOf<R, S> {
+impl<R: Read<S>, S: Carried + ?Sized> Outlet for OutletOf<R, S> {
     fn next(&mut self) -> Result<Option<&[u8]>, BusError> {
-        Ok(if self.0.advance()? { self.0.current().map(bytemuck::bytes_of) } else { None })
+        Ok(if self.0.advance()? { self.0.current().map(|sample| bytemuck::cast_slice(sample.words())) } else { None })
     }
 }
 
 struct OpenInlets<'a, B>(&'a B);
 struct OpenOutlets<'a, B>(&'a B);
 
+impl<B: Bus + 'static> OpenInlets<'_, B> {
+    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Inlet>, BusError> {
+        Ok(Box::new(InletOf::<_, S>(S::writer(self.0, topic, bodies, 1)?, PhantomData)))
+    }
+}
+
 impl<B: Bus + 'static> Visit for OpenInlets<'_, B> {
     type Made = Result<Box<dyn Inlet>, BusError>;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Ok(Box::new(InletOf::<_, S>(self.0.writer::<S>(&topic, 1)?, std::marker::PhantomData)))
+        self.open::<S>(&topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        self.open::<FleetSample<L>>(&topic, bodies)
+    }
+}
+
+impl<B: Bus + 'static> OpenOutlets<'_, B> {
+    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Outlet>, BusError> {
+        Ok(Box::new(OutletOf::<_, S>(S::reader(self.0, topic, Reader::Scorer, bodies)?, PhantomData)))
     }
 }
 
@@ -97,7 +114,11 @@ impl<B: Bus + 'static> Visit for OpenOutlets<'_, B> {
     type Made = Result<Box<dyn Outlet>, BusError>;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Ok(Box::new(OutletOf::<_, S>(self.0.reader::<S>(&topic, Reader::Scorer)?, std::marker::PhantomData)))
+        self.open::<S>(&topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        self.open::<FleetSample<L>>(&topic, bodies)
     }
 }
 

@@ -118,7 +118,7 @@ impl Writer {
         body: &[u8],
     ) -> Result<(), RecordError> {
         if self.began_ns.is_none() {
-            self.reserve()?;
+            self.reserve(body.len())?;
             self.began_ns = Some(received_ns);
         }
         self.frame.clear();
@@ -151,10 +151,10 @@ impl Writer {
     }
 
     /// Asks for room for one more chunk and the end of the file.
-    fn reserve(&mut self) -> Result<(), RecordError> {
+    fn reserve(&mut self, first: usize) -> Result<(), RecordError> {
         let end = END_BYTES + self.chunks * (CHUNK_INDEX_BYTES + CHANNEL_INDEX_BYTES * self.channels);
-        // What does not compress grows by a little.
-        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4) as u64;
+        // What does not compress grows by a little, and the last sample may be beyond the size.
+        let chunk = (CHUNK_BYTES + CHUNK_BYTES / 4 + 2 * first) as u64;
         match fallocate(self.file.as_fd(), FallocateFlags::KEEP_SIZE, self.whole, chunk + end) {
             Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => {
                 Err(RecordError::Full { path: self.path.clone(), source: error.into() })

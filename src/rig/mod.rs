@@ -3,16 +3,19 @@
 //! A new rig is its mathematics, one file here, one line in each of the places marked "registry" below, and a
 //! scenario in `config/`. Must not know how roles are driven, nor what carries their samples.
 
+mod fleet;
 mod orbit;
 mod rigid_body;
 
+pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
-pub use rigid_body::RigidBodyRig;
+pub use rigid_body::{RateLaw, RigidBodyRig};
 
 use crate::config::{Checks, ConfigError, Document, finite_positive, nearest};
 use crate::control::Watched;
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
-use crate::role::{Body, Estimator, Guard, Law};
+use crate::role::{Body, Estimator, Guard, Law, SingleBody};
+use crate::sample::FleetSample;
 use nalgebra::SVector;
 use serde::Serialize;
 
@@ -25,19 +28,35 @@ pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
 /// The samples of a rig, by signal.
 pub type Command<R> = <<R as Rig>::Body as Body>::Command;
 
-/// One body of a rig.
+/// The samples of a rig's fleets, by signal.
+pub type FleetTruth<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth>;
+/// The samples of a rig's fleets, by signal.
+pub type FleetMeasurement<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement>;
+/// The samples of a rig's fleets, by signal.
+pub type FleetCommand<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command>;
+
+/// One body of a rig, or a fleet of them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BodyInfo {
     /// The name of its role and its part of service names.
     pub name: String,
     /// Whether the controller drives it.
     pub driven: bool,
+    /// How many bodies it is, if it is a fleet: many in one process, driven as one.
+    pub fleet: Option<usize>,
+}
+
+impl BodyInfo {
+    /// How many bodies its signals tell of.
+    pub fn bodies(&self) -> usize {
+        self.fleet.unwrap_or(1)
+    }
 }
 
 /// A plant, an observer and a control law that belong together.
 pub trait Rig: Clone + Send + Sync + 'static {
     /// The kind of body.
-    type Body: Body;
+    type Body: SingleBody;
     /// What observes the first body.
     type Estimator: Estimator<Measurement = Measurement<Self>>;
     /// What drives a driven body.
@@ -48,6 +67,8 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type EstimateGuard: Guard<Estimate<Self>>;
     /// What keeps commands that cannot be from the actuators.
     type CommandGuard: Guard<Command<Self>>;
+    /// Many bodies in one process; [`NoFleet`] where the rig has none.
+    type Fleet: Fleet<Estimate<Self>>;
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
     const AXES: usize;
 
@@ -65,6 +86,10 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn estimate_guard(&self) -> Self::EstimateGuard;
     /// A guard for a body's commands.
     fn command_guard(&self, index: usize) -> Self::CommandGuard;
+    /// The fleet in the place of the body with this index, if there is one.
+    fn fleet(&self, _index: usize) -> Option<Self::Fleet> {
+        None
+    }
     /// The physical bounds that the guards work with.
     fn limits(&self) -> Vec<Figure>;
     /// Energy and angular momentum of the observed body as estimated, in any unit, if they are to stay constant.
@@ -78,10 +103,11 @@ pub trait Rig: Clone + Send + Sync + 'static {
     /// What a run is scored by; the unit is the last part of each name.
     fn metrics(&self) -> &'static [&'static str];
     /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample, +inf once a body is
-    /// lost. `truth` gives the truth of a body by its index.
+    /// lost. `truth` gives the truth of a body by its index, `fleet` that of a fleet.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
+        fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
         estimate: Option<&Estimate<Self>>,
         out: &mut [f64],
     );

@@ -12,7 +12,7 @@ pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub(super) use resolve::{hold, rendezvous};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, FleetTruth, NoFleet, Rig};
 use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold, Watched};
 use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
@@ -145,6 +145,7 @@ impl Rig for OrbitRig {
     type MeasurementGuard = MeasurementGuard;
     type EstimateGuard = EstimateGuard;
     type CommandGuard = CommandGuard;
+    type Fleet = NoFleet;
     const AXES: usize = 4;
 
     fn bodies(&self) -> &[BodyInfo] {
@@ -216,6 +217,7 @@ impl Rig for OrbitRig {
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
+        _fleet: impl Fn(usize) -> Option<&'a FleetTruth<Self>>,
         estimate: Option<&OrbitEstimate>,
         out: &mut [f64],
     ) {

@@ -2,16 +2,16 @@
 //!
 //! Must not pair samples of different ticks, and must not see the truth.
 
-use crate::sample::Sample;
+use crate::sample::{Message, Sample};
 
 /// The control law of one rig for one follower.
 pub trait Law {
     /// What it knows of the leader.
     type Estimate: Sample;
     /// What it knows of the follower.
-    type Measurement: Sample;
+    type Measurement: Message + ?Sized;
     /// What it decides.
-    type Command: Sample;
+    type Command: Message + ?Sized;
 
     /// Writes the command, everything but the stamp.
     fn command(&mut self, estimate: &Self::Estimate, measurement: &Self::Measurement, out: &mut Self::Command);

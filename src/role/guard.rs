@@ -6,7 +6,7 @@
 use crate::sample::Stamp;
 
 /// Judges the samples of one signal, in the order of their ticks.
-pub trait Guard<S> {
+pub trait Guard<S: ?Sized> {
     /// Whether the sample is to be believed. One that is becomes what the next are compared with.
     fn accepts(&mut self, sample: &S) -> bool;
 }
@@ -15,7 +15,7 @@ pub trait Guard<S> {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Unguarded;
 
-impl<S> Guard<S> for Unguarded {
+impl<S: ?Sized> Guard<S> for Unguarded {
     #[inline]
     fn accepts(&mut self, _sample: &S) -> bool {
         true

@@ -11,4 +11,4 @@ mod plant;
 pub use controller::{Controller, Law};
 pub use guard::{Bounds, Guard, Plausible, Unguarded};
 pub use observer::{Estimator, Observer};
-pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm};
+pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};

@@ -3,7 +3,7 @@
 //! Must not see the truth, and must not let a measurement that is not finite, lacks a component or is not believed reach its
 //! filter: the estimate goes on by the model then.
 
-use crate::sample::{Sample, Stamp, status};
+use crate::sample::{Message, Sample, Stamp, status};
 
 /// The estimator of one rig.
 pub trait Estimator {

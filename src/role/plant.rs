@@ -3,16 +3,16 @@
 //! Logical execution time: what was computed from the measurement of tick k−1 acts from tick k on, never earlier, never
 //! later. Must not need any other role to be alive.
 
-use crate::sample::{Sample, Stamp, status};
+use crate::sample::{Message, Sample, Stamp, status};
 
 /// A body: what moves, what is measured of it, and what holds its input.
 pub trait Body {
     /// The full state, for recording and scoring.
-    type Truth: Sample;
+    type Truth: Message + ?Sized;
     /// What the sensors report.
-    type Measurement: Sample;
+    type Measurement: Message + ?Sized;
     /// What the actuators take.
-    type Command: Sample;
+    type Command: Message + ?Sized;
 
     /// Takes a new input, to be held until the next. Returns whether it was usable; an unusable one changes nothing.
     fn apply(&mut self, command: &Self::Command) -> bool;
@@ -29,6 +29,11 @@ pub trait Body {
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
 }
+
+/// A body whose samples have a size that the compiler knows: one, not a fleet.
+pub trait SingleBody: Body<Truth: Sample, Measurement: Sample, Command: Sample> {}
+
+impl<B: Body<Truth: Sample, Measurement: Sample, Command: Sample>> SingleBody for B {}
 
 /// What ends the safe command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -347,9 +347,10 @@ fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result
 fn driven(scenario: &Scenario, name: &str) -> Result<usize, RoleError> {
     let bodies = scenario.rig.bodies();
     match find_role(scenario, name)? {
-        RoleId::Plant(index) if bodies[index].driven => Ok(index),
+        RoleId::Plant(index) if bodies[index].driven && bodies[index].fleet.is_none() => Ok(index),
         _ => {
-            let driven = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect::<Vec<_>>();
+            let single = bodies.iter().filter(|body| body.driven && body.fleet.is_none());
+            let driven = single.map(|body| &*body.name).collect::<Vec<_>>();
             Err(RoleError::NotDriven { role: name.to_owned(), driven: driven.join(", ") })
         }
     }

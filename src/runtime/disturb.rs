@@ -2,34 +2,37 @@
 //!
 //! Must cost an undisturbed role nothing but one look whether there is anything to do.
 
+use crate::bus::Carried;
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario, ScriptedFault};
 use crate::fault::{Action, Change, Fault, Interruption, Transport};
-use crate::sample::Sample;
+use std::borrow::BorrowMut;
 
 /// What happens to the samples of one signal.
 #[derive(Debug)]
-pub struct Disturbance<S> {
+pub struct Disturbance<S: Carried + ?Sized> {
     faults: Vec<Fault>,
     /// Samples on their long way, in the order of their ticks, each with the tick at which it is sent. As much room as
     /// can ever be needed is taken at the start.
-    late: Vec<(u64, S)>,
+    late: Vec<(u64, S::Owned)>,
+    /// How many bodies the signal tells of.
+    bodies: usize,
 }
 
-impl<S: Sample> Disturbance<S> {
-    /// What a scenario does to a role's signal about a body; nothing if there is nothing.
-    pub fn of(scenario: &Scenario, role: &str, body: &str) -> Option<Box<Self>> {
+impl<S: Carried + ?Sized> Disturbance<S> {
+    /// What a scenario does to a role's signal about a body, or a fleet of so many; nothing if there is nothing.
+    pub fn of(scenario: &Scenario, role: &str, body: &str, bodies: usize) -> Option<Box<Self>> {
         let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == Some(body);
-        Self::new(scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect())
+        Self::new(scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect(), bodies)
     }
 
-    fn new(faults: Vec<Fault>) -> Option<Box<Self>> {
+    fn new(faults: Vec<Fault>, bodies: usize) -> Option<Box<Self>> {
         let kept = |fault: &Fault| match fault.action {
             Action::Transport(Transport::Delay { ticks }) => ticks.min(fault.ticks) as usize,
             _ => 0,
         };
         let late = Vec::with_capacity(faults.iter().map(kept).sum());
-        (!faults.is_empty()).then(|| Box::new(Self { faults, late }))
+        (!faults.is_empty()).then(|| Box::new(Self { faults, late, bodies }))
     }
 
     /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
@@ -46,13 +49,20 @@ impl<S: Sample> Disturbance<S> {
         })
     }
 
+    /// A sample to be disturbed.
+    pub fn blank(&self) -> S::Owned {
+        S::blank(self.bodies)
+    }
+
     /// Keeps a sample until `tick`.
-    pub fn keep(&mut self, tick: u64, sample: S) {
-        self.late.push((tick, sample));
+    pub fn keep(&mut self, tick: u64, sample: &S) {
+        let mut kept = self.blank();
+        kept.borrow_mut().assign(sample);
+        self.late.push((tick, kept));
     }
 
     /// A sample that was kept and is to be sent before that of `tick`.
-    pub fn due(&mut self, tick: u64) -> Option<S> {
+    pub fn due(&mut self, tick: u64) -> Option<S::Owned> {
         let due = self.late.iter().position(|(due, _)| *due <= tick)?;
         Some(self.late.remove(due).1)
     }
@@ -153,7 +163,7 @@ mod tests {
     #[test]
     fn what_is_kept_comes_in_order_when_it_is_due_and_takes_no_memory_on_the_way() {
         let delay = Action::Transport(Transport::Delay { ticks: 3 });
-        let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)]).unwrap();
+        let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)], 1).unwrap();
         let room = disturbance.late.capacity();
         assert_eq!(room, 3);
         for tick in 5..105_u64 {
@@ -162,7 +172,7 @@ mod tests {
             assert_eq!(disturbance.way(tick), Some(Transport::Delay { ticks: 3 }));
             let mut sample = RateCommand::default();
             sample.stamp.tick = tick;
-            disturbance.keep(tick + 3, sample);
+            disturbance.keep(tick + 3, &sample);
         }
         assert_eq!((disturbance.way(105), disturbance.late.capacity()), (None, room));
     }
@@ -170,11 +180,11 @@ mod tests {
     #[test]
     fn of_several_faults_the_first_decides_the_way() {
         let [drop, twice] = [Transport::Drop, Transport::Duplicate].map(Action::Transport);
-        let disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)]).unwrap();
+        let disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)], 1).unwrap();
         let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.way(tick));
         let (drop, twice) = (Some(Transport::Drop), Some(Transport::Duplicate));
         assert_eq!(ways, [None, twice, twice, drop, None]);
-        assert!(Disturbance::<RateCommand>::new(Vec::new()).is_none());
+        assert!(Disturbance::<RateCommand>::new(Vec::new(), 1).is_none());
     }
 
     #[test]

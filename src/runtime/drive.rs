@@ -3,7 +3,6 @@
 //! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then naps; what is late is skipped
 //! and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
-use super::WINDOW_TICKS;
 use super::hooks::{self, Place};
 use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
 use crate::bus::{Bus, BusError, Read, Write};
@@ -111,13 +110,14 @@ pub struct Waiting<'a> {
 pub struct Drive<'a, 'b, B: Bus> {
     control: &'a mut Control<'b, B>,
     last_tick: u64,
+    window_ticks: u64,
     next_turn_ns: u64,
 }
 
 impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
-    /// A drive up to `last_tick`.
-    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64) -> Self {
-        Self { control, last_tick, next_turn_ns: 0 }
+    /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
+    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
+        Self { control, last_tick, window_ticks, next_turn_ns: 0 }
     }
 
     /// Drives a node on the time grid.
@@ -232,12 +232,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         Ok(())
     }
 
-    /// Drives a node by its inputs alone, at most [`WINDOW_TICKS`] ahead of the slowest consumer.
+    /// Drives a node by its inputs alone, at most its window ahead of the slowest consumer.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
     pub fn lockstep(&mut self, node: &mut dyn Node) -> Result<Ended, BusError> {
-        let mut up_to = WINDOW_TICKS.min(self.last_tick);
+        let mut up_to = self.window_ticks.min(self.last_tick);
         let mut backoff = Backoff::default();
         while node.next_tick() <= self.last_tick {
             node.before_tick();
@@ -258,7 +258,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             if self.control.stopped()? {
                 return Ok(Ended::Stopped);
             }
-            up_to = (self.control.schedule()?.credit_tick + WINDOW_TICKS).min(self.last_tick);
+            up_to = (self.control.schedule()?.credit_tick + self.window_ticks).min(self.last_tick);
         }
         Ok(Ended::Finished)
     }

@@ -5,19 +5,20 @@
 
 use super::disturb::Disturbance;
 use super::hooks::{self, Place};
-use crate::bus::{Bus, BusError, Read, Reader, Topic, Write};
+use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::fault::Transport;
 use crate::role::{Guard, Unguarded};
-use crate::sample::{Sample, Stamp, VOID};
+use crate::sample::{Stamp, VOID};
 use crate::telemetry::{Ledger, ReadBook, WriteBook};
+use std::borrow::{Borrow, BorrowMut};
 
 /// The writing end of a signal.
-pub struct Output<B: Bus, S: Sample> {
-    port: B::Writer<S>,
+pub struct Output<B: Bus, S: Carried + ?Sized> {
+    port: S::Writer<B>,
     generation: u64,
     /// The last sample sent, until [`settle`](Self::settle) has taken it in.
-    sent: S,
+    sent: S::Owned,
     /// Whether it went out as the one of its tick.
     delivered: bool,
     /// Whether a void takes the place of a sample that does not go out.
@@ -26,15 +27,22 @@ pub struct Output<B: Bus, S: Sample> {
     book: WriteBook,
 }
 
-impl<B: Bus, S: Sample> Output<B, S> {
-    /// Opens a signal for a run that ends with `last_tick`, with its book in the ledger.
+impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
+    /// Opens a signal of so many bodies for a run that ends with `last_tick`, with its book in the ledger.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn open(bus: &B, topic: &Topic, generation: u64, ledger: &Ledger, last_tick: u64) -> Result<Self, BusError> {
+    pub fn open(
+        bus: &B,
+        topic: &Topic,
+        bodies: usize,
+        generation: u64,
+        ledger: &Ledger,
+        last_tick: u64,
+    ) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
-        let port = bus.writer(topic, generation)?;
-        Ok(Self { port, generation, sent: S::default(), delivered: true, voids: false, disturbance: None, book })
+        let (port, sent) = (S::writer(bus, topic, bodies, generation)?, S::blank(bodies));
+        Ok(Self { port, generation, sent, delivered: true, voids: false, disturbance: None, book })
     }
 
     /// With voids in the place of samples that do not go out, for readers that wait for every tick.
@@ -54,16 +62,13 @@ impl<B: Bus, S: Sample> Output<B, S> {
     #[inline]
     pub fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         if self.disturbance.is_some() {
-            let mut sample = S::default();
-            fill(&mut sample);
-            sample.stamp_mut().generation = self.generation;
-            return self.send_disturbed(sample);
+            return self.send_disturbed(fill);
         }
-        let (generation, sent) = (self.generation, &mut self.sent);
+        let (generation, sent) = (self.generation, self.sent.borrow_mut());
         self.port.send(|sample| {
             fill(sample);
             sample.stamp_mut().generation = generation;
-            *sent = *sample;
+            sent.assign(sample);
             hooks::at(Place::Loaned);
         })?;
         hooks::at(Place::Sent);
@@ -72,15 +77,19 @@ impl<B: Bus, S: Sample> Output<B, S> {
 
     /// Sends a sample as the scripted faults have it.
     #[cold]
-    fn send_disturbed(&mut self, mut sample: S) -> Result<(), BusError> {
+    fn send_disturbed(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         let Some(disturbance) = &mut self.disturbance else { return Ok(()) };
+        let mut own = disturbance.blank();
+        let sample: &mut S = own.borrow_mut();
+        fill(sample);
+        sample.stamp_mut().generation = self.generation;
         let stamp = *sample.stamp();
         let (mut injected, way) =
-            (disturbance.tamper(stamp.tick, &mut sample, &self.sent), disturbance.way(stamp.tick));
+            (disturbance.tamper(stamp.tick, sample, self.sent.borrow()), disturbance.way(stamp.tick));
         injected |= way.is_some();
         while let Some(late) = disturbance.due(stamp.tick) {
             self.port.prepare()?;
-            self.port.send(|slot| *slot = late)?;
+            self.port.send(|slot| slot.assign(late.borrow()))?;
             self.book.extra();
         }
         // A sample with a broken stamp goes out as it is, but not as the one of its tick.
@@ -98,7 +107,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
         for _ in 0..copies {
             self.port.prepare()?;
             self.port.send(|slot| {
-                *slot = sample;
+                slot.assign(sample);
                 hooks::at(Place::Loaned);
             })?;
         }
@@ -106,8 +115,9 @@ impl<B: Bus, S: Sample> Output<B, S> {
         if injected {
             self.book.injected();
         }
-        self.sent = sample;
-        *self.sent.stamp_mut() = stamp;
+        let sent = self.sent.borrow_mut();
+        sent.assign(sample);
+        *sent.stamp_mut() = stamp;
         if !self.delivered {
             self.send_void(&stamp)?;
         }
@@ -135,7 +145,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
         }
         self.port.prepare()?;
         self.port.send(|slot| {
-            *slot = S::default();
+            slot.words_mut().fill(0);
             *slot.stamp_mut() = Stamp { generation: stamp.generation | VOID, ..*stamp };
         })
     }
@@ -147,10 +157,10 @@ impl<B: Bus, S: Sample> Output<B, S> {
     #[inline]
     pub fn settle(&mut self) -> Result<(), BusError> {
         if self.delivered {
-            self.book.enter(&self.sent);
+            self.book.enter(self.sent.borrow());
         } else {
             self.book.withheld();
-            self.book.enter_void(self.sent.stamp().tick, self.voids);
+            self.book.enter_void(self.sent.borrow().stamp().tick, self.voids);
         }
         self.port.prepare()
     }
@@ -175,7 +185,7 @@ impl<B: Bus, S: Sample> Output<B, S> {
     /// The last sample that was sent.
     #[inline]
     pub fn sent(&self) -> &S {
-        &self.sent
+        self.sent.borrow()
     }
 
     /// How many samples were made, sent or withheld, also by predecessors.
@@ -220,8 +230,8 @@ enum Newest {
 }
 
 /// The reading end of a signal.
-pub struct Input<B: Bus, S: Sample, G = Unguarded> {
-    port: B::Reader<S>,
+pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
+    port: S::Reader<B>,
     guard: G,
     horizon: Horizon,
     /// Tick and generation of the newest tick that something is known of.
@@ -233,15 +243,15 @@ pub struct Input<B: Bus, S: Sample, G = Unguarded> {
     book: ReadBook,
 }
 
-impl<B: Bus, S: Sample> Input<B, S> {
-    /// Opens a signal, with its book in the ledger.
+impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
+    /// Opens a signal of so many bodies, with its book in the ledger.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn open(bus: &B, topic: &Topic, reader: Reader, ledger: &Ledger) -> Result<Self, BusError> {
+    pub fn open(bus: &B, topic: &Topic, bodies: usize, reader: Reader, ledger: &Ledger) -> Result<Self, BusError> {
         let book = ReadBook::open(ledger);
         Ok(Self {
-            port: bus.reader(topic, reader)?,
+            port: S::reader(bus, topic, reader, bodies)?,
             guard: Unguarded,
             horizon: Horizon::Unknown,
             last: None,
@@ -256,7 +266,15 @@ impl<B: Bus, S: Sample> Input<B, S> {
     /// # Errors
     /// [`BusError::Open`].
     pub fn watch(bus: &B, topic: &Topic, reader: Reader) -> Result<Self, BusError> {
-        Self::open(bus, topic, reader, &Ledger::private(ReadBook::WORDS))
+        Self::watch_many(bus, topic, 1, reader)
+    }
+
+    /// The same for a signal of so many bodies.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn watch_many(bus: &B, topic: &Topic, bodies: usize, reader: Reader) -> Result<Self, BusError> {
+        Self::open(bus, topic, bodies, reader, &Ledger::private(ReadBook::WORDS))
     }
 
     /// The same with a guard.
@@ -266,7 +284,7 @@ impl<B: Bus, S: Sample> Input<B, S> {
     }
 }
 
-impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
+impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// Says which ticks samples can have from now on.
     pub fn expect(&mut self, horizon: Horizon) {
         self.horizon = horizon;
@@ -398,7 +416,7 @@ impl<B: Bus, S: Sample, G: Guard<S>> Input<B, S, G> {
     /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
     #[inline]
     pub fn rejected(&self) -> Option<&Stamp> {
-        self.port.current().filter(|_| self.newest == Newest::Rejected).map(Sample::stamp)
+        self.port.current().filter(|_| self.newest == Newest::Rejected).map(S::stamp)
     }
 
     /// Takes what waits and forgets it, to exercise the link. Before the first tick only.
@@ -441,8 +459,8 @@ mod tests {
         let bus = MemoryBus::new(Depths { role: depth, scorer: 1, history: 0 });
         let topic = Topic { scenario: "s".to_owned(), body: "b".to_owned(), signal: Signal::Command };
         let ledger = ledger();
-        let output = Output::open(&bus, &topic, 1, &ledger, LAST).unwrap();
-        Ends { output, input: Input::open(&bus, &topic, Reader::Role, &ledger).unwrap(), ledger }
+        let output = Output::open(&bus, &topic, 1, 1, &ledger, LAST).unwrap();
+        Ends { output, input: Input::open(&bus, &topic, 1, Reader::Role, &ledger).unwrap(), ledger }
     }
 
     impl Ends {
@@ -504,8 +522,8 @@ mod tests {
         let again = ends.ledger.reopened();
         let bus = MemoryBus::new(Depths { role: 8, scorer: 1, history: 0 });
         let topic = Topic { scenario: "s".to_owned(), body: "b".to_owned(), signal: Signal::Command };
-        let mut output = Output::<_, RateCommand>::open(&bus, &topic, 2, &again, LAST).unwrap();
-        let mut input = Input::<_, RateCommand>::open(&bus, &topic, Reader::Role, &again).unwrap();
+        let mut output = Output::<_, RateCommand>::open(&bus, &topic, 1, 2, &again, LAST).unwrap();
+        let mut input = Input::<_, RateCommand>::open(&bus, &topic, 1, Reader::Role, &again).unwrap();
         // Tick 2 is repeated to it, as a link with history does; ticks 3 and 4 fell into the gap.
         for tick in [2, 5] {
             output.send(|sample| sample.stamp.tick = tick).unwrap();

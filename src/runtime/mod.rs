@@ -25,26 +25,47 @@ pub use node::{
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};
+pub(crate) use privileges::{release as release_priority, take as take_privileges};
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Scenario};
+use crate::sample::FleetTruth;
+
+/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks: at most, and with large samples.
+const WINDOW_TICKS: std::ops::RangeInclusive<u64> = 2..=64;
+/// Samples of a fleet that may wait for one reader come to so many bytes at the most, where that is enough to go on.
+const WAITING_BYTES: usize = 1 << 20;
+/// The same for the scorer of a run in real time, which looks seldom.
+const SCORED_BYTES: usize = 1 << 22;
+
+/// How long the longest sample of a fleet is, bytes; none without a fleet.
+fn longest_sample(scenario: &Scenario) -> Option<usize> {
+    let fleets = scenario.rig.bodies().iter().filter_map(|body| body.fleet);
+    fleets.max().map(|bodies| FleetTruth::length(bodies) * size_of::<u64>())
+}
 
 /// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks.
-pub const WINDOW_TICKS: u64 = 64;
+pub fn window_ticks(scenario: &Scenario) -> u64 {
+    let fits = longest_sample(scenario).map_or(u64::MAX, |bytes| (WAITING_BYTES / 2 / bytes) as u64);
+    fits.clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
+}
 
 /// How deep the links of a scenario are.
 pub fn depths(scenario: &Scenario) -> Depths {
     // The scorer looks about every 20 ms; a quarter of a second is slack for a loaded machine.
     let quarter_second = (250_000_000 / scenario.period_ns).next_power_of_two() as usize;
     match scenario.clock {
-        ClockKind::Realtime => Depths { role: 1, scorer: quarter_second.clamp(64, 8192), history: 0 },
+        ClockKind::Realtime => {
+            let fits = longest_sample(scenario).map_or(usize::MAX, |bytes| (SCORED_BYTES / bytes).max(8));
+            Depths { role: 1, scorer: quarter_second.clamp(64, 8192).min(fits), history: 0 }
+        }
         // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever
         // scripted faults add.
         ClockKind::Lockstep | ClockKind::InProcess => {
-            let deep = (2 + disturb::extra_samples(scenario)) * WINDOW_TICKS as usize;
+            let deep = (2 + disturb::extra_samples(scenario)) * window_ticks(scenario) as usize;
             Depths { role: deep, scorer: deep, history: deep }
         }
     }

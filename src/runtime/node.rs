@@ -14,15 +14,15 @@ use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
 use super::link::{Horizon, Input, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
-use crate::bus::{Bus, BusError, Reader, Signal, Topic};
+use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
-use crate::rig::{Rig, Truth};
+use crate::rig::{BodyInfo, Fleet, FleetTruth, Rig, Truth};
 use crate::role::Guard;
-use crate::sample::Sample;
 use crate::serial::LineBook;
 use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
 use crate::with_rig;
+use plant::PlantNode;
 
 /// Which role of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -189,20 +189,24 @@ pub struct Seat<'a, B> {
 }
 
 impl<B: Bus> Seat<'_, B> {
-    fn input<S: Sample, G: Guard<S>>(&self, body: &str, signal: Signal, guard: G) -> Result<Input<B, S, G>, BusError> {
-        let topic = topic(self.scenario, body, signal);
-        let mut input = Input::open(self.bus, &topic, Reader::Role, self.ledger)?.guarded(guard);
+    fn input<S, G: Guard<S>>(&self, body: &BodyInfo, signal: Signal, guard: G) -> Result<Input<B, S, G>, BusError>
+    where
+        S: Carried + ?Sized,
+    {
+        let topic = topic(self.scenario, &body.name, signal);
+        let mut input = Input::open(self.bus, &topic, body.bodies(), Reader::Role, self.ledger)?.guarded(guard);
         input.expect(horizon(self.scenario, None));
         Ok(input)
     }
 
-    fn output<S: Sample>(&self, body: &str, signal: Signal) -> Result<Output<B, S>, BusError> {
-        let topic = topic(self.scenario, body, signal);
-        let output = Output::open(self.bus, &topic, self.generation, self.ledger, self.scenario.last_tick)?;
+    fn output<S: Carried + ?Sized>(&self, body: &BodyInfo, signal: Signal) -> Result<Output<B, S>, BusError> {
+        let topic = topic(self.scenario, &body.name, signal);
+        let (bodies, last_tick) = (body.bodies(), self.scenario.last_tick);
+        let output = Output::open(self.bus, &topic, bodies, self.generation, self.ledger, last_tick)?;
         // Nobody in the loop reads the truth, and the score is to tell what really happened.
         let disturbance = match signal {
             Signal::Truth => None,
-            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), body),
+            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), &body.name, bodies),
         };
         Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
     }
@@ -223,12 +227,15 @@ pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
 
 /// How large the ledger of a role is, words.
 pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
-    fn state_words<R: Rig>(_: &R) -> usize {
-        plant::StateBook::<Truth<R>>::WORDS
+    fn state_words<R: Rig>(rig: &R, index: usize) -> usize {
+        match rig.bodies()[index].fleet {
+            None => plant::StateBook::<Truth<R>>::words(1),
+            Some(bodies) => plant::StateBook::<FleetTruth<R>>::words(bodies),
+        }
     }
     let ports = ports(scenario, role);
     let state = match role {
-        RoleId::Plant(_) => with_rig!(&scenario.rig, rig => state_words(rig)),
+        RoleId::Plant(index) => with_rig!(&scenario.rig, rig => state_words(rig, index)),
         RoleId::Observer => 0,
         RoleId::Controller => WatchBook::WORDS,
     };
@@ -246,7 +253,7 @@ pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
 /// An upper bound on the shared memory that a run takes, bytes.
 pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
     let depths = super::depths(scenario);
-    let port = |port: &Port| footprint(depths, port.topic.signal, port.size);
+    let port = |port: &Port| footprint(&port.qos(depths), port.size);
     let role = |role: RoleId| {
         let Ports { writes, health, .. } = ports(scenario, role);
         writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
@@ -311,7 +318,13 @@ pub fn build<R: Rig, B: Bus + 'static>(
     let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
     Ok(match occupant {
         Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
-        Occupant::Role(RoleId::Plant(index)) => Box::new(plant::PlantNode::<R, B>::open(rig, index, &seat)?),
+        Occupant::Role(RoleId::Plant(index)) => {
+            let info = &rig.bodies()[index];
+            match rig.fleet(index) {
+                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, &seat)?),
+                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, &seat)?),
+            }
+        }
         Occupant::Role(RoleId::Observer) => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
         Occupant::Role(RoleId::Controller) => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
     })
@@ -320,6 +333,8 @@ pub fn build<R: Rig, B: Bus + 'static>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::bus::iox::IoxBus;
     use crate::config::SHIPPED;
 
     #[test]
@@ -328,6 +343,34 @@ mod tests {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
             let names: Vec<&str> = RoleId::all(&scenario).iter().map(|role| role.name(&scenario)).collect();
             assert_eq!(names, scenario.rig.roles(), "{name}");
+        }
+    }
+
+    /// What is asked for before a run is more than it takes, and not much more, whatever the size of a fleet.
+    #[test]
+    fn the_room_that_a_fleet_needs_is_known_beforehand() {
+        for (clock, count) in [("lockstep", 1), ("lockstep", 1000), ("realtime", 1000), ("realtime", 20_000)] {
+            let overrides = [format!("clock={clock}"), format!("follower.0.count={count}")];
+            let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-fleet").unwrap().1;
+            let scenario = Scenario::parse(text, "test", &overrides).unwrap();
+            let domain = OwnedDomain::create(0).unwrap();
+            let bus = IoxBus::enter(domain.domain(), "test", crate::runtime::depths(&scenario)).unwrap();
+            let node = |role| {
+                let ledger = private_ledger(&scenario, role);
+                with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+            };
+            let mut nodes: Vec<ReadyNode> = RoleId::all(&scenario).into_iter().map(node).collect();
+            nodes.iter_mut().for_each(|node| node.warm_up().unwrap());
+            let prefix = domain.domain().prefix();
+            let ours = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(&prefix);
+            let files = std::fs::read_dir("/dev/shm").unwrap().filter_map(Result::ok).filter(ours);
+            let signals: u64 = files.map(|file| file.metadata().unwrap().len()).sum();
+            let words: usize = RoleId::all(&scenario).into_iter().map(|role| ledger_words(&scenario, role)).sum();
+            let (taken, asked) = (signals as usize + 8 * words, shared_memory_bytes(&scenario));
+            println!("{clock} {count}: {taken} bytes of {asked}");
+            assert!(taken <= asked, "{clock} {count}: {taken} bytes of {asked}");
+            assert!(count == 1 || asked < 2 * taken, "{clock} {count}: {taken} bytes of {asked}");
+            assert!(signals > 100 * count, "{clock} {count}: the samples are among them, {signals} bytes");
         }
     }
 }

@@ -7,7 +7,7 @@ use super::drive::{Control, Drive, Ended, Waiting};
 use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
 use super::privileges::Privileges;
-use super::{depths, privileges};
+use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
@@ -67,11 +67,11 @@ pub enum RoleError {
         scenario: PathBuf,
     },
     /// The role is no body that a device could be.
-    #[error("a device can be a driven body only, and `{role}` is none; this scenario has: {driven}")]
+    #[error("a device can be a driven body only, no fleet, and `{role}` is none; this scenario has: {driven}")]
     NotDriven {
         /// As given.
         role: String,
-        /// The driven bodies.
+        /// The driven bodies that are no fleets.
         driven: String,
     },
     /// There is no device for the seat.
@@ -309,7 +309,7 @@ fn drive<B: Bus>(
     let late = scenario.clock == ClockKind::Realtime && !control.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1));
-    let mut drive = Drive::new(control, scenario.last_tick);
+    let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
         ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, privileges)),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),

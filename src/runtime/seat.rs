@@ -4,7 +4,7 @@
 
 use super::node::{Port, RoleId, ports};
 use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, scenario_path};
-use super::{WINDOW_TICKS, depths};
+use super::{depths, window_ticks};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{self, Qos};
 use crate::bus::{Depths, Reader};
@@ -80,6 +80,8 @@ struct SignalDescription {
     type_name: &'static str,
     /// Bytes.
     size: usize,
+    /// Whether it travels as a slice of words of 8 bytes, which the type name is of.
+    slice: bool,
     fields: Vec<FieldDescription>,
     qos: Qos,
     /// How many samples may wait for our own role; only where the role reads.
@@ -120,7 +122,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         tick_hz: 1e9 / scenario.period_ns as f64,
         period_ns: scenario.period_ns,
         last_tick: scenario.last_tick,
-        window_ticks: WINDOW_TICKS,
+        window_ticks: window_ticks(scenario),
         command_timeout_ticks: scenario.command_timeout_ticks,
         rearm: match scenario.rearm {
             Rearm::Auto => "auto",
@@ -187,8 +189,9 @@ impl SignalDescription {
             service: port.topic.to_string(),
             type_name: port.type_name,
             size: port.size,
-            fields: Stamp::FIELDS.iter().chain(port.fields).map(FieldDescription::new).collect(),
-            qos: Qos::of(signal, depths),
+            fields: Stamp::FIELDS.iter().chain(&port.fields).map(FieldDescription::new).collect(),
+            slice: port.fleet,
+            qos: port.qos(depths),
             buffer_size: reader.map(|reader| iox::buffer_size(signal, reader, depths)),
         }
     }

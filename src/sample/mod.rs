@@ -4,10 +4,14 @@
 //! type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of layout changes the
 //! version in the name. Must not know how samples travel.
 
+mod fleet;
 mod orbit;
 mod rigid;
 mod run;
 
+pub use fleet::{
+    CommandLayout, FleetCommand, FleetLayout, FleetMeasurement, FleetSample, FleetTruth, MeasurementLayout, TruthLayout,
+};
 pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
@@ -91,24 +95,32 @@ impl<T: FieldType, const N: usize> FieldType for [T; N] {
     const COUNT: usize = N * T::COUNT;
 }
 
+/// What travels on a link, whatever its length: words of 8 bytes, a stamp at the start.
+pub trait Message: core::fmt::Debug + Send + Sync {
+    /// The stamp.
+    fn stamp(&self) -> &Stamp;
+    /// The stamp, to be written.
+    fn stamp_mut(&mut self) -> &mut Stamp;
+    /// All of it.
+    fn words(&self) -> &[u64];
+    /// All of it, to be written.
+    fn words_mut(&mut self) -> &mut [u64];
+
+    /// The bytes of everything but the stamp: what the state hash covers.
+    #[inline]
+    fn content(&self) -> &[u8] {
+        &bytemuck::cast_slice(self.words())[size_of::<Stamp>()..]
+    }
+}
+
 /// A sample: plain bytes, a stamp at the start, a versioned name, a table of its fields.
-pub trait Sample: bytemuck::Pod + Default + PartialEq + core::fmt::Debug + Send + Sync {
+pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     /// Name and version of the layout, unique among all samples.
     const TYPE_NAME: &'static str;
     /// The fields after the stamp, in order.
     const FIELDS: &'static [Field];
 
-    /// The stamp.
-    fn stamp(&self) -> &Stamp;
-    /// The stamp, to be written.
-    fn stamp_mut(&mut self) -> &mut Stamp;
-
-    /// The bytes of everything but the stamp: what the state hash covers.
-    fn content(&self) -> &[u8] {
-        &bytemuck::bytes_of(self)[size_of::<Stamp>()..]
-    }
-
-    /// Takes over everything but the stamp from the bytes that [`content`](Self::content) gave elsewhere; false, and
+    /// Takes over everything but the stamp from the bytes that [`content`](Message::content) gave elsewhere; false, and
     /// nothing changed, if they are not as many.
     fn set_content(&mut self, content: &[u8]) -> bool {
         let own = &mut bytemuck::bytes_of_mut(self)[size_of::<Stamp>()..];
@@ -157,13 +169,27 @@ macro_rules! sample {
                 kind: <$ty as $crate::sample::FieldType>::KIND,
                 count: <$ty as $crate::sample::FieldType>::COUNT,
             },)+];
+        }
 
+        impl $crate::sample::Message for $name {
+            #[inline]
             fn stamp(&self) -> &$crate::sample::Stamp {
                 &self.stamp
             }
 
+            #[inline]
             fn stamp_mut(&mut self) -> &mut $crate::sample::Stamp {
                 &mut self.stamp
+            }
+
+            #[inline]
+            fn words(&self) -> &[u64] {
+                bytemuck::cast_slice(core::slice::from_ref(self))
+            }
+
+            #[inline]
+            fn words_mut(&mut self) -> &mut [u64] {
+                bytemuck::cast_slice_mut(core::slice::from_mut(self))
             }
         }
 

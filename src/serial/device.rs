@@ -7,8 +7,8 @@ use super::frame::{Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, encode};
 use super::message::{
     Answer, Hello, MAX_CONTENT, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, shorten, write,
 };
-use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
-use crate::sample::{Sample, Stamp, content_length};
+use crate::role::{Actuation, CommandEvent, Plant, Rearm, SingleBody};
+use crate::sample::{Message as _, Sample, Stamp, content_length};
 
 /// A body lives through at most so many ticks that it missed; after a longer absence its clock jumps.
 const CATCH_UP_TICKS: u64 = 100_000;
@@ -16,7 +16,7 @@ const CATCH_UP_TICKS: u64 = 100_000;
 /// A device: the body that `make` gives for a run, behind a byte stream.
 ///
 /// `make` is asked once per run and gives a body at its initial state, or nothing if this device is not that body.
-pub struct Device<B: Body, M> {
+pub struct Device<B: SingleBody, M> {
     name: &'static str,
     make: M,
     tells_truth: bool,
@@ -32,7 +32,7 @@ struct Mouth {
 }
 
 /// One run, seen from the device.
-struct Session<B: Body> {
+struct Session<B: SingleBody> {
     run: u64,
     plant: Plant<B>,
     realtime: bool,
@@ -46,14 +46,14 @@ struct Session<B: Body> {
 }
 
 /// The last tick executed, kept to be told again.
-struct Executed<B: Body> {
+struct Executed<B: SingleBody> {
     tick: u64,
     event: CommandEvent,
     measurement: B::Measurement,
     truth: B::Truth,
 }
 
-impl<B: Body, M: FnMut(&Hello<'_>) -> Option<B>> Device<B, M> {
+impl<B: SingleBody, M: FnMut(&Hello<'_>) -> Option<B>> Device<B, M> {
     const FITS: () = assert!(
         content_length::<B::Command>() <= MAX_CONTENT
             && content_length::<B::Measurement>() <= MAX_CONTENT
@@ -139,7 +139,7 @@ impl Mouth {
 }
 
 /// Begins a run, or goes on with one. Returns the next tick.
-fn greet<B: Body>(
+fn greet<B: SingleBody>(
     session: &mut Option<Session<B>>,
     make: &mut impl FnMut(&Hello<'_>) -> Option<B>,
     hello: &Hello<'_>,
@@ -168,7 +168,7 @@ fn greet<B: Body>(
     Ok(session.insert(begun).next.unwrap_or(0))
 }
 
-impl<B: Body> Session<B> {
+impl<B: SingleBody> Session<B> {
     fn new(body: B, hello: &Hello<'_>, now_ns: u64) -> Self {
         let rearm = if hello.manual_rearm { Rearm::Manual } else { Rearm::Auto };
         let actuation = Actuation { driven: true, timeout_ticks: hello.timeout_ticks, rearm };

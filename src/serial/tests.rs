@@ -186,7 +186,7 @@ impl Rig {
     /// Asks for a tick and gives the answer.
     fn ask(&mut self, tick: u64, value: Option<f64>, ns: u64) -> Option<Event> {
         let command = value.map(command);
-        self.host.request(tick, command.as_ref().map(Sample::content), self.now_ns);
+        self.host.request(tick, command.as_ref().map(crate::sample::Message::content), self.now_ns);
         let end_ns = self.now_ns + ns;
         while self.now_ns < end_ns {
             let events = self.step();

@@ -136,7 +136,7 @@ impl WriteBook {
 
     /// Enters a sample that was sent.
     #[inline]
-    pub fn enter(&mut self, sample: &impl crate::sample::Sample) {
+    pub fn enter(&mut self, sample: &(impl crate::sample::Message + ?Sized)) {
         self.hash.absorb(sample);
         self.words.add(Self::PUBLISHED, 1);
         self.cover(sample.stamp().tick);

@@ -3,7 +3,7 @@
 //! It covers ticks and values, no generation and no time. Checkpoints make it comparable up to any tick.
 
 use super::ledger::{Ledger, Words};
-use crate::sample::Sample;
+use crate::sample::Message;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
 /// The most checkpoints that a writer keeps; longer runs keep every second, third, … tick.
@@ -56,7 +56,7 @@ impl StateHash {
 
     /// Takes in a sample. Ticks rise.
     #[inline]
-    pub fn absorb(&mut self, sample: &impl Sample) {
+    pub fn absorb(&mut self, sample: &(impl Message + ?Sized)) {
         let tick = sample.stamp().tick;
         self.checkpoint(tick);
         let value = self.words.get(Self::VALUE) ^ tick.rotate_left(32);

@@ -57,6 +57,13 @@ impl Latency {
         self.histogram.saturating_record(ns);
     }
 
+    /// Counts everything that another one has counted.
+    pub fn absorb(&mut self, other: &Self) {
+        // Both have the same bounds.
+        self.histogram.add(&other.histogram).expect("histograms of equal bounds add up");
+        self.clipped += other.clipped;
+    }
+
     /// Whether nothing was counted.
     pub fn is_empty(&self) -> bool {
         self.histogram.is_empty()

@@ -172,7 +172,7 @@ pub(in crate::rig) fn hold(
     let initial = vec![OrbitState::from(&raw.spacecraft)];
     let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
     let rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true }],
+        bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true, fleet: None }],
         field,
         initial,
         limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
@@ -212,7 +212,7 @@ pub(in crate::rig) fn rendezvous(
     initial.extend(raw.follower.iter().map(OrbitState::from));
     let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
     let mut rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
+        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
         field,
         initial,
         limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
@@ -225,7 +225,7 @@ pub(in crate::rig) fn rendezvous(
         tick_s: frame.tick_s,
     };
     for follower in &raw.follower {
-        rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true });
+        rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true, fleet: None });
         rig.sensors.push(sensor(frame, rig.sensors.len() as u64, &follower.noise, &follower.bias));
     }
     if sound {

@@ -3,10 +3,13 @@
 use super::limits::RawLimits;
 use crate::config::{Checks, finite_positive};
 use crate::rig::check_name;
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// The most followers: each is a process, and the transport holds 128 of them.
 const MAX_FOLLOWERS: usize = 100;
+/// The most bodies of a fleet: one sample of them is 48 MB.
+const MAX_BODIES: i64 = 1_000_000;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -49,7 +52,11 @@ pub(super) struct RawOutage {
 #[serde(deny_unknown_fields)]
 pub(super) struct RawFollower {
     pub name: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub count: Option<i64>,
     pub initial_rate_rad_s: [f64; 3],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub initial_rate_spread_rad_s: Option<[f64; 3]>,
     #[serde(default = "identical")]
     pub inertia_factor: [f64; 3],
     #[serde(default)]
@@ -60,6 +67,23 @@ pub(super) struct RawFollower {
 
 fn identical() -> [f64; 3] {
     [1.0; 3]
+}
+
+impl RawFollower {
+    /// How many bodies it is, if it is a fleet.
+    pub fn fleet(&self) -> Option<usize> {
+        self.count.and_then(|count| usize::try_from(count).ok())
+    }
+
+    /// How far the initial rates of a fleet's bodies are from the one given, at the most.
+    pub fn spread_rad_s(&self) -> [f64; 3] {
+        self.initial_rate_spread_rad_s.unwrap_or_default()
+    }
+
+    /// The fastest initial rate of a body, rad/s.
+    pub fn fastest(&self) -> Vector3<f64> {
+        Vector3::from(self.initial_rate_rad_s).abs() + Vector3::from(self.spread_rad_s())
+    }
 }
 
 /// What the observer is for.
@@ -145,6 +169,7 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     check_followers(&raw.follower, checks);
     check_noise(checks, "leader", &raw.leader.noise_rad_s);
     check_observer(&raw.observer, checks);
+    check_fleets(raw, checks);
     match (&raw.controller, raw.follower.is_empty()) {
         (None, false) => checks.refuse("controller", "is missing; followers need a [controller] with gain_per_s"),
         (Some(_), true) => checks.refuse("controller", "has no follower to drive; add a [[follower]] or remove it"),
@@ -203,6 +228,46 @@ fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
         for factor in follower.inertia_factor {
             finite_positive(checks, &format!("follower[{index}].inertia_factor"), factor);
         }
+    }
+}
+
+/// What fleets are, and what they do without.
+fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
+    for (index, follower) in raw.follower.iter().enumerate() {
+        let key = |name: &str| format!("follower[{index}].{name}");
+        let spread = follower.initial_rate_spread_rad_s;
+        let Some(count) = follower.count else {
+            checks.require(spread.is_none(), &key("initial_rate_spread_rad_s"), || {
+                "is for many bodies, and this follower is one; give count, or remove it".to_owned()
+            });
+            continue;
+        };
+        checks.require((1..=MAX_BODIES).contains(&count), &key("count"), || {
+            format!("{count} is no number of bodies that one process hosts; give 1 to {MAX_BODIES}")
+        });
+        checks.require(spread.iter().flatten().all(|spread| *spread >= 0.0), &key("initial_rate_spread_rad_s"), || {
+            "is a distance to either side and below zero; give 0 or more".to_owned()
+        });
+        for (name, plain) in [
+            ("inertia_factor", follower.inertia_factor == identical()),
+            ("noise_rad_s", follower.noise_rad_s == [0.0; 3]),
+            ("bias_rad_s", follower.bias_rad_s == [0.0; 3]),
+        ] {
+            checks.require(plain, &key(name), || {
+                "has no meaning for a fleet, whose bodies are like the leader and perfectly measured; remove it or count"
+                    .to_owned()
+            });
+        }
+    }
+    if raw.follower.iter().any(|follower| follower.count.is_some()) {
+        let adapts = raw.controller.as_ref().is_some_and(|controller| controller.adaptation_gain > 0.0);
+        checks.require(!adapts, "controller.adaptation_gain", || {
+            "learns the inertia of single followers, and a fleet's is the leader's; give 0 or leave the fleet out"
+                .to_owned()
+        });
+        checks.require(raw.limits.repeats.is_none(), "limits.repeats", || {
+            "is not counted for the bodies of a fleet; remove it or the fleet".to_owned()
+        });
     }
 }
 

@@ -1,6 +1,6 @@
 //! The synchronising law of one follower, with its certificate computed live.
 
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use nalgebra::Vector3;
@@ -21,24 +21,6 @@ pub struct RateLaw {
     pub(super) tick_s: f64,
 }
 
-impl RateLaw {
-    /// Shortened to what the actuators can do, its direction kept.
-    #[inline]
-    fn limited(&self, asked: Vector3<f64>) -> Vector3<f64> {
-        let largest = asked.amax();
-        if largest > self.acceleration_max_rad_s2 {
-            return shortened(asked, self.acceleration_max_rad_s2 / largest);
-        }
-        asked
-    }
-}
-
-/// Seldom, and apart, so that the division is not made where nobody needs it.
-#[cold]
-fn shortened(asked: Vector3<f64>, factor: f64) -> Vector3<f64> {
-    asked * factor
-}
-
 impl Law for RateLaw {
     type Estimate = RateEstimate;
     type Measurement = RateMeasurement;
@@ -52,7 +34,7 @@ impl Law for RateLaw {
         }
         let (w, p) = self.law.ahead(reference, follower, measurement.applied_rad_s2.into());
         let correction = self.adaptation.correction(&w, &p, self.tick_s);
-        out.acceleration_rad_s2 = self.limited(self.law.command(&w, &p) + correction).into();
+        out.acceleration_rad_s2 = limited(self.law.command(&w, &p) + correction, self.acceleration_max_rad_s2).into();
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
         let error = follower - reference - self.supplied * estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =

@@ -98,21 +98,25 @@ impl Limits {
         ]
     }
 
-    /// A guard for a body's measurements. `coefficients` bound |a| of the body, `factor` is its inertia over the nominal
-    /// one; without the components in `needed` a measurement is of no use to the reader.
+    /// A guard for a body's measurements; without the components in `needed` a measurement is of no use to the reader.
     pub fn measurement(&self, body: &Sensed, tick_s: f64, needed: u64) -> MeasurementGuard {
+        let rate = Plausible::new(self.bounds(body, tick_s));
+        MeasurementGuard { rate, acceleration_rad_s2: self.acceleration_rad_s2, needed }
+    }
+
+    /// What a body's measured rates can be.
+    pub fn bounds(&self, body: &Sensed, tick_s: f64) -> Bounds<3> {
         let free = body.coefficients * (self.rate_rad_s * self.rate_rad_s);
         let driven =
             if body.driven { body.factor.map(|factor| self.acceleration_rad_s2 / factor) } else { Vector3::zeros() };
         let spread = body.deviation * SURE_DEVIATIONS;
         let rounding = Vector3::repeat(8.0 * f64::EPSILON * self.rate_rad_s);
-        let bounds = Bounds {
+        Bounds {
             magnitude: (Vector3::repeat(self.rate_rad_s) + body.bias.abs() + spread).into(),
             slew_per_tick: ((free + driven) * tick_s).into(),
             allowance: (spread * 2.0 + rounding).into(),
             repeats: self.repeats,
-        };
-        MeasurementGuard { rate: Plausible::new(bounds), acceleration_rad_s2: self.acceleration_rad_s2, needed }
+        }
     }
 
     /// A guard for estimates of a body whose |a| are at most `coefficients`.

@@ -4,6 +4,7 @@
 //! Parameters, and the glue between samples and vectors; the mathematics is in `model`, `observe` and `control`.
 
 mod config;
+mod fleet;
 mod identifier;
 mod law;
 mod learner;
@@ -12,6 +13,7 @@ mod observer;
 mod plant;
 mod resolve;
 
+pub use fleet::RateFleet;
 pub use law::RateLaw;
 pub use learner::Learner;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
@@ -24,7 +26,8 @@ use crate::config::Checks;
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{HiddenRate, RateNoise};
-use crate::sample::{RateCommand, RateEstimate, RateTruth, status};
+use crate::sample::{FleetTruth, RateCommand, RateEstimate, RateTruth, status};
+use fleet::farthest;
 use limits::{Limits, Sensed};
 use nalgebra::{Vector1, Vector3};
 use observer::ALL;
@@ -40,6 +43,9 @@ pub struct RigidBodyRig {
     inertia: Inertia,
     /// Per body: initial rate, and inertia over the nominal one.
     initial_rates: Vec<Vector3<f64>>,
+    /// Per body, how far a fleet's initial rates are spread to either side, and what the draws follow from.
+    spreads: Vec<Vector3<f64>>,
+    seed: u64,
     inertia_factors: Vec<Vector3<f64>>,
     /// Bit i set: the leader's component i has a gyro.
     measured: u64,
@@ -101,8 +107,8 @@ impl RigidBodyRig {
                 m / MAX_TURN_RAD
             )
         });
-        for (index, rate) in self.initial_rates[1..].iter().enumerate() {
-            let rate_rad_s = rate.norm();
+        for (index, (rate, spread)) in self.initial_rates.iter().zip(&self.spreads).skip(1).enumerate() {
+            let rate_rad_s = (rate.abs() + spread).norm();
             checks.require(rate_rad_s < limit_rad_s, &format!("follower[{index}].initial_rate_rad_s"), || {
                 format!(
                     "at {rate_rad_s:.3} rad/s it turns too far from one tick of {tick_s} s to the next to be driven; lower \
@@ -136,6 +142,27 @@ impl RigidBodyRig {
         }
     }
 
+    /// A body as its measurements show it.
+    fn sensed(&self, index: usize) -> Sensed {
+        Sensed {
+            // A follower may have another inertia.
+            coefficients: if index == 0 { self.leader_coefficients() } else { Vector3::repeat(1.0) },
+            factor: self.inertia_factors[index],
+            driven: self.bodies[index].driven,
+            deviation: self.deviations_rad_s[index],
+            bias: self.biases_rad_s[index],
+        }
+    }
+
+    /// The law of any follower but for what it keeps of its own.
+    fn synchronizer(&self) -> (Synchronizer, ControllerDesign) {
+        let Some(controller) = self.controller else {
+            unreachable!("a scenario with a follower has a controller: checked when it was resolved")
+        };
+        let lead_s = if controller.predict { self.tick_s } else { 0.0 };
+        (Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s), controller)
+    }
+
     /// The certificate of any follower: they differ in nothing that it knows of.
     fn certificate(&self) -> Option<Certificate> {
         let controller = self.controller?;
@@ -164,6 +191,7 @@ impl Rig for RigidBodyRig {
     type MeasurementGuard = MeasurementGuard;
     type EstimateGuard = EstimateGuard;
     type CommandGuard = CommandGuard;
+    type Fleet = RateFleet;
     const AXES: usize = 3;
 
     fn bodies(&self) -> &[BodyInfo] {
@@ -216,12 +244,9 @@ impl Rig for RigidBodyRig {
     }
 
     fn law(&self, _index: usize) -> RateLaw {
-        let Some(controller) = self.controller else {
-            unreachable!("a scenario with a follower has a controller: checked when it was resolved")
-        };
-        let lead_s = if controller.predict { self.tick_s } else { 0.0 };
+        let (law, controller) = self.synchronizer();
         RateLaw {
-            law: Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s),
+            law,
             adaptation: InertiaAdaptation::new(controller.adaptation_gain),
             certificate: self.certificate(),
             supplied: Vector3::ith(self.supplied(), 1.0),
@@ -233,15 +258,7 @@ impl Rig for RigidBodyRig {
 
     /// A law acts on all components; an observer says itself which it needs.
     fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
-        let body = Sensed {
-            // A follower may have another inertia.
-            coefficients: if index == 0 { self.leader_coefficients() } else { Vector3::repeat(1.0) },
-            factor: self.inertia_factors[index],
-            driven: self.bodies[index].driven,
-            deviation: self.deviations_rad_s[index],
-            bias: self.biases_rad_s[index],
-        };
-        self.limits.measurement(&body, self.tick_s, if acts { ALL } else { 0 })
+        self.limits.measurement(&self.sensed(index), self.tick_s, if acts { ALL } else { 0 })
     }
 
     fn estimate_guard(&self) -> EstimateGuard {
@@ -250,6 +267,11 @@ impl Rig for RigidBodyRig {
 
     fn command_guard(&self, _index: usize) -> CommandGuard {
         self.limits.command()
+    }
+
+    fn fleet(&self, index: usize) -> Option<RateFleet> {
+        let count = self.bodies[index].fleet?;
+        Some(RateFleet::new(self, index, count))
     }
 
     fn limits(&self) -> Vec<Figure> {
@@ -278,6 +300,8 @@ impl Rig for RigidBodyRig {
             Some("is not published by the Kalman filter")
         } else if watched == Watched::Lyapunov && self.certificate().is_none() {
             Some("is published with the first-order filter only")
+        } else if watched == Watched::Lyapunov && self.bodies[1..].iter().all(|body| body.fleet.is_some()) {
+            Some("is not published for a fleet")
         } else {
             None
         }
@@ -291,10 +315,11 @@ impl Rig for RigidBodyRig {
         }
     }
 
-    /// |p − ω| of the worst follower, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
+    /// |p − ω| of the worst follower, of all bodies of fleets too, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a RateTruth>,
+        fleet: impl Fn(usize) -> Option<&'a FleetTruth>,
         estimate: Option<&RateEstimate>,
         out: &mut [f64],
     ) {
@@ -304,7 +329,12 @@ impl Rig for RigidBodyRig {
             _ => f64::NAN,
         };
         let leader = rate(0);
-        let followers = (1..self.bodies.len()).map(|index| distance(rate(index), leader));
+        let follower = |index: usize| match (self.bodies[index].fleet, leader) {
+            (None, _) => distance(rate(index), leader),
+            (Some(_), Some(leader)) => fleet(index).map_or(f64::NAN, |truth| farthest(truth.vector(0), &leader)),
+            (Some(_), None) => f64::NAN,
+        };
+        let followers = (1..self.bodies.len()).map(follower);
         let worst =
             followers.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst });
         let estimate_error = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);

@@ -30,8 +30,10 @@ pub(in crate::rig) fn resolve(
     let observer = design_observer(&raw, &inertia, supplied_axis, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
-        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false }],
+        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
         inertia,
+        spreads: vec![Vector3::zeros()],
+        seed: frame.seed,
         initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
         inertia_factors: vec![Vector3::repeat(1.0)],
         measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
@@ -50,8 +52,9 @@ pub(in crate::rig) fn resolve(
         let factor = Vector3::from(follower.inertia_factor);
         let own = inertia.moments_kg_m2().component_mul(&factor);
         checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
-        rig.bodies.push(BodyInfo { name: follower.name, driven: true });
         rig.initial_rates.push(follower.initial_rate_rad_s.into());
+        rig.spreads.push(follower.spread_rad_s().into());
+        rig.bodies.push(BodyInfo { fleet: follower.fleet(), name: follower.name, driven: true });
         rig.inertia_factors.push(factor);
         rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
         rig.deviations_rad_s.push(follower.noise_rad_s.into());
@@ -108,7 +111,7 @@ fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limit
     let gain_per_s = raw.controller.as_ref().map_or(0.0, |controller| Vector3::from(controller.gain_per_s).amax());
     let about = Circumstances {
         leader_rad_s: inertia.rate_bound_rad_s(&raw.leader.initial_rate_rad_s.into()),
-        follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.initial_rate_rad_s)),
+        follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.fastest().into())),
         transient_rad_s: raw.observer.initial_guess_rad_s.abs()
             + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
         // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.

@@ -11,7 +11,7 @@ use crate::role::CommandEvent;
 use crate::runtime::bridge::DeviceLink;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
-use crate::sample::{Sample, Stamp, content_length, copy_fields};
+use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineBook, MAX_CONTENT};
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 
@@ -66,7 +66,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             assert!(content_length::<Measurement<R>>() <= MAX_CONTENT);
             assert!(content_length::<Truth<R>>() <= MAX_CONTENT);
         }
-        let (scenario, body) = (seat.scenario, &rig.bodies()[index].name);
+        let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
         // The same books in the same order as a simulated plant's. A successor lacks nothing: the state is in the device.
         let book = TickBook::open(seat.ledger);
         let measurement = seat.output(body, Signal::Measurement)?;
@@ -82,7 +82,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             last_tick: scenario.last_tick,
             book,
             interruptions: seat.interruptions(),
-            state: StateBook::open(seat.ledger),
+            state: StateBook::open(seat.ledger, 1),
             asked: false,
             asked_ns: 0,
             command_origin_ns: None,
@@ -117,7 +117,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
         let command = self.command.sample().filter(|_| found);
         self.command_origin_ns = command.map(|command| command.stamp().origin_ns);
-        self.link.request(tick, command.map(Sample::content), now_ns);
+        self.link.request(tick, command.map(Message::content), now_ns);
         (self.asked, self.asked_ns) = (true, now_ns);
         Ok(())
     }

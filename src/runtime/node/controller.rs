@@ -1,23 +1,33 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
+use super::ports::driven;
 use super::{Gate, Node, Poll, RoleId, Seat};
-use crate::bus::{Bus, BusError, Signal};
+use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::{Watchdog, Watched};
-use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
-use crate::role::Controller;
+use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig};
+use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
-use crate::sample::Sample;
+use crate::sample::Message;
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks, WatchBook};
 
-/// One driven body, seen from the controller.
-struct Channel<R: Rig, B: Bus> {
+/// What drives the bodies of a rig one by one.
+type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
+/// What drives its fleets.
+type Many<R, B> = Channel<
+    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Law,
+    <<R as Rig>::Fleet as Fleet<Estimate<R>>>::MeasurementGuard,
+    B,
+>;
+
+/// One driven body, or a fleet, seen from the controller.
+struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
     /// The body's index.
     body: usize,
-    controller: Controller<R::Law>,
-    measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
-    command: Output<B, Command<R>>,
+    controller: Controller<L>,
+    measurement: Input<B, L::Measurement, G>,
+    command: Output<B, L::Command>,
     /// Whether the measurement of the tick at hand is there, and a command is to be sent.
     ready: bool,
     /// When the command at hand was begun and sent, ns; sent at 0 if there is none.
@@ -25,11 +35,96 @@ struct Channel<R: Rig, B: Bus> {
     sent_ns: u64,
 }
 
+impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> Channel<L, G, B> {
+    fn open(
+        index: usize,
+        (body, command): (&BodyInfo, Output<B, L::Command>),
+        law: L,
+        guard: G,
+        seat: &Seat<'_, B>,
+    ) -> Result<Self, BusError> {
+        let measurement = seat.input(body, Signal::Measurement, guard)?;
+        let controller = Controller::new(law);
+        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0 })
+    }
+
+    /// Looks for the measurement of a tick; whether it is known what has become of it.
+    #[inline]
+    fn gather(&mut self, tick: u64) -> Result<bool, BusError> {
+        let found = self.measurement.seek(tick)?;
+        self.ready = found == Seek::Found;
+        Ok(found != Seek::NotYet)
+    }
+
+    /// The body's index, as long as nothing is known of its measurement of this tick.
+    #[inline]
+    fn late(&self, tick: u64) -> Option<usize> {
+        (!self.measurement.knows(tick)).then_some(self.body)
+    }
+
+    /// There is no estimate for this tick, and so there is no command.
+    fn pass_over(&mut self, tick: u64) -> Result<(), BusError> {
+        // What is not used now will never be, and must not fill the link.
+        self.measurement.seek(tick)?;
+        self.command.pass_over(tick)
+    }
+
+    /// Sends the command of this tick, begun at a time, unless the measurement is missing or the watchdog wants silence;
+    /// gives the time at which the next one is begun. Whether it was missing is added to `starved`.
+    #[inline]
+    fn execute(
+        &mut self,
+        estimate: &L::Estimate,
+        silent: bool,
+        (clock, began_ns): (Clock, u64),
+        starved: &mut bool,
+    ) -> Result<u64, BusError> {
+        *starved |= !self.ready;
+        self.ready &= !silent;
+        let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
+            self.command.pass_over(estimate.stamp().tick)?;
+            return Ok(began_ns);
+        };
+        let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
+        self.command.send(|sample| {
+            controller.step(estimate, measurement, sample);
+            *sent_ns = clock.now_ns();
+            sample.stamp_mut().sent_ns = *sent_ns;
+        })?;
+        self.began_ns = began_ns;
+        Ok(self.sent_ns)
+    }
+
+    /// Takes in what a command leaves to be done.
+    #[inline]
+    fn settle(&mut self, timed: bool, origin_ns: u64, step: &mut Latency, age: &mut Latency) -> Result<(), BusError> {
+        if !self.ready {
+            return Ok(());
+        }
+        if timed {
+            step.record(self.began_ns, self.sent_ns);
+            age.record(origin_ns, self.sent_ns);
+        }
+        self.command.settle()
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        self.measurement.warm_up()?;
+        self.command.warm_up()
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.measurement.refresh();
+        self.command.refresh()
+    }
+}
+
 /// A controller with its links and books.
 pub struct ControllerNode<R: Rig, B: Bus> {
     rig: R,
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
-    channels: Vec<Channel<R, B>>,
+    channels: Vec<Single<R, B>>,
+    fleets: Vec<Many<R, B>>,
     clock: Clock,
     book: TickBook,
     watchdog: Watchdog,
@@ -47,28 +142,28 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let book = TickBook::go_on(seat.ledger);
-        let driven = || rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
-        // In the order of the books: everything written, then everything read.
-        let commands: Vec<Output<B, Command<R>>> =
-            driven().map(|(_, body)| seat.output(&body.name, Signal::Command)).collect::<Result<_, _>>()?;
-        let estimate = seat.input(&rig.bodies()[0].name, Signal::Estimate, rig.estimate_guard())?;
+        let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
+        // In the order of the books: everything written, then everything read; fleets last.
+        let written = |(_, body)| seat.output(body, Signal::Command);
+        let commands: Vec<Output<B, Command<R>>> = bodies(false).map(written).collect::<Result<_, _>>()?;
+        let written = |(_, body)| seat.output(body, Signal::Command);
+        let fleet_commands: Vec<Output<B, FleetCommand<R>>> = bodies(true).map(written).collect::<Result<_, _>>()?;
+        let estimate = seat.input(&rig.bodies()[0], Signal::Estimate, rig.estimate_guard())?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
-            Ok(Channel {
-                body: index,
-                controller: Controller::new(rig.law(index)),
-                measurement: seat.input(&body.name, Signal::Measurement, rig.measurement_guard(index, true))?,
-                command,
-                ready: false,
-                began_ns: 0,
-                sent_ns: 0,
-            })
+            Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), seat)
         };
-        let channels = driven().zip(commands).map(channel).collect::<Result<_, BusError>>()?;
+        let channels = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
+        let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
+            let fleet = rig.fleet(index)?;
+            Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), seat))
+        };
+        let fleets = bodies(true).zip(fleet_commands).filter_map(channel).collect::<Result<_, BusError>>()?;
         let watch_book = WatchBook::open(seat.ledger);
         Ok(Self {
             rig: rig.clone(),
             estimate,
             channels,
+            fleets,
             clock: seat.clock,
             book,
             watchdog: watch_book.watchdog(seat.scenario.watch),
@@ -90,6 +185,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             if self.clock == Clock::Monotonic {
                 // Meanwhile the others, so that the newest are at hand when the estimate comes, which is the last as a rule.
                 self.channels.iter_mut().try_for_each(|channel| channel.measurement.seek(u64::MAX).map(drop))?;
+                self.fleets.iter_mut().try_for_each(|fleet| fleet.measurement.seek(u64::MAX).map(drop))?;
             }
             return Ok(false);
         }
@@ -99,9 +195,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         };
         let mut complete = true;
         for channel in &mut self.channels {
-            let found = channel.measurement.seek(tick)?;
-            channel.ready = found == Seek::Found;
-            complete &= found != Seek::NotYet;
+            complete &= channel.gather(tick)?;
+        }
+        for fleet in &mut self.fleets {
+            complete &= fleet.gather(tick)?;
         }
         Ok(complete || overdue)
     }
@@ -111,11 +208,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     fn pass_over(&mut self) -> Result<(), BusError> {
         let next = self.book.next();
         for tick in next..=self.estimate.last_tick().unwrap_or(next) {
-            for channel in &mut self.channels {
-                // What is not used now will never be, and must not fill the link.
-                channel.measurement.seek(tick)?;
-                channel.command.pass_over(tick)?;
-            }
+            self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
+            self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
             self.skip_to(tick + 1);
         }
         Ok(())
@@ -144,23 +238,15 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let clock = self.clock;
         let mut began_ns = self.received_ns;
         let mut starved = false;
-        for Channel { controller, measurement, command, ready, began_ns: began, sent_ns, .. } in &mut self.channels {
-            starved |= !*ready;
-            *ready &= !silent;
-            let Some(measurement) = measurement.sample().filter(|_| *ready) else {
-                command.pass_over(stamp.tick)?;
-                continue;
-            };
-            command.send(|sample| {
-                controller.step(estimate, measurement, sample);
-                *sent_ns = clock.now_ns();
-                sample.stamp_mut().sent_ns = *sent_ns;
-            })?;
-            *began = began_ns;
-            began_ns = *sent_ns;
-            if let (true, Some((v, _))) = (self.watchdog.active(), R::lyapunov(command.sent())) {
+        for channel in &mut self.channels {
+            began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved)?;
+            let watched = self.watchdog.active() && channel.ready;
+            if let (true, Some((v, _))) = (watched, R::lyapunov(channel.command.sent())) {
                 self.watchdog.magnitude(Watched::Lyapunov, stamp.tick, v);
             }
+        }
+        for fleet in &mut self.fleets {
+            began_ns = fleet.execute(estimate, silent, (clock, began_ns), &mut starved)?;
         }
         (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
         self.skip_to(stamp.tick);
@@ -184,6 +270,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(Horizon::Due(grid));
             self.channels.iter_mut().for_each(|channel| channel.measurement.expect(Horizon::Due(grid)));
+            self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(Horizon::Due(grid)));
         }
         self.skip_to(first_tick);
     }
@@ -202,8 +289,10 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn awaits(&self) -> Option<RoleId> {
-        let late = self.channels.iter().find(|channel| !channel.measurement.knows(self.book.next()));
-        Some(late.map_or(RoleId::Observer, |channel| RoleId::Plant(channel.body)))
+        let next = self.book.next();
+        let single = || self.channels.iter().find_map(|channel| channel.late(next));
+        let late = single().or_else(|| self.fleets.iter().find_map(|fleet| fleet.late(next)));
+        Some(late.map_or(RoleId::Observer, RoleId::Plant))
     }
 
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
@@ -211,7 +300,9 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         let tick = self.book.next();
         if !self.estimate.knows(tick) {
             self.estimate.sleep(until_ns)?;
-        } else if let Some(late) = self.channels.iter_mut().find(|channel| !channel.measurement.knows(tick)) {
+        } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
+            late.measurement.sleep(until_ns)?;
+        } else if let Some(late) = self.fleets.iter_mut().find(|fleet| fleet.late(tick).is_some()) {
             late.measurement.sleep(until_ns)?;
         } else {
             return Ok(false);
@@ -225,12 +316,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         if timed {
             self.hop.record(self.estimate_sent_ns, self.received_ns);
         }
-        for channel in self.channels.iter_mut().filter(|channel| channel.ready) {
-            if timed {
-                self.step.record(channel.began_ns, channel.sent_ns);
-                self.age.record(self.origin_ns, channel.sent_ns);
-            }
-            channel.command.settle()?;
+        for channel in &mut self.channels {
+            channel.settle(timed, self.origin_ns, &mut self.step, &mut self.age)?;
+        }
+        for fleet in &mut self.fleets {
+            fleet.settle(timed, self.origin_ns, &mut self.step, &mut self.age)?;
         }
         if self.watchdog.active() {
             self.watch_book.store(&self.watchdog);
@@ -245,19 +335,14 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn warm_up(&mut self) -> Result<(), BusError> {
         self.estimate.warm_up()?;
-        for channel in &mut self.channels {
-            channel.measurement.warm_up()?;
-            channel.command.warm_up()?;
-        }
-        Ok(())
+        self.channels.iter_mut().try_for_each(Channel::warm_up)?;
+        self.fleets.iter_mut().try_for_each(Channel::warm_up)
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
         self.estimate.refresh();
-        self.channels.iter_mut().try_for_each(|channel| {
-            channel.measurement.refresh();
-            channel.command.refresh()
-        })
+        self.channels.iter_mut().try_for_each(Channel::refresh)?;
+        self.fleets.iter_mut().try_for_each(Channel::refresh)
     }
 
     fn ticks(&self) -> Ticks {

@@ -7,7 +7,7 @@ use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
-use crate::sample::Sample;
+use crate::sample::Message;
 use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
 
 /// The instants of one executed tick, ns.
@@ -35,7 +35,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let leader = &rig.bodies()[0].name;
+        let leader = &rig.bodies()[0];
         let book = TickBook::go_on(seat.ledger);
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
@@ -56,7 +56,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     fn execute(&mut self) -> Result<Poll, BusError> {
         let received = self.clock.now_ns();
         let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
-        let Some(stamp) = measurement.map(Sample::stamp).or(rejected).copied() else { return self.pass_over() };
+        let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
         let (observer, clock) = (&mut self.observer, self.clock);
         let mut done = 0;
         self.estimate.send(|sample| {

@@ -1,43 +1,48 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
 use super::{Gate, Node, Poll, RoleId, Seat};
-use crate::bus::{Bus, BusError, Signal};
+use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
-use crate::rig::{Command, Measurement, Rig, Truth};
-use crate::role::{CommandEvent, Plant};
+use crate::rig::BodyInfo;
+use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
-use crate::sample::{Sample, Stamp};
+use crate::sample::{Message, Stamp};
 use crate::telemetry::{Latency, Ledger, StageReport, TickBook, Ticks, Words};
+use std::borrow::{Borrow, BorrowMut};
 use std::marker::PhantomData;
 
+/// A body whose samples links carry: one, or a fleet.
+pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> {}
+
+impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried>> Hosted for P {}
+
 /// A plant with its links and books.
-pub struct PlantNode<R: Rig, B: Bus> {
-    plant: Plant<R::Body>,
-    command: Option<Input<B, Command<R>, R::CommandGuard>>,
-    measurement: Output<B, Measurement<R>>,
-    truth: Output<B, Truth<R>>,
+pub struct PlantNode<P: Hosted, G, B: Bus> {
+    plant: Plant<P>,
+    command: Option<Input<B, P::Command, G>>,
+    measurement: Output<B, P::Measurement>,
+    truth: Output<B, P::Truth>,
     clock: Clock,
     grid: Grid,
     last_tick: u64,
     book: TickBook,
     interruptions: Interruptions,
-    state: StateBook<Truth<R>>,
+    state: StateBook<P::Truth>,
     lateness: Latency,
     age: Latency,
     step: Latency,
 }
 
-impl<R: Rig, B: Bus> PlantNode<R, B> {
-    pub fn open(rig: &R, index: usize, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
+impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
+    pub fn open(body: P, guard: G, info: &BodyInfo, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+        let scenario = seat.scenario;
         let book = TickBook::go_on(seat.ledger);
-        let measurement = seat.output(&body.name, Signal::Measurement)?;
-        let truth = seat.output(&body.name, Signal::Truth)?;
-        let command =
-            body.driven.then(|| seat.input(&body.name, Signal::Command, rig.command_guard(index))).transpose()?;
+        let measurement = seat.output(info, Signal::Measurement)?;
+        let truth = seat.output(info, Signal::Truth)?;
+        let command = info.driven.then(|| seat.input(info, Signal::Command, guard)).transpose()?;
         Ok(Self {
-            plant: Plant::new(rig.body(index), scenario.actuation(body.driven), scenario.tick_s()),
+            plant: Plant::new(body, scenario.actuation(info.driven), scenario.tick_s()),
             command,
             measurement,
             truth,
@@ -46,7 +51,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
             last_tick: scenario.last_tick,
             book,
             interruptions: seat.interruptions(),
-            state: StateBook::open(seat.ledger),
+            state: StateBook::open(seat.ledger, info.bodies()),
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -69,7 +74,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
     }
 
     /// Takes over a body from a predecessor that died: it has moved on by itself, and its actuators have protected it.
-    fn resume(&mut self, truth: &Truth<R>, first_tick: u64) {
+    fn resume(&mut self, truth: &P::Truth, first_tick: u64) {
         self.plant.resume(truth, self.measurement.made());
         let first_tick = first_tick.max(truth.stamp().tick + 1);
         self.plant.advance(1);
@@ -115,7 +120,7 @@ impl<R: Rig, B: Bus> PlantNode<R, B> {
     }
 }
 
-impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
+impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
     fn time_triggered(&self) -> bool {
         true
     }
@@ -130,7 +135,7 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
             command.expect(Horizon::Due(grid));
         }
         if let Some(truth) = self.state.load() {
-            self.resume(&truth, first_tick);
+            self.resume(truth.borrow(), first_tick);
         } else {
             self.skip_to(first_tick);
         }
@@ -222,43 +227,45 @@ impl<R: Rig, B: Bus> Node for PlantNode<R, B> {
 
 /// The last state of a body, kept in the ledger so that whoever simulates it next can go on from there: a body does not
 /// vanish with the process that simulates it.
-pub struct StateBook<S> {
+pub struct StateBook<S: ?Sized> {
     words: Words,
+    bodies: usize,
     sample: PhantomData<S>,
 }
 
-impl<S: Sample> StateBook<S> {
-    const SAMPLE_WORDS: usize = size_of::<S>() / size_of::<u64>();
+impl<S: Carried + ?Sized> StateBook<S> {
     /// Words of the ledger: which of the two copies holds, from 1, and the copies. One of them is always whole.
-    pub const WORDS: usize = 1 + 2 * Self::SAMPLE_WORDS;
-
-    pub fn open(ledger: &Ledger) -> Self {
-        Self { words: ledger.take(Self::WORDS), sample: PhantomData }
+    pub fn words(bodies: usize) -> usize {
+        1 + 2 * S::length(bodies)
     }
 
-    fn begin(copy: u64) -> usize {
-        1 + (copy as usize - 1) * Self::SAMPLE_WORDS
+    pub fn open(ledger: &Ledger, bodies: usize) -> Self {
+        Self { words: ledger.take(Self::words(bodies)), bodies, sample: PhantomData }
+    }
+
+    fn begin(&self, copy: u64) -> usize {
+        1 + (copy as usize - 1) * S::length(self.bodies)
     }
 
     #[inline]
     pub fn store(&mut self, sample: &S) {
         let copy = if self.words.get(0) == 1 { 2 } else { 1 };
-        let words: &[u64] = bytemuck::cast_slice(std::slice::from_ref(sample));
-        for (index, word) in words.iter().enumerate() {
-            self.words.set(Self::begin(copy) + index, *word);
+        let begin = self.begin(copy);
+        for (index, word) in sample.words().iter().enumerate() {
+            self.words.set(begin + index, *word);
         }
         self.words.set(0, copy);
     }
 
-    fn load(&self) -> Option<S> {
+    fn load(&self) -> Option<S::Owned> {
         let copy = self.words.get(0);
         if !(1..=2).contains(&copy) {
             return None;
         }
-        let mut sample = S::default();
-        let words: &mut [u64] = bytemuck::cast_slice_mut(std::slice::from_mut(&mut sample));
-        for (index, word) in words.iter_mut().enumerate() {
-            *word = self.words.get(Self::begin(copy) + index);
+        let mut sample = S::blank(self.bodies);
+        let begin = self.begin(copy);
+        for (index, word) in sample.borrow_mut().words_mut().iter_mut().enumerate() {
+            *word = self.words.get(begin + index);
         }
         Some(sample)
     }

@@ -3,10 +3,11 @@
 //! In the order in which the nodes open them, which is that of their books. Must not open anything.
 
 use super::{RoleId, topic};
-use crate::bus::{Signal, Topic};
+use crate::bus::iox::Qos;
+use crate::bus::{Carried, Depths, Signal, Topic};
 use crate::config::Scenario;
-use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig, Truth};
-use crate::sample::{Field, Health, Sample, Schedule};
+use crate::rig::{BodyInfo, Command, Estimate, Fleet, Measurement, Rig, Truth};
+use crate::sample::{Field, FleetLayout, FleetSample, Health, Sample, Schedule};
 use crate::with_rig;
 
 /// One signal as it travels: where, and what its bytes mean.
@@ -19,7 +20,17 @@ pub struct Port {
     /// The length of a sample, bytes.
     pub size: usize,
     /// The fields after the stamp, in order.
-    pub fields: &'static [Field],
+    pub fields: Vec<Field>,
+    /// Whether it tells of a fleet, and travels as a slice of words.
+    pub fleet: bool,
+}
+
+impl Port {
+    /// What to ask of its service.
+    pub fn qos(&self, depths: Depths) -> Qos {
+        let signal = self.topic.signal;
+        if self.fleet { Qos::of_fleet(signal, depths) } else { Qos::of(signal, depths) }
+    }
 }
 
 /// The signals of a role.
@@ -41,6 +52,8 @@ pub trait Visit {
     type Made;
     /// Does it.
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made;
+    /// Does it where the signal is that of a fleet of so many bodies.
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made;
 }
 
 /// The signals of a role of a scenario.
@@ -64,35 +77,77 @@ pub fn visit_reads<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -
     with_rig!(&scenario.rig, rig => reads(rig, scenario, role, visit))
 }
 
-fn writes<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    let of = |body: &BodyInfo, signal| topic(scenario, &body.name, signal);
-    let bodies = rig.bodies();
-    match role {
-        RoleId::Plant(index) => vec![
-            visit.visit::<Measurement<R>>(of(&bodies[index], Signal::Measurement)),
-            visit.visit::<Truth<R>>(of(&bodies[index], Signal::Truth)),
-        ],
-        RoleId::Observer => vec![visit.visit::<Estimate<R>>(of(&bodies[0], Signal::Estimate))],
-        RoleId::Controller => {
-            let driven = bodies.iter().filter(|body| body.driven);
-            driven.map(|body| visit.visit::<Command<R>>(of(body, Signal::Command))).collect()
+/// The layouts of a rig's fleets.
+type TruthOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth;
+type MeasurementOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement;
+type CommandOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command;
+
+/// Which of a body's signals, single or fleet's.
+struct Signals<'a, R, V> {
+    rig: &'a R,
+    scenario: &'a Scenario,
+    visit: &'a mut V,
+}
+
+impl<R: Rig, V: Visit> Signals<'_, R, V> {
+    fn estimate(&mut self) -> V::Made {
+        self.visit.visit::<Estimate<R>>(topic(self.scenario, &self.rig.bodies()[0].name, Signal::Estimate))
+    }
+
+    fn truth(&mut self, body: &BodyInfo) -> V::Made {
+        let topic = topic(self.scenario, &body.name, Signal::Truth);
+        match body.fleet {
+            None => self.visit.visit::<Truth<R>>(topic),
+            Some(bodies) => self.visit.visit_fleet::<TruthOf<R>>(topic, bodies),
+        }
+    }
+
+    fn measurement(&mut self, body: &BodyInfo) -> V::Made {
+        let topic = topic(self.scenario, &body.name, Signal::Measurement);
+        match body.fleet {
+            None => self.visit.visit::<Measurement<R>>(topic),
+            Some(bodies) => self.visit.visit_fleet::<MeasurementOf<R>>(topic, bodies),
+        }
+    }
+
+    fn command(&mut self, body: &BodyInfo) -> V::Made {
+        let topic = topic(self.scenario, &body.name, Signal::Command);
+        match body.fleet {
+            None => self.visit.visit::<Command<R>>(topic),
+            Some(bodies) => self.visit.visit_fleet::<CommandOf<R>>(topic, bodies),
         }
     }
 }
 
-fn reads<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    let of = |body: &BodyInfo, signal| topic(scenario, &body.name, signal);
-    let bodies = rig.bodies();
+/// The driven bodies in the order in which a controller serves them: single ones, then fleets.
+pub(super) fn driven<R: Rig>(rig: &R) -> impl Iterator<Item = (usize, &BodyInfo)> {
+    let driven = || rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+    driven().filter(|(_, body)| body.fleet.is_none()).chain(driven().filter(|(_, body)| body.fleet.is_some()))
+}
+
+fn writes<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    let mut signals = Signals { rig, scenario, visit };
     match role {
         RoleId::Plant(index) => {
-            let driven = Some(&bodies[index]).filter(|body| body.driven);
-            driven.map(|body| visit.visit::<Command<R>>(of(body, Signal::Command))).into_iter().collect()
+            let body = &rig.bodies()[index];
+            vec![signals.measurement(body), signals.truth(body)]
         }
-        RoleId::Observer => vec![visit.visit::<Measurement<R>>(of(&bodies[0], Signal::Measurement))],
+        RoleId::Observer => vec![signals.estimate()],
+        RoleId::Controller => driven(rig).map(|(_, body)| signals.command(body)).collect(),
+    }
+}
+
+fn reads<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    let mut signals = Signals { rig, scenario, visit };
+    match role {
+        RoleId::Plant(index) => {
+            let driven = Some(&rig.bodies()[index]).filter(|body| body.driven);
+            driven.map(|body| signals.command(body)).into_iter().collect()
+        }
+        RoleId::Observer => vec![signals.measurement(&rig.bodies()[0])],
         RoleId::Controller => {
-            let estimate = visit.visit::<Estimate<R>>(of(&bodies[0], Signal::Estimate));
-            let driven = bodies.iter().filter(|body| body.driven);
-            let measurements = driven.map(|body| visit.visit::<Measurement<R>>(of(body, Signal::Measurement)));
+            let estimate = signals.estimate();
+            let measurements = driven(rig).map(|(_, body)| signals.measurement(body));
             std::iter::once(estimate).chain(measurements).collect()
         }
     }
@@ -105,8 +160,17 @@ impl Visit for Describe {
     type Made = Port;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Port {
-        Port { topic, type_name: S::TYPE_NAME, size: size_of::<S>(), fields: S::FIELDS }
+        describe::<S>(topic, 1, false)
     }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Port {
+        describe::<FleetSample<L>>(topic, bodies, true)
+    }
+}
+
+fn describe<S: Carried + ?Sized>(topic: Topic, bodies: usize, fleet: bool) -> Port {
+    let size = S::length(bodies) * size_of::<u64>();
+    Port { topic, type_name: S::type_name(), size, fields: S::fields(bodies), fleet }
 }
 
 #[cfg(test)]
@@ -130,6 +194,8 @@ mod tests {
     impl Bus for Watched {
         type Writer<S: Sample> = <MemoryBus as Bus>::Writer<S>;
         type Reader<S: Sample> = <MemoryBus as Bus>::Reader<S>;
+        type FleetWriter<L: FleetLayout> = <MemoryBus as Bus>::FleetWriter<L>;
+        type FleetReader<L: FleetLayout> = <MemoryBus as Bus>::FleetReader<L>;
 
         fn writer<S: Sample>(&self, topic: &Topic, _generation: u64) -> Result<Self::Writer<S>, BusError> {
             self.written.borrow_mut().push((topic.clone(), S::TYPE_NAME));
@@ -139,6 +205,21 @@ mod tests {
         fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError> {
             self.read.borrow_mut().push((topic.clone(), S::TYPE_NAME));
             self.bus.reader(topic, reader)
+        }
+
+        fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<Self::FleetWriter<L>, BusError> {
+            self.written.borrow_mut().push((topic.clone(), L::TYPE_NAME));
+            self.bus.fleet_writer(topic, bodies)
+        }
+
+        fn fleet_reader<L: FleetLayout>(
+            &self,
+            topic: &Topic,
+            reader: Reader,
+            bodies: usize,
+        ) -> Result<Self::FleetReader<L>, BusError> {
+            self.read.borrow_mut().push((topic.clone(), L::TYPE_NAME));
+            self.bus.fleet_reader(topic, reader, bodies)
         }
     }
 

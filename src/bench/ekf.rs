@@ -1,7 +1,7 @@
 //! The textbook's extended Kalman filter of a free body's three rates, two of them measured: what the filters of this
 //! project are measured against. No part of the product.
 
-use corotate::model::{euler, rk4_step};
+use crate::model::{euler, rk4_step};
 use nalgebra::{Matrix3, Vector3};
 
 /// Linearised about its own estimate, as the textbook has it; that is why it may diverge.
@@ -12,7 +12,9 @@ pub struct Ekf {
     sensor_variance: f64,
     /// Density of the white noise that drives the hidden component, (rad/s)²/s.
     density: f64,
+    /// Its estimate of the angular velocity, rad/s.
     pub state: Vector3<f64>,
+    /// How far it trusts that, (rad/s)².
     pub covariance: Matrix3<f64>,
 }
 

@@ -1,13 +1,16 @@
 //! A body's motion and what noisy sensors make of it, for every kind of conic; the hidden axis is 3. No part of the product.
 
-use corotate::model::{Inertia, Noise, RigidBody};
-use corotate::observe::{HiddenRate, RateSample};
+use crate::model::{Inertia, Noise, RigidBody};
+use crate::observe::{HiddenRate, RateSample};
 use nalgebra::Vector3;
 
 /// A body and its initial rates, rad/s.
 pub struct Case {
+    /// Its conic.
     pub name: &'static str,
+    /// Principal moments of inertia, kg m².
     pub moments: [f64; 3],
+    /// Angular velocity at the beginning, rad/s.
     pub start: [f64; 3],
 }
 
@@ -22,17 +25,22 @@ pub const CASES: [Case; 5] = [
 
 /// A free motion as truth and as measured at every tick.
 pub struct Recording {
+    /// The body's coefficients a of \[D\](2).
     pub coefficients: Vector3<f64>,
+    /// The tick, s.
     pub tick_s: f64,
     /// Standard deviation of the measured components, rad/s.
     pub deviation: f64,
+    /// Angular velocity at every tick, rad/s.
     pub truth: Vec<Vector3<f64>>,
+    /// The same with the noise of the measured components, rad/s.
     pub measured: Vec<Vector3<f64>>,
 }
 
 impl Recording {
+    /// Records a case for so many seconds, its noise white, of the given standard deviation, rad/s, and seed.
     pub fn new(case: &Case, tick_s: f64, duration_s: f64, deviation: f64, seed: u64) -> Self {
-        let body = RigidBody::new(&Inertia::new(case.moments).unwrap());
+        let body = RigidBody::new(&Inertia::new(case.moments).expect("the cases are bodies"));
         let mut noise = Noise::new(seed, 0, [deviation, deviation, 0.0], [0.0, 0.0, f64::NAN]);
         let mut rate = Vector3::from(case.start);
         let (mut truth, mut measured) = (vec![rate], vec![rate + noise.sample()]);
@@ -49,11 +57,13 @@ impl Recording {
         Vector3::new(self.deviation, self.deviation, f64::NAN)
     }
 
+    /// A measured sample of a body that moves freely.
     pub fn sample(&self, index: usize) -> RateSample {
         RateSample { rate_rad_s: self.measured[index], torque_rad_s2: Vector3::zeros() }
     }
 
+    /// The relation for the hidden component, which knows of the noise.
     pub fn relation(&self) -> HiddenRate {
-        HiddenRate::new(&self.coefficients, 3, 1e-6).unwrap().with_noise(&self.sensors())
+        HiddenRate::new(&self.coefficients, 3, 1e-6).expect("the cases have a relation").with_noise(&self.sensors())
     }
 }

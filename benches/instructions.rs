@@ -1,0 +1,107 @@
+//! Instructions per estimate-and-control step, counted by callgrind: a regression shows however noisy the machine is.
+//!
+//! `cargo bench --bench instructions` compares with `benches/instructions.json` and fails beyond its tolerance;
+//! `-- --save` writes it anew. Needs valgrind. The figures are those of one compiler: see `compiler` in the file.
+
+use corotate::bench::{STEP_KINDS, repeat_step};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+/// Passes over a second of samples in the two runs whose difference counts: everything else is in both.
+const PASSES: [u64; 2] = [1, 51];
+const STEPS_PER_PASS: u64 = 1000;
+/// How many more instructions than were kept are a regression, %.
+const TOLERANCE_PERCENT: f64 = 2.0;
+
+/// What is kept.
+#[derive(Debug, Serialize, Deserialize)]
+struct Kept {
+    compiler: String,
+    tolerance_percent: f64,
+    instructions_per_step: BTreeMap<String, f64>,
+}
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let done = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["--repeat", kind, passes] => passes.parse().map(|n| repeat_step(kind, n)).map_err(|error| error.to_string()),
+        ["--save"] => save(),
+        [] => compare(),
+        _ => Err("give nothing, or --save".to_owned()),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(reason) => {
+            eprintln!("instructions: {reason}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn path() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/instructions.json")
+}
+
+fn count_all() -> Result<BTreeMap<String, f64>, String> {
+    STEP_KINDS.iter().map(|kind| Ok(((*kind).to_owned(), per_step(kind)?))).collect()
+}
+
+/// Instructions per step of a kind, to a tenth.
+fn per_step(kind: &str) -> Result<f64, String> {
+    let [few, many] = PASSES.map(|passes| collected(kind, passes));
+    let exact = (many? as f64 - few? as f64) / ((PASSES[1] - PASSES[0]) * STEPS_PER_PASS) as f64;
+    Ok((exact * 10.0).round() / 10.0)
+}
+
+/// Instructions of a whole process.
+fn collected(kind: &str, passes: u64) -> Result<u64, String> {
+    let program = std::env::current_exe().map_err(|error| error.to_string())?;
+    let done = Command::new("valgrind")
+        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
+        .arg(program)
+        .args(["--repeat", kind, &passes.to_string()])
+        .output()
+        .map_err(|error| format!("there is no valgrind ({error}); install it (Debian: apt install valgrind)"))?;
+    let text = String::from_utf8_lossy(&done.stderr);
+    let count = text.lines().find_map(|line| line.split_once("Collected :")?.1.trim().parse().ok());
+    count.filter(|_| done.status.success()).ok_or_else(|| format!("valgrind failed: {}", text.trim()))
+}
+
+fn compiler() -> String {
+    let asked = Command::new("rustc").arg("--version").output();
+    asked.map_or("unknown".to_owned(), |done| String::from_utf8_lossy(&done.stdout).trim().to_owned())
+}
+
+fn save() -> Result<(), String> {
+    let instructions_per_step = count_all()?;
+    let kept = Kept { compiler: compiler(), tolerance_percent: TOLERANCE_PERCENT, instructions_per_step };
+    let text = serde_json::to_string_pretty(&kept).map_err(|error| error.to_string())?;
+    println!("{text}");
+    std::fs::write(path(), format!("{text}\n")).map_err(|error| error.to_string())
+}
+
+fn compare() -> Result<(), String> {
+    let text = std::fs::read_to_string(path()).map_err(|error| format!("{error}; make it with -- --save"))?;
+    let kept: Kept = serde_json::from_str(&text).map_err(|error| error.to_string())?;
+    if kept.compiler != compiler() {
+        println!("the kept figures are those of {}, this is {}", kept.compiler, compiler());
+    }
+    let mut worse = Vec::new();
+    println!("{:>14} {:>10} {:>10} {:>8}", "instructions", "kept", "now", "change");
+    for (kind, now) in &count_all()? {
+        let before = kept.instructions_per_step.get(kind).copied().unwrap_or(f64::NAN);
+        let change = 100.0 * (now / before - 1.0);
+        println!("{kind:>14} {before:>10.1} {now:>10.1} {change:>+7.2}%");
+        // What was never kept is no number, and not within.
+        let within = change <= kept.tolerance_percent;
+        if !within {
+            worse.push(kind.clone());
+        }
+    }
+    match worse.is_empty() {
+        true => Ok(()),
+        false => Err(format!("more than {} % above what was kept: {}", kept.tolerance_percent, worse.join(", "))),
+    }
+}

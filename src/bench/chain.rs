@@ -1,0 +1,124 @@
+//! The whole chain at several rates, beside the same chain of bare iceoryx2 hops: same cores, same priorities, same waits.
+//!
+//! From when the leader's tick was due until the controller has sent its command. The follower looks at it when the next
+//! tick is due, by definition, so the hop to it is never waited for.
+
+use super::exchange::{Mechanism, Opening, Sender, Station, Wake};
+use super::hop::{in_the_leaders_place, send_paced};
+use super::peer::Peer;
+use super::{Bench, BenchError, Board, Row};
+use crate::bus::domain::OwnedDomain;
+use crate::clock::{Grid, monotonic_ns};
+use crate::config::{SHIPPED, Scenario};
+use crate::launch::{Launch, Outcome};
+use crate::runtime::RoleId;
+
+const RATES_HZ: [u64; 4] = [1000, 5000, 10_000, 20_000];
+/// Words of the bare samples: 128 bytes, as much as a measurement takes, and an estimate nearly.
+const WORDS: usize = 16;
+/// Until the first sample of a round is due, ns.
+const START_NS: u64 = 20_000_000;
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let (rounds, seconds) = (bench.size(4, 1), bench.size(2.0, 0.1));
+    let domain = OwnedDomain::create(0)?;
+    let mut raw = RawChain::open(bench, board, &domain)?;
+    for round in 1..=rounds {
+        for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
+            bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
+            let (ours, floor) = (format!("ours, {hz} Hz"), format!("raw hops, {hz} Hz"));
+            let outcome = run_pair(bench, *hz, seconds)?;
+            for (name, role, stage, beside) in [
+                (ours.clone(), "controller", "age", Some(floor.as_str())),
+                (format!("ours until the estimate is sent, {hz} Hz"), "observer", "age", None),
+                (format!("step of the observer, {hz} Hz"), "observer", "step", None),
+                (format!("step of the controller, {hz} Hz"), "controller", "step", None),
+            ] {
+                stages(&outcome, role, stage).for_each(|latency| board.record(Row::Chain, &name, beside, &latency));
+            }
+            let (missed, elapsed) = outcome.reports.iter().fold((0, 0), |(missed, elapsed), report| {
+                (missed + report.ticks.missed + report.ticks.starved, elapsed + report.ticks.elapsed)
+            });
+            let share = 100.0 * missed as f64 / elapsed as f64;
+            board.add(Row::Chain, &format!("missed or starved, {hz} Hz"), "%", None, share);
+            raw.measure(board, &floor, *hz, (seconds * *hz as f64) as u64)?;
+        }
+    }
+    Ok(())
+}
+
+/// The latencies of a stage of a role.
+pub(super) fn stages<'a>(
+    outcome: &'a Outcome,
+    role: &'a str,
+    stage: &'a str,
+) -> impl Iterator<Item = crate::telemetry::Latency> + 'a {
+    let of_role = outcome.reports.iter().filter(move |report| report.role == role);
+    of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
+}
+
+/// A real-time run of the pair of bodies.
+pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64) -> Result<Outcome, BenchError> {
+    let (name, text) = SHIPPED[0];
+    let overrides =
+        [format!("tick_hz={hz}.0"), format!("duration_s={seconds:?}"), "accept={}".into(), "clock=realtime".into()];
+    let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
+    let mut launch = Launch {
+        program: bench.program.clone(),
+        external: Vec::new(),
+        record: None,
+        require_realtime: false,
+        signal: bench.signal,
+        progress: &mut |_| {},
+    };
+    let outcome = crate::launch::run(&scenario, &mut launch)?;
+    bench.interrupted()?;
+    Ok(outcome)
+}
+
+/// Bare hops in a row: this process in the leader's place, a peer in the observer's, one in the controller's.
+struct RawChain {
+    sender: Sender,
+    relay: Peer,
+    last: Peer,
+    number: u64,
+}
+
+impl RawChain {
+    fn open(bench: &Bench<'_>, board: &mut Board, domain: &OwnedDomain) -> Result<Self, BenchError> {
+        let link = |name: &str| Opening {
+            mechanism: Mechanism::Iceoryx,
+            wake: Wake::Spin,
+            words: WORDS,
+            name: name.to_owned(),
+            direction: 0,
+            descriptors: None,
+        };
+        let mut relay = Peer::start(bench, domain.domain(), true, Vec::new())?;
+        let mut last = Peer::start(bench, domain.domain(), false, Vec::new())?;
+        let mut sender = Station { domain: domain.domain(), process: "bench" }.sender(&link("first"), None)?;
+        relay.open(link("first"), Some(link("second")))?;
+        last.open(link("second"), None)?;
+        sender.refresh()?;
+        for peer in [&mut relay, &mut last] {
+            board.granted(std::mem::take(&mut peer.grants));
+        }
+        Ok(Self { sender, relay, last, number: 0 })
+    }
+
+    fn measure(&mut self, board: &mut Board, name: &str, hz: u64, count: u64) -> Result<(), BenchError> {
+        let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: 1_000_000_000 / hz };
+        self.relay.receive(grid, self.number + 1, count, true)?;
+        self.last.receive(grid, self.number + 1, count, false)?;
+        in_the_leaders_place(board, |beside| {
+            send_paced(&mut self.sender, grid, count, &mut self.number, beside.contains(&RoleId::Observer))
+        })?;
+        let (_, lost_first) = self.relay.received()?;
+        let ([due, _], lost) = self.last.received()?;
+        board.record(Row::Chain, name, None, &due);
+        let share = 100.0 * (lost + lost_first) as f64 / (2 * count) as f64;
+        board.add(Row::Chain, &format!("overtaken in {name}"), "%", None, share);
+        Ok(())
+    }
+}

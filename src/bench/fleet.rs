@@ -1,0 +1,82 @@
+//! The law of a fleet beside a copy of the same bytes, and beside the same law follower by follower.
+//!
+//! All read three arrays of f64 and write three others: 48 bytes per follower. What is measured is what the controller of a
+//! fleet runs. The largest fleets leave the caches: there the copy is the memory's bandwidth.
+
+use super::{Bench, BenchError, Board, Row};
+use crate::control::{FleetLaw, Synchronizer};
+use crate::model::{Inertia, RigidBody};
+use nalgebra::Vector3;
+use std::hint::black_box;
+use std::time::Instant;
+
+/// How many followers.
+const COUNTS: [usize; 6] = [1, 10, 100, 1000, 10_000, 100_000];
+/// Bytes that a follower takes: rates in, commands out.
+const BYTES: f64 = 48.0;
+
+/// The arrays of a fleet: rates and commands by component.
+struct Arrays {
+    rates: [Vec<f64>; 3],
+    commands: [Vec<f64>; 3],
+}
+
+impl Arrays {
+    fn new(count: usize) -> Self {
+        let rate = |component: usize| (0..count).map(|n| ((n * 3 + component) as f64 * 0.7).sin()).collect();
+        Self { rates: [rate(0), rate(1), rate(2)], commands: [(); 3].map(|()| vec![0.0; count]) }
+    }
+
+    fn split(&mut self) -> ([&[f64]; 3], [&mut [f64]; 3]) {
+        (self.rates.each_ref().map(|rates| &**rates), self.commands.each_mut().map(|commands| &mut **commands))
+    }
+
+    /// Nanoseconds per follower of one turn of at least so many followers.
+    fn turn(&mut self, followers: usize, mut once: impl FnMut([&[f64]; 3], [&mut [f64]; 3])) -> f64 {
+        let count = self.rates[0].len();
+        let rounds = followers.div_ceil(count);
+        let began = Instant::now();
+        for _ in 0..rounds {
+            let (rates, commands) = black_box(&mut *self).split();
+            once(rates, commands);
+        }
+        began.elapsed().as_nanos() as f64 / (rounds * count) as f64
+    }
+}
+
+fn copy(from: [&[f64]; 3], to: [&mut [f64]; 3]) {
+    to.into_iter().zip(from).for_each(|(to, from)| to.copy_from_slice(from));
+}
+
+/// The same law follower by follower, as a process with a single one runs it.
+fn one_by_one(law: &Synchronizer, reference: &Vector3<f64>, from: [&[f64]; 3], [u1, u2, u3]: [&mut [f64]; 3]) {
+    for n in 0..u1.len() {
+        let rate = black_box(Vector3::new(from[0][n], from[1][n], from[2][n]));
+        let command = law.command(reference, &rate);
+        (u1[n], u2[n], u3[n]) = (command.x, command.y, command.z);
+    }
+}
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let (rounds, followers) = (bench.size(41, 3), bench.size(200_000, 2000));
+    let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).expect("a body has such an inertia"));
+    let one = Synchronizer::new(body, Vector3::repeat(4.0), 0.0);
+    let law = FleetLaw::new(one, 1e3);
+    let reference = Vector3::new(0.6, -0.4, 0.8);
+    for count in COUNTS {
+        bench.next(&format!("fleet: {count} followers"))?;
+        let mut arrays = Arrays::new(count);
+        let floor = format!("copy, N = {count}");
+        for _ in 0..rounds {
+            let ns = arrays.turn(followers, |rates, commands| law.command(&reference, rates, commands));
+            board.add(Row::Fleet, &format!("law, N = {count}"), "ns", Some(&floor), ns);
+            let ns = arrays.turn(followers, copy);
+            board.add(Row::Fleet, &floor, "ns", None, ns);
+            board.add(Row::Fleet, &format!("bandwidth of the copy, N = {count}"), "GB/s", None, BYTES / ns);
+            let ns = arrays.turn(followers, |rates, commands| one_by_one(&one, &reference, rates, commands));
+            board.add(Row::Fleet, &format!("law one by one, N = {count}"), "ns", Some(&floor), ns);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,231 @@
+//! One hop between two processes on two cores, by every mechanism in turn: paced and from when due; back to back besides.
+//!
+//! The sender is this process in the leader's place, the receiver a peer in the controller's. Must not favour
+//! anyone: same cores, same privileges, same samples, same waits.
+
+use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
+use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns, pair};
+use super::{Bench, BenchError, Board, Row};
+use crate::bus::domain::{Domain, OwnedDomain};
+use crate::clock::{Grid, monotonic_ns, wait_until};
+use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
+use crate::telemetry::{Grant, Latency};
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::fd::OwnedFd;
+use rustix::thread::{sched_getaffinity, sched_setaffinity};
+use std::io;
+use std::net::UdpSocket;
+use std::os::unix::net::UnixDatagram;
+
+/// The pace of the open loop: 1 kHz.
+const PERIOD_NS: u64 = 1_000_000;
+/// Until the first sample of a round is due: both ends must have begun to wait.
+const START_NS: u64 = 5_000_000;
+/// Words of the samples: 64, 128, 256 bytes.
+const SIZES: [usize; 3] = [8, 16, 32];
+
+/// Who takes part, by how the receiver waits.
+const SPINNERS: [Mechanism; 4] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::Blackboard, Mechanism::SharedMemory];
+const SLEEPERS: [Mechanism; 7] = [
+    Mechanism::Ours,
+    Mechanism::Iceoryx,
+    Mechanism::SharedMemory,
+    Mechanism::EventFd,
+    Mechanism::Pipe,
+    Mechanism::UnixSocket,
+    Mechanism::Udp,
+];
+const HYBRIDS: [Mechanism; 3] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory];
+
+/// One way of one size with both of its ends.
+pub(super) struct Pair {
+    name: String,
+    floor: Option<String>,
+    sender: Sender,
+    back: Receiver,
+    peer: Peer,
+    number: u64,
+}
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let domain = OwnedDomain::create(0)?;
+    let ways = [(Wake::Spin, &SPINNERS[..]), (Wake::Event, &SLEEPERS[..]), (Wake::Hybrid, &HYBRIDS[..])];
+    for (wake, mechanisms) in ways {
+        for words in bench.size(&SIZES[..], &SIZES[..1]).iter().copied() {
+            bench.next(&format!("hop: {}, {} bytes", wake.name(), 8 * words))?;
+            let pairs: Result<Vec<_>, _> = mechanisms
+                .iter()
+                .map(|mechanism| Pair::open(bench, domain.domain(), *mechanism, wake, words))
+                .collect();
+            let mut pairs = pairs?;
+            for pair in &mut pairs {
+                board.granted(pair.grants());
+            }
+            take_turns(bench, board, &mut pairs, wake)?;
+        }
+    }
+    Ok(())
+}
+
+/// Everyone in turn, round after round.
+fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake: Wake) -> Result<(), BenchError> {
+    let (rounds, paced) = (bench.size(8, 1), bench.size(250, 20));
+    let exchanges = match wake {
+        Wake::Spin => bench.size(5000, 200),
+        Wake::Event | Wake::Hybrid => bench.size(500, 50),
+    };
+    for _ in 0..rounds {
+        for pair in &mut *pairs {
+            let (name, floor) = (pair.name.clone(), pair.floor.clone());
+            bench.next(&format!("hop: {name}"))?;
+            let measured = in_the_leaders_place(board, |_| {
+                let paced = pair.paced(paced)?;
+                Ok((paced, pair.back_to_back(exchanges)?))
+            });
+            let (([due, sent], lost), one_way_us) = measured?;
+            if lost > 0 {
+                board.remark(format!("{name}: the receiver was late and {lost} samples of a round were overtaken"));
+            }
+            board.record(Row::Hop, &name, floor.as_deref(), &due);
+            let suffixed =
+                |suffix: &str| (format!("{name}, {suffix}"), floor.as_ref().map(|f| format!("{f}, {suffix}")));
+            let (name_sent, floor_sent) = suffixed("from send");
+            board.record(Row::Hop, &name_sent, floor_sent.as_deref(), &sent);
+            let (name_tight, floor_tight) = suffixed("back to back");
+            board.add(Row::Hop, &name_tight, "us", floor_tight.as_deref(), one_way_us);
+        }
+    }
+    Ok(())
+}
+
+/// Does something with what the leader asks for, and gives it back; told whether others need the leader's core.
+pub(super) fn in_the_leaders_place<T>(
+    board: &mut Board,
+    work: impl FnOnce(&[RoleId]) -> Result<T, BenchError>,
+) -> Result<T, BenchError> {
+    let cores = sched_getaffinity(None).ok();
+    let Privileges { grants, beside, .. } = take_privileges(&pair(), RoleId::Plant(0));
+    board.granted(grants);
+    let done = work(&beside);
+    release_priority();
+    // Where it cannot be had back the rest of the suite stays on the leader's core.
+    let _ = cores.map(|cores| sched_setaffinity(None, &cores));
+    done
+}
+
+impl Pair {
+    /// Opens both ends.
+    pub fn open(
+        bench: &Bench<'_>,
+        domain: &Domain,
+        mechanism: Mechanism,
+        wake: Wake,
+        words: usize,
+    ) -> Result<Self, BenchError> {
+        let title = |mechanism: Mechanism| format!("{}, {}, {} B", mechanism.name(wake), wake.name(), 8 * words);
+        let floor = (mechanism == Mechanism::Ours).then(|| title(Mechanism::Iceoryx));
+        let name: String = title(mechanism).chars().filter(|letter| letter.is_ascii_alphanumeric()).collect();
+        let descriptors = match mechanism.descriptors() {
+            true => Some(descriptors(mechanism).map_err(BenchError::system("open descriptors"))?),
+            false => None,
+        };
+        let numbers = descriptors.as_ref().map(Descriptors::numbers);
+        let opening =
+            |direction| Opening { mechanism, wake, words, name: name.clone(), direction, descriptors: numbers };
+        let (ours, theirs) = descriptors.map_or((None, Vec::new()), |pair| (Some(pair.ours), pair.theirs.into()));
+        let [read, write] = ours.map_or([None, None], |[read, write]| [Some(read), Some(write)]);
+        let mut peer = Peer::start(bench, domain, false, theirs)?;
+        let station = Station { domain, process: "bench" };
+        // A blackboard must be there before anybody reads it: the writers' ends come first.
+        let mut sender = station.sender(&opening(0), write)?;
+        peer.open(opening(0), Some(opening(1)))?;
+        let back = station.receiver(&opening(1), read)?;
+        sender.refresh()?;
+        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0 })
+    }
+
+    /// What the peer asked of the machine.
+    pub fn grants(&mut self) -> Vec<Grant> {
+        std::mem::take(&mut self.peer.grants)
+    }
+
+    /// So many samples, each sent when it is due; what the receiver measured, from due and from sent.
+    fn paced(&mut self, count: u64) -> Result<([Latency; 2], u64), BenchError> {
+        let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: PERIOD_NS };
+        self.peer.receive(grid, self.number + 1, count, false)?;
+        send_paced(&mut self.sender, grid, count, &mut self.number, false)?;
+        self.peer.received()
+    }
+
+    /// So many samples there and back without a pause: half of the mean round trip, µs.
+    pub fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
+        self.peer.echo(count)?;
+        self.back.refresh();
+        let began_ns = monotonic_ns();
+        for _ in 0..count {
+            self.number += 1;
+            self.sender.send(self.number, 0)?;
+            self.sender.prepare()?;
+            if self.back.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)?.is_none() {
+                return Err(BenchError::Peer(format!("{}: it did not echo", self.name)));
+            }
+        }
+        let one_way_us = (monotonic_ns() - began_ns) as f64 / 2e3 / count as f64;
+        self.peer.echoed()?;
+        Ok(one_way_us)
+    }
+}
+
+/// Sends the samples of a grid from tick 1 to `count`, each when it is due, and gives way after each if so told.
+pub(super) fn send_paced(
+    sender: &mut Sender,
+    grid: Grid,
+    count: u64,
+    number: &mut u64,
+    give_way: bool,
+) -> Result<(), BenchError> {
+    for tick in 1..=count {
+        let due_ns = grid.due_ns(tick);
+        wait_until(due_ns, lead_ns(grid));
+        *number += 1;
+        sender.send(*number, due_ns)?;
+        if give_way {
+            // Who waits for it waits for this core too.
+            std::thread::yield_now();
+        }
+        sender.prepare()?;
+    }
+    Ok(())
+}
+
+/// The descriptors of both ends and directions.
+fn descriptors(mechanism: Mechanism) -> io::Result<Descriptors> {
+    match mechanism {
+        Mechanism::Pipe => {
+            let ((their_read, our_write), (our_read, their_write)) = (io::pipe()?, io::pipe()?);
+            Ok(Descriptors {
+                ours: [our_read.into(), our_write.into()],
+                theirs: [their_read.into(), their_write.into()],
+            })
+        }
+        Mechanism::UnixSocket => {
+            let (ours, theirs) = UnixDatagram::pair()?;
+            both(ours.try_clone()?.into(), ours.into(), theirs.try_clone()?.into(), theirs.into())
+        }
+        Mechanism::Udp => {
+            let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0")?, UdpSocket::bind("127.0.0.1:0")?);
+            ours.connect(theirs.local_addr()?)?;
+            theirs.connect(ours.local_addr()?)?;
+            both(ours.try_clone()?.into(), ours.into(), theirs.try_clone()?.into(), theirs.into())
+        }
+        _ => {
+            let (there, back) = (eventfd(0, EventfdFlags::CLOEXEC)?, eventfd(0, EventfdFlags::CLOEXEC)?);
+            both(back.try_clone()?, there.try_clone()?, there, back)
+        }
+    }
+}
+
+fn both(our_read: OwnedFd, our_write: OwnedFd, their_read: OwnedFd, their_write: OwnedFd) -> io::Result<Descriptors> {
+    Ok(Descriptors { ours: [our_read, our_write], theirs: [their_read, their_write] })
+}

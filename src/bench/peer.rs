@@ -1,0 +1,298 @@
+//! The other end of a hop: a process of its own, this program again, that receives, echoes or passes on what it is sent.
+//!
+//! Asks for the same privileges as the role whose place it has. Takes its orders as lines of JSON on standard input and
+//! answers on standard output, never while it measures. Dies with its parent.
+
+use super::exchange::{Opening, Receiver, Sender, Station, Wake};
+use super::{Bench, BenchError};
+use crate::bus::BusError;
+use crate::bus::domain::Domain;
+use crate::clock::{Grid, monotonic_ns, sleep_until};
+use crate::config::{SHIPPED, Scenario};
+use crate::runtime::{Privileges, RoleId, take_privileges};
+use crate::telemetry::{Grant, Latency, StageReport};
+use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
+use serde::{Deserialize, Serialize};
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::mpsc::{Receiver as Lines, channel};
+use std::time::Duration;
+
+/// How long before a sample is due both ends wake, as roles do, ns.
+const LEAD_NS: u64 = 60_000;
+/// How long one who spins and then sleeps spins after the sample was due, ns.
+pub(super) const SPIN_NS: u64 = 50_000;
+/// A sample that has not come for so long is lost, ns.
+pub(super) const LOST_NS: u64 = 1_000_000_000;
+/// A peer that has said nothing for so long hangs.
+const WATCHDOG: Duration = Duration::from_secs(60);
+
+/// The scenario whose roles' places the measuring processes take.
+pub(super) fn pair() -> Scenario {
+    let (name, text) = SHIPPED[0];
+    Scenario::parse(text, name, &[]).expect("shipped scenarios are valid")
+}
+
+/// What the command line of a peer says.
+#[derive(Debug, Clone)]
+pub struct PeerSeat {
+    /// The domain's directory.
+    pub domain: PathBuf,
+    /// Whether it has the observer's place, beside the leader where cores are few; else the controller's.
+    pub observer: bool,
+}
+
+/// What a peer is asked to do.
+#[derive(Debug, Serialize, Deserialize)]
+enum Order {
+    /// Open these ends: one to read from, one to write to.
+    Open { inlet: Opening, outlet: Option<Opening> },
+    /// Receive so many samples that are due on a grid, the first of this number; if so told, pass them on.
+    Receive { epoch_ns: u64, period_ns: u64, first: u64, count: u64, pass_on: bool },
+    /// Send every one of so many samples back at once.
+    Echo { count: u64 },
+}
+
+/// What it answers.
+#[derive(Debug, Serialize, Deserialize)]
+enum Answer {
+    /// It is there, with these privileges.
+    Here(Vec<Grant>),
+    /// The ends are open.
+    Open,
+    /// Received: from when due, from when sent; and how many were overtaken by the next.
+    Received { due: StageReport, sent: StageReport, lost: u64 },
+    /// All are echoed.
+    Echoed,
+}
+
+/// Serves as a peer until standard input ends.
+///
+/// # Errors
+/// Why it cannot, in words.
+pub fn serve_peer(seat: &PeerSeat) -> Result<(), String> {
+    let domain = Domain::join(&seat.domain).map_err(|error| error.to_string())?;
+    let (role, waits_for) = match seat.observer {
+        true => (RoleId::Observer, RoleId::Plant(0)),
+        false => (RoleId::Controller, RoleId::Observer),
+    };
+    let Privileges { grants, beside, .. } = take_privileges(&pair(), role);
+    say(&Answer::Here(grants))?;
+    let mut ends = None;
+    for line in std::io::stdin().lock().lines() {
+        let line = line.map_err(|error| error.to_string())?;
+        let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
+        ends.iter_mut().for_each(|(receiver, _): &mut (Receiver, _)| receiver.refresh());
+        let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
+        if let (Some((receiver, _)), true) = (&mut ends, beside.contains(&waits_for)) {
+            receiver.give_way();
+        }
+        say(&answer)?;
+    }
+    Ok(())
+}
+
+fn say(answer: &Answer) -> Result<(), String> {
+    let line = serde_json::to_string(answer).map_err(|error| error.to_string())?;
+    let mut stdout = std::io::stdout().lock();
+    writeln!(stdout, "{line}").and_then(|()| stdout.flush()).map_err(|error| error.to_string())
+}
+
+fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Sender>)>) -> Result<Answer, BusError> {
+    match (order, ends) {
+        (Order::Open { inlet, outlet }, ends) => {
+            let station = Station { domain, process: "peer" };
+            let receiver = station.receiver(inlet, descriptor(inlet, 0))?;
+            let sender = outlet.as_ref().map(|outlet| station.sender(outlet, descriptor(outlet, 1))).transpose()?;
+            *ends = Some((receiver, sender));
+            Ok(Answer::Open)
+        }
+        (Order::Receive { epoch_ns, period_ns, first, count, pass_on }, Some((receiver, sender))) => {
+            let grid = Grid { epoch_ns: *epoch_ns, period_ns: *period_ns };
+            receive(grid, *first, *count, receiver, sender.as_mut().filter(|_| *pass_on))
+        }
+        (Order::Echo { count }, Some((receiver, Some(sender)))) => {
+            for _ in 0..*count {
+                let Some(content) = receiver.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)? else {
+                    return Err(BusError::Device { reason: "a sample is lost that nothing could overtake".to_owned() });
+                };
+                sender.send(content.number, content.due_ns)?;
+                sender.prepare()?;
+            }
+            Ok(Answer::Echoed)
+        }
+        _ => Err(BusError::Device { reason: "nothing is open".to_owned() }),
+    }
+}
+
+/// A descriptor that was inherited.
+#[allow(unsafe_code)]
+fn descriptor(opening: &Opening, index: usize) -> Option<OwnedFd> {
+    // SAFETY: the parent left this descriptor open for us alone, and says its number once.
+    opening.descriptors.map(|numbers| unsafe { OwnedFd::from_raw_fd(numbers[index]) })
+}
+
+/// How long before a sample is due both ends wake: at a short period there must be some sleep left.
+pub(super) fn lead_ns(grid: Grid) -> u64 {
+    LEAD_NS.min(grid.period_ns / 4)
+}
+
+/// Receives what is due on a grid. A link of the newest sample alone may lose some: to a receiver that is late.
+fn receive(
+    grid: Grid,
+    first: u64,
+    count: u64,
+    receiver: &mut Receiver,
+    mut sender: Option<&mut Sender>,
+) -> Result<Answer, BusError> {
+    let (mut due, mut sent, mut lost, mut tick) = (Latency::default(), Latency::default(), 0, 0);
+    while tick < count {
+        let due_ns = grid.due_ns(tick + 1);
+        if receiver.wake() != Wake::Event {
+            sleep_until(due_ns - lead_ns(grid));
+        }
+        let Some(content) = receiver.receive(due_ns + SPIN_NS, grid.due_ns(count) + LOST_NS)? else {
+            lost += count - tick;
+            break;
+        };
+        let now_ns = monotonic_ns();
+        if content.number < first {
+            continue;
+        }
+        if let Some(sender) = &mut sender {
+            sender.send(content.number, content.due_ns)?;
+            sender.prepare()?;
+        }
+        due.record(content.due_ns, now_ns);
+        sent.record(content.sent_ns, now_ns);
+        lost += content.number - first - tick;
+        tick = content.number - first + 1;
+    }
+    let report = |stage: &str, latency: &Latency| {
+        let (histogram, clipped) = latency.encode();
+        StageReport { stage: stage.to_owned(), histogram, clipped }
+    };
+    Ok(Answer::Received { due: report("due", &due), sent: report("sent", &sent), lost })
+}
+
+/// A peer as its parent sees it.
+pub(super) struct Peer {
+    child: Child,
+    orders: Option<ChildStdin>,
+    answers: Lines<String>,
+    /// What it asked of the machine.
+    pub grants: Vec<Grant>,
+}
+
+impl Peer {
+    /// Starts a peer; it inherits `theirs`, which are of no more use here then.
+    pub fn start(bench: &Bench<'_>, domain: &Domain, observer: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
+        for fd in &theirs {
+            rustix::io::fcntl_setfd(fd, rustix::io::FdFlags::empty())
+                .map_err(|error| BenchError::system("hand a descriptor on")(error.into()))?;
+        }
+        let mut command = Command::new(&bench.program);
+        command.arg("bench-peer").arg("--domain").arg(domain.root());
+        command.arg("--parent").arg(std::process::id().to_string());
+        if observer {
+            command.arg("--observer");
+        }
+        let mut child = command
+            .process_group(0)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(BenchError::system("start a measuring peer"))?;
+        let (orders, stdout) = (child.stdin.take(), child.stdout.take());
+        let (lines, answers) = channel();
+        // Ends with the peer's output.
+        std::thread::spawn(move || {
+            for line in stdout.into_iter().flat_map(|stdout| BufReader::new(stdout).lines()).map_while(Result::ok) {
+                if lines.send(line).is_err() {
+                    break;
+                }
+            }
+        });
+        let mut peer = Self { child, orders, answers, grants: Vec::new() };
+        match peer.answer()? {
+            Answer::Here(grants) => peer.grants = grants,
+            other => return Err(unexpected(&other)),
+        }
+        Ok(peer)
+    }
+
+    /// Opens the peer's ends.
+    pub fn open(&mut self, inlet: Opening, outlet: Option<Opening>) -> Result<(), BenchError> {
+        self.tell(&Order::Open { inlet, outlet })?;
+        match self.answer()? {
+            Answer::Open => Ok(()),
+            other => Err(unexpected(&other)),
+        }
+    }
+
+    /// Lets it receive what is due on a grid from tick 1 to `count`, from number `first` on, and pass it on; the answer
+    /// comes later.
+    pub fn receive(&mut self, grid: Grid, first: u64, count: u64, pass_on: bool) -> Result<(), BenchError> {
+        self.tell(&Order::Receive { epoch_ns: grid.epoch_ns, period_ns: grid.period_ns, first, count, pass_on })
+    }
+
+    /// What it received: latencies from when due, and from when sent; how many samples were lost.
+    pub fn received(&mut self) -> Result<([Latency; 2], u64), BenchError> {
+        match self.answer()? {
+            Answer::Received { due, sent, lost } => Ok(([due.latency(), sent.latency()], lost)),
+            other => Err(unexpected(&other)),
+        }
+    }
+
+    /// Lets it echo.
+    pub fn echo(&mut self, count: u64) -> Result<(), BenchError> {
+        self.tell(&Order::Echo { count })
+    }
+
+    /// Waits until everything is echoed.
+    pub fn echoed(&mut self) -> Result<(), BenchError> {
+        match self.answer()? {
+            Answer::Echoed => Ok(()),
+            other => Err(unexpected(&other)),
+        }
+    }
+
+    fn tell(&mut self, order: &Order) -> Result<(), BenchError> {
+        let line = serde_json::to_string(order).map_err(|error| BenchError::Peer(error.to_string()))?;
+        let orders = self.orders.as_mut().ok_or_else(|| BenchError::Peer("it takes no orders".to_owned()))?;
+        writeln!(orders, "{line}").map_err(|error| BenchError::Peer(error.to_string()))
+    }
+
+    fn answer(&mut self) -> Result<Answer, BenchError> {
+        let line = self.answers.recv_timeout(WATCHDOG).map_err(|_| BenchError::Peer("no answer".to_owned()))?;
+        serde_json::from_str(&line).map_err(|error| BenchError::Peer(error.to_string()))
+    }
+}
+
+fn unexpected(answer: &Answer) -> BenchError {
+    BenchError::Peer(format!("it answered {answer:?}"))
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        // One that waits for orders ends with them; one that hangs in a receive does not.
+        self.orders.take();
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Pairs of descriptors for an exchange in both directions: ours and theirs, each to read from and to write to.
+pub(super) struct Descriptors {
+    pub ours: [OwnedFd; 2],
+    pub theirs: [OwnedFd; 2],
+}
+
+impl Descriptors {
+    /// The numbers under which the peer will have its own.
+    pub fn numbers(&self) -> [i32; 2] {
+        [self.theirs[0].as_raw_fd(), self.theirs[1].as_raw_fd()]
+    }
+}

@@ -1,0 +1,167 @@
+//! The end of a benchmark run: a table for people, JSON for programs, histograms for HdrHistogram's tools.
+//!
+//! Must not compute a figure: what is not on the board is not told.
+
+use super::{Bench, Board, Figure, Row, TARGETS, Verdict};
+use crate::launch::plain;
+use crate::telemetry::Host;
+use crate::telemetry::{Grant, write_hgrm};
+use serde::Serialize;
+use std::fmt::Write as _;
+use std::fs;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+/// Layout version of `bench.json`.
+const SCHEMA: &str = "corotate/bench/v1";
+
+/// Everything that a benchmark run found out, as it is written to `bench.json`.
+#[derive(Debug, Serialize)]
+pub struct Results {
+    schema: &'static str,
+    version: &'static str,
+    revision: &'static str,
+    started_utc: String,
+    /// Whether this was a smoke run, whose figures mean nothing.
+    pub quick: bool,
+    host: Host,
+    /// Everything that was asked of the machine.
+    pub privileges: Vec<Grant>,
+    /// What was measured.
+    pub figures: Vec<Figure>,
+    /// The targets of the rows that were measured.
+    pub targets: Vec<Verdict>,
+    /// What a reader must know.
+    pub remarks: Vec<String>,
+}
+
+impl Results {
+    /// Draws up the results of a run that began at `started`.
+    pub fn new(bench: &Bench<'_>, mut board: Board, privileges: Vec<Grant>, started: jiff::Timestamp) -> Self {
+        board.compare();
+        Self {
+            schema: SCHEMA,
+            version: env!("CARGO_PKG_VERSION"),
+            revision: env!("COROTATE_REVISION"),
+            started_utc: started.to_string(),
+            quick: bench.quick,
+            host: Host::this(),
+            privileges,
+            targets: TARGETS.iter().filter_map(|target| target.judge(&board)).collect(),
+            figures: board.figures().to_vec(),
+            remarks: board.remarks().to_vec(),
+        }
+    }
+
+    /// Whether every target that could be measured is met.
+    pub fn met(&self) -> bool {
+        self.targets.iter().all(|verdict| verdict.met != Some(false))
+    }
+}
+
+/// The results as text for people.
+pub fn table(results: &Results) -> String {
+    let mut text = String::new();
+    let host = &results.host;
+    let _ = writeln!(
+        text,
+        "corotate {} ({}), {} cores of {}, Linux {}",
+        results.version, results.revision, host.cores, host.cpu, host.kernel
+    );
+    if results.quick {
+        let _ = writeln!(text, "a smoke run: everything is exercised, no figure means anything");
+    }
+    for (row, name, title) in Row::ALL {
+        let figures: Vec<_> = results.figures.iter().filter(|figure| figure.row == row).collect();
+        if !figures.is_empty() {
+            let _ = writeln!(text, "\n{name}: {title}\n{}", rows(&figures));
+        }
+    }
+    let _ = writeln!(text, "\n{}", targets(&results.targets));
+    for remark in &results.remarks {
+        let _ = writeln!(text, "note: {remark}");
+    }
+    let (granted, denied): (Vec<_>, Vec<_>) = results.privileges.iter().partition(|grant| grant.granted);
+    let names = |grants: &[&Grant]| {
+        grants.iter().map(|grant| format!("{} {}", grant.privilege, grant.asked)).collect::<Vec<_>>().join(", ")
+    };
+    let _ = writeln!(text, "granted: {}", if granted.is_empty() { "nothing".to_owned() } else { names(&granted) });
+    for grant in denied {
+        let _ = writeln!(text, "not granted: {} {}: {}", grant.privilege, grant.asked, grant.reason);
+    }
+    text
+}
+
+fn rows(figures: &[&Figure]) -> comfy_table::Table {
+    let timed = figures.iter().any(|figure| figure.latency.is_some());
+    let mut heads = vec!["", "median", "unit", "rounds, least to most"];
+    if timed {
+        heads.extend(["p50", "p99", "p99.9", "max"]);
+    }
+    heads.extend(["over", "beside"]);
+    let mut table = plain(&heads);
+    for figure in figures {
+        let (least, most) = figure
+            .rounds
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), value| (least.min(*value), most.max(*value)));
+        let spread = format!("{} x {} to {}", figure.rounds.len(), number(least), number(most));
+        let mut cells = vec![figure.name.clone(), number(figure.median), figure.unit.to_owned(), spread];
+        if timed {
+            let latency = figure.latency.map(|l| [l.p50_us, l.p99_us, l.p999_us, l.max_us].map(number));
+            cells.extend(latency.unwrap_or_default());
+        }
+        let beside = figure.beside.as_ref();
+        cells.extend([beside.map_or(String::new(), |beside| format!("{:.2} x", beside.ratio))]);
+        cells.extend([beside.map_or(String::new(), |beside| beside.figure.clone())]);
+        table.add_row(cells);
+    }
+    table
+}
+
+fn targets(targets: &[Verdict]) -> comfy_table::Table {
+    let mut table = plain(&["target", "", "is", "verdict"]);
+    for verdict in targets {
+        let met = match verdict.met {
+            Some(true) => "met",
+            Some(false) => "NOT MET",
+            None => "not measured",
+        };
+        let value = verdict.value.map_or("-".to_owned(), number);
+        table.add_row([verdict.row.name().to_owned(), verdict.what.clone(), value, met.to_owned()]);
+    }
+    table
+}
+
+/// Three digits, or as many as there are before the point.
+fn number(value: f64) -> String {
+    let digits = match value.abs() {
+        large if large >= 100.0 => 0,
+        large if large >= 10.0 => 1,
+        large if large >= 0.1 || large == 0.0 => 2,
+        _ => 4,
+    };
+    format!("{value:.digits$}")
+}
+
+/// Writes `bench.json`, `bench.txt` and `latency/<row>.<figure>.hgrm` into `directory`, which exists.
+///
+/// # Errors
+/// Those of the file system.
+pub fn write_results(directory: &Path, results: &Results) -> io::Result<()> {
+    fs::write(directory.join("bench.txt"), table(results))?;
+    let mut json = BufWriter::new(fs::File::create(directory.join("bench.json"))?);
+    serde_json::to_writer_pretty(&mut json, results)?;
+    json.flush()?;
+    let latency = directory.join("latency");
+    fs::create_dir_all(&latency)?;
+    for figure in &results.figures {
+        if let Some(pooled) = &figure.pooled {
+            let name = figure.name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
+            let mut out = BufWriter::new(fs::File::create(latency.join(format!("{}.{name}.hgrm", figure.row.name())))?);
+            write_hgrm(pooled, &mut out)?;
+            out.flush()?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,52 @@
+//! What a whole run takes: to start, to stop, of memory; beside a bare process and a bare node.
+
+use super::watch::Watch;
+use super::{Bench, BenchError, Board, Row};
+use crate::bus::domain::OwnedDomain;
+use crate::bus::raw::RawNode;
+use std::process::{Command, Stdio};
+use std::time::Instant;
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let rounds = bench.size(5, 1);
+    for round in 1..=rounds {
+        bench.next(&format!("run: round {round} of {rounds}"))?;
+        let observed =
+            Watch { overrides: &["duration_s=1.0", "clock=realtime"], environment: Vec::new(), midway: &mut |_, _| {} }
+                .run(bench)?;
+        for (name, floor, value) in [
+            ("start to first tick", Some("bare process"), observed.start_ms),
+            ("last tick to end", Some("bare process"), observed.stop_ms),
+        ] {
+            value.into_iter().for_each(|value| board.add(Row::Run, name, "ms", floor, value));
+        }
+        board.add(Row::Run, "bare process", "ms", None, bare_process(bench)?);
+        board.add(Row::Run, "bare iceoryx2 node", "ms", None, bare_node()?);
+        let roles = observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
+        let largest = roles.map(|(_, mib)| *mib).fold(f64::NAN, f64::max);
+        board.add(Row::Run, "memory of the largest role", "MiB", None, largest);
+        for (name, mib) in &observed.resident_mib {
+            board.add(Row::Run, &format!("memory of {name}"), "MiB", None, *mib);
+        }
+        board.add(Row::Run, "shared memory", "MiB", None, observed.shared_mib);
+    }
+    Ok(())
+}
+
+/// This program started, and ended at once, ms.
+fn bare_process(bench: &Bench<'_>) -> Result<f64, BenchError> {
+    let began = Instant::now();
+    let mut command = Command::new(&bench.program);
+    command.arg("--version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.status().map_err(BenchError::system("start a process"))?;
+    Ok(began.elapsed().as_secs_f64() * 1e3)
+}
+
+/// A node made and dropped in a domain of its own, ms.
+fn bare_node() -> Result<f64, BenchError> {
+    let domain = OwnedDomain::create(0)?;
+    let began = Instant::now();
+    drop(RawNode::enter(domain.domain(), "bare")?);
+    Ok(began.elapsed().as_secs_f64() * 1e3)
+}

@@ -1,0 +1,248 @@
+//! What a tick takes of the system in the steady state of a real run: faults and switches as the kernel counts them per
+//! process, system calls by perf or strace, allocations by a preloaded counter.
+//!
+//! Counts that do not disturb each other are taken in one run; whoever watches system calls gets a run of its own.
+
+use super::compiled::{compile, temporary_directory};
+use super::watch::{Process, Watch, status_word};
+use super::{Bench, BenchError, Board, Row};
+use std::ffi::OsString;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// The allocator that counts.
+const ALLOCATIONS: &str = include_str!("allocations.c");
+/// Samples that a role sends per tick: iceoryx2 allocates once for each.
+const SAMPLES: [(&str, f64); 4] = [("leader", 2.0), ("follower", 2.0), ("observer", 1.0), ("controller", 1.0)];
+/// Between two words of a role to the launcher, s; each is a sample too.
+const WORD_S: f64 = 0.02;
+
+/// What the kernel and the allocator have counted of a process so far.
+#[derive(Debug, Clone, Copy)]
+struct Counts {
+    faults: u64,
+    voluntary: u64,
+    involuntary: u64,
+    allocations: Option<u64>,
+}
+
+impl Counts {
+    fn of(pid: i32, allocations: &Path) -> Option<Self> {
+        let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+        // After the name, which may hold anything, in parentheses: state is field 3, minor faults 10, major ones 12.
+        let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+        let field = |number: usize| fields.get(number - 3)?.parse::<u64>().ok();
+        let counted = fs::read(allocations.join(pid.to_string())).ok();
+        Some(Self {
+            faults: field(10)? + field(12)?,
+            voluntary: status_word(pid, "voluntary_ctxt_switches:")?,
+            involuntary: status_word(pid, "nonvoluntary_ctxt_switches:")?,
+            allocations: counted.and_then(|bytes| Some(u64::from_ne_bytes(bytes.try_into().ok()?))),
+        })
+    }
+}
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let (rounds, window) = (bench.size(3, 1), bench.size(Duration::from_secs(2), Duration::from_millis(300)));
+    for round in 1..=rounds {
+        bench.next(&format!("toll: counts, round {round} of {rounds}"))?;
+        count(bench, board, window)?;
+        bench.next(&format!("toll: system calls, round {round} of {rounds}"))?;
+        calls(bench, board, window)?;
+    }
+    Ok(())
+}
+
+/// A run with the window in its midst, and time for whoever counts to begin and to end.
+fn watch(
+    bench: &mut Bench<'_>,
+    window: Duration,
+    environment: Vec<(&'static str, OsString)>,
+    midway: &mut dyn FnMut(&[Process], u64),
+) -> Result<(), BenchError> {
+    let duration = format!("duration_s={:?}", window.as_secs_f64() + bench.size(4.0, 2.0));
+    Watch { overrides: &[&duration, "clock=realtime"], environment, midway }.run(bench).map(|_| ())
+}
+
+/// Faults, switches and allocations.
+fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
+    let directory = temporary_directory().map_err(BenchError::Peer)?;
+    let mut environment = Vec::new();
+    match compile(ALLOCATIONS, directory.path(), "allocations") {
+        Ok(library) => {
+            environment.push(("LD_PRELOAD", library.into_os_string()));
+            environment.push(("COROTATE_BENCH_ALLOCATIONS", directory.path().as_os_str().to_owned()));
+        }
+        Err(reason) => board.remark(format!("allocations are not counted: {reason}")),
+    }
+    let mut counted = Vec::new();
+    watch(bench, window, environment, &mut |processes, period_ns| {
+        let look = |process: &Process| Counts::of(process.pid, directory.path());
+        let began = Instant::now();
+        let before: Vec<_> = processes.iter().map(look).collect();
+        std::thread::sleep(window);
+        let ticks = began.elapsed().as_nanos() as f64 / period_ns as f64;
+        let after = processes.iter().map(look);
+        let pairs = processes.iter().cloned().zip(before).zip(after);
+        counted = pairs.filter_map(|((process, before), after)| Some((process, before?, after?, ticks))).collect();
+    })?;
+    let (mut worst_faults, mut worst_allocations) = (f64::NAN, f64::NAN);
+    for (process, before, after, ticks) in counted {
+        let mut add = |what: &str, value: f64| {
+            board.add(Row::Toll, &format!("{what}, {}", process.name), "per tick", None, value)
+        };
+        let per_tick = |before: u64, after: u64| (after - before) as f64 / ticks;
+        let faults = per_tick(before.faults, after.faults);
+        add("page faults", faults);
+        add("voluntary context switches", per_tick(before.voluntary, after.voluntary));
+        add("involuntary context switches", per_tick(before.involuntary, after.involuntary));
+        let Some((_, samples)) = SAMPLES.iter().find(|(role, _)| *role == process.name) else { continue };
+        worst_faults = worst_faults.max(faults);
+        if let (Some(before), Some(after)) = (before.allocations, after.allocations) {
+            let all = per_tick(before, after);
+            add("allocations", all);
+            let words = ticks * 1e-3 / WORD_S / ticks;
+            worst_allocations = worst_allocations.max((all - samples - words).max(0.0));
+        }
+    }
+    for (name, value) in [
+        ("page faults, worst role", worst_faults),
+        ("allocations beyond iceoryx2's one per sample, worst role", worst_allocations),
+    ] {
+        if !value.is_nan() {
+            board.add(Row::Toll, name, "per tick", None, value);
+        }
+    }
+    Ok(())
+}
+
+/// System calls, by whatever can count them here.
+fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
+    let mut counted = Vec::new();
+    watch(bench, window, Vec::new(), &mut |processes, period_ns| {
+        let ticks = window.as_nanos() as f64 / period_ns as f64;
+        let watchers: Vec<_> =
+            processes.iter().map(|process| (process.clone(), Watcher::start(process.pid, window))).collect();
+        counted = watchers
+            .into_iter()
+            .map(|(process, watcher)| (process, watcher.and_then(Watcher::finish), ticks))
+            .collect();
+    })?;
+    let mut worst = f64::NAN;
+    for (process, calls, ticks) in counted {
+        match calls {
+            Ok(Calls { all, waits }) => {
+                let (all, waits) = (all as f64 / ticks, waits as f64 / ticks);
+                board.add(Row::Toll, &format!("system calls, {}", process.name), "per tick", None, all);
+                let beyond = format!("system calls beyond its waits, {}", process.name);
+                board.add(Row::Toll, &beyond, "per tick", None, all - waits);
+                if process.name != "launcher" {
+                    worst = worst.max(all - waits);
+                }
+            }
+            Err(reason) => board.remark(format!("system calls are not counted: {reason}")),
+        }
+    }
+    if !worst.is_nan() {
+        board.add(Row::Toll, "system calls beyond its waits, worst role", "per tick", None, worst);
+    }
+    Ok(())
+}
+
+/// System calls of a process, and those of them that wait or wake.
+struct Calls {
+    all: u64,
+    waits: u64,
+}
+
+/// Calls that wait for the time or another role, or wake one.
+const WAITS: [&str; 3] = ["clock_nanosleep", "futex", "sched_yield"];
+
+/// A program that counts the system calls of a process for a while.
+enum Watcher {
+    Perf(std::process::Child),
+    Strace(std::process::Child),
+}
+
+impl Watcher {
+    /// Starts perf, which hardly disturbs; or strace, which does.
+    fn start(pid: i32, window: Duration) -> Result<Self, String> {
+        let seconds = format!("{:?}", window.as_secs_f64());
+        let mut events = vec!["raw_syscalls:sys_enter".to_owned()];
+        events.extend(WAITS.iter().map(|call| format!("syscalls:sys_enter_{call}")));
+        let probe = Command::new("perf").args(["stat", "-e", &events.join(","), "true"]).output();
+        let spawn =
+            |command: &mut Command| command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
+        if probe.is_ok_and(|done| done.status.success()) {
+            let mut command = Command::new("perf");
+            command.args(["stat", "-x,", "-e", &events.join(","), "-p", &pid.to_string(), "--", "sleep", &seconds]);
+            return spawn(&mut command).map(Self::Perf).map_err(|error| error.to_string());
+        }
+        let mut command = Command::new("timeout");
+        command.args(["-s", "INT", &seconds, "strace", "-c", "-f", "-p", &pid.to_string()]);
+        let missing = |error| format!("neither perf with tracepoints nor strace is there ({error})");
+        spawn(&mut command).map(Self::Strace).map_err(missing)
+    }
+
+    fn finish(self) -> Result<Calls, String> {
+        let (child, parse): (_, fn(&str) -> Option<Calls>) = match self {
+            Self::Perf(child) => (child, parse_perf),
+            Self::Strace(child) => (child, parse_strace),
+        };
+        let done = child.wait_with_output().map_err(|error| error.to_string())?;
+        let text = String::from_utf8_lossy(&done.stderr);
+        parse(&text).ok_or_else(|| format!("what the counting program says cannot be read: {}", text.trim()))
+    }
+}
+
+/// `count,,event,…` per line.
+fn parse_perf(text: &str) -> Option<Calls> {
+    let counts = text.lines().filter_map(|line| {
+        let mut fields = line.split(',');
+        let count = fields.next()?.parse::<u64>().ok()?;
+        Some((count, fields.nth(1)?.to_owned()))
+    });
+    let counts: Vec<(u64, String)> = counts.collect();
+    let all = counts.iter().find(|(_, event)| event.starts_with("raw_syscalls"))?.0;
+    let waits = counts.iter().filter(|(_, event)| event.starts_with("syscalls:")).map(|(count, _)| count).sum();
+    Some(Calls { all, waits })
+}
+
+/// `% time seconds usecs/call calls [errors] syscall` per line.
+fn parse_strace(text: &str) -> Option<Calls> {
+    let mut calls = Calls { all: 0, waits: 0 };
+    for line in text.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let (Some(count), Some(name)) = (words.get(3).and_then(|word| word.parse::<u64>().ok()), words.last()) else {
+            continue;
+        };
+        if *name != "total" {
+            calls.all += count;
+            calls.waits += if WAITS.contains(name) { count } else { 0 };
+        }
+    }
+    text.contains("syscall").then_some(calls)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn perf_and_strace_are_read() {
+        let perf = "2017,,raw_syscalls:sys_enter,2001000,100.00,,\n2001,,syscalls:sys_enter_clock_nanosleep,1,100,,\n\
+                    7,,syscalls:sys_enter_futex,1,100,,\n<not counted>,,syscalls:sys_enter_sched_yield,0,0,,\n";
+        let Calls { all, waits } = parse_perf(perf).unwrap();
+        assert_eq!((all, waits), (2017, 2008));
+        assert!(parse_perf("Error: no such event").is_none());
+        let strace = "% time     seconds  usecs/call     calls    errors syscall\n------ ----------- ----------- \
+                      --------- --------- ------\n 90.00    0.1           2      1000         3 clock_nanosleep\n 10.00    \
+                      0.1           2        20           read\n100.00    0.2           2      1020         3 total\n";
+        let Calls { all, waits } = parse_strace(strace).unwrap();
+        assert_eq!((all, waits), (1020, 1000));
+        assert!(parse_strace("strace: no such process").is_none());
+    }
+}

@@ -1,0 +1,244 @@
+//! A whole `corotate run` as its user starts it, watched from outside: how long it takes to start and stop, what its
+//! processes take of the system, at which rate its ticks really come.
+//!
+//! Looks at /proc and at the run's own signals, as any program may. Must not disturb what it watches more than a reader of
+//! these signals does.
+
+use super::{Bench, BenchError};
+use crate::bus::domain::Domain;
+use crate::bus::iox::{IoxBus, IoxReader};
+use crate::bus::{Bus, Read, Reader, Signal};
+use crate::clock::monotonic_ns;
+use crate::config::{SHIPPED, Scenario};
+use crate::runtime::{depths, topic};
+use crate::sample::{Phase, RateMeasurement, Schedule};
+use rustix::process::{Pid, Signal as Kill, kill_process};
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+/// Between two looks, ns.
+const LOOK_NS: u64 = 1_000_000;
+/// Looks between two at memory.
+const SLOW_LOOKS: u64 = 20;
+/// A run that takes so much longer than it should hangs, ns.
+const HUNG_NS: u64 = 60_000_000_000;
+
+/// One process of a run.
+#[derive(Debug, Clone)]
+pub(super) struct Process {
+    /// The role's name, or `launcher`.
+    pub name: String,
+    pub pid: i32,
+}
+
+/// What a run showed.
+#[derive(Debug, Default)]
+pub(super) struct Observed {
+    /// From the start of the process to the first tick, ms.
+    pub start_ms: Option<f64>,
+    /// From the last tick to the end of the process, ms.
+    pub stop_ms: Option<f64>,
+    /// Peak resident memory by process, MiB.
+    pub resident_mib: BTreeMap<String, f64>,
+    /// The most shared memory at any look, MiB.
+    pub shared_mib: f64,
+    /// How far the rate of the leader's ticks was from what it should be, %.
+    pub rate_error_percent: Option<f64>,
+}
+
+/// A run to be watched.
+pub(super) struct Watch<'a> {
+    /// Overrides of the shipped scenario `rigid-pair`.
+    pub overrides: &'a [&'a str],
+    /// Environment of all its processes.
+    pub environment: Vec<(&'static str, OsString)>,
+    /// Called once, a sixth of the run after the first tick, with its processes and its period, ns.
+    pub midway: &'a mut dyn FnMut(&[Process], u64),
+}
+
+/// The run's own signals.
+struct Line {
+    domain: Domain,
+    schedule: IoxReader<Schedule>,
+    leader: IoxReader<RateMeasurement>,
+    /// Tick and time of the first and last measurement seen.
+    seen: Option<[(u64, u64); 2]>,
+    /// Last, so that it is dropped after what was opened on it.
+    _bus: IoxBus,
+}
+
+impl Watch<'_> {
+    /// Runs it to its end.
+    pub fn run(&mut self, bench: &mut Bench<'_>) -> Result<Observed, BenchError> {
+        let (name, text) = SHIPPED[0];
+        let mut overrides: Vec<String> = self.overrides.iter().map(|text| (*text).to_owned()).collect();
+        overrides.push("accept={}".to_owned());
+        let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
+        let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
+        let file = directory.path().join("scenario.toml");
+        fs::write(&file, scenario.to_toml()).map_err(BenchError::system("write a scenario"))?;
+        let mut command = Command::new(&bench.program);
+        command.arg("run").arg(&file).arg("--out").arg(directory.path().join("out"));
+        command.envs(self.environment.drain(..)).process_group(0);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit());
+        let started_ns = monotonic_ns();
+        let mut child = command.spawn().map_err(BenchError::system("start a run"))?;
+        let observed = self.follow(bench, &scenario, &mut child, started_ns);
+        if observed.is_err() {
+            // It ends in order, its roles with it.
+            let _ = Pid::from_raw(child.id() as i32).map(|pid| kill_process(pid, Kill::TERM));
+            let _ = child.wait();
+        }
+        observed
+    }
+
+    fn follow(
+        &mut self,
+        bench: &mut Bench<'_>,
+        scenario: &Scenario,
+        child: &mut Child,
+        started_ns: u64,
+    ) -> Result<Observed, BenchError> {
+        let length_ns = scenario.last_tick * scenario.period_ns;
+        let (mut observed, mut line, mut epoch_ns, mut look) = (Observed::default(), None, None, 0_u64);
+        let mut processes = vec![Process { name: "launcher".to_owned(), pid: child.id() as i32 }];
+        let mut midway_done = false;
+        loop {
+            std::thread::sleep(Duration::from_nanos(LOOK_NS));
+            look += 1;
+            if let Some(status) = child.try_wait().map_err(BenchError::system("wait for a run"))? {
+                let last_tick_ns = epoch_ns.map(|epoch_ns: u64| epoch_ns + length_ns);
+                observed.stop_ms = last_tick_ns.map(|last_ns| monotonic_ns().saturating_sub(last_ns) as f64 / 1e6);
+                observed.rate_error_percent = line.as_ref().and_then(|line: &Line| line.rate_error(scenario));
+                return match status.success() {
+                    true => Ok(observed),
+                    false => Err(BenchError::Peer(format!("`corotate run` ended with {status}"))),
+                };
+            }
+            bench.interrupted()?;
+            if monotonic_ns() > started_ns + length_ns + HUNG_NS {
+                return Err(BenchError::Peer("`corotate run` hangs".to_owned()));
+            }
+            match &mut line {
+                None => {
+                    let children = children_of(child.id() as i32);
+                    line = Line::open(scenario, &children);
+                }
+                Some(line) => {
+                    if epoch_ns.is_none() {
+                        epoch_ns = line.epoch_ns()?;
+                        observed.start_ms = epoch_ns.map(|epoch| epoch.saturating_sub(started_ns) as f64 / 1e6);
+                    }
+                    line.look_at_leader()?;
+                }
+            }
+            let due = epoch_ns.is_some_and(|epoch_ns| monotonic_ns() > epoch_ns + length_ns / 6);
+            if due && !midway_done {
+                midway_done = true;
+                processes.extend(roles(scenario, child.id() as i32));
+                (self.midway)(&processes, scenario.period_ns);
+            }
+            if look % SLOW_LOOKS == 0 || due {
+                observed.look_at_memory(&processes, line.as_ref().map(|line| &line.domain));
+            }
+        }
+    }
+}
+
+impl Observed {
+    fn look_at_memory(&mut self, processes: &[Process], domain: Option<&Domain>) {
+        for process in processes {
+            if let Some(kib) = status_word(process.pid, "VmHWM:") {
+                // The peak never falls; a process that is ending has none.
+                let mib = self.resident_mib.entry(process.name.clone()).or_default();
+                *mib = mib.max(kib as f64 / 1024.0);
+            }
+        }
+        let bytes = domain.map_or(0, shared_bytes);
+        self.shared_mib = self.shared_mib.max(bytes as f64 / f64::from(1 << 20));
+    }
+}
+
+impl Line {
+    /// Opens the signals of the run whose roles are among these processes; none while it has none.
+    fn open(scenario: &Scenario, processes: &[(i32, Vec<String>)]) -> Option<Self> {
+        let root = processes.iter().find_map(|(_, words)| argument(words, "--domain").map(PathBuf::from))?;
+        let domain = Domain::join(&root).ok()?;
+        let bus = IoxBus::enter(&domain, "bench", depths(scenario)).ok()?;
+        let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role).ok()?;
+        let leader = bus.reader(&topic(scenario, "leader", Signal::Measurement), Reader::Role).ok()?;
+        Some(Self { domain, schedule, leader, seen: None, _bus: bus })
+    }
+
+    /// When the first tick is due, once that is known.
+    fn epoch_ns(&mut self) -> Result<Option<u64>, BenchError> {
+        while self.schedule.advance()? {}
+        let runs = self.schedule.current().filter(|word| Phase::from_number(word.phase) == Phase::Run);
+        Ok(runs.map(|word| word.epoch_ns).filter(|epoch_ns| *epoch_ns > 0))
+    }
+
+    fn look_at_leader(&mut self) -> Result<(), BenchError> {
+        while self.leader.advance()? {}
+        // Generation 0 is warm-up.
+        if let Some(stamp) = self.leader.current().map(|sample| sample.stamp).filter(|stamp| stamp.generation > 0) {
+            let now = (stamp.tick, stamp.sent_ns);
+            self.seen = Some([self.seen.map_or(now, |[first, _]| first), now]);
+        }
+        Ok(())
+    }
+
+    /// How far the rate of ticks was from the scenario's, %.
+    fn rate_error(&self, scenario: &Scenario) -> Option<f64> {
+        let [(first, from_ns), (last, to_ns)] = self.seen?;
+        let should_ns = (last - first) * scenario.period_ns;
+        (should_ns > 0).then(|| ((to_ns - from_ns) as f64 / should_ns as f64 - 1.0).abs() * 100.0)
+    }
+}
+
+/// The processes that a process has started, with their command lines.
+fn children_of(parent: i32) -> Vec<(i32, Vec<String>)> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
+    pids.filter(|pid| status_word(*pid, "PPid:") == Some(parent as u64)).map(|pid| (pid, words_of(pid))).collect()
+}
+
+fn words_of(pid: i32) -> Vec<String> {
+    let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    line.split(|byte| *byte == 0).map(|word| String::from_utf8_lossy(word).into_owned()).collect()
+}
+
+fn argument<'a>(words: &'a [String], name: &str) -> Option<&'a str> {
+    let index = words.iter().position(|word| word == name)?;
+    words.get(index + 1).map(String::as_str)
+}
+
+/// The roles that a launcher has started.
+fn roles(scenario: &Scenario, launcher: i32) -> Vec<Process> {
+    let names = scenario.rig.roles();
+    let role = |(pid, words): (i32, Vec<String>)| {
+        let kind = words.get(1)?.clone();
+        let name = argument(&words, "--body").map_or(kind, str::to_owned);
+        names.contains(&name.as_str()).then_some(Process { name, pid })
+    };
+    children_of(launcher).into_iter().filter_map(role).collect()
+}
+
+/// A number of /proc/PID/status.
+pub(super) fn status_word(pid: i32, key: &str) -> Option<u64> {
+    let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    text.lines().find_map(|line| line.strip_prefix(key)?.split_whitespace().next()?.parse().ok())
+}
+
+/// What a domain's files take of shared memory, bytes.
+fn shared_bytes(domain: &Domain) -> u64 {
+    let prefix = domain.prefix();
+    let entries = fs::read_dir(Path::new("/dev/shm")).into_iter().flatten().flatten();
+    let own = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
+    own.filter_map(|entry| entry.metadata().ok()).map(|data| data.blocks() * 512).sum()
+}

@@ -1,0 +1,387 @@
+//! A fleet of rigid bodies: many followers that are like the leader, simulated, driven and guarded as one.
+//!
+//! Each of them gets the bits that it would get alone. Must not treat bodies differently: what is missing, late or impossible
+//! for one is so for all.
+
+use super::RigidBodyRig;
+use crate::control::FleetLaw;
+use crate::model::{RigidBody, flow_all, uniform};
+use crate::rig::Fleet;
+use crate::role::{Body, Bounds, Guard, Law};
+use crate::sample::{
+    CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
+};
+use nalgebra::Vector3;
+
+/// Where a vector lies in its samples.
+const OMEGA: usize = 0;
+const APPLIED: usize = 1;
+const ACCELERATION: usize = 0;
+/// After a gap of so many ticks in what was believed, a sample must also continue what came just before it, as that of a
+/// single body.
+const SHORT_GAP_TICKS: u64 = 2;
+/// The draws of fleets are not those of sensors.
+const STREAMS: u64 = 1 << 32;
+
+/// One number per body, for each component.
+type Arrays = [Vec<f64>; 3];
+
+fn zeros(count: usize) -> Arrays {
+    [(); 3].map(|()| vec![0.0; count])
+}
+
+fn all(arrays: &Arrays) -> [&[f64]; 3] {
+    arrays.each_ref().map(|array| &**array)
+}
+
+fn all_mut(arrays: &mut Arrays) -> [&mut [f64]; 3] {
+    arrays.each_mut().map(|array| &mut **array)
+}
+
+fn assign(to: [&mut [f64]; 3], from: [&[f64]; 3]) {
+    to.into_iter().zip(from).for_each(|(to, from)| to.copy_from_slice(from));
+}
+
+/// The largest |rate − reference| of all bodies, rad/s; not a number if one of them is none.
+pub(super) fn farthest(rates: [&[f64]; 3], reference: &Vector3<f64>) -> f64 {
+    let [r1, r2, r3] = rates;
+    let errors = r1.iter().zip(r2).zip(r3).map(|((r1, r2), r3)| (Vector3::new(*r1, *r2, *r3) - reference).norm());
+    errors.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst })
+}
+
+/// A fleet as a scenario has it.
+#[derive(Debug)]
+pub struct RateFleet {
+    body: RigidBody,
+    initial: Arrays,
+    law: FleetLaw,
+    learned: bool,
+    bounds: Bounds<3>,
+    acceleration_max_rad_s2: f64,
+}
+
+impl RateFleet {
+    /// The fleet of `count` bodies in the place of the body with this index.
+    pub(super) fn new(rig: &RigidBodyRig, index: usize, count: usize) -> Self {
+        let (law, controller) = rig.synchronizer();
+        let acceleration_max_rad_s2 = rig.limits.acceleration_rad_s2;
+        let mut draw = uniform(rig.seed, STREAMS | index as u64);
+        let (centre, spread) = (rig.initial_rates[index], rig.spreads[index]);
+        let mut initial = zeros(count);
+        // Body by body, so that the first ones of a larger fleet are those of a smaller one.
+        let [r1, r2, r3] = &mut initial;
+        for ((r1, r2), r3) in r1.iter_mut().zip(r2).zip(r3) {
+            [*r1, *r2, *r3] = (centre + spread.map(|spread| spread * (2.0 * draw() - 1.0))).into();
+        }
+        Self {
+            body: RigidBody::new(&rig.inertia),
+            initial,
+            law: FleetLaw::new(law, acceleration_max_rad_s2),
+            learned: controller.learned,
+            bounds: rig.limits.bounds(&rig.sensed(index), rig.tick_s),
+            acceleration_max_rad_s2,
+        }
+    }
+
+    fn count(&self) -> usize {
+        self.initial[0].len()
+    }
+}
+
+impl Fleet<RateEstimate> for RateFleet {
+    type Truth = TruthLayout;
+    type Measurement = MeasurementLayout;
+    type Command = CommandLayout;
+    type Body = FleetPlant;
+    type Law = FleetRateLaw;
+    type MeasurementGuard = FleetMeasurementGuard;
+    type CommandGuard = FleetCommandGuard;
+
+    fn body(&self) -> FleetPlant {
+        FleetPlant { body: self.body, rates: self.initial.clone(), asked: zeros(self.count()) }
+    }
+
+    fn law(&self) -> FleetRateLaw {
+        let ahead = if self.law.predicts() { zeros(self.count()) } else { Arrays::default() };
+        FleetRateLaw { law: self.law, learned: self.learned, ahead }
+    }
+
+    fn measurement_guard(&self) -> FleetMeasurementGuard {
+        FleetMeasurementGuard {
+            bounds: self.bounds,
+            acceleration_max_rad_s2: self.acceleration_max_rad_s2,
+            generation: 0,
+            believed: zeros(self.count()),
+            believed_tick: None,
+            doubted: zeros(self.count()),
+            doubted_tick: None,
+        }
+    }
+
+    fn command_guard(&self) -> FleetCommandGuard {
+        FleetCommandGuard { count: self.count() as u64, acceleration_max_rad_s2: self.acceleration_max_rad_s2 }
+    }
+}
+
+/// Many rigid bodies with perfect rate gyros and torquers.
+#[derive(Debug)]
+pub struct FleetPlant {
+    body: RigidBody,
+    rates: Arrays,
+    asked: Arrays,
+}
+
+impl Body for FleetPlant {
+    type Truth = FleetTruth;
+    type Measurement = FleetMeasurement;
+    type Command = FleetCommand;
+
+    fn apply(&mut self, command: &FleetCommand) -> bool {
+        let asked = command.vector(ACCELERATION);
+        let usable = asked.into_iter().all(|asked| within(asked, f64::MAX));
+        if usable {
+            assign(all_mut(&mut self.asked), asked);
+        }
+        usable
+    }
+
+    fn apply_safe(&mut self) {
+        self.asked.iter_mut().for_each(|asked| asked.fill(0.0));
+    }
+
+    fn truth(&self, status: u64, out: &mut FleetTruth) {
+        out.set_status(status);
+        assign(out.vector_mut(OMEGA), all(&self.rates));
+        assign(out.vector_mut(APPLIED), all(&self.asked));
+    }
+
+    fn status_of(truth: &FleetTruth) -> u64 {
+        truth.status()
+    }
+
+    fn measure(&mut self, status: u64, out: &mut FleetMeasurement) {
+        out.set_status(status);
+        assign(out.vector_mut(OMEGA), all(&self.rates));
+        assign(out.vector_mut(APPLIED), all(&self.asked));
+    }
+
+    fn resume(&mut self, truth: &FleetTruth, _measured: u64) {
+        assign(all_mut(&mut self.rates), truth.vector(OMEGA));
+        assign(all_mut(&mut self.asked), truth.vector(APPLIED));
+    }
+
+    fn flow(&mut self, dt_s: f64) {
+        flow_all(&self.body, all_mut(&mut self.rates), all(&self.asked), dt_s);
+    }
+}
+
+/// The synchronising law of all followers of a fleet. No V is published.
+#[derive(Debug)]
+pub struct FleetRateLaw {
+    law: FleetLaw,
+    /// Whether the law works with the coefficients that the observer has learned.
+    learned: bool,
+    /// Room for the predicted rates, if there is a prediction.
+    ahead: Arrays,
+}
+
+impl Law for FleetRateLaw {
+    type Estimate = RateEstimate;
+    type Measurement = FleetMeasurement;
+    type Command = FleetCommand;
+
+    fn command(&mut self, estimate: &RateEstimate, measurement: &FleetMeasurement, out: &mut FleetCommand) {
+        if self.learned {
+            self.law.learn(estimate.coefficients.into());
+        }
+        let reference = Vector3::from(estimate.omega_rad_s);
+        let rates = measurement.vector(OMEGA);
+        out.set_status(0);
+        if self.law.predicts() {
+            assign(all_mut(&mut self.ahead), rates);
+            let reference = self.law.ahead(&reference, all_mut(&mut self.ahead), measurement.vector(APPLIED));
+            self.law.command(&reference, all(&self.ahead), out.vector_mut(ACCELERATION));
+        } else {
+            self.law.command(&reference, rates, out.vector_mut(ACCELERATION));
+        }
+    }
+}
+
+/// Guards measurements of a fleet as [`Plausible`](crate::role::Plausible) does those of a body: a sample is believed for all
+/// bodies or for none.
+#[derive(Debug)]
+pub struct FleetMeasurementGuard {
+    bounds: Bounds<3>,
+    acceleration_max_rad_s2: f64,
+    generation: u64,
+    /// The last rates that were believed, and their tick.
+    believed: Arrays,
+    believed_tick: Option<u64>,
+    /// The rates of the sample before, if that was not believed.
+    doubted: Arrays,
+    doubted_tick: Option<u64>,
+}
+
+impl FleetMeasurementGuard {
+    /// Whether all rates are in range and can have come from these by now.
+    fn reached(&self, rates: [&[f64]; 3], from: &Arrays, since: u64, tick: u64) -> bool {
+        let ticks = tick.saturating_sub(since).max(1) as f64;
+        (0..3).all(|axis| {
+            let change = self.bounds.allowance[axis] + self.bounds.slew_per_tick[axis] * ticks;
+            near(rates[axis], &from[axis], change)
+        })
+    }
+
+    fn possible(&self, rates: [&[f64]; 3], tick: u64) -> bool {
+        let in_range = rates.into_iter().zip(self.bounds.magnitude).all(|(rates, limit)| within(rates, limit));
+        let Some(since) = self.believed_tick.filter(|_| in_range) else { return in_range };
+        let smooth = match self.doubted_tick {
+            Some(doubted) if tick.saturating_sub(since) > SHORT_GAP_TICKS => {
+                self.reached(rates, &self.doubted, doubted, tick)
+            }
+            _ => true,
+        };
+        smooth && self.reached(rates, &self.believed, since, tick)
+    }
+}
+
+impl Guard<FleetMeasurement> for FleetMeasurementGuard {
+    fn accepts(&mut self, sample: &FleetMeasurement) -> bool {
+        let limit = self.acceleration_max_rad_s2;
+        let whole = sample.told_bodies() == self.believed[0].len() as u64;
+        if !(whole && sample.vector(APPLIED).into_iter().all(|applied| within(applied, limit))) {
+            return false;
+        }
+        let stamp = sample.stamp();
+        if stamp.generation != self.generation {
+            (self.generation, self.believed_tick, self.doubted_tick) = (stamp.generation, None, None);
+        }
+        let rates = sample.vector(OMEGA);
+        let believed = self.possible(rates, stamp.tick);
+        if believed {
+            assign(all_mut(&mut self.believed), rates);
+            (self.believed_tick, self.doubted_tick) = (Some(stamp.tick), None);
+        } else {
+            assign(all_mut(&mut self.doubted), rates);
+            self.doubted_tick = Some(stamp.tick);
+        }
+        believed
+    }
+}
+
+/// Guards commands of a fleet: the actuators can do all that is asked.
+#[derive(Debug)]
+pub struct FleetCommandGuard {
+    count: u64,
+    acceleration_max_rad_s2: f64,
+}
+
+impl Guard<FleetCommand> for FleetCommandGuard {
+    fn accepts(&mut self, sample: &FleetCommand) -> bool {
+        let asked = sample.vector(ACCELERATION);
+        sample.told_bodies() == self.count && asked.into_iter().all(|asked| within(asked, self.acceleration_max_rad_s2))
+    }
+}
+
+/// Whether all values are at most so large; what is no number is not.
+#[multiversion::multiversion(targets = "simd")]
+#[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
+fn within(values: &[f64], limit: f64) -> bool {
+    // Bits, not a branch: they are gathered in any order, and so in vectors.
+    values.iter().fold(1, |all, value| all & u64::from(value.abs() <= limit)) == 1
+}
+
+/// Whether all values are at most so far from these; what is no number is not.
+#[multiversion::multiversion(targets = "simd")]
+#[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
+fn near(values: &[f64], from: &[f64], change: f64) -> bool {
+    values.iter().zip(from).fold(1, |all, (value, from)| all & u64::from((value - from).abs() <= change)) == 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bus::FleetBuffer;
+    use crate::config::{SHIPPED, Scenario};
+    use crate::rig::{AnyRig, Rig};
+    use crate::sample::{RateMeasurement, Stamp};
+
+    fn rig(overrides: &[&str]) -> RigidBodyRig {
+        let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
+        match Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap().rig {
+            AnyRig::RigidBody(rig) => rig,
+            AnyRig::Orbit(_) => unreachable!("the first scenario is of rigid bodies"),
+        }
+    }
+
+    /// Over whatever comes: steady motion, jumps, gaps, numbers that are none, new lives of the sender.
+    #[test]
+    fn a_fleet_s_guard_judges_as_that_of_a_single_body() {
+        let mut single = rig(&[]).measurement_guard(1, true);
+        let mut many = rig(&["follower.0.count=5"]).fleet(1).unwrap().measurement_guard();
+        let (mut draw, mut sample) = (uniform(3, 0), FleetBuffer::<MeasurementLayout>::new(5));
+        let (mut rate, mut stamp, mut verdicts) = ([0.0; 3], Stamp { generation: 1, ..Stamp::default() }, [0, 0]);
+        for _ in 0..20_000 {
+            let event = (draw() * 100.0) as u64;
+            stamp.tick += if event < 3 { 1 + (draw() * 60.0) as u64 } else { 1 };
+            stamp.generation += u64::from(event == 4);
+            let reach = if (5..8).contains(&event) { 1.0 } else { 2e-3 };
+            rate = rate.map(|rate| (rate + reach * (draw() - 0.5)).clamp(-2.5, 2.5));
+            let (mut told, mut applied) = (rate, [0.1; 3]);
+            match event {
+                10 => told[1] = f64::NAN,
+                11 => told[2] = f64::INFINITY,
+                12 => applied[0] = f64::NAN,
+                13 => told[0] = 1e3,
+                _ => {}
+            }
+            let one =
+                RateMeasurement { stamp, omega_rad_s: told, applied_rad_s2: applied, valid: 7, ..Default::default() };
+            let all = sample.sample_mut();
+            all.set_status(0);
+            *all.stamp_mut() = stamp;
+            for axis in 0..3 {
+                // The others stay where they are: they are always possible.
+                all.vector_mut(OMEGA)[axis][3] = told[axis];
+                all.vector_mut(APPLIED)[axis][3] = applied[axis];
+            }
+            let believed = single.accepts(&one);
+            assert_eq!(believed, many.accepts(sample.sample()), "{one:?}");
+            verdicts[usize::from(believed)] += 1;
+        }
+        assert!(verdicts.iter().all(|count| *count > 1000), "{verdicts:?}");
+    }
+
+    #[test]
+    fn a_sample_for_another_number_of_bodies_is_none() {
+        let fleet = rig(&["follower.0.count=5"]).fleet(1).unwrap();
+        let (mut measurement, mut command) =
+            (FleetBuffer::<MeasurementLayout>::new(5), FleetBuffer::<CommandLayout>::new(5));
+        assert!(!fleet.measurement_guard().accepts(measurement.sample()), "it says that it is for none");
+        assert!(!fleet.command_guard().accepts(command.sample()));
+        measurement.sample_mut().set_status(0);
+        command.sample_mut().set_status(0);
+        assert!(fleet.measurement_guard().accepts(measurement.sample()));
+        assert!(fleet.command_guard().accepts(command.sample()));
+        command.sample_mut().vector_mut(ACCELERATION)[2][4] = f64::NAN;
+        assert!(!fleet.command_guard().accepts(command.sample()));
+    }
+
+    #[test]
+    fn initial_rates_follow_from_the_seed_and_stay_within_their_spread() {
+        let initial = |count: usize, seed: u64| {
+            let overrides = [
+                format!("follower.0.count={count}"),
+                format!("seed={seed}"),
+                "follower.0.initial_rate_rad_s=[0.5, 0.0, -1.0]".to_owned(),
+                "follower.0.initial_rate_spread_rad_s=[0.25, 0.0, 2.0]".to_owned(),
+            ];
+            rig(&overrides.each_ref().map(|text| &**text)).fleet(1).unwrap().initial
+        };
+        let (few, many, other) = (initial(10, 1), initial(1000, 1), initial(10, 2));
+        assert!(few[0] == many[0][..10] && few[0] != other[0], "a larger fleet begins as a smaller one");
+        assert!(many[0].iter().all(|rate| (rate - 0.5).abs() <= 0.25) && many[1].iter().all(|rate| *rate == 0.0));
+        let mean = many[2].iter().sum::<f64>() / 1000.0;
+        assert!(many[2].iter().all(|rate| (rate + 1.0).abs() <= 2.0) && (mean + 1.0).abs() < 0.1, "{mean}");
+    }
+}

@@ -1,0 +1,233 @@
+//! Samples of a fleet: many bodies of the rig `rigid-body` in one process. Their length is that of the fleet.
+//!
+//! A header, then vectors of three components as structures of arrays: component 1 of every body, component 2 of every body,
+//! component 3. Everything is a word of 8 bytes, so the bytes are those of a message whose arrays have that fixed length.
+
+use super::{Field, FieldKind, Message, Stamp};
+use bytemuck::TransparentWrapper;
+use core::fmt;
+use core::marker::PhantomData;
+
+/// Components of a vector.
+const AXES: usize = 3;
+/// Words before the arrays: the stamp, the number of bodies, the status.
+const HEADER: usize = size_of::<Stamp>() / size_of::<u64>() + 2;
+const BODIES: usize = HEADER - 2;
+const STATUS: usize = HEADER - 1;
+
+type Words = [u64];
+
+/// What a fleet's sample holds besides its header.
+pub trait FleetLayout: fmt::Debug + Send + Sync + 'static {
+    /// Name and version of the layout, unique among all samples.
+    const TYPE_NAME: &'static str;
+    /// The names of its vectors, in order; the unit is the last part of each.
+    const VECTORS: &'static [&'static str];
+}
+
+/// A sample of a fleet, in place.
+#[repr(transparent)]
+#[derive(TransparentWrapper)]
+#[transparent(Words)]
+pub struct FleetSample<L: FleetLayout> {
+    layout: PhantomData<L>,
+    words: Words,
+}
+
+/// The states of all bodies as they really are. For recording and scoring only: no controller opens it.
+///
+/// `omega_rad_s`: angular velocities, rad/s; `applied_rad_s2`: control accelerations held from this tick on, rad/s².
+pub type FleetTruth = FleetSample<TruthLayout>;
+/// What the sensors and actuators of all bodies report at a tick; every component is measured.
+///
+/// `omega_rad_s`: angular velocities, rad/s; `applied_rad_s2`: control accelerations held from this tick on, rad/s².
+pub type FleetMeasurement = FleetSample<MeasurementLayout>;
+/// What the actuators of all bodies are to apply from the next tick on.
+///
+/// `acceleration_rad_s2`: control accelerations (torque over inertia), rad/s².
+pub type FleetCommand = FleetSample<CommandLayout>;
+
+macro_rules! layout {
+    ($name:ident = $type_name:literal [$($vector:literal),+]) => {
+        #[doc = concat!("The layout `", $type_name, "`.")]
+        #[derive(Debug)]
+        pub enum $name {}
+
+        impl FleetLayout for $name {
+            const TYPE_NAME: &'static str = $type_name;
+            const VECTORS: &'static [&'static str] = &[$($vector),+];
+        }
+    };
+}
+
+layout!(TruthLayout = "corotate/rigid-fleet/truth/v1" ["omega_rad_s", "applied_rad_s2"]);
+layout!(MeasurementLayout = "corotate/rigid-fleet/measurement/v1" ["omega_rad_s", "applied_rad_s2"]);
+layout!(CommandLayout = "corotate/rigid-fleet/command/v1"["acceleration_rad_s2"]);
+
+impl<L: FleetLayout> FleetSample<L> {
+    /// How long a sample of so many bodies is, words.
+    pub const fn length(bodies: usize) -> usize {
+        HEADER + L::VECTORS.len() * AXES * bodies
+    }
+
+    /// The fields after the stamp, in order, of a sample of so many bodies.
+    pub fn fields(bodies: usize) -> impl Iterator<Item = Field> {
+        let word = size_of::<u64>();
+        let header = [("bodies", BODIES), ("status", STATUS)].into_iter();
+        let header = header.map(move |(name, at)| Field { name, offset: at * word, kind: FieldKind::U64, count: 1 });
+        let vector = move |(index, name): (usize, &&'static str)| Field {
+            name,
+            offset: (HEADER + index * AXES * bodies) * word,
+            kind: FieldKind::F64,
+            count: AXES * bodies,
+        };
+        header.chain(L::VECTORS.iter().enumerate().map(vector))
+    }
+
+    /// A sample in its words.
+    ///
+    /// # Panics
+    /// If they are not as many as those of some number of bodies, [`length`](Self::length).
+    #[inline]
+    pub fn over(words: &[u64]) -> &Self {
+        assert!(Self::fits(words.len()), "a fleet's sample is a header and whole vectors");
+        Self::wrap_ref(words)
+    }
+
+    /// The same, to be written.
+    ///
+    /// # Panics
+    /// As [`over`](Self::over).
+    #[inline]
+    pub fn over_mut(words: &mut [u64]) -> &mut Self {
+        assert!(Self::fits(words.len()), "a fleet's sample is a header and whole vectors");
+        Self::wrap_mut(words)
+    }
+
+    #[inline]
+    fn fits(length: usize) -> bool {
+        length.checked_sub(HEADER).is_some_and(|values| values.is_multiple_of(L::VECTORS.len() * AXES))
+    }
+
+    /// How many bodies it has room for.
+    #[inline]
+    pub fn bodies(&self) -> usize {
+        (self.words.len() - HEADER) / (L::VECTORS.len() * AXES)
+    }
+
+    /// For how many bodies its sender says that it is.
+    #[inline]
+    pub fn told_bodies(&self) -> u64 {
+        self.words[BODIES]
+    }
+
+    /// Bits of [`status`](super::status), which are those of all bodies.
+    #[inline]
+    pub fn status(&self) -> u64 {
+        self.words[STATUS]
+    }
+
+    /// Writes the header's status and number of bodies.
+    #[inline]
+    pub fn set_status(&mut self, status: u64) {
+        self.words[BODIES] = self.bodies() as u64;
+        self.words[STATUS] = status;
+    }
+
+    /// The components of a vector by its place in the layout, each for every body.
+    #[inline]
+    pub fn vector(&self, index: usize) -> [&[f64]; AXES] {
+        let bodies = self.bodies();
+        let values: &[f64] = bytemuck::cast_slice(&self.words[HEADER + index * AXES * bodies..][..AXES * bodies]);
+        let (first, others) = values.split_at(bodies);
+        let (second, third) = others.split_at(bodies);
+        [first, second, third]
+    }
+
+    /// The same, to be written.
+    #[inline]
+    pub fn vector_mut(&mut self, index: usize) -> [&mut [f64]; AXES] {
+        let bodies = self.bodies();
+        let words = &mut self.words[HEADER + index * AXES * bodies..][..AXES * bodies];
+        let (first, others) = bytemuck::cast_slice_mut(words).split_at_mut(bodies);
+        let (second, third) = others.split_at_mut(bodies);
+        [first, second, third]
+    }
+}
+
+impl<L: FleetLayout> Message for FleetSample<L> {
+    #[inline]
+    fn stamp(&self) -> &Stamp {
+        bytemuck::from_bytes(bytemuck::cast_slice(&self.words[..BODIES]))
+    }
+
+    #[inline]
+    fn stamp_mut(&mut self) -> &mut Stamp {
+        bytemuck::from_bytes_mut(bytemuck::cast_slice_mut(&mut self.words[..BODIES]))
+    }
+
+    #[inline]
+    fn words(&self) -> &[u64] {
+        &self.words
+    }
+
+    #[inline]
+    fn words_mut(&mut self) -> &mut [u64] {
+        &mut self.words
+    }
+}
+
+impl<L: FleetLayout> fmt::Debug for FleetSample<L> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = L::TYPE_NAME;
+        f.debug_struct(name).field("stamp", self.stamp()).field("bodies", &self.bodies()).finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check<L: FleetLayout>(bodies: usize) {
+        let mut next = size_of::<Stamp>();
+        for field in FleetSample::<L>::fields(bodies) {
+            assert_eq!(field.offset, next, "{}: {} follows its predecessor", L::TYPE_NAME, field.name);
+            next += 8 * field.count;
+        }
+        assert_eq!(next, 8 * FleetSample::<L>::length(bodies), "{}: the fields fill the sample", L::TYPE_NAME);
+    }
+
+    #[test]
+    fn the_fields_fill_the_sample() {
+        for bodies in [1, 3, 1000] {
+            check::<TruthLayout>(bodies);
+            check::<MeasurementLayout>(bodies);
+            check::<CommandLayout>(bodies);
+        }
+    }
+
+    #[test]
+    fn every_value_has_a_place_of_its_own_and_the_table_tells_which() {
+        let mut words = [0; FleetTruth::length(5)];
+        let sample = FleetTruth::over_mut(&mut words);
+        sample.stamp_mut().tick = 7;
+        sample.set_status(9);
+        for vector in 0..2 {
+            for (axis, values) in sample.vector_mut(vector).into_iter().enumerate() {
+                let value = |body: usize| (100 * vector + 10 * axis + body) as f64;
+                values.iter_mut().enumerate().for_each(|(body, slot)| *slot = value(body));
+            }
+        }
+        assert_eq!((sample.stamp().tick, sample.status(), sample.told_bodies()), (7, 9, 5));
+        let second = FleetTruth::fields(5).find(|field| field.name == "applied_rad_s2").unwrap();
+        assert_eq!(f64::from_bits(words[second.offset / 8 + 5 + 2]), 112.0, "vector 1, axis 1, body 2");
+        let sample = FleetTruth::over(&words);
+        assert_eq!(sample.vector(0)[2], [20.0, 21.0, 22.0, 23.0, 24.0]);
+    }
+
+    #[test]
+    fn other_lengths_are_no_samples() {
+        let lengths: Vec<usize> = (0..20).filter(|length| FleetTruth::fits(*length)).collect();
+        assert_eq!(lengths, [6, 12, 18]);
+    }
+}

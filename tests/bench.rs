@@ -1,0 +1,158 @@
+//! The benchmark suite does what it says: every row, every floor, files that other tools read, and nothing left behind.
+//! No figure is judged here: a smoke run on a loaded machine measures nothing.
+
+mod common;
+
+use common::{Bench, Done, Running, await_some};
+use corotate::bench::{Row, TARGETS, agreements};
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Runs a command to its end, and finds out which domains it used.
+fn run(bench: &Bench, arguments: &[&str]) -> (Done, Vec<PathBuf>) {
+    let running = bench.start(arguments);
+    let pid = running.pid();
+    let waiting = std::thread::spawn(move || running.wait());
+    let mut domains = BTreeSet::new();
+    while !waiting.is_finished() && Path::new(&format!("/proc/{pid}")).exists() {
+        domains.extend(bench.domains());
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    (waiting.join().unwrap(), domains.into_iter().collect())
+}
+
+fn measure(bench: &Bench, rows: &[&str]) -> Value {
+    let (done, domains) = run(bench, &[&["bench", "--quick", "--json", "--out", "results"], rows].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.assert_clean(&domains);
+    assert!(done.stderr.contains("a smoke run") && done.stderr.contains("granted: "), "{}", done.stderr);
+    let printed: Value = serde_json::from_str(&done.stdout).unwrap();
+    let written = std::fs::read_to_string(bench.path("results/bench.json")).unwrap();
+    assert_eq!(printed, serde_json::from_str::<Value>(&written).unwrap());
+    assert!(done.stderr.contains(&std::fs::read_to_string(bench.path("results/bench.txt")).unwrap()));
+    printed
+}
+
+/// The rows that were asked for, each with figures, floors and every one of its targets.
+fn assert_rows(bench: &Bench, results: &Value, rows: &[&str]) {
+    assert_eq!((results["schema"].as_str(), results["quick"].as_bool()), (Some("corotate/bench/v1"), Some(true)));
+    assert!(results["host"]["cores"].as_u64().unwrap() > 0 && !results["privileges"].as_array().unwrap().is_empty());
+    let figures = results["figures"].as_array().unwrap();
+    let found: BTreeSet<&str> = figures.iter().map(|figure| figure["row"].as_str().unwrap()).collect();
+    assert_eq!(found, rows.iter().copied().collect());
+    for figure in figures {
+        let rounds: Vec<f64> =
+            figure["rounds"].as_array().unwrap().iter().map(|round| round.as_f64().unwrap()).collect();
+        assert!(!rounds.is_empty() && rounds.iter().all(|round| *round >= 0.0), "{figure}");
+        if !figure["latency"].is_null() {
+            assert_histogram(bench, figure);
+        }
+        if let Some(ratio) = figure["beside"]["ratio"].as_f64() {
+            assert!(ratio.is_finite() && ratio >= 0.0, "{figure}");
+        }
+    }
+    let expected = TARGETS.iter().filter(|target| rows.contains(&target.row.name())).count();
+    assert_eq!(results["targets"].as_array().unwrap().len(), expected);
+}
+
+/// The histogram of a figure is a file with all of its values.
+fn assert_histogram(bench: &Bench, figure: &Value) {
+    let name = figure["name"].as_str().unwrap().replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
+    let path = bench.path(&format!("results/latency/{}.{name}.hgrm", figure["row"].as_str().unwrap()));
+    let text = std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let rows: Vec<Vec<f64>> = text
+        .lines()
+        .skip(2)
+        .filter(|line| !line.starts_with('#'))
+        .map(|line| line.split_whitespace().map(|word| word.parse().unwrap()).collect())
+        .collect();
+    let (last, count) = (rows.last().unwrap(), figure["latency"]["count"].as_u64().unwrap());
+    assert_eq!((last[1], last[2]), (1.0, count as f64), "{}", path.display());
+    assert!((last[0] - figure["latency"]["max_us"].as_f64().unwrap()).abs() <= 1e-3, "{}", path.display());
+}
+
+fn has(results: &Value, row: &str, name: &str) -> bool {
+    let figures = results["figures"].as_array().unwrap();
+    figures.iter().any(|figure| figure["row"] == row && figure["name"] == name)
+}
+
+#[test]
+fn the_step_and_the_hop_stand_beside_all_their_floors() {
+    let bench = Bench::new();
+    let results = measure(&bench, &["step", "fleet", "hop"]);
+    assert_rows(&bench, &results, &["step", "fleet", "hop"]);
+    for name in ["first order", "second order", "identifier", "orbit"] {
+        assert!(has(&results, "step", name) && has(&results, "step", &format!("{name} in C")), "{name}");
+    }
+    assert!(has(&results, "step", "first order by an EKF") && has(&results, "step", "bare copy of its samples"));
+    assert!(has(&results, "fleet", "law, N = 100000") && has(&results, "fleet", "copy, N = 1"));
+    let spinners = ["ours", "iceoryx2", "iceoryx2 blackboard", "shared memory"].map(|name| (name, "spin"));
+    let sleepers = ["ours", "iceoryx2", "futex", "eventfd", "pipe", "Unix socket", "UDP loopback"];
+    let sleepers = sleepers.map(|name| (name, "event"));
+    let hybrids = ["ours", "iceoryx2", "futex"].map(|name| (name, "hybrid"));
+    for (name, wake) in spinners.into_iter().chain(sleepers).chain(hybrids) {
+        for suffix in ["", ", from send", ", back to back"] {
+            let figure = format!("{name}, {wake}, 64 B{suffix}");
+            assert!(has(&results, "hop", &figure), "{figure}");
+        }
+    }
+}
+
+#[test]
+fn whole_runs_stand_beside_theirs() {
+    let bench = Bench::new();
+    let rows = ["chain", "tick", "lockstep", "run", "toll"];
+    let results = measure(&bench, &rows);
+    assert_rows(&bench, &results, &rows);
+    for (row, name) in [
+        ("chain", "ours, 1000 Hz"),
+        ("chain", "raw hops, 1000 Hz"),
+        ("tick", "ours, in a run"),
+        ("tick", "bare sleep"),
+        ("tick", "rate error of a run"),
+        ("lockstep", "lockstep"),
+        ("lockstep", "two raw hops back to back"),
+        ("lockstep", "in one thread, rigid-pair"),
+        ("run", "start to first tick"),
+        ("run", "bare iceoryx2 node"),
+        ("run", "memory of observer"),
+        ("run", "shared memory"),
+        ("toll", "page faults, leader"),
+        ("toll", "allocations, controller"),
+        ("toll", "voluntary context switches, follower"),
+    ] {
+        assert!(has(&results, row, name), "{row}: {name}");
+    }
+}
+
+#[test]
+fn the_code_in_c_computes_the_same_numbers() {
+    let agreements = agreements().unwrap();
+    assert_eq!(agreements.len(), 4);
+    for agreement in agreements {
+        assert!(agreement.words && agreement.largest < 1e-12, "{agreement:?}");
+    }
+}
+
+#[test]
+fn ctrl_c_ends_it_and_leaves_nothing() {
+    let bench = Bench::new();
+    let running: Running = bench.start(&["bench", "hop", "--out", "results"]);
+    await_some(|| (bench.processes().len() > 2).then_some(()));
+    let domains = bench.domains();
+    assert_eq!(domains.len(), 1);
+    running.signal(2);
+    let done = running.wait();
+    assert_eq!(done.code, Some(130), "{done:?}");
+    bench.assert_clean(&domains);
+}
+
+#[test]
+fn a_row_that_is_none_is_refused_with_those_that_are() {
+    let done = Bench::new().run(&["bench", "hops"]);
+    assert_eq!(done.code, Some(2), "{done:?}");
+    for (_, name, _) in Row::ALL {
+        assert!(done.stderr.contains(name), "{}", done.stderr);
+    }
+}

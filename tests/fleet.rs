@@ -1,0 +1,199 @@
+//! Fleets: many followers in one process. Each gets the bits that it gets alone, under every clock; what happens to a
+//! follower happens to all of a fleet at once.
+
+mod common;
+
+use common::{Bench, send_signal, shipped};
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Carried, Reader, Signal};
+use corotate::config::Scenario;
+use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
+use corotate::sample::{FleetTruth, RateTruth};
+use corotate::with_rig;
+use serde_json::Value;
+
+const SIGKILL: i32 = 9;
+
+/// Rate and applied acceleration of one body, tick by tick.
+type Motion = Vec<([f64; 3], [f64; 3])>;
+
+/// Runs a scenario in this thread and looks at every truth of its follower.
+fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], bodies: usize, mut look: impl FnMut(&S)) {
+    let common =
+        ["accept={}", "limits={rate_rad_s=10.0, acceleration_rad_s2=3.0}", "duration_s=2.0", "clock=in-process"];
+    let overrides: Vec<String> = common.iter().map(|text| (*text).to_owned()).chain(overrides.to_vec()).collect();
+    let scenario = Scenario::load(&shipped(name), &overrides).unwrap();
+    let bus = MemoryBus::new(depths(&scenario));
+    let node = |role| {
+        let ledger = private_ledger(&scenario, role);
+        with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+    };
+    let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
+    let body = &scenario.rig.bodies()[1].name;
+    let mut truth: Input<MemoryBus, S> =
+        Input::watch_many(&bus, &topic(&scenario, body, Signal::Truth), bodies, Reader::Scorer).unwrap();
+    let each = |_| {
+        assert!(truth.advance().unwrap());
+        look(truth.sample().unwrap());
+        true
+    };
+    in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
+}
+
+fn alone(rate: [f64; 3], overrides: &[String]) -> Motion {
+    let mut motion = Motion::new();
+    let start = format!("follower.0.initial_rate_rad_s={rate:?}");
+    watch::<RateTruth>("rigid-pair", &[overrides, &[start]].concat(), 1, |truth| {
+        motion.push((truth.omega_rad_s, truth.applied_rad_s2));
+    });
+    motion
+}
+
+fn fleet(count: usize, overrides: &[String]) -> Vec<Motion> {
+    let mut motions = vec![Motion::new(); count];
+    let many = [format!("follower.0.count={count}"), "follower.0.initial_rate_spread_rad_s=[2.0, 2.0, 2.0]".to_owned()];
+    watch::<FleetTruth>("rigid-pair", &[overrides, &many].concat(), count, |truth| {
+        for (body, motion) in motions.iter_mut().enumerate() {
+            motion.push((truth.vector(0).map(|rates| rates[body]), truth.vector(1).map(|applied| applied[body])));
+        }
+    });
+    motions
+}
+
+/// One body, or every tenth of many; with and without a prediction; at a tick that takes one step of the integration and at
+/// one that takes several; and with an actuator that is at its limit for a while.
+#[test]
+fn every_body_of_a_fleet_moves_bit_by_bit_as_it_does_alone() {
+    for (count, predict, tick_hz) in
+        [(1, false, 1000), (31, false, 1000), (31, true, 1000), (21, true, 50), (1, true, 50)]
+    {
+        let overrides = [format!("controller.predict={predict}"), format!("tick_hz={tick_hz}")];
+        for (body, motion) in fleet(count, &overrides).iter().enumerate().step_by(10) {
+            let single = alone(motion[0].0, &overrides);
+            assert_eq!(motion.len(), single.len());
+            let limited = single.iter().any(|(_, applied)| applied.iter().any(|value| value.abs() == 3.0));
+            assert!(limited || tick_hz != 1000 || motion[0].0[0].abs() < 1.0, "the limit was never reached");
+            for (tick, (ours, theirs)) in motion.iter().zip(&single).enumerate() {
+                assert_eq!(ours.0.map(f64::to_bits), theirs.0.map(f64::to_bits), "{count}: body {body}, tick {tick}");
+                assert_eq!(ours.1, theirs.1, "{count}: body {body}, tick {tick}");
+            }
+        }
+    }
+}
+
+fn hash(bench: &Bench, clock: &str, sets: &[&str]) -> (Value, Value) {
+    let sets = sets.iter().flat_map(|set| ["--set", set]);
+    let arguments: Vec<&str> = ["--clock", clock, "--set", "accept={}"].into_iter().chain(sets).collect();
+    let summary = bench.summary("rigid-fleet", &arguments);
+    assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+    (summary["state"]["hash"].clone(), summary)
+}
+
+/// Whatever is scripted to go wrong: the same bits in one thread and as processes, for the whole fleet at once.
+#[test]
+fn faults_of_a_fleet_are_the_same_in_one_thread_and_in_lockstep() {
+    for (fault, rejected, safe) in [
+        ("{kind=\"not-a-number\", role=\"fleet\", from_tick=100, component=150}", 1, 0),
+        ("{kind=\"out-of-range\", role=\"fleet\", from_tick=100, component=7, value=1e3}", 1, 0),
+        ("{kind=\"infinite\", role=\"controller\", from_tick=100, component=99}", 1, 0),
+        ("{kind=\"bit-flip\", role=\"fleet\", from_tick=100, field=\"bodies\", bit=3}", 1, 0),
+        ("{kind=\"bit-flip\", role=\"controller\", from_tick=100, ticks=50, field=\"acceleration_rad_s2\"}", 0, 0),
+        ("{kind=\"freeze\", role=\"fleet\", from_tick=100, ticks=5}", 0, 0),
+        ("{kind=\"drop\", role=\"controller\", from_tick=100, ticks=30}", 0, 11),
+        ("{kind=\"delay\", role=\"controller\", from_tick=100, ticks=10, delay_ticks=3}", 0, 0),
+        ("{kind=\"duplicate\", role=\"fleet\", from_tick=100, ticks=10}", 0, 0),
+        ("{kind=\"kill\", role=\"fleet\", from_tick=150}", 0, 0),
+        ("{kind=\"kill\", role=\"controller\", from_tick=150}", 0, 0),
+    ] {
+        let bench = Bench::new();
+        let sets = [&format!("fault=[{fault}]"), "duration_s=0.6", "follower.0.count=77"];
+        let ((one, summary), (many, _)) = (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
+        assert_eq!(one, many, "{fault}");
+        let of = |role: &str, key: &str| summary["books"]["roles"][role][key].as_u64().unwrap();
+        assert_eq!(of("fleet", "safe"), safe, "{fault}: {summary:#}");
+        let all = summary["books"]["rejected_samples"].as_u64().unwrap();
+        assert!(if rejected > 0 { all == rejected } else { true }, "{fault}: {all} rejected");
+    }
+}
+
+/// The kill of a fleet's process costs no bit in lockstep: its successor goes on with the bodies where they are.
+#[test]
+fn a_fleet_that_is_killed_goes_on_where_it_was() {
+    let bench = Bench::new();
+    let sets = ["duration_s=0.6", "follower.0.count=333", "controller.predict=true"];
+    let whole = hash(&bench, "lockstep", &sets).0;
+    let kill = "fault=[{kind=\"kill\", role=\"fleet\", from_tick=123}]";
+    let (killed, summary) = hash(&bench, "lockstep", &[&sets[..], &[kill]].concat());
+    assert_eq!(whole, killed);
+    assert_eq!(summary["incidents"][0]["role"], "fleet");
+}
+
+#[test]
+fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
+    let bench = Bench::new();
+    let file = shipped("rigid-fleet");
+    let limits = "accept={settled_by_s=5.0, sync_error_rad_s_max=1e-3}";
+    let arguments = ["run", file.to_str().unwrap(), "--tick-hz", "100", "--duration", "6", "--set", limits, "--json"];
+    let running = bench.start(&arguments);
+    let fleet = bench.await_role("fleet");
+    let domains = bench.domains();
+    std::thread::sleep(std::time::Duration::from_millis(1500));
+    send_signal(fleet, SIGKILL);
+    let done = running.wait();
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert_eq!(summary["incidents"][0]["role"], "fleet", "{summary:#}");
+    assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+    bench.assert_clean(&domains);
+}
+
+#[test]
+fn a_hundred_thousand_bodies_are_a_fleet_like_any_other() {
+    let bench = Bench::new();
+    let (_, summary) = hash(&bench, "in-process", &["follower.0.count=100000", "duration_s=0.1"]);
+    assert_eq!(summary["books"]["missed_ticks"], 0);
+    assert_eq!(summary["score"]["scored_ticks"], 51);
+}
+
+/// A fleet beside single followers, in any order: the books find their links.
+#[test]
+fn a_fleet_flies_beside_single_followers() {
+    let bench = Bench::new();
+    let single = |name: &str| format!("{{name=\"{name}\", initial_rate_rad_s=[0.1, 0.2, 0.3]}}");
+    let fleet =
+        |name: &str, count: usize| format!("{{name=\"{name}\", count={count}, initial_rate_rad_s=[0.1, 0.2, 0.3]}}");
+    let followers = [fleet("f", 5), single("a"), fleet("g", 9), single("b")].join(", ");
+    let sets = [&format!("follower=[{followers}]"), "duration_s=0.4"];
+    let ((one, summary), (many, _)) = (hash(&bench, "in-process", &sets), hash(&bench, "lockstep", &sets));
+    assert_eq!(one, many);
+    assert_eq!(summary["books"]["missed_ticks"], 0);
+    assert!(summary["score"]["certificate"]["held"].as_u64().unwrap() > 100, "of the single ones: {summary:#}");
+}
+
+#[test]
+fn what_no_fleet_can_be_is_refused_with_its_reason() {
+    for (set, said) in [
+        ("follower.0.count=0", "0 is no number of bodies that one process hosts; give 1 to 1000000"),
+        ("follower.0.count=-1", "-1 is no number of bodies"),
+        ("follower.0.count=1000000000", "1000000000 is no number of bodies"),
+        ("follower.0.count=2.5", "give a whole number"),
+        ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "below zero; give 0 or more"),
+        ("follower.0.initial_rate_spread_rad_s=[4000.0, 0.0, 0.0]", "it turns too far from one tick"),
+        ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "has no meaning for a fleet"),
+        ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "has no meaning for a fleet"),
+        ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "has no meaning for a fleet"),
+        ("controller.adaptation_gain=1.0", "learns the inertia of single followers"),
+        ("limits.repeats=10", "is not counted for the bodies of a fleet"),
+        ("watchdog.lyapunov_rad2_s2_max=1.0", "is not published for a fleet"),
+        (
+            "follower=[{name=\"a\", initial_rate_rad_s=[0,0,0], initial_rate_spread_rad_s=[1,1,1]}]",
+            "give count, or remove it",
+        ),
+        ("fault=[{kind=\"lost-axis\", role=\"fleet\", from_tick=1, component=1}]", "this signal is neither"),
+        ("fault=[{kind=\"infinite\", role=\"fleet\", from_tick=1, component=3001}]", "give 1 to 3000"),
+    ] {
+        let done = Bench::new().run(&["check", shipped("rigid-fleet").to_str().unwrap(), "--set", set]);
+        assert_eq!(done.code, Some(2), "{set}: {done:?}");
+        assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
+    }
+}
