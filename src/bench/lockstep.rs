@@ -59,6 +59,7 @@ fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario) -> Result<f64, BenchErro
     let mut launch = Launch {
         program: bench.program.clone(),
         external: Vec::new(),
+        record: None,
         require_realtime: false,
         signal: bench.signal,
         progress: &mut |progress| {
