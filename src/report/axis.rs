@@ -1,7 +1,8 @@
 //! Axes: from values to places between 0 and 1, with ticks that people can read.
 
-/// The most labels on an axis.
+/// About so many labels are on an axis; a time axis has room for more.
 const LABELS: f64 = 7.0;
+const TIME_LABELS: f64 = 10.0;
 /// Of a logarithmic axis no more than so many decades below its top are shown.
 const DECADES: f64 = 36.0;
 
@@ -21,7 +22,13 @@ impl Axis {
     /// A linear axis from one value to another.
     pub fn linear(label: &str, low: f64, high: f64) -> Self {
         let (low, high) = widened(low, high);
-        Self { label: label.to_owned(), low, high, logarithmic: false, ticks: linear_ticks(low, high) }
+        Self { label: label.to_owned(), low, high, logarithmic: false, ticks: linear_ticks(low, high, LABELS) }
+    }
+
+    /// The time in the run up to its end, s.
+    pub fn time(end_s: f64) -> Self {
+        let axis = Self::linear("time in the run, s", 0.0, end_s);
+        Self { ticks: linear_ticks(axis.low, axis.high, TIME_LABELS), ..axis }
     }
 
     /// A linear axis with some room on either side of the values.
@@ -45,7 +52,10 @@ impl Axis {
 
     /// An axis of 1/(1 − p), labelled by p in percent.
     pub fn percentiles(greatest: f64) -> Self {
-        let mut axis = Self::decades("percentile, on an axis of 1/(1 − p)", (1.0, greatest.max(10.0)));
+        let greatest = greatest.max(10.0);
+        let mut axis = Self::decades("percentile, on an axis of 1/(1 − p)", (1.0, greatest));
+        axis.high = greatest.log10();
+        axis.ticks.retain(|(value, _)| *value <= greatest);
         for (index, (_, label)) in axis.ticks.iter_mut().enumerate() {
             *label = match index {
                 0 => "0 %".to_owned(),
@@ -89,15 +99,15 @@ fn widened(low: f64, high: f64) -> (f64, f64) {
     if high - low < least { (low - least, high + least) } else { (low, high) }
 }
 
-fn linear_ticks(low: f64, high: f64) -> Vec<(f64, String)> {
-    let raw = (high - low) / (LABELS - 1.0);
+fn linear_ticks(low: f64, high: f64, labels: f64) -> Vec<(f64, String)> {
+    let raw = (high - low) / (labels - 1.0);
     let decade = 10_f64.powf(raw.log10().floor());
     let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * decade).into_iter().find(|step| *step >= raw).unwrap_or(raw);
     let (first, last) = ((low / step - 1e-9).ceil(), (high / step + 1e-9).floor());
-    let count = (last - first).clamp(0.0, 2.0 * LABELS) as usize;
+    let count = (last - first).clamp(0.0, 2.0 * labels) as usize;
     let label = |value: f64| {
         let largest = low.abs().max(high.abs());
-        if largest >= 1e6 || largest < 1e-3 {
+        if !(1e-3..1e6).contains(&largest) {
             return if value == 0.0 { "0".to_owned() } else { format!("{:.2e}", value).replace('-', "−") };
         }
         let digits = (-step.log10().floor()).max(0.0) as usize;
@@ -136,7 +146,8 @@ mod tests {
 
     #[test]
     fn ticks_are_round_numbers_within_the_axis() {
-        assert_eq!(labels(&Axis::linear("t, s", 0.0, 10.0)), ["0", "2", "4", "6", "8", "10"]);
+        assert_eq!(labels(&Axis::time(10.0)), ["0", "2", "4", "6", "8", "10"]);
+        assert_eq!(labels(&Axis::time(18.0)).len(), 10);
         assert_eq!(labels(&Axis::linear("w", -0.31, 0.62)), ["−0.2", "0.0", "0.2", "0.4", "0.6"]);
         assert_eq!(labels(&Axis::decades("e", (3e-5, 0.7))), ["10⁻⁵", "10⁻⁴", "10⁻³", "0.01", "0.1", "1"]);
         assert_eq!(labels(&Axis::percentiles(20_000.0))[..5], ["0 %", "90 %", "99 %", "99.9 %", "99.99 %"]);

@@ -12,7 +12,7 @@ use std::fmt::Write;
 const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 250.0;
 const LEFT: f64 = 64.0;
-const RIGHT: f64 = 14.0;
+const RIGHT: f64 = 22.0;
 const TOP: f64 = 18.0;
 const BOTTOM: f64 = 42.0;
 /// Side of a picture of a plane.
@@ -248,7 +248,7 @@ pub fn marks(x: &Axis, marks: &Marks) -> String {
         let (width, height) = ((to - from).max(1.5), foot - TOP);
         let _ =
             write!(svg, "<rect class=\"fault\" x=\"{from:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{height}\"/>");
-        if from > labelled + 11.0 {
+        if from > labelled + 15.0 {
             let (at, above) = (from + width / 2.0, TOP - 5.0);
             let _ = write!(
                 svg,

@@ -133,7 +133,7 @@ fn headings(source: &Source) -> (String, String) {
 fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
     let last = traces.and_then(|traces| traces.ticks).map_or(1, |(_, last)| last.max(1));
-    let time = Axis::linear("time in the run, s", 0.0, last as f64 * tick_s);
+    let time = Axis::time(last as f64 * tick_s);
     let faults = tables::faults(source).into_iter().filter(|fault| fault.from_tick <= last);
     let span = |fault: tables::FaultRow| {
         let to = fault.from_tick.saturating_add(fault.ticks).min(last);

@@ -58,24 +58,27 @@ pub fn read_curve(text: &str) -> Result<Vec<(f64, f64)>, String> {
 
 /// One picture per stage: title, explanation and picture.
 pub fn pictures(curves: &[Curve]) -> Vec<(String, String, Picture)> {
+    // A role has its colour in every picture.
+    let mut roles: Vec<&str> = Vec::new();
+    for curve in curves.iter().filter(|curve| curve.stage != BASELINE) {
+        if !roles.contains(&curve.role.as_str()) {
+            roles.push(&curve.role);
+        }
+    }
     let shown = STAGES.iter().filter_map(|(stage, what)| {
         let with = |curve: &&Curve| curve.stage == *stage || (*stage == "lateness" && curve.stage == BASELINE);
         let curves: Vec<&Curve> = curves.iter().filter(with).collect();
-        (!curves.is_empty()).then(|| ((*stage).to_owned(), (*what).to_owned(), picture(stage, &curves)))
+        (!curves.is_empty()).then(|| ((*stage).to_owned(), (*what).to_owned(), picture(stage, &curves, &roles)))
     });
     shown.collect()
 }
 
-fn picture(stage: &str, curves: &[&Curve]) -> Picture {
+fn picture(stage: &str, curves: &[&Curve], roles: &[&str]) -> Picture {
     let points = || curves.iter().flat_map(|curve| &curve.points);
     let greatest = points().map(|point| point.0).fold(1.0, f64::max);
     let low = points().map(|point| point.1).filter(|us| *us > 0.0).fold(f64::INFINITY, f64::min);
     let high = points().map(|point| point.1).fold(0.0, f64::max);
     let (x, y) = (Axis::percentiles(greatest), Axis::decades("latency, µs", (low, high)));
-    let mut roles: Vec<&str> = curves.iter().map(|curve| curve.role.as_str()).collect();
-    roles.dedup();
-    roles.sort_unstable();
-    roles.dedup();
     let line = |curve: &&Curve| {
         if curve.stage == BASELINE {
             return Line::through("grey d2", &format!("{}: baseline", curve.role), curve.points.clone());

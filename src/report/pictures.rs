@@ -7,7 +7,7 @@ use super::columns::{Columns, Extremes};
 use super::counterpart::counterpart;
 use super::model::{Block, Section};
 use super::source::Source;
-use super::traces::{BODIES_SHOWN, Traces};
+use super::traces::{BODIES_SHOWN, MetricTrace, Traces};
 use crate::config::Scenario;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
@@ -147,8 +147,6 @@ fn orbits(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Figures, 
         figures.push((plane("velocities in the plane Vr Vθ", names, &velocities, false), caption));
     }
     figures.extend(orbit_states(traces, full.as_ref(), time, scenario.tick_s()));
-    let names = ["Ur", "Uθ"];
-    figures.extend(controls(traces, time, scenario.tick_s(), "applied_du_s2", "thrust per mass, du/s²", &names));
     Ok(figures)
 }
 
@@ -172,13 +170,15 @@ fn orbit_plane(traces: &Traces, full: Option<&Traces>) -> (Picture, String) {
     (plane("motion in the plane with full state and with the observer", names, &lines, true), caption.to_owned())
 }
 
-/// \[S\] Fig. 2: states over time.
+/// \[S\] Fig. 2: states and controls over time.
 fn orbit_states(traces: &Traces, full: Option<&Traces>, time: &Axis, tick_s: f64) -> Figures {
     let states = [
         ("radius_du", 0, "r, du", "Distance from the centre."),
         ("velocity_du_s", 0, "Vr, du/s", "Radial velocity."),
         ("velocity_du_s", 1, "Vθ, du/s", "Transverse velocity."),
         ("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
+        ("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
+        ("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
     ];
     let first = traces.bodies.first().map(String::as_str).unwrap_or_default();
     let mut figures = Vec::new();
@@ -192,7 +192,8 @@ fn orbit_states(traces: &Traces, full: Option<&Traces>, time: &Axis, tick_s: f64
                 traces.get(body, "truth", field, element).map(|columns| line(class, body, columns))
             });
         let own_class = if full.is_some() { "b d1" } else { "k d0" };
-        let own = traces.get(first, "truth", field, element).map(|columns| line(own_class, first, columns));
+        let own_label = if full.is_some() { "with the observer (this run)" } else { first };
+        let own = traces.get(first, "truth", field, element).map(|columns| line(own_class, own_label, columns));
         let seen = (field == "velocity_du_s").then(|| traces.get(first, "estimate", field, element)).flatten();
         let seen = seen.map(|columns| line("s d2", "estimate", columns));
         let (columns, lines) = present(others.chain([full, own, seen]));
@@ -206,50 +207,60 @@ fn orbit_states(traces: &Traces, full: Option<&Traces>, time: &Axis, tick_s: f64
 
 fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) -> Section {
     let tick_s = scenario.tick_s();
-    let shown =
-        || traces.metrics.iter().filter(|metric| metric.values.iter().any(|(_, extremes)| !extremes.is_empty()));
-    let (low, high) = range(shown().map(|metric| &metric.values), true);
+    let told = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
+    let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(told).collect();
+    let (low, high) = range(shown.iter().map(|metric| &metric.values), true);
     let y = Axis::decades("error, in the unit of each", (low.max(ERROR_FLOOR), high.max(ERROR_FLOOR)));
-    let mut lines = Vec::new();
-    for (index, metric) in shown().enumerate() {
-        lines.push(Line::of(COMPONENTS[index % COMPONENTS.len()], metric.name, &metric.values, tick_s));
-    }
     let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * tick_s);
-    let rate = scenario.rig.certificates().iter().map(|certificate| certificate.rate_per_s).reduce(f64::min);
-    let start = |metric: &Columns<Extremes>| metric.iter().find(|(_, e)| !e.is_empty()).map(|(_, e)| e.first);
-    let mut guide = |class, label: String, from: f64, rate: f64| {
-        let ends_s = (from / y.foot()).ln() / rate;
-        let at = ends_s.min(end_s);
-        if at > 0.0 && at.is_finite() {
-            lines.push(Line::through(class, &label, vec![(0.0, from), (at, from * (-rate * at).exp())]));
-        }
-    };
-    let certified = rate.filter(|rate| rate.is_finite() && *rate > 0.0);
-    if let (Some(rate), Some(from)) = (certified, shown().next().and_then(|metric| start(&metric.values))) {
-        guide("grey d2", format!("certified: exp(−{rate} t)"), from, rate);
-    }
-    let estimate = shown().find(|metric| metric.name.starts_with("estimate_error"));
-    if let (Some(rate), Some(from)) = (observer_rate(scenario), estimate.and_then(|metric| start(&metric.values))) {
-        guide("grey d4", format!("observer: exp(−{rate} t)"), from, rate);
-    }
-    for (index, metric) in shown().enumerate() {
-        if let Some(limit) = scenario.accept.metric_max.get(metric.name) {
-            let class = ["limit o d1", "limit b d1", "limit g d1", "limit p d1"][index % 4];
-            let from = scenario.accept.settled_by_s.min(end_s);
-            lines.push(Line::through(
-                class,
-                &format!("limit of {}", metric.name),
-                vec![(from, *limit), (end_s, *limit)],
-            ));
-        }
-    }
+    let of = |(metric, class): (&&MetricTrace, &'static str)| Line::of(class, metric.name, &metric.values, tick_s);
+    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS).map(of).collect();
+    lines.extend(falling(scenario, &shown, y.foot(), end_s));
+    lines.extend(limits(scenario, &shown, end_s));
     let caption = "Errors on a logarithmic axis, every tick scored as the launcher scores it. The straight lines fall at the \
                    certified rate and at the observer's, from the first error on: what is proven is the rate of fall, \
                    not the constant before it. Zeros are drawn at the foot.";
     let picture = over_time("errors over time, logarithmic", time, &y, &lines);
-    let mut blocks = vec![Block::Figures(vec![(picture, caption.to_owned())])];
-    blocks.push(rescored(source, traces));
+    let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), rescored(source, traces)];
     Section { id: "errors", title: "Synchronisation and estimation error", blocks }
+}
+
+/// Lines from the first errors on, that fall at the certified rate and at the observer's.
+fn falling(scenario: &Scenario, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Vec<Line> {
+    let certified = scenario.rig.certificates().iter().map(|certificate| certificate.rate_per_s).reduce(f64::min);
+    let estimate = shown.iter().find(|metric| metric.name.starts_with("estimate_error"));
+    let both = [
+        ("grey d2", "certified", certified, shown.first()),
+        ("grey d4", "observer", observer_rate(scenario), estimate),
+    ];
+    let line = |(class, name, rate, metric): (&'static str, &str, Option<f64>, Option<&&MetricTrace>)| {
+        let (rate, metric) = (rate.filter(|rate| rate.is_finite() && *rate > 0.0)?, metric?);
+        let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
+        let to_s = ((from / foot).ln() / rate).min(end_s);
+        let end = (to_s, from * (-rate * to_s).exp());
+        (to_s > 0.0).then(|| Line::through(class, &format!("{name}: exp(−{rate} t)"), vec![(0.0, from), end]))
+    };
+    both.into_iter().filter_map(line).collect()
+}
+
+/// What `[accept]` allows, from when on it does.
+fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> {
+    const SETTLED: [&str; 4] = ["limit o d1", "limit b d1", "limit g d1", "limit p d1"];
+    const DECLARED: [&str; 4] = ["limit o d2", "limit b d2", "limit g d2", "limit p d2"];
+    let accept = &scenario.accept;
+    let kinds = [
+        ("limit of", &accept.metric_max, accept.settled_by_s, SETTLED),
+        ("declared bound of", &accept.metric_peak, accept.peak_from_s, DECLARED),
+    ];
+    let mut lines = Vec::new();
+    for (what, limits, from_s, classes) in kinds {
+        for (metric, class) in shown.iter().zip(classes) {
+            if let Some(limit) = limits.get(metric.name).filter(|_| from_s < end_s) {
+                let label = format!("{what} {}", metric.name);
+                lines.push(Line::through(class, &label, vec![(from_s, *limit), (end_s, *limit)]));
+            }
+        }
+    }
+    lines
 }
 
 /// The rate that the observer of first order was designed for, 1/s; the slower where there are two.
@@ -261,8 +272,8 @@ fn observer_rate(scenario: &Scenario) -> Option<f64> {
 
 /// The metrics as the recording's samples give them.
 fn rescored(source: &Source, traces: &Traces) -> Block {
-    let number = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:e}"));
-    let row = |metric: &super::traces::MetricTrace| {
+    let number = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.4e}"));
+    let row = |metric: &MetricTrace| {
         let told = source.summary.as_ref().and_then(|s| s.score.metrics.iter().find(|told| told.name == metric.name));
         vec![
             metric.name.to_owned(),
@@ -310,7 +321,7 @@ fn lyapunov(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
             [Line::of("o d0", "measured, tick to tick", fell, tick_s), Line::of("k d1", "bound", bound, tick_s)];
         let caption = format!(
             "How fast V of {body} fell, and the bound of [D](18) that it may not fall slower than: the certificate holds \
-             where the measured line is not below. Where V rose, and where its change is rounding, it is drawn at the foot."
+             where the measured line is not below. Drawn as long as V is more than rounding; where it rose, at the foot."
         );
         figures.push((over_time("rate of fall of V and its bound", time, &y, &lines), caption));
     }

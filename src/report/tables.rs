@@ -37,10 +37,10 @@ pub fn faults(source: &Source) -> Vec<FaultRow> {
     rows
 }
 
+/// A number in few digits; the verdict's are told in full.
 fn number(value: Option<f64>) -> String {
-    value.map_or("–".to_owned(), |value| {
-        if value.abs() >= 1e-3 && value.abs() < 1e6 { format!("{value}") } else { format!("{value:e}") }
-    })
+    let short = |value: f64| Some(format!("{value}")).filter(|text| text.len() <= 8);
+    value.map_or("–".to_owned(), |value| short(value).unwrap_or_else(|| format!("{value:.4e}")))
 }
 
 fn strings(cells: &[&dyn ToString]) -> Vec<String> {

@@ -5,6 +5,7 @@
 
 use super::columns::{Columns, Corners, Count, Extremes};
 use crate::config::Scenario;
+use crate::launch::lyapunov_floor;
 use crate::record::{Column, RecordError, Recording, SignalInfo};
 use crate::rig::{Command, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
@@ -30,7 +31,7 @@ pub struct Traces {
     pub paths: BTreeMap<(String, &'static str), Columns<Corners>>,
     /// Each metric over time.
     pub metrics: Vec<MetricTrace>,
-    /// V's measured rate of fall, and what its bound promises, by body.
+    /// V's measured rate of fall, and what its bound promises, by body, as long as V is more than rounding.
     pub falls: BTreeMap<String, [Columns<Extremes>; 2]>,
     /// By role, in the order of a tick: its samples, and how late each was sent, µs; nothing where there was no time.
     pub roles: Vec<RoleTrace>,
@@ -56,6 +57,7 @@ pub struct MetricTrace {
     pub name: &'static str,
     pub values: Columns<Extremes>,
     pub last: f64,
+    last_tick: u64,
     /// The largest from `accept.settled_by_s` on.
     pub settled_max: Option<f64>,
 }
@@ -125,8 +127,13 @@ struct Tracer<R: Rig> {
 impl<R: Rig> Tracer<R> {
     fn new(rig: &R, scenario: &Scenario, recording: &Recording) -> Self {
         let info = recording.info();
-        let metric =
-            |name: &&'static str| MetricTrace { name, values: Columns::default(), last: f64::NAN, settled_max: None };
+        let metric = |name: &&'static str| MetricTrace {
+            name,
+            values: Columns::default(),
+            last: f64::NAN,
+            last_tick: 0,
+            settled_max: None,
+        };
         let bodies = rig.bodies().iter().map(|body| body.name.clone()).collect();
         let mut traces = Traces { bodies, metrics: rig.metrics().iter().map(metric).collect(), ..Traces::default() };
         let signals = recording.signals().iter().map(|signal| Signal::new(rig, signal, &mut traces)).collect();
@@ -257,7 +264,10 @@ impl<R: Rig> Tracer<R> {
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
             metric.values.at(tick).take(value);
-            metric.last = value;
+            // A tick of which not all has come is scored after later ones.
+            if tick >= metric.last_tick {
+                (metric.last, metric.last_tick) = (value, tick);
+            }
             if settled {
                 metric.settled_max = Some(metric.settled_max.map_or(value, |worst| worst.max(value)));
             }
@@ -270,6 +280,7 @@ impl<R: Rig> Tracer<R> {
         let name = &self.traces.bodies[body];
         if let Some((before, v_before, bound)) = self.before.insert(body, (tick, v, bound))
             && before + 1 == tick
+            && v > lyapunov_floor(self.tick_s)
         {
             let falls = self.traces.falls.entry(name.clone()).or_default();
             falls[0].at(before).take((v_before - v) / self.tick_s);
@@ -305,12 +316,19 @@ impl<R: Rig> Signal<R> {
     fn new(rig: &R, info: &SignalInfo, traces: &mut Traces) -> Self {
         let body = rig.bodies().iter().position(|body| body.name == info.body);
         let fleet = body.and_then(|body| rig.bodies()[body].fleet);
-        // A signal of a body that the scenario does not have is nothing to show.
+        // What the scenario does not have, or has otherwise, is nothing to show; a file may hold anything.
+        let size = info.layout.size();
         let (kind, name) = match (info.signal.as_str(), body, fleet) {
-            ("truth", Some(_), None) => (Kind::Truth, "truth"),
-            ("truth", Some(_), Some(_)) => (Kind::FleetTruth, "truth"),
-            ("estimate", Some(0), _) => (Kind::Estimate(rig.estimate_guard()), "estimate"),
-            ("command", Some(body), None) => (Kind::Command(rig.command_guard(body)), "command"),
+            ("truth", Some(_), None) if size == size_of::<Truth<R>>() => (Kind::Truth, "truth"),
+            ("truth", Some(_), Some(bodies)) if size == 8 * FleetTruth::<R>::length(bodies) => {
+                (Kind::FleetTruth, "truth")
+            }
+            ("estimate", Some(0), _) if size == size_of::<Estimate<R>>() => {
+                (Kind::Estimate(rig.estimate_guard()), "estimate")
+            }
+            ("command", Some(body), None) if size == size_of::<Command<R>>() => {
+                (Kind::Command(rig.command_guard(body)), "command")
+            }
             _ => (Kind::Other, ""),
         };
         let body = body.unwrap_or(0);
