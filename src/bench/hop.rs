@@ -45,6 +45,8 @@ pub(super) struct Pair {
     back: Receiver,
     peer: Peer,
     number: u64,
+    /// Samples that the next one overtook before the receiver, which was late, looked.
+    lost: u64,
 }
 
 /// Measures the row.
@@ -84,9 +86,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
                 Ok((paced, pair.back_to_back(exchanges)?))
             });
             let (([due, sent], lost), one_way_us) = measured?;
-            if lost > 0 {
-                board.remark(format!("{name}: the receiver was late and {lost} samples of a round were overtaken"));
-            }
+            pair.lost += lost;
             board.record(Row::Hop, &name, floor.as_deref(), &due);
             let suffixed =
                 |suffix: &str| (format!("{name}, {suffix}"), floor.as_ref().map(|f| format!("{f}, {suffix}")));
@@ -95,6 +95,12 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
             let (name_tight, floor_tight) = suffixed("back to back");
             board.add(Row::Hop, &name_tight, "us", floor_tight.as_deref(), one_way_us);
         }
+    }
+    let lost: Vec<String> =
+        pairs.iter().filter(|pair| pair.lost > 0).map(|pair| format!("{} {}", pair.name, pair.lost)).collect();
+    if !lost.is_empty() {
+        let of = rounds * paced;
+        board.remark(format!("overtaken by the next before a late receiver looked, of {of}: {}", lost.join("; ")));
     }
     Ok(())
 }
@@ -142,7 +148,7 @@ impl Pair {
         peer.open(opening(0), Some(opening(1)))?;
         let back = station.receiver(&opening(1), read)?;
         sender.refresh()?;
-        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0 })
+        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, lost: 0 })
     }
 
     /// What the peer asked of the machine.
