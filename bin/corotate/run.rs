@@ -131,7 +131,9 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
-    let mut screen = Screen::default();
+    let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
+    let fleets = fleets.map(|body| body.name.clone()).collect();
+    let mut screen = Screen { bar: None, asked: false, fleets };
     let outcome = corotate::launch::run(
         scenario,
         &mut Launch {
@@ -222,10 +224,11 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
 }
 
 /// Progress on a terminal; silence elsewhere, but for what a person must do.
-#[derive(Default)]
 struct Screen {
     bar: Option<ProgressBar>,
     asked: bool,
+    /// The bodies that are many, and that no device can be.
+    fleets: Vec<String>,
 }
 
 impl Screen {
@@ -234,7 +237,7 @@ impl Screen {
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
-                    eprintln!("waiting for {role}: start it with\n  {}", by_hand(role, domain));
+                    eprintln!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain));
                     eprintln!("or give a program of your own the seat\n  {}", seat_path(domain, role).display());
                 }
             }
@@ -247,22 +250,24 @@ impl Screen {
         }
     }
 
+    fn by_hand(&self, role: &str, domain: &Path) -> String {
+        let domain = domain.display();
+        match role {
+            "observer" | "controller" => format!("corotate {role} --domain {domain}"),
+            body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
+                format!("corotate plant --body {body} --domain {domain}")
+            }
+            body => format!(
+                "corotate plant --body {body} --domain {domain}\nor put a device there with\n  \
+                 corotate bridge --serial PATH --body {body} --domain {domain}"
+            ),
+        }
+    }
+
     fn clear(&mut self) {
         if let Some(bar) = self.bar.take() {
             bar.finish_and_clear();
         }
-    }
-}
-
-fn by_hand(role: &str, domain: &Path) -> String {
-    let domain = domain.display();
-    match role {
-        "observer" | "controller" => format!("corotate {role} --domain {domain}"),
-        "leader" => format!("corotate plant --body {role} --domain {domain}"),
-        body => format!(
-            "corotate plant --body {body} --domain {domain}\nor put a device there with\n  \
-             corotate bridge --serial PATH --body {body} --domain {domain}"
-        ),
     }
 }
 
