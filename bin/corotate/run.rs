@@ -40,6 +40,9 @@ pub struct Arguments {
     /// Write the verdict to this file as JUnit XML, one test case per criterion
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
+    /// Record every sample to run.mcap in the directory for the results
+    #[arg(long)]
+    record: bool,
     /// Print the summary as one JSON object on stdout, everything else on stderr
     #[arg(long)]
     json: bool,
@@ -49,7 +52,8 @@ impl Arguments {
     fn overrides(&self) -> Vec<String> {
         let named = [("clock", &self.clock), ("duration_s", &self.duration), ("tick_hz", &self.tick_hz)];
         let named = named.into_iter().filter_map(|(key, value)| value.as_ref().map(|value| format!("{key}={value}")));
-        self.set.iter().cloned().chain(named).collect()
+        let record = self.record.then(|| "record=true".to_owned());
+        self.set.iter().cloned().chain(named).chain(record).collect()
     }
 
     /// What to call the run where the scenario's name is not known.
@@ -139,6 +143,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
         &mut Launch {
             program,
             external: arguments.external.clone(),
+            record: scenario.record.then(|| directory.join("run.mcap")),
             require_realtime: arguments.require_rt,
             signal: &signal,
             progress: &mut |progress| screen.show(progress),
@@ -171,6 +176,9 @@ fn verdict(summary: &Summary) -> Exit {
     if summary.incidents.iter().any(|incident| incident.action == Action::Stopped) {
         return Exit::ProcessLost;
     }
+    if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
+        return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+    }
     if summary.signal != 0 {
         eprintln!("corotate: ended in order by signal {}", summary.signal);
         return Exit::Signal(summary.signal);
@@ -182,7 +190,8 @@ fn verdict(summary: &Summary) -> Exit {
     if summary.accepted { Exit::Ok } else { Exit::NotAccepted }
 }
 
-fn exit_of(error: &LaunchError) -> Exit {
+/// The exit code of a run, or a replay, that failed.
+pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
@@ -191,6 +200,7 @@ fn exit_of(error: &LaunchError) -> Exit {
         | LaunchError::Bus(_)
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }
+        | LaunchError::Record(_)
         | LaunchError::Spawn { .. } => Exit::Failure,
     }
 }

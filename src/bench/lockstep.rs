@@ -64,6 +64,7 @@ fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Resu
     let mut launch = Launch {
         program: bench.program.clone(),
         external: Vec::new(),
+        record: None,
         require_realtime: false,
         signal: &end,
         progress: &mut |progress| {

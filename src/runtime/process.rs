@@ -120,7 +120,7 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
 }
 
 /// The domain of a run with its scenario.
-pub(super) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
+pub(crate) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let domain = Domain::join(directory)?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
     Ok((domain, scenario))
