@@ -28,7 +28,8 @@ fn lock_memory() -> io::Result<()> {
             let (limit, enough) = (limit >> 10, ENOUGH_LOCKED >> 10);
             Err(io::Error::other(format!("the memlock limit is {limit} KiB, and less than {enough} is not safe")))
         }
-        _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?),
+        // What is touched stays; what is never touched, as most of the program, takes no memory. The warm-up touches the rest.
+        _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT)?),
     }
 }
 
