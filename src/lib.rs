@@ -18,6 +18,7 @@
 //! | `shared` | words of memory that processes share | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
+//! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
 //! | `bench` | what all of it costs beside its floors | no |
 //!
@@ -47,6 +48,8 @@ pub mod clock;
 pub mod config;
 #[cfg(feature = "runtime")]
 pub mod launch;
+#[cfg(feature = "runtime")]
+pub mod record;
 #[cfg(feature = "runtime")]
 pub mod rig;
 #[cfg(feature = "runtime")]

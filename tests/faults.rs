@@ -49,6 +49,7 @@ impl Disturbed {
         let mut launch = Launch {
             program: PathBuf::new(),
             external: Vec::new(),
+            record: None,
             require_realtime: false,
             signal: &AtomicUsize::new(0),
             progress: &mut |_| {},

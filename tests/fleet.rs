@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{Bench, send_signal, shipped};
+use common::{Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
 use corotate::config::Scenario;
@@ -145,6 +145,35 @@ fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
     assert_eq!(summary["incidents"][0]["role"], "fleet", "{summary:#}");
     assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
     bench.assert_clean(&domains);
+}
+
+/// Started by hand, which a device cannot be, it gives the bits of one that the launcher starts; its seat tells of slices.
+#[test]
+fn a_fleet_may_be_started_by_hand_and_is_no_device() {
+    let bench = Bench::new();
+    let short = ["duration_s=0.4", "follower.0.count=50"];
+    let whole = hash(&bench, "in-process", &short).0;
+    let file = shipped("rigid-fleet");
+    let sets = short.iter().flat_map(|set| ["--set", set]);
+    let run =
+        ["run", file.to_str().unwrap(), "--json", "--set", "accept={}", "--clock", "lockstep", "--external", "fleet"];
+    let running = bench.start(&run.into_iter().chain(sets).collect::<Vec<_>>());
+    let seat = await_some(|| {
+        let seat = bench.domains().first()?.join("fleet.seat.json");
+        seat.is_file().then_some(seat)
+    });
+    let told: Value = serde_json::from_slice(&std::fs::read(&seat).unwrap()).unwrap();
+    assert_eq!((&told["writes"][1]["slice"], &told["writes"][1]["size"]), (&true.into(), &(8 * (6 + 6 * 50)).into()));
+    assert_eq!((&told["health"]["slice"], &told["reads"][0]["slice"]), (&false.into(), &true.into()));
+    let domain = seat.parent().unwrap().to_str().unwrap();
+    let refused = bench.run(&["bridge", "--serial", "/dev/null", "--body", "fleet", "--domain", domain]);
+    assert!(refused.code == Some(2) && refused.stderr.contains("no fleet, and `fleet` is none"), "{refused:?}");
+    let served = bench.run(&["plant", "--body", "fleet", "--domain", domain]);
+    assert_eq!(served.code, Some(0), "{served:?}");
+    let done = running.wait();
+    assert!(done.stderr.contains("corotate plant --body fleet") && !done.stderr.contains("bridge"), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["state"]["hash"], whole, "{summary:#}");
 }
 
 #[test]

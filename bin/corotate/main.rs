@@ -3,7 +3,11 @@
 mod bench;
 mod bridge;
 mod check;
+mod diff;
+mod export;
 mod init;
+mod record;
+mod replay;
 mod role;
 mod run;
 mod seat;
@@ -11,6 +15,7 @@ mod seat;
 use clap::{Parser, Subcommand};
 use std::io::{self, Write};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 /// Bodies move together although not everything about them can be measured.
 ///
@@ -55,6 +60,14 @@ enum Command {
     Controller(role::Arguments),
     /// Put a device behind a serial line into a driven body's seat in a run
     Bridge(bridge::Arguments),
+    /// Record every sample of a running loop to a file
+    Record(record::Arguments),
+    /// Feed a recording to the live roles and compare what they say, bit for bit
+    Replay(replay::Arguments),
+    /// Compare two recordings
+    Diff(diff::Arguments),
+    /// Write a recording as tables
+    Export(export::Arguments),
     /// Measure what everything costs beside its floors, on this machine
     Bench(bench::Arguments),
     /// Take the other end of a hop that is measured
@@ -115,6 +128,8 @@ fn say(text: &str) -> Result<(), Exit> {
 }
 
 fn main() -> ExitCode {
+    // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
+    let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
     let exit = match Arguments::parse().command {
         None => run::run(&run::Arguments::default()),
         Some(Command::Run(arguments)) => run::run(&arguments),
@@ -125,6 +140,10 @@ fn main() -> ExitCode {
         Some(Command::Observer(arguments)) => role::role("observer", &arguments),
         Some(Command::Controller(arguments)) => role::role("controller", &arguments),
         Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
+        Some(Command::Record(arguments)) => record::record(&arguments),
+        Some(Command::Replay(arguments)) => replay::replay(&arguments),
+        Some(Command::Diff(arguments)) => diff::diff(&arguments),
+        Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {

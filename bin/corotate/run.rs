@@ -40,6 +40,9 @@ pub struct Arguments {
     /// Write the verdict to this file as JUnit XML, one test case per criterion
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
+    /// Record every sample to run.mcap in the directory for the results
+    #[arg(long)]
+    record: bool,
     /// Print the summary as one JSON object on stdout, everything else on stderr
     #[arg(long)]
     json: bool,
@@ -49,7 +52,8 @@ impl Arguments {
     fn overrides(&self) -> Vec<String> {
         let named = [("clock", &self.clock), ("duration_s", &self.duration), ("tick_hz", &self.tick_hz)];
         let named = named.into_iter().filter_map(|(key, value)| value.as_ref().map(|value| format!("{key}={value}")));
-        self.set.iter().cloned().chain(named).collect()
+        let record = self.record.then(|| "record=true".to_owned());
+        self.set.iter().cloned().chain(named).chain(record).collect()
     }
 
     /// What to call the run where the scenario's name is not known.
@@ -122,12 +126,15 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
-    let mut screen = Screen::default();
+    let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
+    let fleets = fleets.map(|body| body.name.clone()).collect();
+    let mut screen = Screen { bar: None, asked: false, fleets };
     let outcome = corotate::launch::run(
         scenario,
         &mut Launch {
             program,
             external: arguments.external.clone(),
+            record: scenario.record.then(|| directory.join("run.mcap")),
             require_realtime: arguments.require_rt,
             signal: &signal,
             progress: &mut |progress| screen.show(progress),
@@ -160,6 +167,9 @@ fn verdict(summary: &Summary) -> Exit {
     if summary.incidents.iter().any(|incident| incident.action == Action::Stopped) {
         return Exit::ProcessLost;
     }
+    if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
+        return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+    }
     if summary.signal != 0 {
         eprintln!("corotate: ended in order by signal {}", summary.signal);
         return Exit::Signal(summary.signal);
@@ -171,7 +181,8 @@ fn verdict(summary: &Summary) -> Exit {
     if summary.accepted { Exit::Ok } else { Exit::NotAccepted }
 }
 
-fn exit_of(error: &LaunchError) -> Exit {
+/// The exit code of a run, or a replay, that failed.
+pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
@@ -180,6 +191,7 @@ fn exit_of(error: &LaunchError) -> Exit {
         | LaunchError::Bus(_)
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }
+        | LaunchError::Record(_)
         | LaunchError::Spawn { .. } => Exit::Failure,
     }
 }
@@ -213,10 +225,11 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
 }
 
 /// Progress on a terminal; silence elsewhere, but for what a person must do.
-#[derive(Default)]
 struct Screen {
     bar: Option<ProgressBar>,
     asked: bool,
+    /// The bodies that are many, and that no device can be.
+    fleets: Vec<String>,
 }
 
 impl Screen {
@@ -225,7 +238,7 @@ impl Screen {
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
-                    eprintln!("waiting for {role}: start it with\n  {}", by_hand(role, domain));
+                    eprintln!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain));
                     eprintln!("or give a program of your own the seat\n  {}", seat_path(domain, role).display());
                 }
             }
@@ -238,22 +251,24 @@ impl Screen {
         }
     }
 
+    fn by_hand(&self, role: &str, domain: &Path) -> String {
+        let domain = domain.display();
+        match role {
+            "observer" | "controller" => format!("corotate {role} --domain {domain}"),
+            body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
+                format!("corotate plant --body {body} --domain {domain}")
+            }
+            body => format!(
+                "corotate plant --body {body} --domain {domain}\nor put a device there with\n  \
+                 corotate bridge --serial PATH --body {body} --domain {domain}"
+            ),
+        }
+    }
+
     fn clear(&mut self) {
         if let Some(bar) = self.bar.take() {
             bar.finish_and_clear();
         }
-    }
-}
-
-fn by_hand(role: &str, domain: &Path) -> String {
-    let domain = domain.display();
-    match role {
-        "observer" | "controller" => format!("corotate {role} --domain {domain}"),
-        "leader" => format!("corotate plant --body {role} --domain {domain}"),
-        body => format!(
-            "corotate plant --body {body} --domain {domain}\nor put a device there with\n  \
-             corotate bridge --serial PATH --body {body} --domain {domain}"
-        ),
     }
 }
 

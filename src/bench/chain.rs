@@ -67,6 +67,7 @@ pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64) -> Result<O
     let mut launch = Launch {
         program: bench.program.clone(),
         external: Vec::new(),
+        record: None,
         require_realtime: false,
         signal: bench.signal,
         progress: &mut |_| {},

@@ -3,7 +3,8 @@
 //! Must not compute a figure: what is not on the board is not told.
 
 use super::{Bench, Board, Figure, Row, TARGETS, Verdict};
-use crate::launch::{Host, plain};
+use crate::launch::plain;
+use crate::telemetry::Host;
 use crate::telemetry::{Grant, write_hgrm};
 use serde::Serialize;
 use std::fmt::Write as _;

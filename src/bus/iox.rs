@@ -108,11 +108,10 @@ fn history(signal: Signal, depths: Depths) -> usize {
     }
 }
 
-/// Only what is scored needs room for the scorer.
+/// What is scored or recorded needs room for those who look only now and then.
 fn deepest(signal: Signal, depths: Depths) -> usize {
     match signal {
-        Signal::Truth | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
-        Signal::Measurement => depths.role,
+        Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
         Signal::Health | Signal::Schedule => 1,
     }
 }

@@ -69,7 +69,7 @@ pub enum BusError {
 pub enum Reader {
     /// A role: the newest sample only in real time, all of them in lockstep.
     Role,
-    /// The scorer, which looks only now and then but wants every sample.
+    /// The scorer or the recorder, which look only now and then but want every sample.
     Scorer,
 }
 

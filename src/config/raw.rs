@@ -19,6 +19,8 @@ pub(super) struct Raw {
     #[serde(default = "default_seed")]
     pub seed: u64,
     #[serde(default)]
+    pub record: bool,
+    #[serde(default)]
     pub actuator: Actuator,
     #[serde(default)]
     pub realtime: Realtime,

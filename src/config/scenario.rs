@@ -46,6 +46,10 @@ pub struct Scenario {
     pub period_ns: u64,
     /// The last tick; the first is 0.
     pub last_tick: u64,
+    /// The seed of all randomness.
+    pub seed: u64,
+    /// Whether every sample is to be recorded.
+    pub record: bool,
     /// After how many missing commands a driven body goes to its safe command.
     pub command_timeout_ticks: u64,
     /// What ends the safe command.
@@ -122,6 +126,8 @@ impl Scenario {
             clock: raw.clock,
             period_ns,
             last_tick,
+            seed: raw.seed,
+            record: raw.record,
             command_timeout_ticks: raw.actuator.command_timeout_ticks,
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,

@@ -40,10 +40,16 @@ impl RoleProcess {
     pub fn start(program: &Path, scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
         let name = role.name(scenario).to_owned();
         let mut command = Command::new(program);
-        command.arg(role.kind()).arg("--domain").arg(domain.root()).arg("--parent").arg(std::process::id().to_string());
+        command.arg(role.kind()).arg("--domain").arg(domain.root());
         if let RoleId::Plant(_) = role {
             command.arg("--body").arg(&name);
         }
+        Self::spawn(command, name)
+    }
+
+    /// Starts what dies with this process and is listened to under a name.
+    pub fn spawn(mut command: Command, name: String) -> Result<Self, LaunchError> {
+        command.arg("--parent").arg(std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the launcher alone, and the launcher ends the roles in order.
         command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|source| LaunchError::Spawn { role: name.clone(), source })?;

@@ -5,8 +5,9 @@ use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
 use crate::config::{OnFailure, Scenario};
+use crate::record::Recorder;
 use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
-use crate::telemetry::Ledger;
+use crate::telemetry::{Ledger, RoleReport};
 use crate::with_rig;
 use std::cell::RefCell;
 use std::sync::atomic::Ordering;
@@ -36,9 +37,17 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         successor.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, tick);
         Ok(Some(successor))
     };
-    let mut failure = None;
+    let mut recorder = launch.record.as_deref().map(|file| Recorder::open(scenario, &bus, file)).transpose()?;
+    if let Some(recorder) = &mut recorder {
+        recorder.start(0, true)?;
+    }
+    let (mut failure, mut unrecorded) = (None, None);
     let ended = in_turn(&mut nodes, scenario.last_tick, revive, |tick| {
         let mut scorer = scorer.borrow_mut();
+        if let (Some(recorder), None) = (&mut recorder, &unrecorded) {
+            unrecorded = recorder.poll().err();
+            unrecorded.iter().for_each(|error| eprintln!("corotate: {error}; the run goes on"));
+        }
         match scorer.poll(1) {
             Ok(_) => proceed(&**scorer, scenario, launch, tick),
             Err(error) => {
@@ -54,8 +63,16 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     for (incident, recovery_s) in incidents.iter_mut().zip(&score.recoveries_s) {
         incident.recovery_s = *recovery_s;
     }
+    let reports: Vec<RoleReport> =
+        seats.iter().map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new())).collect();
+    let recording = recorder.map(|mut recorder| {
+        // What was sent after the last look, if the run was stopped in the midst of a tick.
+        let last = if unrecorded.is_none() { recorder.poll().err() } else { unrecorded };
+        recorder.finish(&reports, last.as_ref())
+    });
     Ok(Outcome {
-        reports: seats.iter().map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new())).collect(),
+        reports,
+        recording,
         unbooked: Vec::new(),
         problems: Vec::new(),
         score,

@@ -7,6 +7,8 @@ mod in_process;
 mod junit;
 mod outcome;
 mod processes;
+mod recorder;
+mod replay;
 mod score;
 mod supervision;
 mod table;
@@ -14,8 +16,8 @@ mod trace;
 
 pub use children::janitor;
 pub use junit::junit;
-pub(crate) use outcome::Host;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
+pub use replay::replay_as_process;
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
 pub(crate) use table::plain;
@@ -24,6 +26,7 @@ pub use table::{line_words, table};
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
+use crate::record::RecordError;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;
 use std::path::PathBuf;
@@ -35,6 +38,8 @@ pub struct Launch<'a> {
     pub program: PathBuf,
     /// Roles that somebody else starts, besides the scenario's own.
     pub external: Vec<String>,
+    /// The file to record every sample to.
+    pub record: Option<PathBuf>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
     /// The signal that asked the run to end; 0 while none has.
@@ -128,6 +133,9 @@ pub enum LaunchError {
         /// The roles.
         roles: String,
     },
+    /// The recording could not be begun, or not be written where nobody else does.
+    #[error(transparent)]
+    Record(#[from] RecordError),
     /// A privilege was required and not granted.
     #[error("required and not granted: {}", denied.iter().map(|(role, grant)| format!("{role}: {} {} ({})", grant.privilege, grant.asked, grant.reason)).collect::<Vec<_>>().join("; "))]
     Privileges {

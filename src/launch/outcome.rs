@@ -4,11 +4,13 @@
 
 use super::{Action, Incident, Score};
 use crate::config::Scenario;
+use crate::record::RecordingReport;
 use crate::rig::{CertificateReport, Figure};
 use crate::runtime::RoleId;
 use crate::serial::LineBook;
 use crate::telemetry::{
-    Grant, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm, write_hlog,
+    Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm,
+    write_hlog,
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -34,6 +36,8 @@ pub struct Outcome {
     pub incidents: Vec<Incident>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
+    /// What was recorded, if that was asked for.
+    pub recording: Option<RecordingReport>,
     /// The domain that was used, if there was one.
     pub domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
@@ -87,6 +91,9 @@ pub struct Summary {
     /// The books of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineBook>,
+    /// What was recorded, if that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordingReport>,
     /// Everything that was asked of the machine.
     pub privileges: Vec<RoleGrant>,
 }
@@ -191,14 +198,6 @@ pub struct RoleGrant {
     pub grant: Grant,
 }
 
-#[derive(Debug, Serialize)]
-pub(crate) struct Host {
-    pub name: String,
-    pub kernel: String,
-    pub cores: usize,
-    pub cpu: String,
-}
-
 impl Summary {
     /// Draws up the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
@@ -235,6 +234,7 @@ impl Summary {
             books,
             latencies,
             lines: lines(&outcome.reports),
+            recording: outcome.recording.clone(),
             privileges: privileges(outcome),
         }
     }
@@ -426,20 +426,6 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
         add("step_latency_p99_us_max".to_owned(), limit, worst, judged);
     }
     criteria
-}
-
-impl Host {
-    pub(crate) fn this() -> Self {
-        let system = rustix::system::uname();
-        let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-        let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-        Self {
-            name: system.nodename().to_string_lossy().into_owned(),
-            kernel: format!("{} {}", system.release().to_string_lossy(), system.version().to_string_lossy()),
-            cores: std::thread::available_parallelism().map_or(0, usize::from),
-            cpu: model.map_or("unknown".to_owned(), |(_, name)| name.trim().to_owned()),
-        }
-    }
 }
 
 /// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `hashes.txt`, `latency/`.

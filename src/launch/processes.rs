@@ -3,6 +3,7 @@
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
 use super::children::{END_LIMIT, Janitor, RoleProcess};
+use super::recorder::RecorderWatch;
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
@@ -60,9 +61,10 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;
     let Dismissal { reports, unbooked, problems } = crew.dismiss();
     let score = scorer.finish()?;
-    let incidents = crew.incidents(&score.recoveries_s);
+    let (incidents, recorder) = crew.incidents(&score.recoveries_s);
+    let recording = recorder.finish(domain, &reports);
     let domain = Some(domain.root().to_owned());
-    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, domain, signal })
+    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal })
 }
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
@@ -126,6 +128,7 @@ struct Crew<'a> {
     schedule: <IoxBus as Bus>::Writer<Schedule>,
     word: Schedule,
     incidents: Vec<Incident>,
+    recorder: RecorderWatch,
 }
 
 impl<'a> Crew<'a> {
@@ -136,6 +139,7 @@ impl<'a> Crew<'a> {
         bus: &'a IoxBus,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
+        let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
         // All of them first: they come up while their links are opened here.
         let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
             true => Ok((role, None)),
@@ -146,7 +150,7 @@ impl<'a> Crew<'a> {
         let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
         let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
-        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents })
+        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder })
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -196,8 +200,9 @@ impl<'a> Crew<'a> {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
+            let recording = self.recorder.ready()?;
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
-            if missing.is_empty() {
+            if missing.is_empty() && recording {
                 return Ok(true);
             }
             if launch.signal.load(Ordering::Relaxed) != 0 {
@@ -222,8 +227,9 @@ impl<'a> Crew<'a> {
         let (mut next_look_ns, mut somebody_ended) = (0, false);
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
             let scored = scorer.poll(CREDIT_TICKS)?;
-            if lockstep && scored > 0 {
-                self.word.credit_tick = scorer.next_tick();
+            let credit = if lockstep { self.recorder.credit(scorer.next_tick())? } else { 0 };
+            if credit > self.word.credit_tick {
+                self.word.credit_tick = credit;
                 self.announce()?;
                 backoff = Backoff::default();
             }
@@ -257,6 +263,7 @@ impl<'a> Crew<'a> {
     /// Notices roles that have failed and brings them back; false if the run is to end for that.
     fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
+        self.recorder.supervise(self.bus);
         for member in &mut self.members {
             if let Some(failure) = member.failure(self.scenario, self.bus) {
                 let incident = member.fail(failure, self.scenario, now_ns);
@@ -296,6 +303,7 @@ impl<'a> Crew<'a> {
     /// Hears how the roles are.
     fn listen(&mut self) -> Result<(), BusError> {
         let now_ns = monotonic_ns();
+        self.recorder.listen()?;
         self.members.iter_mut().try_for_each(|member| member.listen(now_ns))
     }
 
@@ -320,6 +328,12 @@ impl<'a> Crew<'a> {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
+        // The recorder stays until nobody sends any more.
+        let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
+        while self.recorder.lingers() && monotonic_ns() < limit_ns {
+            let _ = self.announce();
+            self.pause(monotonic_ns() + LOOK_NS);
+        }
         let mut dismissal = Dismissal::default();
         for member in &mut self.members {
             let reported = report_path(self.domain.root(), &member.name).exists();
@@ -335,14 +349,11 @@ impl<'a> Crew<'a> {
         dismissal
     }
 
-    /// What happened, with the scorer's times of recovery.
-    fn incidents(self, recoveries_s: &[Option<f64>]) -> Vec<Incident> {
+    /// What happened, with the scorer's times of recovery; and the recorder, which has yet to end.
+    fn incidents(self, recoveries_s: &[Option<f64>]) -> (Vec<Incident>, RecorderWatch) {
         let recoveries = recoveries_s.iter().copied().chain(std::iter::repeat(None));
-        self.incidents
-            .into_iter()
-            .zip(recoveries)
-            .map(|(incident, recovery_s)| Incident { recovery_s, ..incident })
-            .collect()
+        let recovered = self.incidents.into_iter().zip(recoveries);
+        (recovered.map(|(incident, recovery_s)| Incident { recovery_s, ..incident }).collect(), self.recorder)
     }
 }
 

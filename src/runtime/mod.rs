@@ -21,13 +21,13 @@ pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
     Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report, topic,
-    visit_writes,
+    visit_reads, visit_writes,
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{release as release_priority, take as take_privileges};
 pub use process::{RoleError, RoleSeat, run_role, serve};
-pub(crate) use process::{open_ledger, report_path, scenario_path, write_whole};
+pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

@@ -9,7 +9,7 @@ mod observer;
 mod plant;
 mod ports;
 
-pub use ports::{Port, Ports, Visit, ports, visit_writes};
+pub use ports::{Port, Ports, Visit, ports, visit_reads, visit_writes};
 
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
@@ -290,9 +290,9 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
         let Ports { writes, health, .. } = ports(scenario, role);
         writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
     };
-    COMMON_BYTES
-        + port(&ports(scenario, RoleId::Observer).schedule)
-        + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
+    let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
+    // The recorder says how it is, as the roles do.
+    COMMON_BYTES + port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
 /// The tick that a role has not finished, by its ledger.

@@ -142,7 +142,7 @@ pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), R
 }
 
 /// The domain of a run with its scenario.
-pub(super) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
+pub(crate) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let domain = Domain::join(directory)?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
     Ok((domain, scenario))

@@ -5,6 +5,7 @@
 mod books;
 mod export;
 mod hash;
+mod host;
 mod latency;
 mod ledger;
 mod report;
@@ -12,6 +13,7 @@ mod report;
 pub use books::{ReadBook, TickBook, WatchBook, WriteBook};
 pub use export::{write_hgrm, write_hlog};
 pub use hash::{Checkpoints, StateHash, combine};
+pub use host::Host;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};
 pub use ledger::{Ledger, LedgerError, Words};
 pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

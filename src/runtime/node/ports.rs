@@ -61,7 +61,7 @@ pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
     let describe = &mut Describe;
     Ports {
         writes: visit_writes(scenario, role, describe),
-        reads: with_rig!(&scenario.rig, rig => reads(rig, scenario, role, describe)),
+        reads: visit_reads(scenario, role, describe),
         health: describe.visit::<Health>(topic(scenario, role.name(scenario), Signal::Health)),
         schedule: describe.visit::<Schedule>(topic(scenario, "run", Signal::Schedule)),
     }
@@ -70,6 +70,11 @@ pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
 /// Visits the signals that a role writes for the loop, in their order.
 pub fn visit_writes<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
     with_rig!(&scenario.rig, rig => writes(rig, scenario, role, visit))
+}
+
+/// Visits the signals that a role reads of the loop, in their order.
+pub fn visit_reads<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
+    with_rig!(&scenario.rig, rig => reads(rig, scenario, role, visit))
 }
 
 /// The layouts of a rig's fleets.

@@ -1,0 +1,42 @@
+//! `corotate export`: a recording as tables.
+
+use crate::record::exit_of;
+use crate::{Exit, fail, say};
+use corotate::record::{Recording, export_csv};
+use std::path::PathBuf;
+
+/// Options of `corotate export`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The recording
+    file: PathBuf,
+    /// Write one CSV file per signal into this directory
+    #[arg(long, value_name = "DIR")]
+    csv: PathBuf,
+}
+
+const EXAMPLES: &str = "\
+Every sample is a row: time in the run in s, when it was received in ns, and every element of every field. Numbers read back
+to the same bits.
+
+Example:
+  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --csv tables
+  head -2 tables/leader.estimate.csv";
+
+/// Exports.
+pub fn export(arguments: &Arguments) -> Exit {
+    let files = Recording::open(&arguments.file).and_then(|recording| {
+        if let Some(damage) = recording.damage() {
+            eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
+        }
+        export_csv(&recording, &arguments.csv)
+    });
+    match files {
+        Ok(files) => {
+            let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
+            say(&lines).err().unwrap_or(Exit::Ok)
+        }
+        Err(error) => fail(exit_of(&error), &error),
+    }
+}

@@ -1,0 +1,146 @@
+//! The recorder of a run, seen from the launcher: started beside the roles, or by somebody else while they run.
+//!
+//! In lockstep nobody gets ahead of it by more than the window, as of the scorer. Must not let a recorder that died, or says
+//! nothing any more, hold the run up.
+
+use super::LaunchError;
+use super::children::RoleProcess;
+use crate::bus::domain::Domain;
+use crate::bus::iox::IoxBus;
+use crate::bus::{Bus, BusError, Read, Reader, Signal};
+use crate::clock::monotonic_ns;
+use crate::config::Scenario;
+use crate::record::{RECORDER, RecordingReport};
+use crate::runtime::{report_path, topic};
+use crate::sample::{Health, RoleState};
+use crate::telemetry::RoleReport;
+use std::path::Path;
+use std::process::Command;
+
+/// The most that one look adds to its silence, ns: a launcher that stood still blames nobody.
+const LOOK_MAX_NS: u64 = 100_000_000;
+
+/// A run's recorder, if it has one.
+pub(super) struct RecorderWatch {
+    process: Option<RoleProcess>,
+    /// The name of the file, for a recorder of ours.
+    file: Option<String>,
+    health: <IoxBus as Bus>::Reader<Health>,
+    last: Health,
+    silent_ns: u64,
+    looked_ns: u64,
+    limit_ns: u64,
+    problem: Option<String>,
+}
+
+impl RecorderWatch {
+    /// Starts a recorder to `file`; without one, looks out for somebody else's.
+    pub fn start(
+        program: &Path,
+        file: Option<&Path>,
+        scenario: &Scenario,
+        domain: &Domain,
+        bus: &IoxBus,
+    ) -> Result<Self, LaunchError> {
+        let start = |file: &Path| {
+            let mut command = Command::new(program);
+            command.arg("record").arg("--domain").arg(domain.root()).arg("--out").arg(file);
+            RoleProcess::spawn(command, RECORDER.to_owned())
+        };
+        Ok(Self {
+            health: bus.reader(&topic(scenario, RECORDER, Signal::Health), Reader::Role)?,
+            process: file.map(start).transpose()?,
+            file: file.map(|file| file.file_name().unwrap_or_default().to_string_lossy().into_owned()),
+            last: Health::default(),
+            silent_ns: 0,
+            looked_ns: monotonic_ns(),
+            limit_ns: (scenario.supervision.heartbeat_timeout_s * 1e9) as u64,
+            problem: None,
+        })
+    }
+
+    /// Hears how it is.
+    pub fn listen(&mut self) -> Result<(), BusError> {
+        let now_ns = monotonic_ns();
+        self.silent_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
+        self.looked_ns = now_ns;
+        while self.health.advance()? {
+            if let Some(health) = self.health.current() {
+                (self.last, self.silent_ns) = (*health, 0);
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the ticks may run; how it failed if they never will.
+    pub fn ready(&mut self) -> Result<bool, LaunchError> {
+        let Some(process) = &mut self.process else { return Ok(true) };
+        if let Some(status) = process.ended() {
+            let failure = process.failure(status);
+            let (cause, last_words) = (failure.cause, failure.last_words);
+            return Err(LaunchError::Died { role: RECORDER.to_owned(), cause, last_words });
+        }
+        Ok(self.state() >= RoleState::Ready)
+    }
+
+    /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder.
+    pub fn credit(&mut self, scored: u64) -> Result<u64, BusError> {
+        self.listen()?;
+        Ok(if self.active() { self.last.stamp.tick.min(scored) } else { scored })
+    }
+
+    /// Looks whether it has failed: then the run goes on without.
+    pub fn supervise(&mut self, bus: &IoxBus) {
+        if self.problem.is_some() || self.state() == RoleState::Done {
+            return;
+        }
+        let ended = self.process.as_mut().and_then(|process| process.ended().map(|status| process.failure(status)));
+        let silent = self.active() && self.silent_ns > self.limit_ns;
+        let problem = match ended {
+            Some(failure) => failure.cause,
+            None if silent => {
+                self.process.as_mut().map(RoleProcess::kill);
+                "it said nothing any more".to_owned()
+            }
+            None => return,
+        };
+        eprintln!("corotate: the recorder failed: {problem}; the run goes on without");
+        self.problem = Some(problem);
+        bus.clear_dead();
+    }
+
+    /// Whether it still writes: a process of ours has not ended, or somebody else's has not said that it is done.
+    pub fn lingers(&mut self) -> bool {
+        // Nothing is lost but its last words if the link has failed.
+        let _ = self.listen();
+        match &mut self.process {
+            Some(process) => process.ended().is_none(),
+            None => self.active(),
+        }
+    }
+
+    /// Tells what is in the file, beside the roles' final books. A recorder that has not ended by now is ended.
+    pub fn finish(mut self, domain: &Domain, roles: &[RoleReport]) -> Option<RecordingReport> {
+        let file = self.file.take()?;
+        self.process = None;
+        let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
+        let report = left.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        let mut report: RecordingReport = report.unwrap_or_else(|| {
+            let problem = self.problem.unwrap_or_else(|| "it left no report".to_owned());
+            let (messages, bytes, signals) = (0, 0, Vec::new());
+            RecordingReport { file, complete: false, whole: true, problem: Some(problem), messages, bytes, signals }
+        });
+        report.reconcile(roles);
+        Some(report)
+    }
+
+    /// Whether there is one that takes samples, or is about to: from its first word on.
+    fn active(&self) -> bool {
+        let records = (RoleState::Ready..RoleState::Done).contains(&self.state());
+        records && self.problem.is_none() && self.health.written()
+    }
+
+    fn state(&self) -> RoleState {
+        RoleState::from_number(self.last.state)
+    }
+}

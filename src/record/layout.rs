@@ -1,0 +1,149 @@
+//! The layout of a sample as a recording tells it: a ROS 2 message definition, made of the table that seats are made of.
+//!
+//! A sample's bytes are the body of that message in little-endian CDR: every field is naturally aligned, so nothing is
+//! transformed. Must not know files.
+
+use crate::sample::{Field, FieldKind, Stamp};
+use std::fmt::Write;
+
+/// What comes before the body of a message: little-endian CDR, no options.
+pub const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
+
+/// One field of a recorded layout.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Column {
+    /// Its name; the unit is its last part.
+    pub name: String,
+    /// The type of its elements.
+    pub kind: FieldKind,
+    /// How many elements.
+    pub count: usize,
+    /// Bytes from the start of the sample.
+    pub offset: usize,
+}
+
+impl Column {
+    /// The names of its elements: its own, or with an index for each.
+    pub fn elements(&self) -> impl Iterator<Item = String> + '_ {
+        let one = self.count == 1;
+        (0..self.count).map(move |index| if one { self.name.clone() } else { format!("{}[{index}]", self.name) })
+    }
+}
+
+/// The layout of a sample.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layout {
+    /// Name and version.
+    pub type_name: String,
+    /// All fields, the stamp's first.
+    pub columns: Vec<Column>,
+}
+
+impl Layout {
+    /// The layout of a sample of ours.
+    pub fn of(type_name: &str, fields: &[Field]) -> Self {
+        let column = |field: &Field| Column {
+            name: field.name.to_owned(),
+            kind: field.kind,
+            count: field.count,
+            offset: field.offset,
+        };
+        Self { type_name: type_name.to_owned(), columns: Stamp::FIELDS.iter().chain(fields).map(column).collect() }
+    }
+
+    /// Reads a message definition that [`definition`](Self::definition) wrote; none if it is of another kind.
+    pub fn parse(definition: &str) -> Option<Self> {
+        let type_name = definition.lines().next()?.strip_prefix("# ")?.to_owned();
+        let (mut columns, mut offset) = (Vec::new(), 0_usize);
+        let lines = definition.lines().map(|line| line.split_once('#').map_or(line, |(code, _)| code).trim());
+        for line in lines.filter(|line| !line.is_empty()) {
+            let (of, name) = line.split_once(' ')?;
+            let (element, count) = match of.split_once('[') {
+                Some((element, count)) => (element, count.strip_suffix(']')?.parse().ok()?),
+                None => (of, 1_usize),
+            };
+            let kind = match element {
+                "uint64" => FieldKind::U64,
+                "float64" => FieldKind::F64,
+                _ => return None,
+            };
+            columns.push(Column { name: name.trim().to_owned(), kind, count, offset });
+            offset = count.checked_mul(8).and_then(|bytes| offset.checked_add(bytes))?;
+        }
+        let stamped = Stamp::FIELDS.iter().zip(&columns).filter(|(own, read)| own.name == read.name).count();
+        (stamped == Stamp::FIELDS.len()).then_some(Self { type_name, columns })
+    }
+
+    /// The length of a sample, bytes.
+    pub fn size(&self) -> usize {
+        self.columns.iter().map(|column| 8 * column.count).sum()
+    }
+
+    /// The message definition (`ros2msg`). Its first line is the sample's own name.
+    pub fn definition(&self) -> String {
+        let mut text = format!("# {}\n", self.type_name);
+        for Column { name, kind, count, .. } in &self.columns {
+            let kind = match kind {
+                FieldKind::U64 => "uint64",
+                FieldKind::F64 => "float64",
+            };
+            let array = if *count == 1 { String::new() } else { format!("[{count}]") };
+            // Writing to a string does not fail.
+            let _ = writeln!(text, "{kind}{array} {name}");
+        }
+        text
+    }
+
+    /// The message's name: `corotate/rigid-body/truth/v1` is `corotate/msg/RigidBodyTruthV1`.
+    pub fn message_name(&self) -> String {
+        let words = self.type_name.split(['/', '-']).skip(1);
+        let capital = |word: &str| {
+            let mut letters = word.chars();
+            letters.next().map_or(String::new(), |first| first.to_ascii_uppercase().to_string() + letters.as_str())
+        };
+        format!("corotate/msg/{}", words.map(capital).collect::<String>())
+    }
+
+    /// The layout on one line, for people.
+    pub fn words(&self) -> String {
+        let word = |column: &Column| match column.count {
+            1 => column.name.clone(),
+            count => format!("{}[{count}]", column.name),
+        };
+        let fields = self.columns.iter().skip(Stamp::FIELDS.len()).map(word).collect::<Vec<_>>();
+        format!("{} ({})", self.type_name, fields.join(", "))
+    }
+}
+
+/// The topic under which a service's samples are recorded: a name that ROS accepts.
+pub fn topic_of(service: &str) -> String {
+    format!("/{}", service.replace('-', "_"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample::{OrbitMeasurement, RateEstimate, Sample};
+
+    #[test]
+    fn a_definition_reads_back_as_the_layout_that_it_was_made_of() {
+        for layout in [
+            Layout::of(RateEstimate::TYPE_NAME, RateEstimate::FIELDS),
+            Layout::of(OrbitMeasurement::TYPE_NAME, OrbitMeasurement::FIELDS),
+        ] {
+            assert_eq!(Layout::parse(&layout.definition()).unwrap(), layout);
+        }
+        let layout = Layout::of(RateEstimate::TYPE_NAME, RateEstimate::FIELDS);
+        assert_eq!(layout.size(), size_of::<RateEstimate>());
+        assert_eq!(layout.message_name(), "corotate/msg/RigidBodyEstimateV2");
+        assert!(layout.definition().contains("\nfloat64[3] omega_rad_s\n"));
+    }
+
+    #[test]
+    fn another_definition_is_none_of_ours() {
+        for text in ["", "uint64 tick", "# x\nuint64 tick\n", "# x\nstring name", "# x\nuint64[9999999999999999999] a"]
+        {
+            assert!(Layout::parse(text).is_none(), "{text}");
+        }
+    }
+}

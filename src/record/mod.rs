@@ -1,0 +1,114 @@
+//! Every sample of a run in one file, by a process that no role waits for; and what can be done with such a file.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `layout` | the layout of a sample as a ROS 2 message definition |
+//! | `writer` | the MCAP file: chunks of bounded age, a full disk |
+//! | `recorder` | takes every sample of a run off a bus, and keeps count |
+//! | `process` | the recorder as a process beside a loop |
+//! | `reader` | a recording as data: metadata, signals, samples, columns |
+//! | `script` | what a role did, so that it can do it again |
+//! | `replay` | recorded inputs through the live roles, outputs compared bit for bit |
+//! | `diff` | two recordings beside each other |
+//! | `export` | columns for everyone else |
+//!
+//! Must not change a sample, nor hold a loop up, except by the credit that it gives in lockstep.
+
+mod diff;
+mod export;
+mod layout;
+mod process;
+mod reader;
+mod recorder;
+mod replay;
+mod script;
+mod writer;
+
+pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
+pub use export::export_csv;
+pub use layout::{Column, Layout, topic_of};
+pub use process::{RecorderSeat, run_recorder};
+pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
+pub(crate) use recorder::RECORDER;
+pub use recorder::{Recorder, RecordingReport, SignalReport};
+pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_process};
+pub use script::{InputScript, Item, Limit, Script, Step};
+
+use crate::bus::BusError;
+use crate::bus::domain::DomainError;
+use crate::config::ConfigError;
+use crate::runtime::RoleError;
+use std::io;
+use std::path::PathBuf;
+
+/// What can go wrong with a recording.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The run could not be joined.
+    #[error(transparent)]
+    Run(#[from] RoleError),
+    /// The domain is none.
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    /// A link failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// There is no room for more.
+    #[error("the disk is full: {} ends here, readable ({source}); free some room, or record elsewhere with --out", path.display())]
+    Full {
+        /// The recording.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The file cannot be written.
+    #[error("cannot write {}: {source}; it ends with its last whole chunk, readable without an index", path.display())]
+    Write {
+        /// The recording, or a file made of it.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The recording.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The file is none of ours.
+    #[error("{} is no recording of corotate: {reason}; `corotate run --record` makes one", path.display())]
+    NotOurs {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The scenario in the recording is refused.
+    #[error("the scenario in {} is refused by this version: {source}", path.display())]
+    Scenario {
+        /// The recording.
+        path: PathBuf,
+        /// Why.
+        source: Box<ConfigError>,
+    },
+    /// The recording was made with samples of another layout.
+    #[error(
+        "{service} was recorded as {recorded}, and this version has {ours}; replay it with the version that made it"
+    )]
+    Layout {
+        /// The signal.
+        service: String,
+        /// The layout in the recording.
+        recorded: String,
+        /// This version's.
+        ours: String,
+    },
+    /// What is asked for is not in the recording.
+    #[error("{reason}")]
+    Missing {
+        /// What, and what to do.
+        reason: String,
+    },
+}

@@ -1,0 +1,180 @@
+//! The recorder as a process beside a loop: never of real-time priority, and on no core that the scenario names for roles.
+//!
+//! Must not keep a role waiting: what it cannot take in time is lost and told. In lockstep the launcher gives no credit
+//! beyond what it has taken.
+
+use super::RecordError;
+use super::recorder::{RECORDER, Recorder, RecordingReport};
+use crate::bus::domain::Domain;
+use crate::bus::iox::IoxBus;
+use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
+use crate::clock::{monotonic_ns, sleep_until};
+use crate::config::{ClockKind, Cores, Scenario};
+use crate::runtime::{
+    Backoff, RoleError, RoleId, depths, join, open_ledger, report, report_path, topic, window_ticks, write_whole,
+};
+use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use crate::telemetry::RoleReport;
+use rustix::process::nice;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// How much it gives way to others.
+const NICE: i32 = 10;
+/// In real time, between two looks at the samples, ns.
+const LOOK_NS: u64 = 5_000_000;
+/// In lockstep, the same when nothing has come for a while, ns.
+const LULL_NS: u64 = 50_000;
+/// Between two words to the launcher, ns, unless a credit is due.
+const WORD_NS: u64 = 20_000_000;
+/// In lockstep: a word after so many ticks.
+const CREDIT_TICKS: u64 = 8;
+/// The run is over when nothing has come for so long after its stop, ns; and for so long it may still come.
+const QUIET_NS: u64 = 100_000_000;
+const LEAVE_NS: u64 = 3_000_000_000;
+
+/// What to record, and where to.
+#[derive(Debug, Clone)]
+pub struct RecorderSeat {
+    /// The domain's directory.
+    pub domain: PathBuf,
+    /// The file.
+    pub file: PathBuf,
+}
+
+/// Records a run to its end, or until `terminated`, and leaves the report in the domain too.
+///
+/// # Errors
+/// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
+pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
+    let (domain, scenario) = join(&seat.domain)?;
+    give_way(&scenario);
+    let bus = IoxBus::enter(&domain, RECORDER, depths(&scenario)).map_err(RoleError::from)?;
+    let mut line = Line::open(&scenario, &bus)?;
+    let mut recorder = Recorder::open(&scenario, &bus, &seat.file)?;
+    let lockstep = scenario.clock != ClockKind::Realtime;
+    let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
+    let ended = follow(&mut recorder, &mut line, credit_ticks, terminated);
+    let report = recorder.finish(&books(&domain, &scenario), ended.as_ref().err());
+    let path = report_path(domain.root(), RECORDER);
+    let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");
+    // The launcher is gone, and its domain with it, if this fails: the report is printed as well.
+    let _ = write_whole(&path, &text);
+    let _ = line.say(RoleState::Done, u64::MAX);
+    Ok(report)
+}
+
+/// Nobody waits for a recorder, so it lets everybody pass. What is not granted is no harm.
+fn give_way(scenario: &Scenario) {
+    let _ = nice(NICE);
+    if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
+        critical.iter().for_each(|core| allowed.unset(*core));
+        if allowed.count() > 0 {
+            let _ = sched_setaffinity(None, &CpuSet::clone(&allowed));
+        }
+    }
+}
+
+/// Takes samples from the first tick to the last.
+fn follow(
+    recorder: &mut Recorder,
+    line: &mut Line,
+    credit_ticks: Option<u64>,
+    terminated: &AtomicBool,
+) -> Result<(), RecordError> {
+    let (mut backoff, mut whole) = (Backoff::default(), false);
+    loop {
+        line.say(RoleState::Ready, 0)?;
+        let schedule = line.hear()?;
+        let phase = Phase::from_number(schedule.phase);
+        // Before the first word nothing is known.
+        whole |= schedule.stamp.generation > 0 && phase < Phase::Run;
+        match phase {
+            Phase::Run => {
+                recorder.start(schedule.epoch_ns, whole)?;
+                break;
+            }
+            Phase::Stop => return Ok(()),
+            _ if terminated.load(Ordering::Relaxed) => return Ok(()),
+            _ => sleep_until(monotonic_ns() + LOOK_NS / 5),
+        }
+    }
+    let (mut said, mut next_word_ns) = (0, 0);
+    loop {
+        let taken = recorder.poll()?;
+        let (now_ns, next_tick) = (monotonic_ns(), recorder.next_tick());
+        if now_ns >= next_word_ns || credit_ticks.is_some_and(|ticks| next_tick >= said + ticks) {
+            line.say(RoleState::Running, next_tick)?;
+            (said, next_word_ns) = (next_tick, now_ns + WORD_NS);
+        }
+        if terminated.load(Ordering::Relaxed) || Phase::from_number(line.hear()?.phase) == Phase::Stop {
+            break;
+        }
+        match (credit_ticks.is_some(), taken) {
+            (false, _) => sleep_until(now_ns + LOOK_NS),
+            (true, 0) if backoff.brief() => {}
+            (true, 0) => sleep_until(monotonic_ns() + LULL_NS),
+            (true, _) => backoff = Backoff::default(),
+        }
+    }
+    drain(recorder, terminated)
+}
+
+/// Takes what roles that are ending still send.
+fn drain(recorder: &mut Recorder, terminated: &AtomicBool) -> Result<(), RecordError> {
+    let stopped_ns = monotonic_ns();
+    let mut quiet_since_ns = stopped_ns;
+    while !terminated.load(Ordering::Relaxed) {
+        let (taken, now_ns) = (recorder.poll()?, monotonic_ns());
+        if taken > 0 {
+            quiet_since_ns = now_ns;
+        }
+        if now_ns - quiet_since_ns > QUIET_NS || now_ns - stopped_ns > LEAVE_NS {
+            break;
+        }
+        sleep_until(now_ns + LOOK_NS);
+    }
+    recorder.poll()?;
+    Ok(())
+}
+
+/// The books of all roles, as far as they have got: their own account, or what their ledgers say.
+fn books(domain: &Domain, scenario: &Scenario) -> Vec<RoleReport> {
+    let book = |role: RoleId| {
+        let file = std::fs::read(report_path(domain.root(), role.name(scenario))).ok();
+        file.and_then(|bytes| serde_json::from_slice(&bytes).ok()).or_else(|| {
+            let ledger = open_ledger(domain, scenario, role).ok().filter(|ledger| ledger.generation() > 0)?;
+            Some(report(scenario, role, &ledger, Vec::new(), Vec::new()))
+        })
+    };
+    RoleId::all(scenario).into_iter().filter_map(book).collect()
+}
+
+/// The recorder's line to the launcher.
+struct Line {
+    schedule: <IoxBus as Bus>::Reader<Schedule>,
+    health: <IoxBus as Bus>::Writer<Health>,
+}
+
+impl Line {
+    fn open(scenario: &Scenario, bus: &IoxBus) -> Result<Self, BusError> {
+        Ok(Self {
+            health: bus.writer(&topic(scenario, RECORDER, Signal::Health), 1)?,
+            schedule: bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
+        })
+    }
+
+    fn say(&mut self, state: RoleState, tick: u64) -> Result<(), BusError> {
+        self.health.send(|health| {
+            let sent_ns = monotonic_ns();
+            health.stamp = Stamp { tick, generation: 1, origin_ns: sent_ns, sent_ns };
+            health.state = state as u64;
+        })
+    }
+
+    fn hear(&mut self) -> Result<Schedule, BusError> {
+        while self.schedule.advance()? {}
+        Ok(self.schedule.current().copied().unwrap_or_default())
+    }
+}

@@ -1,0 +1,377 @@
+//! Recorded inputs through a live, unmodified role, and what it publishes beside what was recorded, bit for bit.
+//!
+//! Here the role is driven in one thread; [`crate::launch`] does it with a process, by the same script and the same
+//! comparison. The time at which a sample was sent is no output and not compared.
+
+use super::RecordError;
+use super::reader::{Recording, Track};
+use super::script::{Limit, Script, Step};
+use crate::bus::memory::MemoryBus;
+use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic, Write};
+use crate::config::Scenario;
+use crate::runtime::{Gate, Poll, ReadyNode, RoleId, Visit, build, depths, private_ledger, visit_reads, visit_writes};
+use crate::sample::{FieldKind, FleetLayout, FleetSample, Sample, Stamp, VOID};
+use crate::telemetry::Ledger;
+use crate::with_rig;
+use std::marker::PhantomData;
+
+/// The column of a sample that tells when it was sent.
+const SENT: &str = "sent_ns";
+
+/// The first thing in which a role's output differs from what was recorded.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// The tick of the recorded sample, or of the one that is not recorded.
+    pub tick: u64,
+    /// The signal.
+    pub service: String,
+    /// Which element of which field; none if one of the two samples does not exist.
+    pub field: Option<String>,
+    /// What was recorded.
+    pub recorded: String,
+    /// What the role says now.
+    pub replayed: String,
+}
+
+/// How one role's replay went.
+#[derive(Debug, Clone)]
+pub struct RoleReplay {
+    /// The role.
+    pub role: String,
+    /// Ticks that it executed.
+    pub ticks: u64,
+    /// Lives that it had.
+    pub lives: u64,
+    /// Samples compared.
+    pub samples: u64,
+    /// The first difference, if there is any.
+    pub difference: Option<Difference>,
+    /// From where on nothing can be said.
+    pub limit: Option<Limit>,
+}
+
+/// Writing ends for a role's inputs.
+pub struct Inlets(Vec<Box<dyn Inlet>>);
+/// Reading ends for a role's outputs.
+pub struct Outlets(Vec<Box<dyn Outlet>>);
+
+trait Inlet {
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError>;
+    fn refresh(&mut self) -> Result<(), BusError>;
+}
+
+trait Outlet {
+    fn next(&mut self) -> Result<Option<&[u8]>, BusError>;
+}
+
+struct InletOf<W, S: ?Sized>(W, PhantomData<S>);
+struct OutletOf<R, S: ?Sized>(R, PhantomData<S>);
+
+impl<W: Write<S>, S: Carried + ?Sized> Inlet for InletOf<W, S> {
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.0.send(|sample| bytemuck::cast_slice_mut(sample.words_mut()).copy_from_slice(bytes))
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.0.refresh()
+    }
+}
+
+impl<R: Read<S>, S: Carried + ?Sized> Outlet for OutletOf<R, S> {
+    fn next(&mut self) -> Result<Option<&[u8]>, BusError> {
+        Ok(if self.0.advance()? { self.0.current().map(|sample| bytemuck::cast_slice(sample.words())) } else { None })
+    }
+}
+
+struct OpenInlets<'a, B>(&'a B);
+struct OpenOutlets<'a, B>(&'a B);
+
+impl<B: Bus + 'static> OpenInlets<'_, B> {
+    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Inlet>, BusError> {
+        Ok(Box::new(InletOf::<_, S>(S::writer(self.0, topic, bodies, 1)?, PhantomData)))
+    }
+}
+
+impl<B: Bus + 'static> Visit for OpenInlets<'_, B> {
+    type Made = Result<Box<dyn Inlet>, BusError>;
+
+    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
+        self.open::<S>(&topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        self.open::<FleetSample<L>>(&topic, bodies)
+    }
+}
+
+impl<B: Bus + 'static> OpenOutlets<'_, B> {
+    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Outlet>, BusError> {
+        Ok(Box::new(OutletOf::<_, S>(S::reader(self.0, topic, Reader::Scorer, bodies)?, PhantomData)))
+    }
+}
+
+impl<B: Bus + 'static> Visit for OpenOutlets<'_, B> {
+    type Made = Result<Box<dyn Outlet>, BusError>;
+
+    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
+        self.open::<S>(&topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
+        self.open::<FleetSample<L>>(&topic, bodies)
+    }
+}
+
+impl Inlets {
+    /// Opens a role's inputs for writing.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn open<B: Bus + 'static>(scenario: &Scenario, role: RoleId, bus: &B) -> Result<Self, BusError> {
+        Ok(Self(visit_reads(scenario, role, &mut OpenInlets(bus)).into_iter().collect::<Result<_, _>>()?))
+    }
+
+    /// Sends a sample, given as its bytes, on an input.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn send(&mut self, input: usize, bytes: &[u8]) -> Result<(), BusError> {
+        self.0[input].send(bytes)
+    }
+
+    /// Lets a reader that has come later know of these ends.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn refresh(&mut self) -> Result<(), BusError> {
+        self.0.iter_mut().try_for_each(|inlet| inlet.refresh())
+    }
+}
+
+impl Outlets {
+    /// Opens a role's outputs for reading.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn open<B: Bus + 'static>(scenario: &Scenario, role: RoleId, bus: &B) -> Result<Self, BusError> {
+        Ok(Self(visit_writes(scenario, role, &mut OpenOutlets(bus)).into_iter().collect::<Result<_, _>>()?))
+    }
+}
+
+/// Compares what a role publishes with what it published.
+pub struct Comparer<'a> {
+    tracks: &'a [Track],
+    /// Per output, the next recorded sample to compare with.
+    next: Vec<usize>,
+    /// Per output, the tick after the last that has come.
+    come: Vec<u64>,
+    realtime: bool,
+    limit: Option<u64>,
+    /// The role may go on beyond its script; that is not looked at.
+    end: u64,
+    samples: u64,
+    difference: Option<Difference>,
+}
+
+impl<'a> Comparer<'a> {
+    /// A comparison that has not begun.
+    pub fn new(script: &'a Script) -> Self {
+        Self {
+            tracks: &script.outputs,
+            next: vec![0; script.outputs.len()],
+            come: vec![0; script.outputs.len()],
+            end: script.steps.last().map_or(0, |step| step.tick + 1),
+            realtime: script.realtime,
+            limit: script.limit.as_ref().map(|limit| limit.tick),
+            samples: 0,
+            difference: None,
+        }
+    }
+
+    /// Takes whatever has come; true if some has.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn take(&mut self, outlets: &mut Outlets) -> Result<bool, BusError> {
+        let mut some = false;
+        for (output, outlet) in outlets.0.iter_mut().enumerate() {
+            while let Some(bytes) = outlet.next()? {
+                some = true;
+                self.compare(output, bytes);
+            }
+        }
+        Ok(some)
+    }
+
+    /// Real time has no voids: in its replay they stand for what was not published.
+    fn counts(&self, stamp: &Stamp) -> bool {
+        stamp.generation != 0 && !(self.realtime && stamp.generation & VOID != 0)
+    }
+
+    fn beyond(&self, tick: u64) -> bool {
+        tick >= self.end || self.limit.is_some_and(|limit| tick >= limit)
+    }
+
+    /// The tick before which everything has come.
+    pub fn next_tick(&self) -> u64 {
+        self.come.iter().copied().min().unwrap_or(0)
+    }
+
+    fn compare(&mut self, output: usize, bytes: &[u8]) {
+        let stamp: Stamp = bytemuck::pod_read_unaligned(&bytes[..size_of::<Stamp>()]);
+        if stamp.generation != 0 {
+            self.come[output] = self.come[output].max(stamp.tick.saturating_add(1).min(self.end));
+        }
+        if !self.counts(&stamp) {
+            return;
+        }
+        let (track, index) = (&self.tracks[output], self.next[output]);
+        self.next[output] += 1;
+        if self.difference.as_ref().is_some_and(|first| first.tick <= stamp.tick) {
+            return;
+        }
+        if index >= track.len() {
+            // A recording that was cut off says nothing of what comes after.
+            if !self.beyond(stamp.tick) {
+                self.differ(stamp.tick, track, None, "nothing".to_owned(), "a sample".to_owned());
+            }
+            return;
+        }
+        let recorded = track.stamp(index);
+        if self.beyond(recorded.tick.min(stamp.tick)) {
+            return;
+        }
+        self.samples += 1;
+        for column in &track.info.layout.columns {
+            for element in 0..column.count {
+                let at = column.offset + 8 * element;
+                let (was, is) = (&track.sample(index)[at..at + 8], &bytes[at..at + 8]);
+                if was != is && column.name != SENT {
+                    let name = column.elements().nth(element);
+                    self.differ(recorded.tick, track, name, words(column.kind, was), words(column.kind, is));
+                    return;
+                }
+            }
+        }
+    }
+
+    fn differ(&mut self, tick: u64, track: &Track, field: Option<String>, recorded: String, replayed: String) {
+        if self.difference.as_ref().is_none_or(|first| tick < first.tick) {
+            let service = track.info.service.clone();
+            self.difference = Some(Difference { tick, service, field, recorded, replayed });
+        }
+    }
+
+    /// Closes the comparison of a role up to the step `last`: what is recorded and did not come is a difference too.
+    pub fn finish(mut self, script: &Script, steps: &[Step], limit: Option<Limit>) -> RoleReplay {
+        let end = limit.as_ref().map_or(u64::MAX, |limit| limit.tick);
+        for (output, track) in self.tracks.iter().enumerate() {
+            if let Some(index) = (self.next[output]..track.len()).find(|index| self.counts(&track.stamp(*index))) {
+                let tick = track.stamp(index).tick;
+                if tick < end {
+                    self.differ(tick, track, None, "a sample".to_owned(), "nothing".to_owned());
+                }
+            }
+        }
+        RoleReplay {
+            role: script.name.clone(),
+            ticks: steps.iter().filter(|step| step.tick < end).count() as u64,
+            lives: steps.last().map_or(0, |step| step.generation),
+            samples: self.samples,
+            difference: self.difference,
+            limit,
+        }
+    }
+}
+
+/// A value for people, with its bits where it is a number.
+fn words(kind: FieldKind, bytes: &[u8]) -> String {
+    let mut word = [0; 8];
+    word.copy_from_slice(bytes);
+    match kind {
+        FieldKind::U64 => u64::from_le_bytes(word).to_string(),
+        FieldKind::F64 => format!("{:?} (0x{:016x})", f64::from_le_bytes(word), u64::from_le_bytes(word)),
+    }
+}
+
+/// Replays a role of a recording in this thread. `scenario` is the recording's with the clock `lockstep`.
+///
+/// # Errors
+/// [`RecordError`].
+pub fn replay_in_process(recording: &Recording, scenario: &Scenario, role: RoleId) -> Result<RoleReplay, RecordError> {
+    let script = Script::read(recording, scenario, role)?;
+    let bus = MemoryBus::new(depths(scenario));
+    let ledger = private_ledger(scenario, role);
+    let mut outlets = Outlets::open(scenario, role, &bus)?;
+    let mut comparer = Comparer::new(&script);
+    let mut stage = Stage {
+        script: &script,
+        scenario,
+        bus: &bus,
+        ledger: &ledger,
+        inlets: Inlets::open(scenario, role, &bus)?,
+        node: None,
+        bytes: Vec::new(),
+    };
+    for number in 0..script.steps.len() {
+        if comparer.beyond(script.steps[number].tick) {
+            break;
+        }
+        stage.play(number, &mut || comparer.take(&mut outlets).map(drop))?;
+    }
+    Ok(comparer.finish(&script, &script.steps, script.limit.clone()))
+}
+
+/// A role on its stage.
+struct Stage<'a> {
+    script: &'a Script,
+    scenario: &'a Scenario,
+    bus: &'a MemoryBus,
+    ledger: &'a Ledger,
+    inlets: Inlets,
+    node: Option<ReadyNode>,
+    bytes: Vec<u8>,
+}
+
+impl Stage<'_> {
+    /// Plays one step: feeds what the role had, one tick after the other, and lets it execute.
+    fn play(&mut self, number: usize, look: &mut dyn FnMut() -> Result<(), BusError>) -> Result<(), BusError> {
+        let step = self.script.steps[number];
+        self.enter(step)?;
+        let Some(node) = &mut self.node else { return Ok(()) };
+        let plant = matches!(self.script.role, RoleId::Plant(_));
+        if plant {
+            node.skip_to(step.tick);
+        }
+        let mut executed = false;
+        for (_, round) in self.script.rounds(number) {
+            for (input, item) in round {
+                self.script.inputs[input].write(item, &mut self.bytes);
+                self.inlets.send(input, &self.bytes)?;
+            }
+            if !executed && node.poll(Gate::Inputs { up_to: step.tick })? == Poll::Executed {
+                executed = true;
+                if step.settled {
+                    node.settle()?;
+                }
+            }
+            look()?;
+        }
+        Ok(())
+    }
+
+    /// Builds the role anew for every life that it had.
+    fn enter(&mut self, step: Step) -> Result<(), BusError> {
+        while self.node.is_none() || self.ledger.generation() < step.generation {
+            self.node = None;
+            let (script, scenario) = (self.script, self.scenario);
+            let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, script.role, self.bus, self.ledger))?;
+            if self.ledger.generation() >= step.generation {
+                let first_tick = if step.generation == 1 { 0 } else { step.tick };
+                node.start(script.grid, first_tick);
+            }
+            self.node = Some(node);
+        }
+        Ok(())
+    }
+}

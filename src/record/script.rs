@@ -1,0 +1,441 @@
+//! What a role did in a recorded run, as a script by which it can do it again: its lives, the ticks that it executed, and for
+//! each the inputs that it had.
+//!
+//! A role's inputs are those of a lockstep run: one sample or one void per tick. A recording of lockstep has them as they
+//! were. In real time a role that missed a tick, or an input, must miss it again: what it executed is told by what it
+//! published, and what a body applied by its status word; everything else becomes a void. From where the recording does not
+//! tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
+
+use super::RecordError;
+use super::reader::{Recording, SignalInfo, Track};
+use crate::clock::Grid;
+use crate::config::{ClockKind, Scenario};
+use crate::fault::Action;
+use crate::runtime::{Port, RoleId, ports};
+use crate::sample::{Stamp, VOID, status};
+use std::collections::BTreeMap;
+
+/// A role's successor is not counted further up than this; what says so has a broken stamp.
+const LIVES_MAX: u64 = 1000;
+
+/// One executed tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Step {
+    /// The tick.
+    pub tick: u64,
+    /// Which life of the role.
+    pub generation: u64,
+    /// Whether the role lived to do what a tick leaves to be done.
+    pub settled: bool,
+}
+
+/// One sample to be fed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Item {
+    /// The recorded sample with this index.
+    Recorded(usize),
+    /// A void of a tick, from a sender in this life.
+    Void(u64, u64),
+}
+
+/// One input of a role.
+#[derive(Debug)]
+pub struct InputScript {
+    /// What was recorded of it.
+    pub track: Track,
+    /// What the role gets.
+    pub items: Vec<Item>,
+    /// Per step: which of the items, first and behind the last, it gets then.
+    pub spans: Vec<[usize; 2]>,
+}
+
+impl InputScript {
+    /// The bytes of an item.
+    pub fn write(&self, item: usize, bytes: &mut Vec<u8>) {
+        bytes.clear();
+        match self.items[item] {
+            Item::Recorded(index) => bytes.extend_from_slice(self.track.sample(index)),
+            Item::Void(tick, generation) => {
+                let stamp = Stamp { tick, generation: generation | VOID, ..Stamp::default() };
+                bytes.extend_from_slice(bytemuck::bytes_of(&stamp));
+                bytes.resize(self.track.info.layout.size(), 0);
+            }
+        }
+    }
+}
+
+/// From which tick on nothing can be said, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Limit {
+    /// The first such tick.
+    pub tick: u64,
+    /// Why.
+    pub reason: String,
+}
+
+/// What one role did.
+#[derive(Debug)]
+pub struct Script {
+    /// The role.
+    pub role: RoleId,
+    /// Its name.
+    pub name: String,
+    /// The ticks that it executed.
+    pub steps: Vec<Step>,
+    /// What it was given.
+    pub inputs: Vec<InputScript>,
+    /// What it published.
+    pub outputs: Vec<Track>,
+    /// How far it can be told.
+    pub limit: Option<Limit>,
+    /// The time grid of the run.
+    pub grid: Grid,
+    /// Whether its links lost what came too late.
+    pub realtime: bool,
+}
+
+impl Script {
+    /// Reads what a role did. `scenario` is that of the recording.
+    ///
+    /// # Errors
+    /// [`RecordError`].
+    pub fn read(recording: &Recording, scenario: &Scenario, role: RoleId) -> Result<Self, RecordError> {
+        let ports = ports(scenario, role);
+        let named = |ports: &[Port]| -> Vec<String> { ports.iter().map(|port| port.topic.to_string()).collect() };
+        let (reads, writes) = (named(&ports.reads), named(&ports.writes));
+        let wanted = |info: &SignalInfo| reads.contains(&info.service) || writes.contains(&info.service);
+        let mut tracks = recording.tracks(wanted)?;
+        let mut take = |services: &[String]| -> Vec<Track> {
+            let mut one = |service: &String| {
+                let index = tracks.iter().position(|track| track.info.service == *service)?;
+                Some(tracks.swap_remove(index))
+            };
+            services.iter().filter_map(&mut one).collect()
+        };
+        let (inputs, outputs) = (take(&reads), take(&writes));
+        let realtime = recording.info().clock == ClockKind::Realtime.name();
+        let grid = Grid { epoch_ns: recording.info().epoch_ns, period_ns: recording.info().period_ns.max(1) };
+        let mut reading = Reading {
+            recording,
+            scenario,
+            role,
+            grid,
+            inputs: inputs.into_iter().map(Source::new).collect(),
+            outputs,
+            limit: None,
+        };
+        if !recording.info().whole {
+            reading.limit(0, || {
+                "it was begun in the midst of the run, and what the role knew then is not in it".to_owned()
+            });
+        }
+        let steps = if realtime { reading.executed() } else { reading.every_tick() };
+        let inputs = if realtime { reading.used(&steps) } else { reading.all(&steps) };
+        reading.lost();
+        let Reading { outputs, limit, .. } = reading;
+        let name = role.name(scenario).to_owned();
+        Ok(Self { role, name, steps, inputs, outputs, limit, grid, realtime })
+    }
+}
+
+impl Script {
+    /// What is fed for a step, one tick after the other: the tick, and which item of which input. All inputs reach the step's
+    /// own tick together, however many come before. A body without inputs has one round with nothing in it.
+    pub fn rounds(&self, number: usize) -> impl Iterator<Item = (u64, Vec<(usize, usize)>)> + '_ {
+        let (step, realtime) = (self.steps[number], self.realtime);
+        let rounds = self.inputs.iter().map(|input| input.spans[number]).map(|[begin, end]| end - begin).max();
+        let rounds = rounds.unwrap_or(0).max(1);
+        (0..rounds).map(move |round| {
+            let item = |(input, script): (usize, &InputScript)| {
+                let [begin, end] = script.spans[number];
+                let item = (end + round).checked_sub(rounds).filter(|item| *item >= begin)?;
+                Some((input, item))
+            };
+            // What lockstep has beside one sample per tick belongs to the step.
+            let before = if realtime { (rounds - 1 - round) as u64 } else { 0 };
+            (step.tick.saturating_sub(before), self.inputs.iter().enumerate().filter_map(item).collect())
+        })
+    }
+}
+
+/// One input that is read.
+struct Source {
+    track: Track,
+    by_tick: BTreeMap<u64, usize>,
+}
+
+impl Source {
+    fn new(track: Track) -> Self {
+        Self { track, by_tick: BTreeMap::new() }
+    }
+}
+
+/// A script in the making.
+struct Reading<'a> {
+    recording: &'a Recording,
+    scenario: &'a Scenario,
+    role: RoleId,
+    grid: Grid,
+    inputs: Vec<Source>,
+    outputs: Vec<Track>,
+    limit: Option<Limit>,
+}
+
+impl Reading<'_> {
+    /// Nothing can be said from a tick on.
+    fn limit(&mut self, tick: u64, reason: impl FnOnce() -> String) {
+        if self.limit.as_ref().is_none_or(|limit| tick < limit.tick) {
+            self.limit = Some(Limit { tick, reason: reason() });
+        }
+    }
+
+    /// Whether a scripted fault touches what the role publishes of a body at a tick.
+    fn disturbed(&self, output: &Track, tick: u64) -> bool {
+        let name = self.role.name(self.scenario);
+        let here = |body: &Option<String>| body.as_ref() == Some(&output.info.body);
+        output.info.signal != "truth"
+            && self.scenario.faults.iter().any(|scripted| {
+                scripted.role == name
+                    && here(&scripted.body)
+                    && !matches!(scripted.fault.action, Action::Role(_))
+                    && scripted.fault.acts(tick)
+            })
+    }
+
+    /// Lockstep: every tick, in as many lives as the generations tell.
+    fn every_tick(&mut self) -> Vec<Step> {
+        let (mut steps, mut next, mut life) = (Vec::<Step>::new(), 0, 1);
+        let mut gap = None;
+        if let Some(output) = self.outputs.first() {
+            for index in 0..output.len() {
+                let stamp = output.stamp(index);
+                let generation = stamp.generation & !VOID;
+                let disturbed = self.disturbed(output, next) || self.disturbed(output, stamp.tick);
+                if !disturbed && stamp.tick <= next && (life + 1..life + LIVES_MAX).contains(&generation) {
+                    // The successor does again what was not finished.
+                    while steps.last().is_some_and(|step| step.tick > stamp.tick) {
+                        steps.pop();
+                    }
+                    if let Some(last) = steps.last_mut().filter(|last| last.tick == stamp.tick) {
+                        last.settled = false;
+                    }
+                    (next, life) = (stamp.tick, generation);
+                }
+                if stamp.tick == next {
+                    steps.push(Step { tick: next, generation: life, settled: true });
+                    next += 1;
+                } else if stamp.tick > next && !disturbed {
+                    gap = Some(next);
+                    break;
+                }
+            }
+        }
+        if let Some(tick) = gap {
+            self.limit(tick, || format!("the recording lacks tick {tick}"));
+        }
+        steps
+    }
+
+    /// Lockstep: everything that came, up to the sample that the step needs.
+    fn all(&mut self, steps: &[Step]) -> Vec<InputScript> {
+        let delay = self.delay();
+        let mut scripts = Vec::new();
+        for Source { track, .. } in std::mem::take(&mut self.inputs) {
+            let (mut spans, mut at, mut life, mut lacking) = (Vec::new(), 0, 1, None);
+            for step in steps {
+                let Some(needed) = step.tick.checked_sub(delay) else {
+                    spans.push([at, at]);
+                    continue;
+                };
+                if step.generation != life {
+                    // A successor is sent again what its predecessor had.
+                    life = step.generation;
+                    at = (0..track.len()).find(|index| track.stamp(*index).tick == needed).unwrap_or(at).min(at);
+                }
+                let begin = at;
+                match (at..track.len()).find(|index| track.stamp(*index).tick == needed) {
+                    Some(found) => at = found + 1,
+                    None => {
+                        lacking.get_or_insert(step.tick);
+                    }
+                }
+                spans.push([begin, at]);
+            }
+            if let Some(tick) = lacking {
+                let service = track.info.service.clone();
+                self.limit(tick, || format!("the recording lacks {service} of tick {}", tick - delay));
+            }
+            let items = (0..track.len()).map(Item::Recorded).collect();
+            scripts.push(InputScript { track, items, spans });
+        }
+        scripts
+    }
+
+    /// By how many ticks an input is older than the step that takes it: a command acts one tick later.
+    fn delay(&self) -> u64 {
+        u64::from(matches!(self.role, RoleId::Plant(_)))
+    }
+
+    /// Whether a stamp can be of its tick: nobody knows a sample of a tick that is not due.
+    fn possible(&self, stamp: &Stamp) -> bool {
+        stamp.generation != 0 && stamp.tick <= self.scenario.last_tick && stamp.tick <= self.grid.tick_at(stamp.sent_ns)
+    }
+
+    /// Real time: the ticks of which the role published something.
+    fn executed(&mut self) -> Vec<Step> {
+        for index in 0..self.inputs.len() {
+            let mut by_tick = BTreeMap::new();
+            let (track, mut next) = (&self.inputs[index].track, 0);
+            for sample in 0..track.len() {
+                let stamp = track.stamp(sample);
+                if stamp.tick >= next && self.possible(&stamp) {
+                    by_tick.insert(stamp.tick, sample);
+                    next = stamp.tick + 1;
+                }
+            }
+            self.inputs[index].by_tick = by_tick;
+        }
+        let mut ticks = BTreeMap::new();
+        // A plant's truth is what really happened; it is written after the measurement.
+        let telling = if self.delay() == 1 { 1..2 } else { 0..self.outputs.len() };
+        for output in &self.outputs[telling] {
+            for index in 0..output.len() {
+                let stamp = output.stamp(index);
+                if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
+                    ticks.entry(stamp.tick).or_insert((stamp.generation, true));
+                }
+            }
+            // Where a fault kept the sample back or changed its stamp, it was made as long as there was something to make.
+            if let Some(first) = self.inputs.first() {
+                for tick in first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)) {
+                    ticks.entry(*tick).or_insert((0, true));
+                }
+            }
+        }
+        self.unsettled(&mut ticks);
+        let mut life = 1;
+        let step = |(tick, (generation, settled)): (u64, (u64, bool))| {
+            if (life + 1..life + LIVES_MAX).contains(&generation) {
+                life = generation;
+            }
+            Step { tick, generation: life, settled }
+        };
+        ticks.into_iter().map(step).collect()
+    }
+
+    /// A plant that died between its measurement and its truth had moved nothing.
+    fn unsettled(&self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
+        let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) else { return };
+        for index in 0..output.len() {
+            let stamp = output.stamp(index);
+            if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
+                ticks.entry(stamp.tick).or_insert((stamp.generation, false));
+            }
+        }
+    }
+
+    /// Real time: the inputs that the role used, by what it made of them.
+    fn used(&mut self, steps: &[Step]) -> Vec<InputScript> {
+        let delay = self.delay();
+        let mut scripts = Vec::new();
+        let sources = std::mem::take(&mut self.inputs);
+        for (input, source) in sources.into_iter().enumerate() {
+            // Every input but a controller's estimate belongs to one output.
+            let told_by = if delay == 1 { None } else { input.checked_sub(1) };
+            let said: Option<Vec<u64>> = told_by.map(|output| self.said(output));
+            let (mut items, mut spans, mut at_tick, mut generation) = (Vec::new(), Vec::new(), 0, 1);
+            let mut life = 1;
+            for step in steps {
+                let begin = items.len();
+                let Some(needed) = step.tick.checked_sub(delay) else {
+                    spans.push([begin, begin]);
+                    continue;
+                };
+                if step.generation != life {
+                    (life, at_tick) = (step.generation, at_tick.min(needed));
+                }
+                items.extend((at_tick..needed).map(|tick| Item::Void(tick, generation)));
+                at_tick = needed + 1;
+                let used = match (&said, delay) {
+                    (None, 1) => self.applied(step.tick),
+                    (None, _) => true,
+                    (Some(ticks), _) => ticks.binary_search(&step.tick).is_ok(),
+                };
+                match source.by_tick.get(&needed).filter(|_| used) {
+                    Some(index) => {
+                        generation = source.track.stamp(*index).generation;
+                        items.push(Item::Recorded(*index));
+                    }
+                    None => {
+                        items.push(Item::Void(needed, generation));
+                        if used {
+                            let service = source.track.info.service.clone();
+                            self.limit(step.tick, || format!("the recording lacks {service} of tick {needed}"));
+                        }
+                    }
+                }
+                spans.push([begin, items.len()]);
+            }
+            scripts.push(InputScript { track: source.track, items, spans });
+        }
+        scripts
+    }
+
+    /// The ticks of which an output has a sample, or would have but for a scripted fault.
+    fn said(&self, output: usize) -> Vec<u64> {
+        let Some(output) = self.outputs.get(output) else { return Vec::new() };
+        let stamps = (0..output.len()).map(|index| output.stamp(index)).filter(|stamp| self.possible(stamp));
+        let mut ticks: Vec<u64> = stamps.map(|stamp| stamp.tick).collect();
+        let last = self.scenario.last_tick;
+        let faults = self.scenario.faults.iter().map(|scripted| &scripted.fault);
+        let touched =
+            faults.flat_map(|fault| fault.from_tick..fault.from_tick.saturating_add(fault.ticks).min(last + 1));
+        ticks.extend(touched.filter(|tick| self.disturbed(output, *tick)));
+        ticks.sort_unstable();
+        ticks.dedup();
+        ticks
+    }
+
+    /// Whether a body applied the command that was due at a tick, or had one that it did not believe.
+    fn applied(&self, tick: u64) -> bool {
+        let Some(truth) = self.outputs.get(1) else { return true };
+        let word = first_of(truth, tick).and_then(|index| truth.unsigned(index, "status"));
+        word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
+    }
+
+    /// A file that was cut off ends with each signal at a tick of its own.
+    fn cut_off(&mut self) {
+        let after = |track: &Track| track.regular().last().map_or(0, |index| track.stamp(index).tick + 1);
+        let end = self.outputs.iter().map(after).min().unwrap_or(0);
+        self.limit(end, || "the file was cut off there".to_owned());
+    }
+
+    /// What was published and is not in the recording may have been anything.
+    fn lost(&mut self) {
+        let Some(end) = self.recording.info().end.as_ref().filter(|_| self.recording.damage().is_none()) else {
+            return self.cut_off();
+        };
+        let lost = |service: &str| {
+            let books = end.signals.iter().find(|books| books.service == service && books.lost.unwrap_or(0) > 0)?;
+            Some((books.gaps.first().map_or(0, |gap| gap[0]), books.lost.unwrap_or(0)))
+        };
+        let found: Vec<_> = self
+            .outputs
+            .iter()
+            .filter_map(|track| Some((track.info.service.clone(), lost(&track.info.service)?)))
+            .collect();
+        for (service, (tick, count)) in found {
+            self.limit(tick, || format!("{count} samples of {service} are not in the recording"));
+        }
+    }
+}
+
+/// The first sample of a tick: a track is in the order of its ticks but for what a fault has touched.
+fn first_of(track: &Track, tick: u64) -> Option<usize> {
+    let (mut low, mut high) = (0, track.len());
+    while low < high {
+        let middle = low + (high - low) / 2;
+        if track.stamp(middle).tick < tick { low = middle + 1 } else { high = middle }
+    }
+    (low < track.len() && track.stamp(low).tick == tick).then_some(low)
+}

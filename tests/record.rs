@@ -1,0 +1,428 @@
+//! Recordings: what is in them beside what was published, read by programs that share no code with ours; replayed; cut off.
+
+mod common;
+
+use common::{Bench, Done, await_some, send_signal, shipped};
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Carried, Read, Reader, Topic};
+use corotate::config::Scenario;
+use corotate::record::{Recording, topic_of};
+use corotate::runtime::{RoleId, Visit, build, depths, in_turn, private_ledger, visit_writes};
+use corotate::sample::{FleetLayout, FleetSample, Sample};
+use corotate::with_rig;
+use serde_json::Value;
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+const SIGKILL: i32 = 9;
+const SIGSTOP: i32 = 19;
+
+/// Runs a shipped scenario with a recording; gives the run's end and the recording.
+fn record(bench: &Bench, scenario: &str, out: &str, arguments: &[&str]) -> (Done, PathBuf) {
+    let file = shipped(scenario);
+    let common = ["run", file.to_str().unwrap(), "--record", "--out", out, "--set", "accept={}"];
+    (bench.run(&[&common, arguments].concat()), bench.path(out).join("run.mcap"))
+}
+
+fn summary(bench: &Bench, out: &str) -> Value {
+    serde_json::from_slice(&std::fs::read(bench.path(out).join("summary.json")).unwrap()).unwrap()
+}
+
+fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
+    bench.run(&[&["replay", file.to_str().unwrap()], options].concat())
+}
+
+type Tap = (String, Box<dyn FnMut(&mut Vec<u8>)>);
+
+fn tap<S: Carried + ?Sized>(bus: &MemoryBus, topic: &Topic, bodies: usize) -> Tap {
+    let mut reader = S::reader(bus, topic, Reader::Scorer, bodies).unwrap();
+    let take = move |bytes: &mut Vec<u8>| {
+        while reader.advance().unwrap() {
+            bytes.extend_from_slice(bytemuck::cast_slice(reader.current().unwrap().words()));
+        }
+    };
+    (topic.to_string(), Box::new(take))
+}
+
+/// Opens a signal to take its bytes as they were sent.
+struct Open<'a>(&'a MemoryBus);
+
+impl Visit for Open<'_> {
+    type Made = Tap;
+
+    fn visit<S: Sample>(&mut self, topic: Topic) -> Tap {
+        tap::<S>(self.0, &topic, 1)
+    }
+
+    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Tap {
+        tap::<FleetSample<L>>(self.0, &topic, bodies)
+    }
+}
+
+/// Everything that is published in a run in this thread, byte by byte, by service; no recorder takes part.
+fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
+    let bus = MemoryBus::new(depths(scenario));
+    let roles = RoleId::all(scenario);
+    let mut taps: Vec<Tap> = roles.iter().flat_map(|role| visit_writes(scenario, *role, &mut Open(&bus))).collect();
+    let mut all: BTreeMap<String, Vec<u8>> = BTreeMap::new();
+    let node = |role: &RoleId| {
+        let ledger = private_ledger(scenario, *role);
+        with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, &ledger)).unwrap()
+    };
+    let mut nodes: Vec<_> = roles.iter().map(node).collect();
+    let none = |_| panic!("no role dies here");
+    let grid = corotate::clock::Grid { epoch_ns: 0, period_ns: scenario.period_ns };
+    nodes.iter_mut().for_each(|node| node.start(grid, 0));
+    in_turn(&mut nodes, scenario.last_tick, none, |_| {
+        taps.iter_mut().for_each(|(service, take)| take(all.entry(service.clone()).or_default()));
+        true
+    })
+    .unwrap();
+    all
+}
+
+/// The interpreter that has the readers' requirements; made by the script that says what is missing if it fails.
+fn python() -> PathBuf {
+    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/venv")).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
+}
+
+#[test]
+fn foreign_readers_decode_every_field_of_every_sample_as_it_was_published() {
+    let (bench, python) = (Bench::new(), python());
+    for (scenario, clock) in [("rigid-pair", "lockstep"), ("orbit-rendezvous", "in-process"), ("gyro-loss", "lockstep")]
+    {
+        let overrides = [format!("clock={clock}"), "duration_s=1".to_owned(), "accept={}".to_owned()];
+        let published = published(&Scenario::load(&shipped(scenario), &overrides).unwrap());
+        let (done, file) = record(&bench, scenario, scenario, &["--clock", clock, "--duration", "1"]);
+        assert_eq!(done.code, Some(0), "{done:?}");
+        let decoded = bench.path(&format!("{scenario}.decoded"));
+        std::fs::create_dir(&decoded).unwrap();
+        let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/decode.py");
+        let arguments = [program.to_str().unwrap(), file.to_str().unwrap(), decoded.to_str().unwrap()];
+        let done = bench.start_program(&python, &arguments).wait();
+        assert_eq!(done.code, Some(0), "{done:?}");
+        assert!(published.len() >= 5, "{}", published.len());
+        for (service, bytes) in &published {
+            for reader in ["mcap", "rosbags"] {
+                let path = decoded.join(format!("{reader}{}", topic_of(service).replace('/', ".")));
+                assert!(std::fs::read(&path).unwrap() == *bytes, "{scenario}: {service} by {reader}");
+            }
+        }
+        assert_eq!(std::fs::read_dir(&decoded).unwrap().count(), 2 * published.len(), "no signal beside those");
+    }
+}
+
+#[test]
+fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
+    let bench = Bench::new();
+    for clock in ["in-process", "lockstep", "realtime"] {
+        let (done, file) = record(&bench, "rigid-pair", clock, &["--clock", clock, "--duration", "1"]);
+        assert_eq!(done.code, Some(0), "{done:?}");
+        let recording = &summary(&bench, clock)["recording"];
+        assert_eq!(recording["complete"], true, "{recording}");
+        for signal in recording["signals"].as_array().unwrap() {
+            assert_eq!(signal["recorded"], signal["published"], "{signal}");
+        }
+        for options in [&[][..], &["--processes"]] {
+            let done = replay(&bench, &file, options);
+            assert_eq!(done.code, Some(0), "{clock} {options:?}: {done:?}");
+            assert_eq!(done.stdout.matches("the same to the last bit").count(), 4, "{done:?}");
+        }
+    }
+    let [one, other] = ["in-process", "lockstep"].map(|clock| bench.path(clock).join("run.mcap"));
+    let done = bench.run(&["diff", one.to_str().unwrap(), other.to_str().unwrap()]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let recording = Recording::open(&one).unwrap();
+    assert_eq!((recording.signals().len(), recording.damage()), (6, None));
+    assert_eq!((recording.info().seed, recording.info().whole), (1, true));
+    let track = recording.tracks(|info| info.signal == "estimate").unwrap().swap_remove(0);
+    assert_eq!(track.ticks(), (0..=1000).collect::<Vec<_>>());
+    assert_eq!(track.column("omega_rad_s", 0).unwrap()[0], 0.6);
+    assert!(track.column("omega_rad_s", 3).is_none());
+    let done = bench.run(&["export", one.to_str().unwrap(), "--csv", "tables"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let table = std::fs::read_to_string(bench.path("tables/leader.estimate.csv")).unwrap();
+    let row: Vec<&str> = table.lines().nth(501).unwrap().split(',').collect();
+    let value: f64 = row[8].parse().unwrap();
+    assert_eq!((row[2], value.to_bits()), ("500", track.column("omega_rad_s", 2).unwrap()[500].to_bits()));
+}
+
+#[test]
+fn faults_and_deaths_are_replayed_as_they_were() {
+    let bench = Bench::new();
+    for role in ["leader", "follower", "observer", "controller"] {
+        let fault = format!("fault=[{{kind=\"kill\",role=\"{role}\",from_tick=400}}]");
+        for clock in ["in-process", "lockstep", "realtime"] {
+            let out = format!("{role}-{clock}");
+            let options = ["--clock", clock, "--duration", "1", "--set", &fault];
+            let (done, file) = record(&bench, "rigid-pair", &out, &options);
+            assert_eq!(done.code, Some(0), "{out}: {done:?}");
+            let done = replay(&bench, &file, &[]);
+            assert_eq!(done.code, Some(0), "{out}: {done:?}");
+            assert!(done.stdout.contains("in 2 lives") && !done.stdout.contains("nothing can be"), "{out}: {done:?}");
+        }
+    }
+    let long = ["--duration", "14"];
+    for (scenario, clock, duration) in [
+        ("faults", "in-process", long),
+        ("faults", "lockstep", long),
+        ("rigid-fleet", "lockstep", ["--duration", "0.2"]),
+    ] {
+        let out = format!("{scenario}-{clock}");
+        let (done, file) = record(&bench, scenario, &out, &[&["--clock", clock], &duration[..]].concat());
+        assert_eq!(done.code, Some(0), "{done:?}");
+        for options in [&[][..], &["--processes"]] {
+            let done = replay(&bench, &file, options);
+            assert_eq!(done.code, Some(0), "{clock} {options:?}: {done:?}");
+            assert!(!done.stdout.contains("nothing can be"), "{done:?}");
+        }
+    }
+}
+
+/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick.
+fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
+    let bytes = std::fs::read(from).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    for index in &summary.metadata_indexes {
+        writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        let mut channel = (*message.channel).clone();
+        let mut of = (**channel.schema.as_ref().unwrap()).clone();
+        of.data = Cow::Owned(schema(String::from_utf8(of.data.to_vec()).unwrap()).into_bytes());
+        channel.schema = Some(of.into());
+        let mut data = message.data.to_vec();
+        change(&channel.topic, message.sequence, &mut data);
+        message.data = Cow::Owned(data);
+        message.channel = channel.into();
+        writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+#[test]
+fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
+    let bench = Bench::new();
+    let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "lockstep", "--duration", "1"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let changed = bench.path("changed.mcap");
+    // The last bit of the third component of the estimate: behind the CDR header, the stamp and two components.
+    let flip = |at: usize, topic: &'static str, tick: u32| {
+        rewrite(
+            &file,
+            &changed,
+            |schema| schema,
+            move |name, sequence, data| {
+                if name == topic && sequence == tick {
+                    data[at] ^= 1;
+                }
+            },
+        );
+    };
+    flip(4 + 32 + 16, "/corotate/rigid_pair/leader/estimate", 700);
+    for options in [&["--role", "observer"][..], &["--role", "observer", "--processes"], &[]] {
+        let done = replay(&bench, &changed, options);
+        assert_eq!(done.code, Some(3), "{done:?}");
+        let words = "tick 700, corotate/rigid-pair/leader/estimate omega_rad_s[2]:\n  recorded ";
+        assert!(done.stdout.contains(words) && done.stdout.contains("\n  replayed "), "{done:?}");
+    }
+    let done = bench.run(&["diff", file.to_str().unwrap(), changed.to_str().unwrap()]);
+    assert!(done.code == Some(3) && done.stdout.contains("tick 700, leader/estimate omega_rad_s[2]"), "{done:?}");
+    let tolerant = ["diff", file.to_str().unwrap(), changed.to_str().unwrap(), "--relative", "1e-12"];
+    assert_eq!(bench.run(&tolerant).code, Some(0));
+    // An input: what the observer makes of it differs from then on.
+    flip(4 + 32, "/corotate/rigid_pair/leader/measurement", 500);
+    let done = replay(&bench, &changed, &["--role", "observer"]);
+    assert!(done.code == Some(3) && done.stdout.contains("at tick 500, "), "{done:?}");
+    // The generation of the last sample is part of the output, too.
+    flip(4 + 8, "/corotate/rigid_pair/follower/command", 1000);
+    let done = replay(&bench, &changed, &["--role", "controller"]);
+    assert!(done.code == Some(3) && done.stdout.contains("tick 1000, "), "{done:?}");
+    rewrite(
+        &file,
+        &changed,
+        |schema| schema.replace("estimate/v2", "estimate/v1").replace("closure", "sum"),
+        |_, _, _| {},
+    );
+    let done = replay(&bench, &changed, &[]);
+    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(done.stderr.contains("corotate/rigid-body/estimate/v1 (") && done.stderr.contains(" sum, "), "{done:?}");
+    assert!(
+        done.stderr.contains("corotate/rigid-body/estimate/v2 (") && done.stderr.contains(" closure, "),
+        "{done:?}"
+    );
+}
+
+#[test]
+fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
+    let bench = Bench::new();
+    let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "in-process", "--duration", "2"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let bytes = std::fs::read(&file).unwrap();
+    let cut = bench.path("cut.mcap");
+    let mut replayed = 0;
+    for part in 0..12 {
+        std::fs::write(&cut, &bytes[..bytes.len() * part / 12]).unwrap();
+        let done = replay(&bench, &cut, &[]);
+        let readable = done.code == Some(0) && done.stderr.contains("as far as it goes");
+        assert!(readable || (done.code == Some(2) && done.stderr.contains("no recording")), "{part}: {done:?}");
+        replayed += u32::from(readable);
+    }
+    assert!(replayed >= 8, "{replayed}");
+    for seed in 1..40_usize {
+        let mut wrong = bytes.clone();
+        for turn in 0..8 {
+            let at = seed.wrapping_mul(2_654_435_761).wrapping_add(turn * 7_919 * seed) % wrong.len();
+            wrong[at] ^= 1 << (turn % 8);
+        }
+        std::fs::write(&cut, &wrong).unwrap();
+        for command in [&["replay"][..], &["export", "--csv", "tables"]] {
+            let done = bench.run(&[command, &[cut.to_str().unwrap()]].concat());
+            assert!(matches!(done.code, Some(0 | 2 | 3)), "{seed}: {done:?}");
+        }
+    }
+    let done = bench.run(&["replay", "nowhere.mcap"]);
+    assert!(done.code == Some(1) && done.stderr.contains("nowhere.mcap"), "{done:?}");
+}
+
+/// Where files have a limit, which any user can have, as where the disk is full.
+#[test]
+fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
+    let bench = Bench::new();
+    for clock in ["in-process", "lockstep"] {
+        let program = bench.command().get_program().to_owned();
+        let script = format!(
+            "ulimit -f 600; exec {} run {} --record --out {clock} --clock {clock} --duration 6 --set 'accept={{}}'",
+            program.to_str().unwrap(),
+            shipped("rigid-pair").display()
+        );
+        let done = bench.start_program(Path::new("bash"), &["-c", &script]).wait();
+        assert_eq!(done.code, Some(1), "{done:?}");
+        assert!(done.stderr.contains("the recording is not complete") && done.stderr.contains("run.mcap"), "{done:?}");
+        let summary = summary(&bench, clock);
+        assert_eq!(summary["score"]["scored_ticks"], 6001);
+        assert_eq!(summary["recording"]["complete"], false);
+        let signal = &summary["recording"]["signals"][0];
+        assert_eq!(signal["published"], 6001);
+        assert_eq!(signal["gaps"][0][1], 6000, "{signal}");
+        let file = bench.path(clock).join("run.mcap");
+        assert!(Recording::open(&file).unwrap().signals()[0].samples > 1000);
+        assert_eq!(replay(&bench, &file, &[]).code, Some(0));
+    }
+}
+
+/// A disk of its own, where this user may make one: then the file has its index, because room for it was kept.
+#[test]
+fn on_a_full_disk_the_recording_has_an_end() {
+    let bench = Bench::new();
+    std::fs::create_dir(bench.path("small")).unwrap();
+    let program = bench.command().get_program().to_owned();
+    let script = format!(
+        "mount -t tmpfs -o size=700k tmpfs small || exit 77; {} run {} --record --out small --clock lockstep --duration 6 \
+         --set 'accept={{}}'; code=$?; cp small/run.mcap kept.mcap; exit $code",
+        program.to_str().unwrap(),
+        shipped("rigid-pair").display()
+    );
+    let options = ["--user", "--map-root-user", "--mount", "bash", "-c", &script];
+    let done = bench.start_program(Path::new("unshare"), &options).wait();
+    if done.code == Some(77) || done.stderr.contains("unshare failed") {
+        eprintln!("not tested: this user may not mount a disk of its own");
+        return;
+    }
+    assert!(done.code == Some(1) && done.stderr.contains("the disk is full"), "{done:?}");
+    let recording = Recording::open(&bench.path("kept.mcap")).unwrap();
+    assert_eq!(recording.damage(), None);
+    let end = recording.info().end.as_ref().unwrap();
+    assert!(!end.complete && end.problem.contains("the disk is full"), "{}", end.problem);
+    assert!(mcap::Summary::read(&std::fs::read(bench.path("kept.mcap")).unwrap()).unwrap().is_some());
+    assert_eq!(replay(&bench, &bench.path("kept.mcap"), &[]).code, Some(0));
+}
+
+#[test]
+fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
+    let bench = Bench::new();
+    for (clock, signal, ticks) in
+        [("realtime", SIGKILL, 2000), ("lockstep", SIGKILL, 60_000), ("lockstep", SIGSTOP, 60_000)]
+    {
+        let out = format!("{clock}-{signal}");
+        let (duration, scenario) = ((ticks / 1000).to_string(), shipped("rigid-pair"));
+        let timeout = "supervision.heartbeat_timeout_s=0.5";
+        let fixed =
+            ["run", scenario.to_str().unwrap(), "--record", "--out", &out, "--set", "accept={}", "--set", timeout];
+        let running = bench.start(&[&fixed[..], &["--clock", clock, "--duration", &duration]].concat());
+        let domain = await_some(|| bench.domains().pop());
+        let file = bench.path(&out).join("run.mcap");
+        // Under way: there is more than the head of the file.
+        await_some(|| std::fs::metadata(&file).ok().filter(|file| file.len() > 100_000));
+        let recorder = bench.await_role("record");
+        send_signal(recorder, signal);
+        let done = running.wait();
+        assert_eq!(done.code, Some(1), "{out}: {done:?}");
+        assert!(done.stderr.contains("the recorder failed"), "{out}: {done:?}");
+        let summary = summary(&bench, &out);
+        let scored = &summary["score"];
+        assert_eq!(scored["scored_ticks"].as_u64().unwrap() + scored["unscored_ticks"].as_u64().unwrap(), ticks + 1);
+        assert_eq!(summary["recording"]["complete"], false);
+        let done = replay(&bench, &file, &[]);
+        assert_eq!(done.code, Some(0), "{out}: {done:?}");
+        assert!(Recording::open(&file).unwrap().signals()[0].samples > 100, "{out}");
+        bench.assert_clean(&[domain]);
+    }
+}
+
+/// All that a run shares lies in files that begin with its domain's name.
+fn shared_bytes(domain: &Path) -> u64 {
+    use std::os::unix::fs::MetadataExt;
+    let name = format!("corotate_{}_", domain.file_name().unwrap().to_str().unwrap());
+    let files = std::fs::read_dir("/dev/shm").unwrap().flatten();
+    let ours = files.filter(|file| file.file_name().to_string_lossy().starts_with(&name));
+    ours.filter_map(|file| Some(file.metadata().ok()?.blocks() * 512)).sum()
+}
+
+#[test]
+fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_mebibytes() {
+    let bench = Bench::new();
+    for (clock, seconds) in [("realtime", "3"), ("lockstep", "60")] {
+        let scenario = shipped("rigid-pair");
+        let fixed = ["run", scenario.to_str().unwrap(), "--out", clock, "--set", "accept={}", "--clock", clock];
+        let running = bench.start(&[&fixed[..], &["--duration", seconds]].concat());
+        let controller = bench.await_role("controller");
+        let domain = await_some(|| bench.domains().pop());
+        // The controller's process is up long before the ticks end; by then they run.
+        std::thread::sleep(Duration::from_millis(if clock == "realtime" { 700 } else { 100 }));
+        let file = format!("{clock}.mcap");
+        let recorder = bench.start(&["record", "--domain", domain.to_str().unwrap(), "--out", &file]);
+        await_some(|| std::fs::metadata(bench.path(&file)).ok().filter(|file| file.len() > 0));
+        if clock == "realtime" {
+            let shared = shared_bytes(&domain);
+            assert!(shared > 0 && shared <= 4 << 20, "{shared} bytes");
+        }
+        let (done, recorded) = (running.wait(), recorder.wait());
+        assert_eq!(done.code, Some(0), "{done:?} {controller}");
+        assert!(!recorded.stdout.is_empty(), "{recorded:?}");
+        let recording = Recording::open(&bench.path(&file)).unwrap();
+        let end = recording.info().end.as_ref().unwrap();
+        if recording.info().whole {
+            // On a slow machine it came before the first tick.
+            continue;
+        }
+        assert!(!end.complete && recorded.code == Some(0), "{recorded:?}");
+        assert!(recorded.stdout.contains("from the midst of the run on"), "{recorded:?}");
+        let track = recording.tracks(|info| info.signal == "truth").unwrap().swap_remove(0);
+        let ticks = track.ticks();
+        if clock == "lockstep" {
+            assert!(ticks.windows(2).all(|pair| pair[0] + 1 == pair[1]), "lockstep loses nothing");
+        }
+        assert!(ticks.last().is_some_and(|tick| *tick == recording.info().last_tick), "{:?}", ticks.last());
+        let done = replay(&bench, &bench.path(&file), &[]);
+        assert!(done.code == Some(0) && done.stdout.contains("in the midst of the run"), "{done:?}");
+        bench.assert_clean(&[domain]);
+    }
+}
