@@ -3,7 +3,9 @@
 use crate::record;
 use crate::{Exit, fail, say};
 use corotate::report::{ReportError, report as compose};
+use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Options of `corotate report`.
 #[derive(clap::Args)]
@@ -30,7 +32,12 @@ pub fn report(arguments: &Arguments) -> Exit {
     let source = &arguments.source;
     let directory = if source.is_dir() { source } else { source.parent().unwrap_or(Path::new("")) };
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("report.html"));
-    let written = compose(source).and_then(|report| {
+    // Drawn on stderr, and only if that is a terminal.
+    let spinner = ProgressBar::new_spinner().with_message(format!("reading {}", source.display()));
+    spinner.enable_steady_tick(Duration::from_millis(100));
+    let composed = compose(source);
+    spinner.finish_and_clear();
+    let written = composed.and_then(|report| {
         report.remarks().iter().for_each(|remark| eprintln!("corotate: {remark}"));
         report.write(&out)
     });

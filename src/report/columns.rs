@@ -147,13 +147,13 @@ impl Column for Count {
 mod tests {
     use super::*;
 
-    /// A spike of one tick among a million, up and down, is in the picture, wherever it is.
+    /// A spike of one tick among very many, up and down, is in the picture, wherever it is.
     #[test]
     fn no_extreme_is_lost_however_many_ticks_there_are() {
-        for spike in [0, 1, 777_777, 999_999] {
+        for spike in [0, 1, 77_777, 99_999] {
             let (mut wave, mut path) = (Columns::<Extremes>::default(), Columns::<Corners>::default());
-            for tick in 0..1_000_000_u64 {
-                let x = (tick as f64 * 1e-5).sin();
+            for tick in 0..100_000_u64 {
+                let x = (tick as f64 * 1e-4).sin();
                 let (up, down) = (if tick == spike { 5.0 } else { x }, if tick == spike { -7.0 } else { x });
                 wave.at(tick).take(up);
                 wave.at(tick).take(down);

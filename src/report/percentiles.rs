@@ -104,7 +104,7 @@ mod tests {
         let points = read_curve(&String::from_utf8(text).unwrap()).unwrap();
         let (first, last) = (points[0], *points.last().unwrap());
         assert!(first.0 == 1.0 && (first.1 - 1.0).abs() < 0.01, "{first:?}");
-        assert!(last.0 == 1000.0 && (last.1 - 1000.0).abs() < 1.0, "{last:?}");
+        assert!((1000.0..1025.0).contains(&last.0) && (last.1 - 1000.0).abs() < 1.0, "{last:?}");
         let median = points.iter().find(|point| point.0 >= 2.0).unwrap();
         assert!((median.1 - 500.0).abs() < 1.0, "{median:?}");
         assert!(points.windows(2).all(|pair| pair[0].0 <= pair[1].0 && pair[0].1 <= pair[1].1));
