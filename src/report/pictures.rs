@@ -71,6 +71,13 @@ fn present<'a>(
 
 fn rates(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
+    for (name, names) in [("ω1 ω2", ["ω1, rad/s", "ω2, rad/s"]), ("ω2 ω3", ["ω2, rad/s", "ω3, rad/s"])] {
+        let lines = paths(traces, name);
+        if !lines.is_empty() {
+            let caption = "Angular velocity in a plane. A dot is where a path begins.".to_owned();
+            figures.push((plane(&format!("angular velocities in the plane {name}"), names, &lines, false), caption));
+        }
+    }
     for axis in 0..3 {
         let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
         let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
@@ -97,13 +104,6 @@ fn rates(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
         "control acceleration, rad/s²",
         &["u1", "u2", "u3"],
     ));
-    for (name, names) in [("ω1 ω2", ["ω1, rad/s", "ω2, rad/s"]), ("ω2 ω3", ["ω2, rad/s", "ω3, rad/s"])] {
-        let lines = paths(traces, name);
-        if !lines.is_empty() {
-            let caption = "The same in a plane. A dot is where a path begins.".to_owned();
-            figures.push((plane(&format!("angular velocities in the plane {name}"), names, &lines, false), caption));
-        }
-    }
     figures
 }
 
