@@ -45,6 +45,9 @@ fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, 
     if hidden > 0 {
         blocks.push(Block::Text(format!("{hidden} more bodies are scored and not drawn.")));
     }
+    if scenario.rig.bodies().iter().any(|body| body.fleet.is_some()) {
+        blocks.push(Block::Text("A fleet is a band from the least to the greatest of its bodies.".to_owned()));
+    }
     blocks.push(Block::Figures(figures));
     Ok(Section { id: "motion", title: "Motion", blocks })
 }
