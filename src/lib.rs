@@ -20,6 +20,7 @@
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
+//! | `report` | a run as one page that is looked at | no |
 //! | `bench` | what all of it costs beside its floors | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
@@ -50,6 +51,8 @@ pub mod config;
 pub mod launch;
 #[cfg(feature = "runtime")]
 pub mod record;
+#[cfg(feature = "runtime")]
+pub mod report;
 #[cfg(feature = "runtime")]
 pub mod rig;
 #[cfg(feature = "runtime")]

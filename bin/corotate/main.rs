@@ -8,6 +8,7 @@ mod export;
 mod init;
 mod record;
 mod replay;
+mod report;
 mod role;
 mod run;
 mod seat;
@@ -40,6 +41,8 @@ Examples:
   corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
                                                  a device as the follower of a run --external follower
+  corotate report runs/20261121T150000Z-rigid-pair
+                                                 the run as one page, report.html
   corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
@@ -68,6 +71,8 @@ enum Command {
     Diff(diff::Arguments),
     /// Write a recording as tables
     Export(export::Arguments),
+    /// Show a run, or a recording, as one page
+    Report(report::Arguments),
     /// Measure what everything costs beside its floors, on this machine
     Bench(bench::Arguments),
     /// Take the other end of a hop that is measured
@@ -144,6 +149,7 @@ fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::replay(&arguments),
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
+        Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {
