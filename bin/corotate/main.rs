@@ -4,6 +4,7 @@ mod bench;
 mod bridge;
 mod check;
 mod diff;
+mod doctor;
 mod export;
 mod init;
 mod record;
@@ -11,6 +12,7 @@ mod replay;
 mod role;
 mod run;
 mod seat;
+mod watch;
 
 use clap::{Parser, Subcommand};
 use std::io::{self, Write};
@@ -40,6 +42,8 @@ Examples:
   corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
                                                  a device as the follower of a run --external follower
+  corotate watch                                 a screen on the newest run
+  corotate doctor                                is this machine fit for real time, and what to do about it
   corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
@@ -68,6 +72,10 @@ enum Command {
     Diff(diff::Arguments),
     /// Write a recording as tables
     Export(export::Arguments),
+    /// Watch a running loop on the terminal
+    Watch(watch::Arguments),
+    /// Tell whether this machine is fit for real time, and what to do about it
+    Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
     Bench(bench::Arguments),
     /// Take the other end of a hop that is measured
@@ -144,6 +152,8 @@ fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::replay(&arguments),
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
+        Some(Command::Watch(arguments)) => watch::watch(&arguments),
+        Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {

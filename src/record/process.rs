@@ -65,8 +65,8 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     Ok(report)
 }
 
-/// Nobody waits for a recorder, so it lets everybody pass. What is not granted is no harm.
-fn give_way(scenario: &Scenario) {
+/// Nobody waits for a recorder, or a watcher, so it lets everybody pass. What is not granted is no harm.
+pub(crate) fn give_way(scenario: &Scenario) {
     let _ = nice(NICE);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
         critical.iter().for_each(|core| allowed.unset(*core));
