@@ -167,9 +167,14 @@ fn faults_and_deaths_are_replayed_as_they_were() {
             assert!(done.stdout.contains("in 2 lives") && !done.stdout.contains("nothing can be"), "{out}: {done:?}");
         }
     }
-    for (scenario, clock) in [("faults", "in-process"), ("faults", "lockstep"), ("rigid-fleet", "lockstep")] {
+    let long = ["--duration", "14"];
+    for (scenario, clock, duration) in [
+        ("faults", "in-process", long),
+        ("faults", "lockstep", long),
+        ("rigid-fleet", "lockstep", ["--duration", "0.2"]),
+    ] {
         let out = format!("{scenario}-{clock}");
-        let (done, file) = record(&bench, scenario, &out, &["--clock", clock]);
+        let (done, file) = record(&bench, scenario, &out, &[&["--clock", clock], &duration[..]].concat());
         assert_eq!(done.code, Some(0), "{done:?}");
         for options in [&[][..], &["--processes"]] {
             let done = replay(&bench, &file, options);

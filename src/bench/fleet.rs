@@ -3,6 +3,7 @@
 //! All read three arrays of f64 and write three others: 48 bytes per follower. What is measured is what the controller of a
 //! fleet runs. The largest fleets leave the caches: there the copy is the memory's bandwidth.
 
+use super::hop::in_the_leaders_place;
 use super::{Bench, BenchError, Board, Row};
 use crate::control::{FleetLaw, Synchronizer};
 use crate::model::{Inertia, RigidBody};
@@ -69,13 +70,18 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         let mut arrays = Arrays::new(count);
         let floor = format!("copy, N = {count}");
         for _ in 0..rounds {
-            let ns = arrays.turn(followers, |rates, commands| law.command(&reference, rates, commands));
-            board.add(Row::Fleet, &format!("law, N = {count}"), "ns", Some(&floor), ns);
-            let ns = arrays.turn(followers, copy);
-            board.add(Row::Fleet, &floor, "ns", None, ns);
-            board.add(Row::Fleet, &format!("bandwidth of the copy, N = {count}"), "GB/s", None, BYTES / ns);
-            let ns = arrays.turn(followers, |rates, commands| one_by_one(&one, &reference, rates, commands));
-            board.add(Row::Fleet, &format!("law one by one, N = {count}"), "ns", Some(&floor), ns);
+            // In the leader's place, or whatever else the machine does would be measured too.
+            let [ours, copied, single] = in_the_leaders_place(board, |_| {
+                Ok([
+                    arrays.turn(followers, |rates, commands| law.command(&reference, rates, commands)),
+                    arrays.turn(followers, copy),
+                    arrays.turn(followers, |rates, commands| one_by_one(&one, &reference, rates, commands)),
+                ])
+            })?;
+            board.add(Row::Fleet, &format!("law, N = {count}"), "ns", Some(&floor), ours);
+            board.add(Row::Fleet, &floor, "ns", None, copied);
+            board.add(Row::Fleet, &format!("bandwidth of the copy, N = {count}"), "GB/s", None, BYTES / copied);
+            board.add(Row::Fleet, &format!("law one by one, N = {count}"), "ns", Some(&floor), single);
         }
     }
     Ok(())

@@ -14,8 +14,11 @@ use crate::runtime::{RoleId, build, depths, in_turn, private_ledger};
 use crate::sample::Message;
 use crate::with_rig;
 use std::hint::black_box;
-use std::time::Instant;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
+/// What ends a run in order.
+const SIGTERM: usize = 15;
 /// Hops in a row that a lockstep tick waits for: a follower's measurement to the controller, the command back to it.
 const HOPS: f64 = 2.0;
 
@@ -27,15 +30,15 @@ fn scenario(text: &str, overrides: &[&str]) -> Scenario {
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let rounds = bench.size(5, 1);
-    let duration = format!("duration_s={}.0", bench.size(100, 1));
-    let pair = scenario(SHIPPED[0].1, &["clock=lockstep", &duration]);
+    let pair = scenario(SHIPPED[0].1, &["clock=lockstep", "duration_s=100.0"]);
+    let limit = bench.size(Duration::from_secs(3), Duration::from_millis(300));
     let shipped: Vec<_> = SHIPPED.iter().map(|(name, text)| (*name, scenario(text, &["clock=in-process"]))).collect();
     let domain = OwnedDomain::create(0)?;
     let mut hop = Pair::open(bench, domain.domain(), Mechanism::Iceoryx, Wake::Spin, 16)?;
     board.granted(hop.grants());
     for round in 1..=rounds {
         bench.next(&format!("lockstep: round {round} of {rounds}"))?;
-        let per_second = lockstep(bench, &pair)?;
+        let per_second = lockstep(bench, &pair, limit)?;
         board.add(Row::Lockstep, "lockstep", "ticks/s", Some("two raw hops back to back"), per_second);
         let exchanges = bench.size(20_000, 200);
         let one_way_us = in_the_leaders_place(board, |_| hop.back_to_back(exchanges))?;
@@ -53,19 +56,25 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     Ok(())
 }
 
-/// Ticks per second of a lockstep run, between the first tick that its launcher sees and the last.
-fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario) -> Result<f64, BenchError> {
+/// Ticks per second of a lockstep run, between the first tick that its launcher sees and the last; it is ended in order
+/// after so long.
+fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Result<f64, BenchError> {
+    let end = AtomicUsize::new(0);
     let mut seen: Option<[(u64, Instant); 2]> = None;
     let mut launch = Launch {
         program: bench.program.clone(),
         external: Vec::new(),
         record: None,
         require_realtime: false,
-        signal: bench.signal,
+        signal: &end,
         progress: &mut |progress| {
             if let Progress::Running { tick, .. } = progress {
                 let now = (*tick, Instant::now());
-                seen = Some([seen.map_or(now, |[first, _]| first), now]);
+                let first = seen.map_or(now, |[first, _]| first);
+                seen = Some([first, now]);
+                if now.1 > first.1 + limit || bench.interrupted().is_err() {
+                    end.store(SIGTERM, Ordering::Relaxed);
+                }
             }
         },
     };

@@ -78,8 +78,9 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         }
         Err(reason) => board.remark(format!("allocations are not counted: {reason}")),
     }
-    let mut counted = Vec::new();
+    let (mut counted, mut words) = (Vec::new(), 0.0);
     watch(bench, window, environment, &mut |processes, period_ns| {
+        words = period_ns as f64 / 1e9 / WORD_S;
         let look = |process: &Process| Counts::of(process.pid, directory.path());
         let began = Instant::now();
         let before: Vec<_> = processes.iter().map(look).collect();
@@ -104,7 +105,6 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         if let (Some(before), Some(after)) = (before.allocations, after.allocations) {
             let all = per_tick(before, after);
             add("allocations", all);
-            let words = ticks * 1e-3 / WORD_S / ticks;
             worst_allocations = worst_allocations.max((all - samples - words).max(0.0));
         }
     }
@@ -121,11 +121,11 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
 
 /// System calls, by whatever can count them here.
 fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
-    let mut counted = Vec::new();
+    let (mut counted, by_perf) = (Vec::new(), perf_works());
     watch(bench, window, Vec::new(), &mut |processes, period_ns| {
         let ticks = window.as_nanos() as f64 / period_ns as f64;
         let watchers: Vec<_> =
-            processes.iter().map(|process| (process.clone(), Watcher::start(process.pid, window))).collect();
+            processes.iter().map(|process| (process.clone(), Watcher::start(process.pid, window, by_perf))).collect();
         counted = watchers
             .into_iter()
             .map(|(process, watcher)| (process, watcher.and_then(Watcher::finish), ticks))
@@ -135,12 +135,14 @@ fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
     for (process, calls, ticks) in counted {
         match calls {
             Ok(Calls { all, waits }) => {
-                let (all, waits) = (all as f64 / ticks, waits as f64 / ticks);
+                // The counters of a process do not begin at quite the same instant.
+                let beyond_waits = all.saturating_sub(waits) as f64 / ticks;
+                let all = all as f64 / ticks;
                 board.add(Row::Toll, &format!("system calls, {}", process.name), "per tick", None, all);
                 let beyond = format!("system calls beyond its waits, {}", process.name);
-                board.add(Row::Toll, &beyond, "per tick", None, all - waits);
+                board.add(Row::Toll, &beyond, "per tick", None, beyond_waits);
                 if process.name != "launcher" {
-                    worst = worst.max(all - waits);
+                    worst = worst.max(beyond_waits);
                 }
             }
             Err(reason) => board.remark(format!("system calls are not counted: {reason}")),
@@ -161,6 +163,18 @@ struct Calls {
 /// Calls that wait for the time or another role, or wake one.
 const WAITS: [&str; 3] = ["clock_nanosleep", "futex", "sched_yield"];
 
+/// What perf is to count.
+fn events() -> String {
+    let waits = WAITS.iter().map(|call| format!(",syscalls:sys_enter_{call}"));
+    std::iter::once("raw_syscalls:sys_enter".to_owned()).chain(waits).collect()
+}
+
+/// Whether there is a perf that may count system calls.
+fn perf_works() -> bool {
+    let tried = Command::new("perf").args(["stat", "-e", &events(), "true"]).stdin(Stdio::null()).output();
+    tried.is_ok_and(|done| done.status.success())
+}
+
 /// A program that counts the system calls of a process for a while.
 enum Watcher {
     Perf(std::process::Child),
@@ -169,22 +183,16 @@ enum Watcher {
 
 impl Watcher {
     /// Starts perf, which hardly disturbs; or strace, which does.
-    fn start(pid: i32, window: Duration) -> Result<Self, String> {
-        let seconds = format!("{:?}", window.as_secs_f64());
-        let mut events = vec!["raw_syscalls:sys_enter".to_owned()];
-        events.extend(WAITS.iter().map(|call| format!("syscalls:sys_enter_{call}")));
-        let probe = Command::new("perf").args(["stat", "-e", &events.join(","), "true"]).output();
-        let spawn =
-            |command: &mut Command| command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
-        if probe.is_ok_and(|done| done.status.success()) {
-            let mut command = Command::new("perf");
-            command.args(["stat", "-x,", "-e", &events.join(","), "-p", &pid.to_string(), "--", "sleep", &seconds]);
-            return spawn(&mut command).map(Self::Perf).map_err(|error| error.to_string());
-        }
-        let mut command = Command::new("timeout");
-        command.args(["-s", "INT", &seconds, "strace", "-c", "-f", "-p", &pid.to_string()]);
-        let missing = |error| format!("neither perf with tracepoints nor strace is there ({error})");
-        spawn(&mut command).map(Self::Strace).map_err(missing)
+    fn start(pid: i32, window: Duration, by_perf: bool) -> Result<Self, String> {
+        let (seconds, pid) = (format!("{:?}", window.as_secs_f64()), pid.to_string());
+        let mut command = Command::new(if by_perf { "perf" } else { "timeout" });
+        match by_perf {
+            true => command.args(["stat", "-x,", "-e", &events(), "-p", &pid, "--", "sleep", &seconds]),
+            false => command.args(["-s", "INT", &seconds, "strace", "-c", "-f", "-p", &pid]),
+        };
+        let started = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
+        let started = started.map(if by_perf { Self::Perf } else { Self::Strace });
+        started.map_err(|error| format!("neither perf with tracepoints nor strace is there ({error})"))
     }
 
     fn finish(self) -> Result<Calls, String> {

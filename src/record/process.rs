@@ -88,11 +88,8 @@ fn follow(
         line.say(RoleState::Ready, 0)?;
         let schedule = line.hear()?;
         let phase = Phase::from_number(schedule.phase);
-        // Whoever comes later may find samples already, and forgets none of them.
-        if phase == Phase::WarmUp {
-            whole = true;
-            recorder.warm_up()?;
-        }
+        // Before the first word nothing is known.
+        whole |= schedule.stamp.generation > 0 && phase < Phase::Run;
         match phase {
             Phase::Run => {
                 recorder.start(schedule.epoch_ns, whole)?;

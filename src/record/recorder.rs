@@ -158,8 +158,6 @@ struct Desk<'a> {
 trait Tap {
     /// Writes whatever has come; returns how many samples.
     fn drain(&mut self, desk: &mut Desk<'_>) -> Result<u64, RecordError>;
-    /// Takes whatever has come and forgets it.
-    fn forget(&mut self) -> Result<(), BusError>;
     fn announce(&mut self, writer: &mut Writer) -> Result<(), RecordError>;
     fn book(&mut self) -> &mut Book;
     fn service(&self) -> String;
@@ -202,11 +200,6 @@ impl<B: Bus, S: Carried + ?Sized> Tap for SignalTap<B, S> {
             taken += 1;
         }
         Ok(taken)
-    }
-
-    fn forget(&mut self) -> Result<(), BusError> {
-        while !self.book.begun && self.reader.advance()? {}
-        Ok(())
     }
 
     fn announce(&mut self, writer: &mut Writer) -> Result<(), RecordError> {
@@ -290,15 +283,6 @@ impl Recorder {
             realtime: scenario.clock == ClockKind::Realtime,
             begun: false,
         })
-    }
-
-    /// Takes what comes before the ticks run, which is warm-up.
-    ///
-    /// # Errors
-    /// [`RecordError::Bus`].
-    pub fn warm_up(&mut self) -> Result<(), RecordError> {
-        self.taps.iter_mut().try_for_each(|tap| tap.forget())?;
-        Ok(())
     }
 
     /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. `whole` tells that no tick has run.

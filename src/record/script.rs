@@ -124,13 +124,13 @@ impl Script {
             outputs,
             limit: None,
         };
-        let steps = if realtime { reading.executed() } else { reading.every_tick() };
-        let inputs = if realtime { reading.used(&steps) } else { reading.all(&steps) };
         if !recording.info().whole {
             reading.limit(0, || {
                 "it was begun in the midst of the run, and what the role knew then is not in it".to_owned()
             });
         }
+        let steps = if realtime { reading.executed() } else { reading.every_tick() };
+        let inputs = if realtime { reading.used(&steps) } else { reading.all(&steps) };
         reading.lost();
         let Reading { outputs, limit, .. } = reading;
         let name = role.name(scenario).to_owned();

@@ -1,6 +1,6 @@
 //! The device's end: bytes in, frames out, and a [`Plant`] that is measured, commanded and moved by them.
 //!
-//! What firmware has to add is a [`Body`], a byte stream and a clock. Must not do I/O, nor look at a
+//! What firmware has to add is a [`Body`](crate::role::Body), a byte stream and a clock. Must not do I/O, nor look at a
 //! clock: both are handed in.
 
 use super::frame::{Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, encode};
