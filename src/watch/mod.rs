@@ -42,7 +42,7 @@ pub enum WatchError {
     #[error(transparent)]
     Run(#[from] RoleError),
     /// The run did not open its signals, or its seats for readers are taken.
-    #[error("{source}; a run has room for few watchers, and of a fleet for one")]
+    #[error("{source}; does it still wait for a role? A run has room for few watchers, and of a fleet for one")]
     Join {
         /// The signal, and why.
         source: BusError,

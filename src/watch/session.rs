@@ -7,11 +7,11 @@ use super::feed::{Feed, LOOK_NS};
 use super::model::Model;
 use crate::bus::domain::{Domain, domains};
 use crate::bus::iox::IoxBus;
-use crate::bus::{Bus, Read, Reader, Signal};
+use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
 use crate::record::give_way;
-use crate::runtime::{RoleError, depths, join, topic};
+use crate::runtime::{RoleError, depths, hurry, join, release_priority, topic};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -34,6 +34,15 @@ struct Joined {
     _bus: IoxBus,
 }
 
+impl Joined {
+    fn open(domain: &Domain, scenario: &Scenario, end_ns: u64, model: &mut Model) -> Result<Self, BusError> {
+        let bus = insist(end_ns, || IoxBus::join(domain, "watch", depths(scenario)))?;
+        let feed = insist(end_ns, || Feed::open(scenario, &bus, model))?;
+        let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?;
+        Ok(Self { feed, schedule, _bus: bus })
+    }
+}
+
 impl Session {
     /// Joins the run in that domain, or the newest of this user.
     ///
@@ -44,9 +53,6 @@ impl Session {
         let root = directory.map(Path::to_owned).or_else(newest).ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let (domain, scenario) = insist(end_ns, || join(&root))?;
-        give_way(&scenario);
-        let bus = insist(end_ns, || IoxBus::join(&domain, "watch", depths(&scenario)))
-            .map_err(|source| WatchError::Join { source })?;
         let mut model = Model {
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),
@@ -55,13 +61,14 @@ impl Session {
             tick_s: scenario.tick_s(),
             ..Model::default()
         };
-        let feed = insist(end_ns, || Feed::open(&scenario, &bus, &mut model));
-        let feed = feed.map_err(|source| WatchError::Join { source })?;
-        let schedule = bus.reader(&topic(&scenario, "run", Signal::Schedule), Reader::Role)?;
-        Ok(Self { domain, scenario, joined: Some(Joined { feed, schedule, _bus: bus }), model })
+        hurry();
+        let joined = Joined::open(&domain, &scenario, end_ns, &mut model);
+        release_priority();
+        give_way(&scenario);
+        Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
-    /// Takes what has come. To be called every 20 ms or so; the model tells when the run has ended.
+    /// Takes what has come. To be called every 0.1 s or so; the model tells when the run has ended.
     ///
     /// # Errors
     /// [`WatchError::Bus`].
@@ -101,7 +108,10 @@ impl Session {
 
     fn leave(&mut self) {
         self.refresh();
-        if self.joined.take().is_some() {
+        if let Some(joined) = self.joined.take() {
+            hurry();
+            drop(joined);
+            release_priority();
             self.model.ended = true;
             self.domain.forget();
         }
@@ -139,7 +149,7 @@ impl Retry for RoleError {
     }
 }
 
-impl Retry for crate::bus::BusError {
+impl Retry for BusError {
     fn may_pass(&self) -> bool {
         true
     }
