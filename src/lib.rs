@@ -22,6 +22,8 @@
 //! | `launch` | starts, supervises and ends a run; scores it | no |
 //! | `report` | a run as one page that is looked at | no |
 //! | `bench` | what all of it costs beside its floors | no |
+//! | `doctor` | whether this machine is fit for real time | no |
+//! | `watch` | a screen on a running loop | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
 //! rigid bodies*; \[SZ\] V. F. Shcherbak, N. V. Zhogoleva, *Identification of the moments of inertia of a rigid body*;
@@ -48,6 +50,8 @@ pub mod clock;
 #[cfg(feature = "runtime")]
 pub mod config;
 #[cfg(feature = "runtime")]
+pub mod doctor;
+#[cfg(feature = "runtime")]
 pub mod launch;
 #[cfg(feature = "runtime")]
 pub mod record;
@@ -61,3 +65,5 @@ pub mod runtime;
 pub mod shared;
 #[cfg(feature = "runtime")]
 pub mod telemetry;
+#[cfg(feature = "runtime")]
+pub mod watch;

@@ -34,6 +34,16 @@ impl SharedWords {
         Ok(Self { map: MmapRaw::map_raw(&file)?, file })
     }
 
+    /// The words in a file that must be there.
+    ///
+    /// # Errors
+    /// The system's reason.
+    pub fn existing(path: &Path) -> io::Result<Self> {
+        let file = OpenOptions::new().read(true).write(true).open(path)?;
+        // An empty mapping is refused by the system itself.
+        Ok(Self { map: MmapRaw::map_raw(&file)?, file })
+    }
+
     /// The file.
     pub fn file(&self) -> &File {
         &self.file

@@ -4,6 +4,7 @@ mod bench;
 mod bridge;
 mod check;
 mod diff;
+mod doctor;
 mod export;
 mod init;
 mod record;
@@ -12,6 +13,7 @@ mod report;
 mod role;
 mod run;
 mod seat;
+mod watch;
 
 use clap::{Parser, Subcommand};
 use std::io::{self, Write};
@@ -43,6 +45,8 @@ Examples:
                                                  a device as the follower of a run --external follower
   corotate report runs/20261121T150000Z-rigid-pair
                                                  the run as one page, report.html
+  corotate watch                                 a screen on the newest run
+  corotate doctor                                is this machine fit for real time, and what to do about it
   corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
@@ -73,6 +77,10 @@ enum Command {
     Export(export::Arguments),
     /// Show a run, or a recording, as one page
     Report(report::Arguments),
+    /// Watch a running loop on the terminal
+    Watch(watch::Arguments),
+    /// Tell whether this machine is fit for real time, and what to do about it
+    Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
     Bench(bench::Arguments),
     /// Take the other end of a hop that is measured
@@ -150,6 +158,8 @@ fn main() -> ExitCode {
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Report(arguments)) => report::report(&arguments),
+        Some(Command::Watch(arguments)) => watch::watch(&arguments),
+        Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor) => {

@@ -41,7 +41,18 @@ impl Bells {
     /// # Errors
     /// The system's reason.
     pub fn open(domain: &Domain) -> io::Result<Self> {
-        let memory = SharedWords::open(&domain.shared("bells"), BELLS_BYTES / size_of::<u64>())?;
+        Self::over(SharedWords::open(&domain.shared("bells"), BELLS_BYTES / size_of::<u64>())?)
+    }
+
+    /// Those of a domain that has some already.
+    ///
+    /// # Errors
+    /// The system's reason.
+    pub fn join(domain: &Domain) -> io::Result<Self> {
+        Self::over(SharedWords::existing(&domain.shared("bells"))?)
+    }
+
+    fn over(memory: SharedWords) -> io::Result<Self> {
         if memory.halves().len() < BELLS * STRIDE {
             return Err(io::Error::other("the bells of this run are another version's"));
         }

@@ -8,6 +8,7 @@ use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 /// Where the transport's shared memory appears as files.
 const SHARED_MEMORY: &str = "/dev/shm";
@@ -127,6 +128,18 @@ impl Domain {
         &self.root
     }
 
+    /// Whether its run has not been cleared away yet.
+    pub fn exists(&self) -> bool {
+        lock_path(&self.root).is_file()
+    }
+
+    /// Removes what a process that left late has made anew in a domain that is gone.
+    pub fn forget(&self) {
+        if !self.exists() {
+            self.remove();
+        }
+    }
+
     /// What the names of its files in shared memory begin with.
     pub fn prefix(&self) -> String {
         format!("{PREFIX}{}_", self.root.file_name().unwrap_or_default().to_string_lossy())
@@ -176,6 +189,40 @@ pub fn remove_dead_domains() {
     remove_dead(&base());
 }
 
+/// A domain that was found, of a run or of what is left of one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Found {
+    /// Its directory.
+    pub root: PathBuf,
+    /// Whether its launcher is alive.
+    pub alive: bool,
+    /// When it was made, as far as the file system tells.
+    pub made: Option<SystemTime>,
+}
+
+/// The domains of this user, the newest first.
+pub fn domains() -> Vec<Found> {
+    found(&base())
+}
+
+fn found(base: &Path) -> Vec<Found> {
+    let find = |path: PathBuf| {
+        let made = fs::metadata(&path).and_then(|lock| lock.modified()).ok();
+        // Whoever holds the lock is alive; one that is ours now was nobody's, and is let go of at once.
+        let alive = !matches!(lock(&path, Lock::Existing), Ok(Some(_)));
+        Found { root: path.with_extension(""), alive, made }
+    };
+    let mut found: Vec<Found> = locks(base).map(find).collect();
+    found.sort_by_key(|found| std::cmp::Reverse(found.made));
+    found
+}
+
+/// The lock files of all domains.
+fn locks(base: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = fs::read_dir(base).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
+}
+
 fn require_room(needed: u64) -> Result<(), DomainError> {
     // A system that does not tell how much is left is not refused for it.
     let free = statvfs(SHARED_MEMORY).map_or(u64::MAX, |room| room.f_bavail.saturating_mul(room.f_frsize));
@@ -183,11 +230,8 @@ fn require_room(needed: u64) -> Result<(), DomainError> {
 }
 
 fn remove_dead(base: &Path) {
-    for entry in fs::read_dir(base).into_iter().flatten().flatten() {
-        let path = entry.path();
-        if path.extension().is_some_and(|extension| extension == "lock")
-            && let Ok(Some(_held)) = lock(&path, Lock::Existing)
-        {
+    for path in locks(base) {
+        if let Ok(Some(_held)) = lock(&path, Lock::Existing) {
             Domain { root: path.with_extension("") }.remove();
         }
     }
@@ -253,7 +297,11 @@ mod tests {
             fs::create_dir(root).unwrap();
             held = lock(&lock_path(root), Lock::New).unwrap();
         }
+        let alive =
+            |root: &PathBuf| found(base.path()).into_iter().find(|found| found.root == *root).map(|one| one.alive);
+        assert_eq!((alive(&dead), alive(&living)), (Some(false), Some(true)));
         remove_dead(base.path());
+        assert_eq!((alive(&dead), alive(&living)), (None, Some(true)));
         assert!(!dead.exists() && !lock_path(&dead).exists());
         assert!(living.exists() && held.is_some());
     }

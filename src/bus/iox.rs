@@ -24,6 +24,7 @@ use iceoryx2::service::builder::publish_subscribe::Builder;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::fmt;
+use std::io;
 use std::rc::Rc;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
@@ -135,6 +136,8 @@ pub struct IoxBus {
     node: Rc<Node<Ipc>>,
     bells: Bells,
     depths: Depths,
+    /// Whether a signal that nobody has opened yet is made.
+    makes: bool,
 }
 
 impl IoxBus {
@@ -143,12 +146,30 @@ impl IoxBus {
     /// # Errors
     /// [`BusError::Domain`].
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
+        Self::over(domain, name, depths, Bells::open(domain), true)
+    }
+
+    /// The same for one who only looks: of the signals nothing is made, and one that nobody has opened is an error.
+    ///
+    /// # Errors
+    /// [`BusError::Domain`].
+    pub fn join(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
+        Self::over(domain, name, depths, Bells::join(domain), false)
+    }
+
+    fn over(
+        domain: &Domain,
+        name: &str,
+        depths: Depths,
+        bells: io::Result<Bells>,
+        makes: bool,
+    ) -> Result<Self, BusError> {
         // iceoryx2 reports to the console on its own; what matters comes back as an error.
         set_log_level(LogLevel::Fatal);
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
-        let bells = Bells::open(domain).map_err(|error| failed(error.to_string()))?;
+        let bells = bells.map_err(|error| failed(error.to_string()))?;
         let node = Rc::new(enter(domain, name).map_err(failed)?);
-        Ok(Self { node, bells, depths })
+        Ok(Self { node, bells, depths, makes })
     }
 
     /// Whether a signal has a fast lane: where only the newest sample counts.
@@ -158,9 +179,12 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?
-            .open_or_create()
-            .map_err(|error| failed_to_open(topic, end, &error))
+        let builder = self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?;
+        if self.makes {
+            builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
+        } else {
+            builder.open().map_err(|error| failed_to_open(topic, end, &error))
+        }
     }
 
     fn fleet_service<L: FleetLayout>(
@@ -168,9 +192,12 @@ impl IoxBus {
         topic: &Topic,
         end: &'static str,
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
-        self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?
-            .open_or_create()
-            .map_err(|error| failed_to_open(topic, end, &error))
+        let builder = self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?;
+        if self.makes {
+            builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
+        } else {
+            builder.open().map_err(|error| failed_to_open(topic, end, &error))
+        }
     }
 
     fn builder<P: IceoryxSend + fmt::Debug + ?Sized>(

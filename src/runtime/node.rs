@@ -180,6 +180,13 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn settle(&mut self) -> Result<(), BusError>;
+    /// Settles what is left of a tick that the end of the run has come upon.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn finish(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
     /// Counts every tick before `tick` that was not executed as missed.
     fn skip_to(&mut self, tick: u64);
     /// Exercises all links with a sample that no role uses.

@@ -240,6 +240,7 @@ pub fn serve<B: Bus + 'static>(
         Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
+    node.finish()?;
     if scenario.clock == ClockKind::Realtime {
         privileges::release();
     }

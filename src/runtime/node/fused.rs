@@ -106,6 +106,11 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
         self.settle_estimate()
     }
 
+    /// The estimate may have been sent, and used, though the command waits for another input.
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.settle_estimate()
+    }
+
     fn skip_to(&mut self, tick: u64) {
         self.observer.skip_to(tick);
         self.controller.skip_to(tick);

@@ -1,0 +1,163 @@
+//! Is this machine fit for real time? What the kernel and its limits say, and how late bare sleeps really are.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `machine` | reads /proc, /sys and /dev below a root, and judges each line |
+//! | `lateness` | sleeps for some seconds with the privileges that are granted, and judges that |
+//!
+//! Must not change the machine, and must not fail: what the system does not tell is said to be unknown.
+
+mod lateness;
+mod machine;
+
+pub use lateness::{Lateness, measure};
+pub use machine::{Demand, Machine};
+
+use crate::bus::domain::Found;
+use crate::telemetry::Host;
+use serde::Serialize;
+use std::fmt;
+
+/// Layout version of the report.
+const SCHEMA: &str = "corotate/doctor/v1";
+/// How wide the column of names is.
+const NAME_WIDTH: usize = 20;
+
+/// What a line of the report comes to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Verdict {
+    /// As it should be.
+    Ok,
+    /// It works, and something is to be gained, or is not known.
+    Warn,
+    /// Deadlines will be missed for it.
+    Bad,
+}
+
+impl Verdict {
+    /// Its word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Warn => "warn",
+            Self::Bad => "bad",
+        }
+    }
+}
+
+/// One line of the report.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Check {
+    /// What was looked at.
+    pub name: &'static str,
+    /// What was found.
+    pub found: String,
+    /// What it comes to.
+    pub verdict: Verdict,
+    /// What to do about it; none where all is well.
+    pub remedy: Option<String>,
+}
+
+impl Check {
+    fn ok(name: &'static str, found: impl Into<String>) -> Self {
+        Self { name, found: found.into(), verdict: Verdict::Ok, remedy: None }
+    }
+
+    fn warn(name: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { name, found: found.into(), verdict: Verdict::Warn, remedy: Some(remedy.into()) }
+    }
+
+    fn bad(name: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { name, found: found.into(), verdict: Verdict::Bad, remedy: Some(remedy.into()) }
+    }
+}
+
+/// The whole report.
+#[derive(Debug, Clone, Serialize)]
+pub struct Diagnosis {
+    schema: &'static str,
+    host: Host,
+    /// The scenario whose demands the machine is held to.
+    pub scenario: String,
+    /// Whether no line is bad.
+    pub fit: bool,
+    /// The lines.
+    pub checks: Vec<Check>,
+    /// The measurement, if there was one.
+    pub lateness: Option<Lateness>,
+}
+
+impl Diagnosis {
+    /// Puts a report together.
+    pub fn new(scenario: &str, mut checks: Vec<Check>, lateness: Option<Lateness>) -> Self {
+        checks.extend(lateness.iter().map(Lateness::check));
+        let fit = checks.iter().all(|check| check.verdict < Verdict::Bad);
+        Self { schema: SCHEMA, host: Host::this(), scenario: scenario.to_owned(), fit, checks, lateness }
+    }
+
+    /// The report as one line of JSON.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("a report of plain values is JSON") + "\n"
+    }
+}
+
+/// For people: one line per check, and what to do below it.
+impl fmt::Display for Diagnosis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}, {}", self.host.cpu, self.host.kernel)?;
+        for Check { name, found, verdict, remedy } in &self.checks {
+            writeln!(f, "{:<5} {name:<NAME_WIDTH$} {found}", verdict.name())?;
+            if let Some(remedy) = remedy {
+                writeln!(f, "{:<5} {:<NAME_WIDTH$}   {remedy}", "", "")?;
+            }
+        }
+        let count = |verdict| self.checks.iter().filter(|check| check.verdict == verdict).count();
+        let (bad, warn) = (count(Verdict::Bad), count(Verdict::Warn));
+        match self.fit {
+            true => writeln!(f, "fit for {} in real time; {warn} to improve", self.scenario),
+            false => writeln!(f, "not fit for {} in real time: {bad} bad, {warn} to improve", self.scenario),
+        }
+    }
+}
+
+/// What is left of runs whose launcher was killed.
+pub fn leftovers(domains: &[Found]) -> Check {
+    let name = "leftover domains";
+    let dead: Vec<&Found> = domains.iter().filter(|found| !found.alive).collect();
+    let running = domains.len() - dead.len();
+    match dead.first() {
+        None => Check::ok(name, format!("none ({running} running)")),
+        Some(first) => Check::warn(
+            name,
+            format!("{} of dead runs, as {} ({running} running)", dead.len(), first.root.display()),
+            "`corotate doctor --clean` removes them; so does the next run",
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_bad_line_is_enough_and_every_other_line_says_what_to_do() {
+        let warned = vec![Check::ok("a", "1"), Check::warn("b", "2", "mend b")];
+        let fit = Diagnosis::new("test", warned.clone(), None);
+        assert!(fit.fit && fit.to_string().ends_with("fit for test in real time; 1 to improve\n"), "{fit}");
+        let checks = [warned, vec![Check::bad("c", "3", "mend c")]].concat();
+        let unfit = Diagnosis::new("test", checks, None);
+        assert!(!unfit.fit && unfit.to_string().contains("mend c"));
+        let json: serde_json::Value = serde_json::from_str(&unfit.to_json()).unwrap();
+        assert_eq!((json["fit"].as_bool(), json["checks"][2]["verdict"].as_str()), (Some(false), Some("bad")));
+        assert_eq!(json["checks"][1]["remedy"], "mend b");
+    }
+
+    #[test]
+    fn the_dead_are_told_and_the_living_are_not_blamed() {
+        let found = |alive| Found { root: "/run/corotate/00000000".into(), alive, made: None };
+        assert_eq!(leftovers(&[found(true)]).verdict, Verdict::Ok);
+        let check = leftovers(&[found(true), found(false)]);
+        assert!(check.verdict == Verdict::Warn && check.found.starts_with("1 of dead runs"), "{check:?}");
+    }
+}

@@ -1,0 +1,289 @@
+//! Draws the model. 80 by 24 is enough; what has no room is left out from below, and said.
+
+use super::model::{Model, RoleLine, Series};
+use crate::sample::RoleState;
+use ratatui::backend::TestBackend;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Modifier, Style};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Borders, Paragraph, Sparkline, SparklineBar};
+use ratatui::{Frame, Terminal};
+
+/// Below this nothing can be read.
+const MIN_WIDTH: u16 = 60;
+const MIN_HEIGHT: u16 = 12;
+/// Lines for roles and for events, at the most.
+const ROLES_MAX: usize = 8;
+const EVENTS_MAX: usize = 3;
+/// Columns of names and values beside a sparkline, of its scale, and of the list of signals.
+const NAME_WIDTH: u16 = 24;
+const SCALE_WIDTH: u16 = 6;
+const SIGNALS_WIDTH: u16 = 26;
+/// Steps of a sparkline, more than any screen resolves.
+const STEPS: f64 = 1000.0;
+
+const DIM: Style = Style::new().add_modifier(Modifier::DIM);
+const BOLD: Style = Style::new().add_modifier(Modifier::BOLD);
+const ALARM: Style = Style::new().fg(Color::Red).add_modifier(Modifier::BOLD);
+
+/// Draws everything.
+pub fn draw(model: &Model, frame: &mut Frame<'_>) {
+    let area = frame.area();
+    if area.width < MIN_WIDTH || area.height < MIN_HEIGHT {
+        let text = format!("{MIN_WIDTH} x {MIN_HEIGHT} is the least; 80 x 24 shows all. q quits");
+        frame.render_widget(Paragraph::new(text), area);
+        return;
+    }
+    let roles = model.roles.len().min(ROLES_MAX) as u16;
+    // Two lines per sparkline where there is room.
+    let fixed = 1 + (1 + roles) + 1 + (1 + EVENTS_MAX as u16) + 6 + 1;
+    let series = model.series.len() as u16;
+    let lines = if area.height >= fixed + 2 * series { 2 } else { 1 };
+    let [head, role_area, series_area, event_area, signal_area, foot] = Layout::vertical([
+        Constraint::Length(1),
+        Constraint::Length(1 + roles),
+        Constraint::Length(1 + lines * series),
+        Constraint::Length(1 + EVENTS_MAX as u16),
+        Constraint::Min(2),
+        Constraint::Length(1),
+    ])
+    .areas(area);
+    frame.render_widget(header(model), head);
+    frame.render_widget(Paragraph::new(role_lines(model)), role_area);
+    let series_area = section("errors, log scale; the largest of each stretch", series_area, frame);
+    draw_series(model, lines, frame, series_area);
+    draw_events(model, frame, event_area);
+    let signal_area = section("signals", signal_area, frame);
+    draw_signals(model, frame, signal_area);
+    frame.render_widget(Line::styled("q quit  space pause  up/down/tab signal  left/right fields", DIM), foot);
+}
+
+/// The screen as text, without colours.
+pub fn text(model: &Model, width: u16, height: u16) -> String {
+    let Ok(mut terminal) = Terminal::new(TestBackend::new(width, height));
+    let Ok(drawn) = terminal.draw(|frame| draw(model, frame));
+    let rows = drawn.buffer.content().chunks(usize::from(width));
+    rows.map(|row| row.iter().map(|cell| cell.symbol()).collect::<String>().trim_end().to_owned() + "\n").collect()
+}
+
+/// Draws a section's title and gives the room below it.
+fn section(title: &str, area: Rect, frame: &mut Frame<'_>) -> Rect {
+    let block = Block::new().borders(Borders::TOP).border_style(DIM).title(format!(" {title} "));
+    let inner = block.inner(area);
+    frame.render_widget(block, area);
+    inner
+}
+
+fn header(model: &Model) -> Line<'static> {
+    let Model { scenario, clock, tick, last_tick, tick_s, .. } = model;
+    let text = match *clock {
+        "realtime" => format!(
+            "{clock} {:.0} Hz  {:.2} of {:.2} s",
+            1.0 / tick_s,
+            *tick as f64 * tick_s,
+            *last_tick as f64 * tick_s
+        ),
+        _ => (*clock).to_owned(),
+    };
+    let state = match (model.ended, model.paused) {
+        (true, _) => "  ended",
+        (_, true) => "  paused",
+        _ => "",
+    };
+    Line::from(vec![
+        Span::styled(format!("corotate {scenario}"), BOLD),
+        Span::raw(format!("  {text}  tick {tick}/{last_tick}")),
+        Span::styled(state, ALARM),
+    ])
+}
+
+fn role_lines(model: &Model) -> Vec<Line<'static>> {
+    let titles = format!(
+        "{:<14} {:<7} {:>4} {:>9} {:>7} {:>6} {:>13} {:>13}",
+        "role", "state", "life", "tick", "Hz", "missed", "due-sent us", "in-sent us"
+    );
+    let hidden = model.roles.len().saturating_sub(ROLES_MAX);
+    let shown = model.roles.len() - if hidden > 0 { hidden + 1 } else { 0 };
+    let more = (hidden > 0).then(|| Line::styled(format!("... and {} more", hidden + 1), DIM));
+    std::iter::once(Line::styled(titles, DIM)).chain(model.roles[..shown].iter().map(role_line)).chain(more).collect()
+}
+
+fn role_line(role: &RoleLine) -> Line<'static> {
+    let state = RoleState::NAMES.into_iter().find(|(_, state)| *state == role.state).map_or("?", |(name, _)| name);
+    let rate = role.rate.per_s().map_or("-".to_owned(), |rate| format!("{rate:.0}"));
+    let of = |window: &super::Window| {
+        let pair = |[p50, p99]: [f64; 2]| format!("{}/{}", short(p50), short(p99));
+        window.percentiles_us().map_or("-".to_owned(), pair)
+    };
+    let alarmed = |alarm: bool| if alarm { ALARM } else { Style::new() };
+    Line::from(vec![
+        Span::raw(format!("{:<14} ", cut(&role.name, 14))),
+        Span::styled(format!("{state:<7} "), alarmed(role.state == RoleState::Absent)),
+        Span::styled(format!("{:>4} ", role.generation), alarmed(role.generation > 1)),
+        Span::raw(format!("{:>9} {rate:>7} ", role.tick)),
+        Span::styled(format!("{:>6} ", role.missed), alarmed(role.missed > 0)),
+        Span::raw(format!("{:>13} {:>13}", of(&role.lateness), of(&role.step))),
+    ])
+}
+
+/// A number of µs in few columns.
+fn short(us: f64) -> String {
+    match us {
+        us if us < 10.0 => format!("{us:.1}"),
+        us if us < 1e5 => format!("{us:.0}"),
+        us => format!("{us:.0e}"),
+    }
+}
+
+/// The beginning of a text, with a mark where it was cut.
+fn cut(text: &str, width: usize) -> String {
+    match text.chars().count() {
+        length if length <= width => text.to_owned(),
+        _ => text.chars().take(width.saturating_sub(2)).collect::<String>() + "..",
+    }
+}
+
+fn draw_series(model: &Model, lines: u16, frame: &mut Frame<'_>, area: Rect) {
+    let rows = Layout::vertical(model.series.iter().map(|_| Constraint::Length(lines))).split(area);
+    for (series, row) in model.series.iter().zip(rows.iter()) {
+        let columns = [Constraint::Length(NAME_WIDTH), Constraint::Min(10), Constraint::Length(SCALE_WIDTH)];
+        let [name, plot, scale] = Layout::horizontal(columns).areas(*row);
+        let value = if series.last.is_nan() { "-".to_owned() } else { format!("{:.3e}", series.last) };
+        let label = match lines {
+            1 => vec![Line::raw(format!("{} {value}", cut(&series.name, 12)))],
+            _ => vec![Line::raw(cut(&series.name, usize::from(NAME_WIDTH) - 1)), Line::styled(value, BOLD)],
+        };
+        frame.render_widget(Paragraph::new(label), name);
+        draw_line(series, frame, plot, scale);
+    }
+}
+
+/// One sparkline and the decades that it spans.
+fn draw_line(series: &Series, frame: &mut Frame<'_>, plot: Rect, scale: Rect) {
+    let Some((low, high)) = series.history.decades() else { return };
+    let level = |value: f64| {
+        let part = (value.log10() - f64::from(low)) / f64::from(high - low);
+        // A zero lies below every decade, and what is beyond all bounds above.
+        SparklineBar::from((STEPS * part.clamp(0.0, 1.0)) as u64)
+    };
+    let bars: Vec<SparklineBar> = series.history.stretches(usize::from(plot.width)).into_iter().map(level).collect();
+    frame.render_widget(Sparkline::default().max(STEPS as u64).data(bars), plot);
+    let ends =
+        if scale.height > 1 { vec![format!(" 1e{high}"), format!(" 1e{low}")] } else { vec![format!(" 1e{high}")] };
+    frame.render_widget(Paragraph::new(ends.into_iter().map(|end| Line::styled(end, DIM)).collect::<Vec<_>>()), scale);
+}
+
+fn draw_events(model: &Model, frame: &mut Frame<'_>, area: Rect) {
+    let title = match model.scripted {
+        0 => format!("events ({})", model.events.len()),
+        scripted => format!("events ({}); {scripted} faults are scripted", model.events.len()),
+    };
+    let area = section(&title, area, frame);
+    let newest = model.events.iter().rev().take(usize::from(area.height));
+    let lines = newest.map(|event| Line::raw(format!("{:>9}  {}", event.tick, event.text)));
+    frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
+}
+
+fn draw_signals(model: &Model, frame: &mut Frame<'_>, area: Rect) {
+    let [list, fields] = Layout::horizontal([Constraint::Length(SIGNALS_WIDTH), Constraint::Min(10)]).areas(area);
+    let height = usize::from(list.height);
+    let first = (model.selected + 1).saturating_sub(height);
+    let name = |(index, signal): (usize, &super::SignalLine)| {
+        let (mark, style) = if index == model.selected { (">", BOLD) } else { (" ", Style::new()) };
+        Line::styled(format!("{mark}{}", cut(&signal.name, usize::from(SIGNALS_WIDTH) - 2)), style)
+    };
+    let names = model.signals.iter().enumerate().skip(first).take(height).map(name);
+    frame.render_widget(Paragraph::new(names.collect::<Vec<_>>()), list);
+    let Some(selected) = model.signals.get(model.selected) else { return };
+    let field = |(name, value): &(String, String)| Line::raw(format!("{:<17} {value}", cut(name, 17)));
+    let lines: Vec<Line<'_>> = match selected.fields.as_slice() {
+        [] => vec![Line::styled("no sample yet", DIM)],
+        fields => fields.iter().skip(model.scroll).map(field).collect(),
+    };
+    frame.render_widget(Paragraph::new(lines), fields);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Event, SignalLine};
+    use super::*;
+
+    fn model() -> Model {
+        let mut leader = RoleLine::new("leader");
+        (leader.state, leader.generation, leader.tick, leader.missed) = (RoleState::Running, 2, 1234, 7);
+        (1..=100).for_each(|us| leader.lateness.push(us * 1000));
+        let mut error = Series::new("sync_error_rad_s");
+        (0..300).for_each(|k| error.push(10_f64.powf(-f64::from(k) / 30.0)));
+        Model {
+            scenario: "rigid-pair".to_owned(),
+            clock: "realtime",
+            tick: 1234,
+            last_tick: 10_000,
+            tick_s: 1e-3,
+            roles: vec![leader, RoleLine::new("a-follower-with-a-long-name")],
+            series: vec![error, Series::new("estimate_error_rad_s")],
+            events: [Event { tick: 1200, text: "leader is back, in its life 2".to_owned() }].into(),
+            signals: vec![SignalLine {
+                name: "leader/truth".to_owned(),
+                fields: vec![
+                    ("tick".to_owned(), "1234".to_owned()),
+                    ("omega_rad_s".to_owned(), "+1.0000e0".to_owned()),
+                ],
+            }],
+            ..Model::default()
+        }
+    }
+
+    #[test]
+    fn everything_is_on_a_screen_of_80_by_24() {
+        let text = text(&model(), 80, 24);
+        for word in [
+            "corotate rigid-pair  realtime 1000 Hz  1.23 of 10.00 s  tick 1234/10000",
+            "leader         running    2      1234       -      7         50/99             -",
+            "a-follower-w.. absent",
+            "sync_error_rad_s",
+            "1.080e-10",
+            "1e0",
+            "1e-10",
+            "     1200  leader is back, in its life 2",
+            ">leader/truth             tick              1234",
+            "omega_rad_s       +1.0000e0",
+            "q quit",
+        ] {
+            assert!(text.contains(word), "{word}\n{text}");
+        }
+        assert_eq!(text.lines().count(), 24);
+        assert!(text.lines().all(|line| line.chars().count() <= 80));
+    }
+
+    /// A falling error falls on the screen: the bars get no higher from left to right.
+    #[test]
+    fn the_sparkline_falls_with_the_error() {
+        let text = text(&model(), 80, 24);
+        let line = text.lines().find(|line| line.starts_with("sync_error_rad_s")).unwrap();
+        let bars: Vec<u32> = line.chars().skip(24).take_while(|bar| *bar != ' ').map(u32::from).collect();
+        assert!(bars.len() > 10 && bars.windows(2).all(|pair| pair[1] <= pair[0]), "{line}");
+        assert!(bars[0] > bars[bars.len() - 1], "{line}");
+    }
+
+    #[test]
+    fn every_size_is_drawn_without_harm() {
+        let mut model = model();
+        model.roles = (0..40).map(|index| RoleLine::new(&format!("follower-{index}"))).collect();
+        model.signals =
+            (0..90).map(|index| SignalLine { name: format!("f{index}/truth"), fields: Vec::new() }).collect();
+        model.selected = 77;
+        for (width, height) in [(1, 1), (60, 12), (80, 24), (59, 40), (200, 11), (300, 100)] {
+            let text = text(&model, width, height);
+            assert_eq!(text.lines().count(), usize::from(height));
+            assert!(
+                width < 80 || height < 24 || text.contains(">f77/truth") && text.contains("... and 33 more"),
+                "{text}"
+            );
+        }
+        model.paused = true;
+        assert!(text(&model, 80, 24).contains("paused"));
+        model.ended = true;
+        assert!(text(&model, 80, 24).contains("ended"));
+    }
+}

@@ -1,0 +1,244 @@
+//! `corotate watch` in a real terminal, tmux, beside a running loop.
+
+mod common;
+
+use common::{Bench, WATCHDOG, await_some};
+use std::process::Command;
+use std::time::Instant;
+
+/// A tmux server of its own, with one window of 80 by 24 in which a shell runs.
+struct Terminal<'a> {
+    bench: &'a Bench,
+    socket: String,
+}
+
+impl<'a> Terminal<'a> {
+    fn open(bench: &'a Bench) -> Self {
+        let socket = bench.path("tmux").to_str().unwrap().to_owned();
+        let terminal = Self { bench, socket };
+        terminal.tmux(&["-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "sh"]);
+        terminal.tmux(&["set-option", "-g", "status", "off"]);
+        // Whatever the shell's own prompt is, this one is looked for.
+        terminal.enter("PS1='ready> '; clear");
+        terminal.await_text("ready>");
+        terminal
+    }
+
+    fn tmux(&self, arguments: &[&str]) -> String {
+        let mut command = self.bench.command_of("tmux".as_ref());
+        // A test that runs within tmux is not to find that one.
+        let output = command.env_remove("TMUX").args(["-S", &self.socket]).args(arguments).output();
+        let output = output.expect("tmux is missing: tests/run installs it (Debian: apt install tmux)");
+        assert!(output.status.success(), "tmux {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    fn enter(&self, line: &str) {
+        self.tmux(&["send-keys", line, "Enter"]);
+    }
+
+    fn press(&self, key: &str) {
+        self.tmux(&["send-keys", key]);
+    }
+
+    fn screen(&self) -> String {
+        self.tmux(&["capture-pane", "-p"])
+    }
+
+    /// The screen as soon as it is as it should be.
+    fn await_screen(&self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
+        let end = Instant::now() + WATCHDOG;
+        loop {
+            let screen = self.screen();
+            if wanted(&screen) {
+                return screen;
+            }
+            assert!(Instant::now() < end, "there never was {what}:\n{screen}");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+    }
+
+    fn await_text(&self, text: &str) -> String {
+        self.await_screen(text, |screen| screen.contains(text))
+    }
+
+    /// Whether the program has the screen behind the shell's, and the cursor is hidden.
+    fn flag(&self, name: &str) -> bool {
+        self.tmux(&["display-message", "-p", &format!("#{{{name}}}")]).trim() == "1"
+    }
+
+    fn assert_restored(&self) {
+        self.await_screen("the shell's screen", |_| !self.flag("alternate_on"));
+        assert!(self.flag("cursor_flag"), "the cursor is seen again");
+        self.enter("stty -a | grep -o ' icanon\\| echo ' | tr -d '\\n'; echo \"=$?\"");
+        self.await_text("icanon echo =0");
+    }
+}
+
+impl Drop for Terminal<'_> {
+    fn drop(&mut self) {
+        // Only ours: the socket is.
+        let _ = Command::new("tmux").env_remove("TMUX").args(["-S", &self.socket, "kill-server"]).output();
+    }
+}
+
+/// The words of the line that begins with this word.
+fn line(screen: &str, first: &str) -> Vec<String> {
+    let lines = screen.lines().map(|line| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>());
+    lines.into_iter().find(|words| words.first().is_some_and(|word| word == first)).unwrap_or_default()
+}
+
+fn tick(screen: &str, role: &str) -> Option<u64> {
+    line(screen, role).get(3)?.parse().ok()
+}
+
+/// The number below the name of a metric.
+fn value(screen: &str, metric: &str) -> Option<f64> {
+    screen.lines().skip_while(|line| !line.starts_with(metric)).nth(1)?.split_whitespace().next()?.parse().ok()
+}
+
+const RUN: [&str; 7] = ["run", "--duration", "60", "--tick-hz", "100", "--set", "realtime.lock_memory=false"];
+
+#[test]
+fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
+    let bench = Bench::new();
+    let run = bench.start(&[&RUN[..], &["--json"]].concat());
+    let domain = await_some(|| bench.domains().pop());
+    let terminal = Terminal::open(&bench);
+    terminal.enter(&format!("{} watch", env!("CARGO_BIN_EXE_corotate")));
+
+    let running = |screen: &str| ["leader", "follower", "observer", "controller"].map(|role| line(screen, role));
+    let first = terminal.await_screen("four running roles with a rate", |screen| {
+        running(screen).iter().all(|words| words.get(1).is_some_and(|state| state == "running") && words[4] != "-")
+            && value(screen, "estimate_error_rad_s").is_some()
+    });
+    assert!(first.contains("corotate rigid-pair  realtime 100 Hz"), "{first}");
+    for words in running(&first) {
+        let rate: f64 = words[4].parse().unwrap();
+        assert!((20.0..200.0).contains(&rate), "{words:?} at 100 Hz, however loaded the machine is");
+        assert_eq!(words[2], "1", "the first life: {words:?}");
+        assert!(words[6].contains('/'), "lateness: {words:?}");
+    }
+    assert!(running(&first)[2][7].contains('/') && running(&first)[0][7] == "-", "a leader waits for nobody: {first}");
+
+    // Ticks go on and the errors fall by the design's rate, which is more than a decade per second.
+    let started = tick(&first, "leader").unwrap();
+    let later =
+        terminal.await_screen("ticks going on", |screen| tick(screen, "leader").is_some_and(|t| t > started + 300));
+    for metric in ["sync_error_rad_s", "estimate_error_rad_s"] {
+        let (before, after) = (value(&first, metric).unwrap(), value(&later, metric).unwrap());
+        assert!(after < before.max(1e-9), "{metric}: {before:e}, then {after:e}\n{later}");
+    }
+    assert!(later.contains(">leader/measurement"), "{later}");
+
+    // A signal is selected, and stands still while the loop goes on.
+    terminal.press("Up");
+    terminal.await_text(">follower/command");
+    terminal.await_text("acceleration_rad");
+    terminal.press("Space");
+    let paused = terminal.await_text("paused");
+    std::thread::sleep(std::time::Duration::from_millis(500));
+    let still = terminal.screen();
+    assert_eq!(tick(&paused, "leader"), tick(&still, "leader"));
+    terminal.press("Space");
+    terminal.await_screen("ticks going on", |screen| tick(screen, "leader") > tick(&still, "leader"));
+
+    // It follows the window's size.
+    terminal.tmux(&["resize-window", "-x", "100", "-y", "40"]);
+    terminal.await_screen("a screen of 40 lines", |screen| {
+        screen.lines().count() == 40 && screen.lines().nth(39).is_some_and(|l| l.contains("q quit"))
+    });
+
+    terminal.press("q");
+    terminal.assert_restored();
+    terminal.enter("echo code=$?");
+
+    // The loop has not noticed: it ends in order, with books that balance.
+    run.signal(2);
+    let done = run.wait();
+    let summary: serde_json::Value =
+        serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    assert_eq!((done.code, summary["books"]["balanced"].as_bool()), (Some(130), Some(true)), "{}", done.stderr);
+    drop(terminal);
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn a_signal_gives_the_terminal_back_and_the_end_of_the_run_is_told() {
+    let bench = Bench::new();
+    let run = bench.start(&RUN);
+    let domain = await_some(|| bench.domains().pop());
+    let terminal = Terminal::open(&bench);
+    let program = env!("CARGO_BIN_EXE_corotate");
+    terminal.enter(&format!("{program} watch {}; echo code=$?", domain.display()));
+    terminal
+        .await_screen("running roles", |screen| line(screen, "leader").get(1).is_some_and(|state| state == "running"));
+    let watchers =
+        || bench.processes().into_iter().filter(|pid| arguments(*pid).get(1).is_some_and(|word| word == "watch"));
+    watchers().for_each(|pid| common::send_signal(pid, 15));
+    terminal.await_text("code=143");
+    terminal.assert_restored();
+
+    terminal.enter(&format!("clear; {program} watch; echo code=$?"));
+    terminal
+        .await_screen("running roles", |screen| line(screen, "leader").get(1).is_some_and(|state| state == "running"));
+    run.signal(15);
+    assert_eq!(run.wait().code, Some(143));
+    let ended = terminal.await_text("ended");
+    assert!(tick(&ended, "controller").is_some_and(|tick| tick > 0), "what was last seen stays: {ended}");
+    terminal.press("q");
+    terminal.await_text("code=0");
+    drop(terminal);
+    bench.assert_clean(&[domain]);
+}
+
+/// A watcher that is killed leaves nothing that outlives the run.
+#[test]
+fn a_killed_watcher_leaves_nothing() {
+    let bench = Bench::new();
+    let run = bench.start(&RUN);
+    let domain = await_some(|| bench.domains().pop());
+    bench.await_role("controller");
+    let watcher = bench.start(&["watch", "--once", "60"]);
+    let node = || std::fs::read_dir("/proc/self/fd").is_ok() && maps(watcher.pid()).contains("corotate_");
+    await_some(|| node().then_some(()));
+    watcher.signal(9);
+    watcher.wait();
+    run.signal(15);
+    assert_eq!(run.wait().code, Some(143));
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn one_screen_can_be_had_without_a_terminal() {
+    let bench = Bench::new();
+    let run = bench.start(&["run", "--duration", "60", "--clock", "realtime", "--tick-hz", "200"]);
+    let domain = await_some(|| bench.domains().pop());
+    let done = bench.run(&["watch", domain.to_str().unwrap(), "--once", "3"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert_eq!(done.stdout.lines().count(), 24);
+    assert_eq!(line(&done.stdout, "observer")[1], "running", "{}", done.stdout);
+    let refused = bench.run(&["watch", domain.to_str().unwrap()]);
+    assert!(refused.code == Some(2) && refused.stderr.contains("--once"), "{refused:?}");
+    run.signal(15);
+    run.wait();
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn without_a_run_there_is_nothing_to_watch() {
+    let bench = Bench::new();
+    let none = bench.run(&["watch", "--once"]);
+    assert!(none.code == Some(2) && none.stderr.contains("no run of this user"), "{none:?}");
+    let other = bench.run(&["watch", "/tmp", "--once"]);
+    assert!(other.code == Some(2) && other.stderr.contains("not the domain of a run"), "{other:?}");
+}
+
+fn arguments(pid: u32) -> Vec<String> {
+    let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    line.split(|byte| *byte == 0).map(|word| String::from_utf8_lossy(word).into_owned()).collect()
+}
+
+fn maps(pid: u32) -> String {
+    std::fs::read_to_string(format!("/proc/{pid}/maps")).unwrap_or_default()
+}
