@@ -20,6 +20,7 @@
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
+//! | `report` | a run as one page that is looked at | no |
 //! | `bench` | what all of it costs beside its floors | no |
 //! | `doctor` | whether this machine is fit for real time | no |
 //! | `watch` | a screen on a running loop | no |
@@ -54,6 +55,8 @@ pub mod doctor;
 pub mod launch;
 #[cfg(feature = "runtime")]
 pub mod record;
+#[cfg(feature = "runtime")]
+pub mod report;
 #[cfg(feature = "runtime")]
 pub mod rig;
 #[cfg(feature = "runtime")]

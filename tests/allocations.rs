@@ -208,22 +208,28 @@ fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
     Occupant::Device(index, Box::new(link))
 }
 
-fn counts(text: &str, with_device: bool) -> Vec<(RoleReport, Count)> {
-    let overrides = ["clock=realtime", "duration_s=1", "accept={}", "fault=[]", "watchdog={}"].map(str::to_owned);
+fn counts(text: &str, with_device: bool, fused: bool) -> Vec<(RoleReport, Count)> {
+    let fused = format!("launch.fused={fused}");
+    let overrides =
+        ["clock=realtime", "duration_s=1", "accept={}", "fault=[]", "watchdog={}", &fused].map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
     let domain = OwnedDomain::create(0).unwrap();
-    let (roles, (far, path)) = (RoleId::all(&scenario), line());
+    let hosts = RoleId::all(&scenario).into_iter().filter(|role| role.host(&scenario) == *role);
+    let (roles, (far, path)) = (hosts.collect::<Vec<_>>(), line());
     std::thread::scope(|scope| {
-        let (scenario, domain) = (&scenario, &domain);
+        let (scenario, domain, path) = (&scenario, &domain, &path);
         let mut by_device = None;
         let threads: Vec<_> = roles
             .iter()
             .map(|role| match role {
                 RoleId::Plant(index @ 1) if with_device => {
                     by_device = Some(scope.spawn(|| device(scenario, *index, &far)));
-                    let occupant = linked(scenario, *index, &path);
-                    scope.spawn(move || count_role(scenario, occupant, domain))
+                    scope.spawn(move || count_role(scenario, linked(scenario, *index, path), domain))
                 }
+                RoleId::Controller if scenario.fused => scope.spawn(move || {
+                    let observer = Occupant::Fused(private_ledger(scenario, RoleId::Observer));
+                    count_role(scenario, observer, domain)
+                }),
                 role => scope.spawn(move || count_role(scenario, *role, domain)),
             })
             .collect();
@@ -252,14 +258,22 @@ fn assert_none(name: &str, counts: Vec<(RoleReport, Count)>) {
 #[test]
 fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
-        assert_none(name, counts(text, false));
+        assert_none(name, counts(text, false, false));
     }
+}
+
+#[test]
+fn neither_does_an_observer_that_shares_the_controller_s_process() {
+    let (name, text) = corotate::config::SHIPPED[0];
+    let counts = counts(text, false, true);
+    assert!(counts.len() == 3 && counts.iter().all(|(report, _)| report.role != "observer"));
+    assert_none(name, counts);
 }
 
 #[test]
 fn neither_does_a_bridge_to_a_device() {
     let (name, text) = corotate::config::SHIPPED[0];
-    let counts = counts(text, true);
+    let counts = counts(text, true, false);
     assert!(counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
     assert_none(name, counts);
 }

@@ -7,10 +7,14 @@ use common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::Command;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 const SIGSTOP: i32 = 19;
 const SIGCONT: i32 = 18;
+
+/// For tests that need their processes to be served, or that keep others from it: one at a time.
+static CORES: Mutex<()> = Mutex::new(());
 
 /// A shell that runs a line in the bench.
 fn start_in_shell(bench: &Bench, line: &str) -> Running {
@@ -122,6 +126,7 @@ fn a_directory_that_may_not_be_written_is_refused_before_the_run() {
 /// As a host does to a virtual machine: everything stands still for two seconds, and the clock has gone on.
 #[test]
 fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
+    let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let running =
@@ -149,6 +154,7 @@ fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
 /// A role that stands still for less than the limit is waited for: the plant's own expiry covers the gap.
 #[test]
 fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
+    let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let running =
@@ -171,6 +177,7 @@ fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
 /// A neighbour of higher priority takes one core for more than a second.
 #[test]
 fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
+    let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let running =

@@ -9,6 +9,7 @@ mod export;
 mod init;
 mod record;
 mod replay;
+mod report;
 mod role;
 mod run;
 mod seat;
@@ -42,6 +43,8 @@ Examples:
   corotate seat trio.toml follower-a             what that program must know, as JSON
   corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
                                                  a device as the follower of a run --external follower
+  corotate report runs/20261121T150000Z-rigid-pair
+                                                 the run as one page, report.html
   corotate watch                                 a screen on the newest run
   corotate doctor                                is this machine fit for real time, and what to do about it
   corotate bench step hop                        what the step and a hop cost here, beside their floors";
@@ -72,6 +75,8 @@ enum Command {
     Diff(diff::Arguments),
     /// Write a recording as tables
     Export(export::Arguments),
+    /// Show a run, or a recording, as one page
+    Report(report::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
     /// Tell whether this machine is fit for real time, and what to do about it
@@ -152,6 +157,7 @@ fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::replay(&arguments),
         Some(Command::Diff(arguments)) => diff::diff(&arguments),
         Some(Command::Export(arguments)) => export::export(&arguments),
+        Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),

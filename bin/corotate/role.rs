@@ -41,7 +41,10 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
     match run_role(&seat, &terminated) {
         Ok(()) => Exit::Ok,
         Err(error) => {
-            let usage = matches!(error, RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. });
+            let usage = matches!(
+                error,
+                RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Fused { .. }
+            );
             fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
         }
     }

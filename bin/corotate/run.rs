@@ -1,7 +1,7 @@
 //! `corotate run`: one scenario from file to verdict.
 
 use crate::{Exit, fail, print};
-use corotate::config::{ClockKind, SHIPPED, Scenario};
+use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, junit, table, write_run};
 use corotate::runtime::seat_path;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -73,18 +73,9 @@ impl Arguments {
     }
 
     fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
-        if let (Some(role), ClockKind::InProcess) = (self.external.first(), scenario.clock) {
-            let reason = "one process has no room for another's role; give --clock realtime or lockstep";
-            return Err(format!("--external {role}: {reason}"));
-        }
-        let roles = scenario.rig.roles();
-        match self.external.iter().find(|role| !roles.contains(&role.as_str())) {
-            Some(role) => {
-                let known = roles.join(", ");
-                Err(format!("--external {role}: there is no such role; this scenario has: {known}"))
-            }
-            None => Ok(()),
-        }
+        let check =
+            |role: &String| scenario.check_external(role).map_err(|reason| format!("--external {role}: {reason}"));
+        self.external.iter().try_for_each(check)
     }
 }
 

@@ -39,6 +39,7 @@ fn describe(arguments: &Arguments) -> Result<(), Exit> {
         let (role, known) = (arguments.role.clone(), scenario.rig.roles().join(", "));
         fail(Exit::Usage, &RoleError::NoSuchRole { role, known })
     })?;
+    scenario.check_external(&arguments.role).map_err(|reason| fail(Exit::Usage, &reason))?;
     let domain = arguments.domain.as_deref().map(|root| join_run(&scenario, root)).transpose();
     let domain = domain.map_err(|error| fail(Exit::Usage, &error))?;
     if domain.is_none() {

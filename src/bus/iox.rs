@@ -277,7 +277,7 @@ impl Bus for IoxBus {
                 end: "writer",
                 reason: format!("{error:?}"),
             })?;
-        Ok(IoxWriter { publisher, latest, loan: None, bell: self.bells.of(topic), topic: topic.clone() })
+        Ok(IoxWriter { publisher, latest, loan: None, shown: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
@@ -316,11 +316,34 @@ pub struct IoxWriter<S: Sample> {
     publisher: Publisher<Ipc, Wire<S>, ()>,
     latest: Option<LatestWriter<S>>,
     loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    /// What was shown in the lane and is not sent.
+    shown: Option<SampleMut<Ipc, Wire<S>, ()>>,
     bell: Bell,
     topic: Topic,
 }
 
 impl<S: Sample> IoxWriter<S> {
+    /// A sample that is filled, and in the lane if there is one.
+    #[inline]
+    fn filled(&mut self, fill: impl FnOnce(&mut S)) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
+        let mut sample = match self.loan.take() {
+            Some(sample) => sample,
+            None => self.loan()?,
+        };
+        fill(&mut sample.payload_mut().0);
+        if let Some(latest) = &self.latest {
+            latest.put(&sample.payload().0);
+        }
+        Ok(sample)
+    }
+
+    #[inline]
+    fn deliver(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
+        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        self.bell.ring();
+        Ok(())
+    }
+
     fn loan(&self) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
         let chunk = self.publisher.loan_uninit().map_err(|error| self.failed(format!("{error:?}")))?;
         Ok(chunk.write_payload(Wire(S::zeroed())))
@@ -335,17 +358,20 @@ impl<S: Sample> IoxWriter<S> {
 impl<S: Sample> Write<S> for IoxWriter<S> {
     #[inline]
     fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
-        let mut sample = match self.loan.take() {
-            Some(sample) => sample,
-            None => self.loan()?,
-        };
-        fill(&mut sample.payload_mut().0);
-        if let Some(latest) = &self.latest {
-            latest.put(&sample.payload().0);
-        }
-        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
-        self.bell.ring();
-        Ok(())
+        let sample = self.filled(fill)?;
+        self.deliver(sample)
+    }
+
+    #[inline]
+    fn show(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        self.publish()?;
+        self.shown = Some(self.filled(fill)?);
+        if self.latest.is_none() { self.publish() } else { Ok(()) }
+    }
+
+    #[inline]
+    fn publish(&mut self) -> Result<(), BusError> {
+        self.shown.take().map_or(Ok(()), |sample| self.deliver(sample))
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
@@ -475,8 +501,13 @@ impl<S: Sample> Read<S> for IoxReader<S> {
 
     fn refresh(&mut self) {
         if let Lane::Wanted { generation } = self.lane {
-            // Where there is none there will be none: a lane is made before its signal.
-            self.lane = LatestReader::open(&self.node, &self.topic, generation).map_or(Lane::None, Lane::Open);
+            match LatestReader::open(&self.node, &self.topic, generation) {
+                Some(latest) => self.lane = Lane::Open(latest),
+                // Where there is none there will be none: a lane is made before its signal. But before the first sample it
+                // is not known whose to look for.
+                None if self.newest != (0, 0) => self.lane = Lane::None,
+                None => {}
+            }
         }
     }
 }

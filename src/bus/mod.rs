@@ -140,6 +140,21 @@ pub trait Write<S: ?Sized> {
     /// # Errors
     /// [`BusError::Send`].
     fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError>;
+    /// The same, but where readers of the newest sample have a shorter way, only they see it at first, and those that sleep
+    /// are not woken; [`publish`](Self::publish) must follow.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn show(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        self.send(fill)
+    }
+    /// Sends what was only shown, if anything was.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn publish(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
     /// Gets ready for the next [`send`](Self::send), so that it has less to do then.
     ///
     /// # Errors

@@ -162,13 +162,14 @@ pub enum NamedCores {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Launch {
     pub startup_timeout_s: f64,
+    pub fused: bool,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub external: Vec<String>,
 }
 
 impl Default for Launch {
     fn default() -> Self {
-        Self { startup_timeout_s: 30.0, external: Vec::new() }
+        Self { startup_timeout_s: 30.0, fused: false, external: Vec::new() }
     }
 }
 

@@ -1,7 +1,7 @@
 //! A scenario as resolved: every value checked, every default filled in, ready to run.
 
 use super::fault::{self, ScriptedFault};
-use super::raw::{Policy, Raw};
+use super::raw::{Launch, Policy, Raw};
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, accept, nearest, watchdog};
 use crate::control::WatchBounds;
 use crate::rig::{self, AnyRig, Frame};
@@ -17,6 +17,8 @@ const MAX_TICKS: f64 = 3.2e11;
 /// The tables whose content belongs to the rig.
 const RIG_SECTIONS: [&str; 7] =
     ["central_body", "leader", "spacecraft", "follower", "observer", "controller", "limits"];
+/// The roles that `launch.fused` makes one process of.
+const FUSED: [&str; 2] = ["observer", "controller"];
 /// The keys that hold one table each.
 const TABLES: [&str; 12] = [
     "central_body",
@@ -56,6 +58,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// Whether observer and controller share a process, where roles are processes.
+    pub fused: bool,
     /// Roles that somebody else starts: hardware, or a foreign program.
     pub external: Vec<String>,
     /// What the launcher does about roles that fail.
@@ -128,6 +132,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            fused: raw.launch.fused,
             external: raw.launch.external,
             supervision: raw.supervision,
             faults,
@@ -136,6 +141,21 @@ impl Scenario {
             rig,
             resolved,
         })
+    }
+
+    /// Why somebody else cannot start this role in a run of the scenario, if it is so.
+    ///
+    /// # Errors
+    /// The reason, with what to do.
+    pub fn check_external(&self, role: &str) -> Result<(), String> {
+        let roles = self.rig.roles();
+        if self.clock == ClockKind::InProcess {
+            return Err("one process has no room for another's role; give --clock realtime or lockstep".to_owned());
+        }
+        if !roles.contains(&role) {
+            return Err(format!("there is no such role; this scenario has: {}", roles.join(", ")));
+        }
+        if self.fused && FUSED.contains(&role) { Err(fused_with_external(role)) } else { Ok(()) }
     }
 
     /// The period h, s.
@@ -255,6 +275,7 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
             .to_owned()
     });
     let Some(roles) = roles else { return };
+    check_fused(&raw.launch, &roles, checks);
     for (index, role) in external.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
         let known = roles.join(", ");
         checks.refuse(
@@ -262,6 +283,27 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
             format!("there is no role `{role}`; this scenario has: {known}"),
         );
     }
+}
+
+/// The observer can only be fused with a controller that there is, and neither of them with somebody else's program.
+fn check_fused(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
+    if !launch.fused {
+        return;
+    }
+    checks.require(roles.contains(&"controller"), "launch.fused", || {
+        "no body of this scenario is driven, so there is no controller to fuse the observer with; leave it false"
+            .to_owned()
+    });
+    for (index, role) in launch.external.iter().enumerate().filter(|(_, role)| FUSED.contains(&role.as_str())) {
+        checks.refuse(&format!("launch.external[{index}]"), fused_with_external(role));
+    }
+}
+
+/// Why a role that is fused with another cannot be somebody else's.
+fn fused_with_external(role: &str) -> String {
+    format!(
+        "launch.fused makes one process of ours of observer and controller, so nobody else can be the {role}; set it to false"
+    )
 }
 
 /// Roles that a policy names must exist.

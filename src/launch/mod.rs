@@ -18,6 +18,7 @@ pub use children::janitor;
 pub use junit::junit;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use replay::replay_as_process;
+pub(crate) use score::lyapunov_floor;
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
 pub(crate) use table::plain;

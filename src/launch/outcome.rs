@@ -6,6 +6,7 @@ use super::{Action, Incident, Score};
 use crate::config::Scenario;
 use crate::record::RecordingReport;
 use crate::rig::{CertificateReport, Figure};
+use crate::runtime::RoleId;
 use crate::serial::LineBook;
 use crate::telemetry::{
     Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm,
@@ -59,6 +60,9 @@ pub struct Summary {
     pub last_tick: u64,
     pub(super) started_utc: String,
     host: Host,
+    /// Roles that had no process of their own, with the role in whose process they were.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub hosted: BTreeMap<String, String>,
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
     pub signal: usize,
@@ -200,7 +204,8 @@ impl Summary {
         let mut latencies = latencies(&outcome.reports);
         latencies.extend(incident_figures(&outcome.incidents));
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
-        let lost: Vec<&str> = lost.map(|incident| incident.role.as_str()).collect();
+        let lost: Vec<&str> =
+            lost.flat_map(|incident| incident.with.iter().chain([&incident.role])).map(String::as_str).collect();
         let interrupted = outcome.signal != 0 || !lost.is_empty();
         let books = Books::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies);
@@ -214,6 +219,7 @@ impl Summary {
             last_tick: scenario.last_tick,
             started_utc: started.to_string(),
             host: Host::this(),
+            hosted: hosted(scenario),
             domain: outcome.domain.clone(),
             signal: outcome.signal,
             accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
@@ -370,6 +376,12 @@ fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {
         StageFigures { role: report.role.clone(), stage: stage.stage.clone(), figures: latency.percentiles(), latency }
     };
     reports.iter().flat_map(|report| report.stages.iter().map(move |stage| figures(report, stage))).collect()
+}
+
+fn hosted(scenario: &Scenario) -> BTreeMap<String, String> {
+    let roles = RoleId::all(scenario).into_iter().map(|role| (role, role.host(scenario)));
+    let hosted = roles.filter(|(role, host)| role != host);
+    hosted.map(|(role, host)| (role.name(scenario).to_owned(), host.name(scenario).to_owned())).collect()
 }
 
 fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineBook> {

@@ -17,7 +17,7 @@ use crate::runtime::{
     shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
-use crate::telemetry::{Grant, RoleReport};
+use crate::telemetry::{Grant, Ledger, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::path::PathBuf;
@@ -92,6 +92,22 @@ struct Dismissal {
     problems: Vec<String>,
 }
 
+impl Dismissal {
+    /// Takes in what a role has left.
+    fn gather(&mut self, scenario: &Scenario, domain: &Domain, role: RoleId, ledger: &Ledger) {
+        let name = role.name(scenario).to_owned();
+        let file = std::fs::read(report_path(domain.root(), &name)).ok();
+        match file.map(|bytes| serde_json::from_slice(&bytes)) {
+            Some(Ok(report)) => self.reports.push(report),
+            Some(Err(error)) => self.problems.push(format!("{name}: its report is none: {error}")),
+            None if ledger.generation() > 0 => {
+                self.reports.push(report(scenario, role, ledger, Vec::new(), Vec::new()));
+            }
+            None => self.unbooked.push(name),
+        }
+    }
+}
+
 /// Raises the limit on open files as far as it goes, for this process and its children, and checks that it is enough.
 fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
     let limits = getrlimit(Resource::Nofile);
@@ -129,7 +145,8 @@ impl<'a> Crew<'a> {
             true => Ok((role, None)),
             false => RoleProcess::start(&launch.program, scenario, role, domain).map(|process| (role, Some(process))),
         };
-        let started = RoleId::all(scenario).into_iter().map(start).collect::<Result<Vec<_>, _>>()?;
+        let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
+        let started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
         let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
         let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
@@ -319,19 +336,14 @@ impl<'a> Crew<'a> {
         }
         let mut dismissal = Dismissal::default();
         for member in &mut self.members {
-            let file = std::fs::read(report_path(self.domain.root(), &member.name)).ok();
-            if let Some(failure) = member.bad_end(file.is_some()) {
+            let reported = report_path(self.domain.root(), &member.name).exists();
+            if let Some(failure) = member.bad_end(reported) {
                 let stopped = Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) };
                 eprintln!("corotate: {stopped}");
                 self.incidents.push(stopped);
             }
-            match file.map(|bytes| serde_json::from_slice(&bytes)) {
-                Some(Ok(report)) => dismissal.reports.push(report),
-                Some(Err(error)) => dismissal.problems.push(format!("{}: its report is none: {error}", member.name)),
-                None if member.ledger.generation() > 0 => {
-                    dismissal.reports.push(report(self.scenario, member.role, &member.ledger, Vec::new(), Vec::new()));
-                }
-                None => dismissal.unbooked.push(member.name.clone()),
+            for (role, ledger) in member.books() {
+                dismissal.gather(self.scenario, self.domain, role, ledger);
             }
         }
         dismissal

@@ -82,9 +82,13 @@ fn cut(script: &mut Script) {
     script.limit = first;
 }
 
-/// The scenario without what would hold up or kill the process: that has had its effect on the recording.
+/// The scenario without what would hold up or kill the process: that has had its effect on the recording. Every role has
+/// a process of its own here.
 fn without_interruptions(scenario: &Scenario) -> String {
     let mut table = scenario.resolved.clone();
+    if let Some(launch) = table.get_mut("launch").and_then(toml::Value::as_table_mut) {
+        launch.insert("fused".to_owned(), false.into());
+    }
     if let Some(faults) = table.get_mut("fault").and_then(toml::Value::as_array_mut) {
         let interrupts = |fault: &toml::Value| {
             fault.get("kind").and_then(toml::Value::as_str).is_some_and(|kind| ["stall", "kill"].contains(&kind))

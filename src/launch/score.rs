@@ -45,7 +45,7 @@ pub struct CertificateScore {
 ///
 /// The reconstruction of ε divides the rounding of a measured increment by h, and the change of V over a tick is a part h
 /// of V: errors count from rounding/h² on.
-fn lyapunov_floor(tick_s: f64) -> f64 {
+pub(crate) fn lyapunov_floor(tick_s: f64) -> f64 {
     let error = 64.0 * f64::EPSILON / (tick_s * tick_s);
     error * error
 }

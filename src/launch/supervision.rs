@@ -29,6 +29,9 @@ const SILENT_PERIODS: f64 = 10.0;
 pub struct Incident {
     /// The role.
     pub role: String,
+    /// Other roles in the same process, which failed with it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub with: Vec<String>,
     /// Which generation of it.
     pub generation: u64,
     /// The tick that it had not finished.
@@ -58,7 +61,8 @@ pub enum Action {
 
 impl fmt::Display for Incident {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} died at tick {}: {}", self.role, self.tick, self.cause)?;
+        let with: String = self.with.iter().map(|role| format!(", and {role} with it,")).collect();
+        write!(f, "{}{with} died at tick {}: {}", self.role, self.tick, self.cause)?;
         if !self.last_words.is_empty() {
             write!(f, "; it said: {}", self.last_words)?;
         }
@@ -74,6 +78,7 @@ impl Incident {
     pub(super) fn without_process(role: &str, ledger: &Ledger, action: Action) -> Self {
         Self {
             role: role.to_owned(),
+            with: Vec::new(),
             generation: ledger.generation(),
             tick: crate::runtime::next_tick(ledger),
             cause: "it was killed by the scenario".to_owned(),
@@ -91,7 +96,7 @@ pub(super) struct Failure {
     pub last_words: String,
 }
 
-/// One role, seen from the launcher.
+/// One role, seen from the launcher, with what else is in its process.
 pub(super) struct Member {
     pub name: String,
     pub role: RoleId,
@@ -100,6 +105,8 @@ pub(super) struct Member {
     pub external: bool,
     pub last: Health,
     pub ledger: Ledger,
+    /// The other roles in its process, all earlier in a tick, with their books.
+    hosted: Vec<(RoleId, Ledger)>,
     /// What there is to go by where an external role says nothing of itself.
     trace: Option<Trace>,
     health: <IoxBus as Bus>::Reader<Health>,
@@ -124,7 +131,10 @@ impl Member {
     ) -> Result<Self, LaunchError> {
         let (external, now_ns) = (process.is_none(), monotonic_ns());
         let name = role.name(scenario).to_owned();
+        let hosted = role.hosted(scenario).into_iter().filter(|other| *other != role);
+        let hosted = hosted.map(|other| Ok((other, open_ledger(domain, scenario, other)?)));
         Ok(Self {
+            hosted: hosted.collect::<Result<_, LaunchError>>()?,
             health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
             ledger: open_ledger(domain, scenario, role)?,
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
@@ -140,6 +150,11 @@ impl Member {
             restarts: 0,
             restart: None,
         })
+    }
+
+    /// All roles in its process with their books, in the order of a tick.
+    pub fn books(&self) -> impl Iterator<Item = (RoleId, &Ledger)> {
+        self.hosted.iter().map(|(role, ledger)| (*role, ledger)).chain([(self.role, &self.ledger)])
     }
 
     /// Starts its process.
@@ -251,11 +266,11 @@ impl Member {
     /// Decides what is done about a failure, and prepares it.
     pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
-        let again = !self.external
-            && supervision.of(&self.name) == OnFailure::Restart
-            && self.restarts < supervision.restarts_max;
+        let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
+        let again = !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max;
         let incident = Incident {
             role: self.name.clone(),
+            with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
             generation: self.generation,
             tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
             cause: failure.cause,

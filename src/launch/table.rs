@@ -20,6 +20,9 @@ pub fn table(summary: &Summary) -> String {
         summary.tick_hz,
         summary.last_tick + 1
     );
+    for (role, host) in &summary.hosted {
+        let _ = writeln!(text, "fused: the {role} is in the {host}'s process");
+    }
     for note in &summary.notes {
         let _ = writeln!(text, "note: {note}");
     }

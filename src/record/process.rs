@@ -20,8 +20,6 @@ use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// How much it gives way to others.
-const NICE: i32 = 10;
 /// In real time, between two looks at the samples, ns.
 const LOOK_NS: u64 = 5_000_000;
 /// In lockstep, the same when nothing has come for a while, ns.
@@ -49,7 +47,8 @@ pub struct RecorderSeat {
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join(&seat.domain)?;
-    give_way(&scenario);
+    // Not nice to ordinary processes: it must not lose samples because something is being compiled.
+    give_way(&scenario, 0);
     let bus = IoxBus::enter(&domain, RECORDER, depths(&scenario)).map_err(RoleError::from)?;
     let mut line = Line::open(&scenario, &bus)?;
     let mut recorder = Recorder::open(&scenario, &bus, &seat.file)?;
@@ -66,8 +65,8 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
 }
 
 /// Nobody waits for a recorder, or a watcher, so it lets everybody pass. What is not granted is no harm.
-pub(crate) fn give_way(scenario: &Scenario) {
-    let _ = nice(NICE);
+pub(crate) fn give_way(scenario: &Scenario, niceness: i32) {
+    let _ = nice(niceness);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
         critical.iter().for_each(|core| allowed.unset(*core));
         if allowed.count() > 0 {

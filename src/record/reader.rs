@@ -194,6 +194,20 @@ impl Recording {
         Ok(tracks)
     }
 
+    /// Shows every sample in the order in which they came, and keeps none: the index of its signal, when it came in ns on the
+    /// recorder's monotonic clock, its bytes.
+    ///
+    /// # Errors
+    /// [`RecordError::Read`], [`RecordError::NotOurs`].
+    pub fn visit(&self, mut each: impl FnMut(usize, u64, &[u8])) -> Result<(), RecordError> {
+        scan(&self.path, &mut Content::default(), |channel, received_ns, sample| {
+            if let Some(index) = self.signals.iter().position(|signal| signal.channel == channel) {
+                each(index, received_ns, sample);
+            }
+        })?;
+        Ok(())
+    }
+
     /// Checks that every signal has the layout that this version gives it.
     ///
     /// # Errors

@@ -31,11 +31,20 @@ pub enum Ended {
     Stopped,
 }
 
-/// A role's line to the launcher.
+/// What one role says of itself.
+pub struct Voice<B: Bus> {
+    /// Whose it is.
+    pub role: RoleId,
+    /// Where it is said.
+    pub health: B::Writer<Health>,
+    /// Which of the role's lives this is, from 1.
+    pub generation: u64,
+}
+
+/// A process's line to the launcher, with the voice of each of its roles.
 pub struct Control<'a, B: Bus> {
     schedule: B::Reader<Schedule>,
-    health: B::Writer<Health>,
-    generation: u64,
+    voices: Vec<Voice<B>>,
     denied: u64,
     terminated: &'a AtomicBool,
 }
@@ -43,36 +52,34 @@ pub struct Control<'a, B: Bus> {
 impl<'a, B: Bus> Control<'a, B> {
     /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
     /// that asks the process to end.
-    pub fn new(
-        schedule: B::Reader<Schedule>,
-        health: B::Writer<Health>,
-        generation: u64,
-        denied: u64,
-        terminated: &'a AtomicBool,
-    ) -> Self {
-        Self { schedule, health, generation, denied, terminated }
+    pub fn new(schedule: B::Reader<Schedule>, voices: Vec<Voice<B>>, denied: u64, terminated: &'a AtomicBool) -> Self {
+        Self { schedule, voices, denied, terminated }
     }
 
-    /// Whether nobody has had this role's seat before.
+    /// Whether nobody has had these seats before.
     pub fn first(&self) -> bool {
-        self.generation == 1
+        self.voices.iter().all(|voice| voice.generation == 1)
     }
 
-    /// Tells the launcher how the role is.
+    /// Tells the launcher how the roles are.
     ///
     /// # Errors
     /// [`BusError::Send`].
     pub fn announce(&mut self, state: RoleState, node: &dyn Node) -> Result<(), BusError> {
-        let (ticks, generation, denied) = (node.ticks(), self.generation, self.denied);
-        self.health.send(|health| {
-            let sent_ns = monotonic_ns();
-            health.stamp = Stamp { tick: ticks.elapsed, generation, origin_ns: sent_ns, sent_ns };
-            health.state = state as u64;
-            health.executed = ticks.executed;
-            health.missed = ticks.missed;
-            health.denied = denied;
-        })?;
-        self.health.prepare()
+        let denied = self.denied;
+        for Voice { role, health, generation } in &mut self.voices {
+            let ticks = node.of(*role).unwrap_or(node).ticks();
+            health.send(|health| {
+                let sent_ns = monotonic_ns();
+                health.stamp = Stamp { tick: ticks.elapsed, generation: *generation, origin_ns: sent_ns, sent_ns };
+                health.state = state as u64;
+                health.executed = ticks.executed;
+                health.missed = ticks.missed;
+                health.denied = denied;
+            })?;
+            health.prepare()?;
+        }
+        Ok(())
     }
 
     /// The launcher's last word.

@@ -28,7 +28,7 @@ mod off {
 
     /// Nothing.
     #[inline(always)]
-    pub fn enter(_role: &str, _generation: u64) {}
+    pub fn enter(_roles: &[&str], _generation: u64) {}
 
     /// Nothing.
     #[inline(always)]
@@ -53,14 +53,14 @@ mod on {
 
     static HOOK: OnceLock<Option<Hook>> = OnceLock::new();
 
-    /// Arms the hook if it is meant for this role, and for nobody before it.
-    pub fn enter(role: &str, generation: u64) {
-        HOOK.get_or_init(|| parse(&std::env::var("COROTATE_HOOK").ok()?, role).filter(|_| generation == 1));
+    /// Arms the hook if it is meant for one of these roles, which are this process, and for nobody before it.
+    pub fn enter(roles: &[&str], generation: u64) {
+        HOOK.get_or_init(|| parse(&std::env::var("COROTATE_HOOK").ok()?, roles).filter(|_| generation == 1));
     }
 
-    fn parse(text: &str, role: &str) -> Option<Hook> {
+    fn parse(text: &str, roles: &[&str]) -> Option<Hook> {
         let mut words = text.split_whitespace();
-        if words.next()? != role {
+        if !roles.contains(&words.next()?) {
             return None;
         }
         let place = match words.next()? {

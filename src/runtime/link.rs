@@ -23,6 +23,8 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     delivered: bool,
     /// Whether a void takes the place of a sample that does not go out.
     voids: bool,
+    /// Whether samples are shown first, and published when there is time.
+    shows: bool,
     disturbance: Option<Box<Disturbance<S>>>,
     book: WriteBook,
 }
@@ -42,12 +44,17 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     ) -> Result<Self, BusError> {
         let book = WriteBook::open(ledger, last_tick);
         let (port, sent) = (S::writer(bus, topic, bodies, generation)?, S::blank(bodies));
-        Ok(Self { port, generation, sent, delivered: true, voids: false, disturbance: None, book })
+        Ok(Self { port, generation, sent, delivered: true, voids: false, shows: false, disturbance: None, book })
     }
 
     /// With voids in the place of samples that do not go out, for readers that wait for every tick.
     pub fn with_voids(self, voids: bool) -> Self {
         Self { voids, ..self }
+    }
+
+    /// Whose samples are shown to readers of the newest at first, and sent to the others by [`publish`](Self::publish).
+    pub fn shown_first(self) -> Self {
+        Self { shows: true, ..self }
     }
 
     /// With scripted faults.
@@ -65,14 +72,28 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             return self.send_disturbed(fill);
         }
         let (generation, sent) = (self.generation, self.sent.borrow_mut());
-        self.port.send(|sample| {
+        let fill = |sample: &mut S| {
             fill(sample);
             sample.stamp_mut().generation = generation;
             sent.assign(sample);
             hooks::at(Place::Loaned);
-        })?;
+        };
+        if self.shows {
+            self.port.show(fill)?
+        } else {
+            self.port.send(fill)?
+        }
         hooks::at(Place::Sent);
         Ok(())
+    }
+
+    /// Sends what was only shown, if anything was.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn publish(&mut self) -> Result<(), BusError> {
+        self.port.publish()
     }
 
     /// Sends a sample as the scripted faults have it.
@@ -137,6 +158,14 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.port.prepare()?;
         }
         Ok(())
+    }
+
+    /// Sends a void that is in the books again.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn repeat_void(&mut self, tick: u64) -> Result<(), BusError> {
+        self.send_void(&Stamp { tick, generation: self.generation, ..Stamp::default() })
     }
 
     fn send_void(&mut self, stamp: &Stamp) -> Result<(), BusError> {

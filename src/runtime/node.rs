@@ -4,6 +4,7 @@
 
 mod bridge;
 mod controller;
+mod fused;
 mod observer;
 mod plant;
 mod ports;
@@ -57,6 +58,21 @@ impl RoleId {
         Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
     }
 
+    /// The role in whose process it runs: its own, unless the scenario fuses it with another.
+    pub fn host(self, scenario: &Scenario) -> Self {
+        match self {
+            Self::Observer if scenario.fused && scenario.clock != ClockKind::InProcess => Self::Controller,
+            own => own,
+        }
+    }
+
+    /// The roles that run in its process, in the order of a tick; none if it is in another's.
+    pub fn hosted(self, scenario: &Scenario) -> Vec<Self> {
+        let mut hosted = Self::all(scenario);
+        hosted.retain(|role| role.host(scenario) == self);
+        hosted
+    }
+
     /// What kind of role it is, as the command line calls it.
     pub fn kind(self) -> &'static str {
         match self {
@@ -73,6 +89,8 @@ pub enum Occupant {
     Role(RoleId),
     /// A device, as the driven body with this index.
     Device(usize, Box<DeviceLink>),
+    /// This program, as the controller and as the observer too, whose books these are.
+    Fused(Ledger),
 }
 
 impl Occupant {
@@ -81,7 +99,17 @@ impl Occupant {
         match self {
             Self::Role(role) => *role,
             Self::Device(index, _) => RoleId::Plant(*index),
+            Self::Fused(_) => RoleId::Controller,
         }
+    }
+
+    /// Its roles with their books, in the order of a tick; `ledger` has those of the seat.
+    pub(super) fn books(&self, ledger: &Ledger) -> Vec<(RoleId, Ledger)> {
+        let observer = match self {
+            Self::Fused(observer) => Some((RoleId::Observer, observer.reopened())),
+            Self::Role(_) | Self::Device(..) => None,
+        };
+        observer.into_iter().chain([(self.role(), ledger.reopened())]).collect()
     }
 }
 
@@ -152,6 +180,13 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn settle(&mut self) -> Result<(), BusError>;
+    /// Settles what is left of a tick that the end of the run has come upon.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn finish(&mut self) -> Result<(), BusError> {
+        Ok(())
+    }
     /// Counts every tick before `tick` that was not executed as missed.
     fn skip_to(&mut self, tick: u64);
     /// Exercises all links with a sample that no role uses.
@@ -169,6 +204,10 @@ pub trait Node {
     fn ticks(&self) -> Ticks;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
+    /// Of several roles that are driven as one, the node of this role.
+    fn of(&self, _role: RoleId) -> Option<&dyn Node> {
+        None
+    }
     /// The books of its device's serial line, if it has one.
     fn line(&self) -> Option<LineBook> {
         None
@@ -318,6 +357,11 @@ pub fn build<R: Rig, B: Bus + 'static>(
     let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
     Ok(match occupant {
         Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
+        Occupant::Fused(books) => {
+            let (generation, ledger) = (books.enter(), &books.reopened());
+            let observer = Seat { bus, scenario, role: RoleId::Observer, generation, ledger, clock };
+            Box::new(fused::FusedNode::<R, B>::open(rig, &observer, &seat)?)
+        }
         Occupant::Role(RoleId::Plant(index)) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {

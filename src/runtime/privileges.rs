@@ -28,7 +28,8 @@ fn lock_memory() -> io::Result<()> {
             let (limit, enough) = (limit >> 10, ENOUGH_LOCKED >> 10);
             Err(io::Error::other(format!("the memlock limit is {limit} KiB, and less than {enough} is not safe")))
         }
-        _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?),
+        // What is touched stays; what is never touched, as most of the program, takes no memory. The warm-up touches the rest.
+        _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT)?),
     }
 }
 
@@ -61,15 +62,14 @@ pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
     let first_served = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
     // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
     let cores = cores(settings, first_served);
-    let bodies = scenario.rig.bodies().len();
     let mut beside = Vec::new();
-    if let Some(core) = core_of(&cores, role, bodies) {
+    if let Some(core) = core_of(&cores, role, scenario) {
         let mut set = CpuSet::new();
         set.set(core);
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
         if pinned.is_ok() && first_served {
             beside = RoleId::all(scenario);
-            beside.retain(|other| *other != role && core_of(&cores, *other, bodies) == Some(core));
+            beside.retain(|other| other.host(scenario) != role && core_of(&cores, *other, scenario) == Some(core));
         }
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
@@ -108,14 +108,17 @@ fn cores(settings: &Realtime, first_served: bool) -> Vec<usize> {
     }
 }
 
-/// The core of a role of a scenario with so many bodies: plants in turn, for all of them act when the tick is due; observer
-/// and controller on cores of their own if there are any, else beside the leader and beside the first follower, whose
-/// measurements they wait for.
-fn core_of(cores: &[usize], role: RoleId, bodies: usize) -> Option<usize> {
+/// The core of a role's process: plants in turn, for all of them act when the tick is due; observer and controller on cores
+/// of their own if there are any, else beside the leader and beside the first follower, whose measurements they wait for.
+/// Fused, they need one core less, or are beside the leader, of which they want more than of a follower.
+fn core_of(cores: &[usize], role: RoleId, scenario: &Scenario) -> Option<usize> {
+    let bodies = scenario.rig.bodies().len();
+    let fused = RoleId::Observer.host(scenario) == RoleId::Controller;
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
-    let place = match role {
+    let place = match role.host(scenario) {
         RoleId::Plant(index) => index,
         RoleId::Observer => own_or(bodies, 0),
+        RoleId::Controller if fused => own_or(bodies, 0),
         RoleId::Controller => own_or(bodies + 1, 1),
     };
     cores.get(place % cores.len().max(1)).copied()
@@ -153,17 +156,33 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::SHIPPED;
+
+    fn shipped(name: &str, overrides: &[&str]) -> Scenario {
+        let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).unwrap();
+        let overrides: Vec<String> = overrides.iter().map(|one| (*one).to_owned()).collect();
+        Scenario::parse(text, name, &overrides).unwrap()
+    }
 
     #[test]
     fn whoever_waits_for_a_body_is_beside_it_unless_there_are_cores_for_all() {
         let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer, RoleId::Controller];
-        let places = |cores: &[usize]| roles.map(|role| core_of(cores, role, 2).unwrap());
-        assert_eq!(places(&[7]), [7, 7, 7, 7]);
-        assert_eq!(places(&[4, 5]), [4, 5, 4, 5]);
-        assert_eq!(places(&[4, 5, 6]), [4, 5, 6, 5]);
-        assert_eq!(places(&[4, 5, 6, 7, 8]), [4, 5, 6, 7]);
-        assert_eq!(core_of(&[4, 5], RoleId::Plant(2), 3), Some(4));
-        assert_eq!(core_of(&[], RoleId::Plant(2), 3), None);
+        let places = |cores: &[usize], fused: &str| {
+            let scenario = shipped("rigid-pair", &[fused]);
+            roles.map(|role| core_of(cores, role, &scenario).unwrap())
+        };
+        let apart = |cores: &[usize]| places(cores, "launch.fused=false");
+        assert_eq!(apart(&[7]), [7, 7, 7, 7]);
+        assert_eq!(apart(&[4, 5]), [4, 5, 4, 5]);
+        assert_eq!(apart(&[4, 5, 6]), [4, 5, 6, 5]);
+        assert_eq!(apart(&[4, 5, 6, 7, 8]), [4, 5, 6, 7]);
+        let fused = |cores: &[usize]| places(cores, "launch.fused=true");
+        assert_eq!(fused(&[7]), [7, 7, 7, 7]);
+        assert_eq!(fused(&[4, 5]), [4, 5, 4, 4]);
+        assert_eq!(fused(&[4, 5, 6, 7]), [4, 5, 6, 6]);
+        let trio = shipped("rigid-trio", &[]);
+        assert_eq!(core_of(&[4, 5], RoleId::Plant(2), &trio), Some(4));
+        assert_eq!(core_of(&[], RoleId::Plant(2), &trio), None);
     }
 
     #[test]
@@ -175,8 +194,7 @@ mod tests {
     #[test]
     fn what_is_not_granted_is_reported_with_a_remedy() {
         let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
-        let overrides = overrides.map(str::to_owned);
-        let scenario = Scenario::parse(crate::config::SHIPPED[0].1, "test", &overrides).unwrap();
+        let scenario = shipped("rigid-pair", &overrides);
         let Privileges { grants, first_served, beside } = take(&scenario, RoleId::Observer);
         assert_eq!((grants.len(), first_served, beside), (1, false, Vec::new()));
         assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");

@@ -3,7 +3,7 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::bridge::DeviceError;
-use super::drive::{Control, Drive, Ended, Waiting};
+use super::drive::{Control, Drive, Ended, Voice, Waiting};
 use super::hooks::{self, Place};
 use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
 use super::privileges::Privileges;
@@ -57,6 +57,14 @@ pub enum RoleError {
         role: String,
         /// The roles there are.
         known: String,
+    },
+    /// The role is another process's too.
+    #[error("in this run the {role} is in the process of the {host} (launch.fused); start that, or run without")]
+    Fused {
+        /// As given.
+        role: String,
+        /// The role in whose process it is.
+        host: String,
     },
     /// The domain's run is one of another scenario.
     #[error("the run in {} is not one of this scenario with these overrides; give its own file, {}", domain.display(), scenario.display())]
@@ -116,7 +124,21 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
 pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
-    in_domain(&domain, &scenario, role.into(), terminated, |_| {})
+    require_process(&scenario, role)?;
+    let occupant = match role {
+        RoleId::Controller if RoleId::Observer.host(&scenario) == role => {
+            Occupant::Fused(take_ledger(&domain, &scenario, RoleId::Observer)?)
+        }
+        role => role.into(),
+    };
+    in_domain(&domain, &scenario, occupant, terminated, |_| {})
+}
+
+/// Refuses a role that has no process of its own.
+pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), RoleError> {
+    let host = role.host(scenario);
+    let name = |role: RoleId| role.name(scenario).to_owned();
+    if host == role { Ok(()) } else { Err(RoleError::Fused { role: name(role), host: name(host) }) }
 }
 
 /// The domain of a run with its scenario.
@@ -138,14 +160,15 @@ pub(super) fn in_domain(
     scenario: &Scenario,
     occupant: Occupant,
     terminated: &AtomicBool,
-    reported: impl FnOnce(&RoleReport),
+    mut reported: impl FnMut(&RoleReport),
 ) -> Result<(), RoleError> {
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     let privileges = if realtime { privileges::take(scenario, role) } else { Privileges::default() };
-    let ledger = Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))?;
-    hooks::enter(role.name(scenario), ledger.generation() + 1);
+    let ledger = take_ledger(domain, scenario, role)?;
+    let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
+    hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Place::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
     serve(scenario, occupant, &bus, &ledger, terminated, privileges, |report| {
@@ -157,6 +180,11 @@ pub(super) fn in_domain(
 /// A role's ledger in a domain, to be read.
 pub(crate) fn open_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::shared(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
+}
+
+/// The same, to be written by this process alone.
+fn take_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
+    Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
 
 fn ledger_path(domain: &Domain, scenario: &Scenario, role: RoleId) -> PathBuf {
@@ -177,8 +205,8 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a seat on a bus: the phases of a run, from open links to the report. `privileges` are what the caller has taken, and
-/// `ledger` the books, new or a predecessor's.
+/// Serves a seat on a bus: the phases of a run, from open links to the report of each of its roles. `privileges` are what the
+/// caller has taken, and `ledger` the books, new or a predecessor's.
 ///
 /// # Errors
 /// [`RoleError`].
@@ -189,18 +217,21 @@ pub fn serve<B: Bus + 'static>(
     ledger: &Ledger,
     terminated: &AtomicBool,
     privileges: Privileges,
-    deliver: impl FnOnce(&RoleReport) -> Result<(), RoleError>,
+    mut deliver: impl FnMut(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let occupant = occupant.into();
-    let role = occupant.role();
-    let name = role.name(scenario);
+    let (role, books) = (occupant.role(), occupant.books(ledger));
+    let voice = |(role, ledger): &(RoleId, Ledger)| {
+        let (role, generation) = (*role, ledger.generation() + 1);
+        let health = bus.writer(&topic(scenario, role.name(scenario), Signal::Health), generation)?;
+        Ok(Voice { role, health, generation })
+    };
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
-    let health = bus.writer(&topic(scenario, name, Signal::Health), ledger.generation() + 1)?;
+    let voices = books.iter().map(voice).collect::<Result<_, BusError>>()?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
-        health,
-        ledger.generation(),
+        voices,
         privileges.grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,
     );
@@ -209,11 +240,19 @@ pub fn serve<B: Bus + 'static>(
         Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
+    node.finish()?;
     if scenario.clock == ClockKind::Realtime {
         privileges::release();
     }
-    stages.extend(node.stages());
-    deliver(&RoleReport { line: node.line(), ..report(scenario, role, ledger, stages, privileges.grants) })?;
+    for (of, ledger) in &books {
+        // What was asked of the machine, and measured before the ticks, is the seat's own.
+        let seats = *of == role;
+        let (mut stages, grants) =
+            if seats { (std::mem::take(&mut stages), privileges.grants.clone()) } else { Default::default() };
+        let node = node.of(*of).unwrap_or(&*node);
+        stages.extend(node.stages());
+        deliver(&RoleReport { line: node.line(), ..report(scenario, *of, ledger, stages, grants) })?;
+    }
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
         let leave_ns = monotonic_ns() + LEAVE_NS;

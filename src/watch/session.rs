@@ -15,6 +15,8 @@ use crate::runtime::{RoleError, depths, hurry, join, release_priority, topic};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
+/// How much a watcher gives way to everybody.
+const NICENESS: i32 = 10;
 /// For so long a run may still be opening its signals, ns.
 const JOIN_NS: u64 = 10_000_000_000;
 
@@ -64,7 +66,7 @@ impl Session {
         hurry();
         let joined = Joined::open(&domain, &scenario, end_ns, &mut model);
         release_priority();
-        give_way(&scenario);
+        give_way(&scenario, NICENESS);
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 

@@ -147,7 +147,8 @@ impl HiddenObserver {
                 self.status |= status::UNOBSERVABLE;
             }
         }
-        self.last = to;
+        // From where it came, not from the copy: a copy of a copy waits until that has been written.
+        self.last = seen(measurement);
         self.coasted = None;
     }
 

@@ -178,6 +178,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         })
     }
 
+    /// Whether nothing is known of the next tick's estimate.
+    pub fn lacks_estimate(&self) -> bool {
+        !self.estimate.knows(self.book.next())
+    }
+
     /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
@@ -298,7 +303,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
         let tick = self.book.next();
-        if !self.estimate.knows(tick) {
+        if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
         } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
             late.measurement.sleep(until_ns)?;

@@ -52,6 +52,22 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         })
     }
 
+    /// With estimates that are shown to readers of the newest at first; [`publish`](Self::publish) must follow a tick.
+    pub fn shown_first(self) -> Self {
+        Self { estimate: self.estimate.shown_first(), ..self }
+    }
+
+    /// Sends the estimate that was only shown, if one was.
+    #[inline]
+    pub fn publish(&mut self) -> Result<(), BusError> {
+        self.estimate.publish()
+    }
+
+    /// Sends the voids of the ticks from this one on again: they are in the books, and nobody has them.
+    pub fn repeat_voids(&mut self, from: u64) -> Result<(), BusError> {
+        (from..self.book.next()).try_for_each(|tick| self.estimate.repeat_void(tick))
+    }
+
     #[inline]
     fn execute(&mut self) -> Result<Poll, BusError> {
         let received = self.clock.now_ns();

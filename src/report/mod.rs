@@ -1,0 +1,138 @@
+//! A run as one page that is looked at: pictures and tables in a single file of HTML that needs nothing beside it.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `source` | what there is: a run's directory, or a recording alone |
+//! | `summary` | `summary.json`, read back |
+//! | `traces` | one pass over a recording |
+//! | `columns` | signals of any length in a bounded number of columns, their extremes kept |
+//! | `counterpart` | the run that an orbit's is compared with |
+//! | `percentiles` | latency distributions as curves |
+//! | `model` | what is shown, in which order |
+//! | `pictures` | which pictures the samples give |
+//! | `tables` | the tables of the summary |
+//! | `axis`, `chart` | pictures as SVG |
+//! | `html`, `page` | the page |
+//!
+//! Must not judge a run: verdicts are those of its summary. Must not leave out silently: what is missing is said.
+
+mod axis;
+mod chart;
+mod columns;
+mod counterpart;
+mod html;
+mod model;
+mod page;
+mod percentiles;
+mod pictures;
+mod source;
+mod summary;
+mod tables;
+mod traces;
+
+use crate::config::ConfigError;
+use crate::record::RecordError;
+use source::Source;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Why there is no report.
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    /// There is nothing.
+    #[error("there is no {}; give the directory of a run, or its run.mcap", path.display())]
+    Nothing {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// The directory is no run's.
+    #[error(
+        "{} has neither summary.json nor run.mcap; give the directory that `corotate run` named at its end",
+        path.display()
+    )]
+    NoRun {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// A file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The summary is none of this version's.
+    #[error("{} is no summary that can be shown: {reason}; use the version that wrote it", path.display())]
+    Summary {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A latency distribution is none.
+    #[error("{} is no percentile distribution: {reason}; remove it, or run again", path.display())]
+    Latency {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The scenario is refused.
+    #[error("the run's scenario is refused by this version: {0}")]
+    Scenario(#[from] ConfigError),
+    /// The recording cannot be used.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// The run to compare with failed.
+    #[error("the same motion with full state, for comparison, failed: {reason}")]
+    Counterpart {
+        /// Why.
+        reason: String,
+    },
+    /// The page cannot be written.
+    #[error("cannot write {}: {source}; name another file with --out", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+}
+
+/// A page.
+#[derive(Debug)]
+pub struct Report {
+    html: String,
+    remarks: Vec<String>,
+}
+
+impl Report {
+    /// The page: HTML that is well-formed XML too.
+    pub fn html(&self) -> &str {
+        &self.html
+    }
+
+    /// What a reader must know before all else: what is missing, and how to get it.
+    pub fn remarks(&self) -> &[String] {
+        &self.remarks
+    }
+
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// [`ReportError::Write`].
+    pub fn write(&self, path: &Path) -> Result<(), ReportError> {
+        std::fs::write(path, &self.html).map_err(|source| ReportError::Write { path: path.to_owned(), source })
+    }
+}
+
+/// Makes a page of a run's directory, or of a recording alone.
+///
+/// # Errors
+/// [`ReportError`].
+pub fn report(path: &Path) -> Result<Report, ReportError> {
+    let source = Source::open(path)?;
+    let model = model::model(&source)?;
+    Ok(Report { html: page::page(&model), remarks: model.remarks })
+}

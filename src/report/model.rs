@@ -1,0 +1,157 @@
+//! What a report shows, in which order: sections of facts, tables and figures. Must not know how a page is written.
+
+use super::ReportError;
+use super::axis::Axis;
+use super::chart::{Marks, Picture, marks};
+use super::source::Source;
+use super::traces::{Traces, trace};
+use super::{percentiles, pictures, tables};
+use crate::record::RunInfo;
+
+/// A page.
+#[derive(Debug)]
+pub struct Model {
+    /// What it is of.
+    pub title: String,
+    /// When and how that was made.
+    pub subtitle: String,
+    /// The verdict in a word, and whether it is a good one; none where nobody judged.
+    pub verdict: (String, Option<bool>),
+    /// What a reader must know before all else.
+    pub remarks: Vec<String>,
+    /// The marks that all pictures over time use.
+    pub marks: String,
+    /// What is shown.
+    pub sections: Vec<Section>,
+}
+
+/// A part with a heading.
+#[derive(Debug)]
+pub struct Section {
+    /// What links name it by.
+    pub id: &'static str,
+    /// Its heading.
+    pub title: &'static str,
+    /// Its content.
+    pub blocks: Vec<Block>,
+}
+
+/// A piece of a section.
+#[derive(Debug)]
+pub enum Block {
+    /// A paragraph.
+    Text(String),
+    /// Rows under a head. Cells that are numbers stand to the right.
+    Table {
+        /// What it is, if the heading does not say.
+        caption: String,
+        /// The names of its columns.
+        head: Vec<&'static str>,
+        /// The rows.
+        rows: Vec<Vec<String>>,
+    },
+    /// Pictures beside each other as far as there is room, each with its caption.
+    Figures(Vec<(Picture, String)>),
+    /// The shades of a strip and what they mean.
+    Scale(Vec<String>),
+    /// A text to be opened.
+    Details(String, String),
+}
+
+/// Draws up a report.
+pub fn model(source: &Source) -> Result<Model, ReportError> {
+    let mut remarks = source.missing.clone();
+    let traces = match (&source.recording, &source.scenario) {
+        (Some(recording), Some(scenario)) => Some(trace(recording, scenario)?),
+        _ => None,
+    };
+    if let Some(damage) = source.recording.as_ref().and_then(|recording| recording.damage()) {
+        remarks.push(format!("the recording is damaged, and shown as far as it goes: {damage}"));
+    }
+    if let Some(info) = source.recording.as_ref().map(|recording| recording.info()) {
+        remarks.extend(incomplete(info));
+    }
+    let (time, events) = times(source, traces.as_ref());
+    let mut sections = vec![tables::verdict(source, traces.as_ref())];
+    if let Some(traces) = &traces {
+        sections.extend(pictures::sections(source, traces, &time)?);
+    }
+    let latencies = percentiles::pictures(&source.curves);
+    if !latencies.is_empty() {
+        sections.push(latency_section(source, latencies));
+    }
+    if let Some(traces) = &traces {
+        sections.push(pictures::lateness(source, traces, &time));
+    }
+    sections.push(tables::events(source, traces.as_ref()));
+    sections.push(tables::books(source));
+    sections.push(tables::certificate(source));
+    sections.push(tables::machine(source));
+    sections.retain(|section| !section.blocks.is_empty());
+    let (title, subtitle) = headings(source);
+    let verdict = source.summary.as_ref().map_or(("not judged".to_owned(), None), |summary| match summary.accepted {
+        true => ("accepted".to_owned(), Some(true)),
+        false => ("not accepted".to_owned(), Some(false)),
+    });
+    Ok(Model { title, subtitle, verdict, remarks, marks: marks(&time, &events), sections })
+}
+
+fn incomplete(info: &RunInfo) -> Vec<String> {
+    let end = info.end.as_ref();
+    let part = (!info.whole).then(|| "the recording was begun in the midst of the run".to_owned());
+    let lost = end.filter(|end| !end.complete).map(|end| match end.problem.as_str() {
+        "" => "the recording is not complete".to_owned(),
+        problem => format!("the recording is not complete: {problem}"),
+    });
+    part.into_iter().chain(lost).collect()
+}
+
+fn headings(source: &Source) -> (String, String) {
+    if let Some(summary) = &source.summary {
+        let seconds = summary.last_tick as f64 / summary.tick_hz;
+        let about = format!(
+            "{}, {} Hz, {seconds} s; started {}; corotate {} ({})",
+            summary.clock, summary.tick_hz, summary.started_utc, summary.version, summary.revision
+        );
+        return (summary.scenario.clone(), about);
+    }
+    let Some(info) = source.recording.as_ref().map(|recording| recording.info()) else {
+        return (String::new(), String::new());
+    };
+    let about = format!(
+        "{}, {} Hz; recording begun {}; corotate {} ({})",
+        info.clock,
+        1e9 / info.period_ns as f64,
+        info.started_utc,
+        info.version,
+        info.revision
+    );
+    (info.scenario_name.clone(), about)
+}
+
+/// The time axis of all pictures, and what is marked on it.
+fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
+    let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
+    let last = traces.and_then(|traces| traces.ticks).map_or(1, |(_, last)| last.max(1));
+    let time = Axis::time(last as f64 * tick_s);
+    let faults = tables::faults(source).into_iter().filter(|fault| fault.from_tick <= last);
+    let span = |fault: tables::FaultRow| {
+        let to = fault.from_tick.saturating_add(fault.ticks).min(last);
+        (fault.from_tick as f64 * tick_s, to as f64 * tick_s, fault.number)
+    };
+    let incidents = source.summary.iter().flat_map(|summary| &summary.incidents);
+    let (missing, _) = traces.map_or_else(Default::default, Traces::missing);
+    let marks = Marks {
+        faults: faults.map(span).collect(),
+        incidents: incidents.map(|incident| incident.tick as f64 * tick_s).collect(),
+        missing: missing.iter().map(|(from, to)| (*from as f64 * tick_s, *to as f64 * tick_s)).collect(),
+    };
+    (time, marks)
+}
+
+fn latency_section(source: &Source, latencies: Vec<(String, String, Picture)>) -> Section {
+    let figures = latencies.into_iter().map(|(stage, what, picture)| (picture, format!("{stage}: {what}"))).collect();
+    let text = "Every value is counted, none is removed; the end of a curve is its largest value.".to_owned();
+    let blocks = vec![Block::Text(text), Block::Figures(figures), tables::latencies(source)];
+    Section { id: "latency", title: "Latency", blocks }
+}

@@ -1,0 +1,125 @@
+//! The page: a report's content as HTML that is well-formed XML too, with its style inside. No script, no address.
+
+use super::chart::Picture;
+use super::html::escape;
+use super::model::{Block, Model, Section};
+use std::fmt::Write;
+
+const STYLE: &str = include_str!("page.css");
+
+/// Writes the page.
+pub fn page(model: &Model) -> String {
+    let mut html = String::from("<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n");
+    let title = escape(&model.title);
+    // Writing to a string does not fail.
+    let _ = write!(
+        html,
+        "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
+         <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}: {}</title>\n<style>\n{STYLE}</style>\n\
+         </head>\n<body>\n{}\n<main>\n",
+        escape(&model.verdict.0),
+        model.marks
+    );
+    header(model, &mut html);
+    model.sections.iter().for_each(|part| section(part, &mut html));
+    html.push_str("</main>\n</body>\n</html>\n");
+    html
+}
+
+fn header(model: &Model, html: &mut String) {
+    let (word, good) = &model.verdict;
+    let (class, sign) = match good {
+        Some(true) => ("good", "✓ "),
+        Some(false) => ("bad", "✗ "),
+        None => ("open", ""),
+    };
+    let (title, subtitle) = (escape(&model.title), escape(&model.subtitle));
+    let _ = write!(
+        html,
+        "<header>\n<h1>{title} <span class=\"verdict {class}\">{sign}{}</span></h1>\n<p>{subtitle}</p>\n",
+        escape(word)
+    );
+    for remark in &model.remarks {
+        let _ = writeln!(html, "<p class=\"remark\">{}</p>", escape(remark));
+    }
+    html.push_str("<nav>");
+    for part in &model.sections {
+        let _ = write!(html, "<a href=\"#{}\">{}</a> ", part.id, escape(part.title));
+    }
+    html.push_str("</nav>\n</header>\n");
+}
+
+fn section(section: &Section, html: &mut String) {
+    let _ = writeln!(html, "<section id=\"{}\">\n<h2>{}</h2>", section.id, escape(section.title));
+    section.blocks.iter().for_each(|part| block(part, html));
+    html.push_str("</section>\n");
+}
+
+fn block(block: &Block, html: &mut String) {
+    match block {
+        Block::Text(text) => {
+            let _ = writeln!(html, "<p>{}</p>", escape(text));
+        }
+        Block::Table { caption, head, rows } if !rows.is_empty() => table(caption, head, rows, html),
+        Block::Table { .. } => {}
+        Block::Figures(figures) => {
+            html.push_str("<div class=\"figures\">\n");
+            figures.iter().for_each(|(picture, caption)| figure(picture, caption, html));
+            html.push_str("</div>\n");
+        }
+        Block::Scale(labels) => {
+            html.push_str("<p class=\"scale\">");
+            for (index, label) in labels.iter().enumerate() {
+                let _ = write!(
+                    html,
+                    "<span class=\"key\"><svg width=\"16\" height=\"12\"><rect class=\"shade{index}\" width=\"16\" \
+                     height=\"12\"/></svg>{}</span> ",
+                    escape(label)
+                );
+            }
+            html.push_str("</p>\n");
+        }
+        Block::Details(summary, text) => {
+            let (summary, text) = (escape(summary), escape(text));
+            let _ = writeln!(html, "<details><summary>{summary}</summary>\n<pre>{text}</pre></details>");
+        }
+    }
+}
+
+fn table(caption: &str, head: &[&str], rows: &[Vec<String>], html: &mut String) {
+    html.push_str("<div class=\"table\"><table>\n");
+    if !caption.is_empty() {
+        let _ = writeln!(html, "<caption>{}</caption>", escape(caption));
+    }
+    // A column stands to the right if all of it is numbers.
+    let numeric = |column: usize| {
+        let cells = || rows.iter().filter_map(|row| row.get(column)).filter(|cell| *cell != "–");
+        cells().next().is_some() && cells().all(|cell| cell.parse::<f64>().is_ok())
+    };
+    let classes: Vec<&str> = (0..head.len()).map(|column| if numeric(column) { " class=\"n\"" } else { "" }).collect();
+    html.push_str("<thead><tr>");
+    for (name, class) in head.iter().zip(&classes) {
+        let _ = write!(html, "<th{class}>{}</th>", escape(name));
+    }
+    html.push_str("</tr></thead>\n<tbody>\n");
+    for row in rows {
+        html.push_str("<tr>");
+        for (cell, class) in row.iter().zip(&classes) {
+            let _ = write!(html, "<td{class}>{}</td>", escape(cell));
+        }
+        html.push_str("</tr>\n");
+    }
+    html.push_str("</tbody></table></div>\n");
+}
+
+fn figure(picture: &Picture, caption: &str, html: &mut String) {
+    let _ = write!(html, "<figure>\n{}\n<figcaption>", picture.svg);
+    for (class, label) in &picture.legend {
+        let _ = write!(
+            html,
+            "<span class=\"key\"><svg width=\"34\" height=\"10\"><path class=\"line {class}\" d=\"M1 5H33\"/></svg>{}</span> ",
+            escape(label)
+        );
+    }
+    let _ = writeln!(html, "<span class=\"caption\">{}</span></figcaption>\n</figure>", escape(caption));
+}

@@ -1,0 +1,121 @@
+//! Latency distributions as curves over 1/(1 − p), from HdrHistogram's text form, and their pictures.
+
+use super::axis::Axis;
+use super::chart::{Line, Picture, plain};
+
+/// The stages in the order in which they are shown, and what each is.
+const STAGES: [(&str, &str); 7] = [
+    (
+        "lateness",
+        "wake − due of a plant's tick, beside the baseline: the bare wake lateness of the core, nothing of ours running",
+    ),
+    ("hop", "received − sent"),
+    ("step", "one estimate, one command, or one tick of motion, computed and written in place"),
+    (
+        "age",
+        "from when the tick was due until the sample was sent; at a follower, until the command acts (a period by design)",
+    ),
+    ("serial", "request sent − answer received"),
+    ("outage", "from when a failure was noticed until the successor ran"),
+    ("recovery", "from a failed role's last tick until every limit held again"),
+];
+/// What is drawn into the picture of a stage beside it.
+const BASELINE: &str = "baseline";
+/// Colour and dash pattern of each role's curve.
+const CLASSES: [&str; 6] = ["k d0", "o d1", "b d2", "g d3", "p d4", "y d1"];
+
+/// One stage's distribution.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curve {
+    /// The role.
+    pub role: String,
+    /// The stage.
+    pub stage: String,
+    /// 1/(1 − p) and the latency in µs, rising. The last is the largest of all, at the number of values.
+    pub points: Vec<(f64, f64)>,
+}
+
+/// Reads a percentile distribution; otherwise says where it is none.
+pub fn read_curve(text: &str) -> Result<Vec<(f64, f64)>, String> {
+    let mut points: Vec<(f64, f64)> = Vec::new();
+    let rows = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
+    for (index, line) in rows.skip(1) {
+        let broken = || format!("line {}: `{}` is no row of value, percentile and count", index + 1, line.trim());
+        let numbers = line.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>().map_err(|_| broken())?;
+        let (value, x) = match numbers[..] {
+            [value, quantile, _, inverse] if quantile < 1.0 => (value, inverse),
+            [value, _, count] => (value, count),
+            _ => return Err(broken()),
+        };
+        if !value.is_finite() || !x.is_finite() {
+            return Err(broken());
+        }
+        let least = points.last().map_or(1.0, |point| point.0);
+        points.push((x.max(least), value));
+    }
+    if points.is_empty() { Err("it has no rows".to_owned()) } else { Ok(points) }
+}
+
+/// One picture per stage: title, explanation and picture.
+pub fn pictures(curves: &[Curve]) -> Vec<(String, String, Picture)> {
+    // A role has its colour in every picture.
+    let mut roles: Vec<&str> = Vec::new();
+    for curve in curves.iter().filter(|curve| curve.stage != BASELINE) {
+        if !roles.contains(&curve.role.as_str()) {
+            roles.push(&curve.role);
+        }
+    }
+    let shown = STAGES.iter().filter_map(|(stage, what)| {
+        let with = |curve: &&Curve| curve.stage == *stage || (*stage == "lateness" && curve.stage == BASELINE);
+        let curves: Vec<&Curve> = curves.iter().filter(with).collect();
+        (!curves.is_empty()).then(|| ((*stage).to_owned(), (*what).to_owned(), picture(stage, &curves, &roles)))
+    });
+    shown.collect()
+}
+
+fn picture(stage: &str, curves: &[&Curve], roles: &[&str]) -> Picture {
+    let points = || curves.iter().flat_map(|curve| &curve.points);
+    let greatest = points().map(|point| point.0).fold(1.0, f64::max);
+    let low = points().map(|point| point.1).filter(|us| *us > 0.0).fold(f64::INFINITY, f64::min);
+    let high = points().map(|point| point.1).fold(0.0, f64::max);
+    let (x, y) = (Axis::percentiles(greatest), Axis::decades("latency, µs", (low, high)));
+    let line = |curve: &&Curve| {
+        if curve.stage == BASELINE {
+            return Line::through("grey d2", &format!("{}: baseline", curve.role), curve.points.clone());
+        }
+        let place = roles.iter().position(|role| *role == curve.role).unwrap_or(0);
+        Line::through(CLASSES[place % CLASSES.len()], &curve.role, curve.points.clone())
+    };
+    let lines: Vec<Line> = curves.iter().map(line).collect();
+    plain(&format!("latency percentiles of the stage {stage}"), &x, &y, &lines)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::telemetry::{Latency, write_hgrm};
+
+    #[test]
+    fn a_distribution_reads_back_as_it_was_written() {
+        let mut latency = Latency::default();
+        (1..=1000).for_each(|us| latency.record(0, us * 1000));
+        let mut text = Vec::new();
+        write_hgrm(&latency, &mut text).unwrap();
+        let points = read_curve(&String::from_utf8(text).unwrap()).unwrap();
+        let (first, last) = (points[0], *points.last().unwrap());
+        assert!(first.0 == 1.0 && (first.1 - 1.0).abs() < 0.01, "{first:?}");
+        assert!((1000.0..1025.0).contains(&last.0) && (last.1 - 1000.0).abs() < 1.0, "{last:?}");
+        let median = points.iter().find(|point| point.0 >= 2.0).unwrap();
+        assert!((median.1 - 500.0).abs() < 1.0, "{median:?}");
+        assert!(points.windows(2).all(|pair| pair[0].0 <= pair[1].0 && pair[0].1 <= pair[1].1));
+    }
+
+    #[test]
+    fn what_is_no_distribution_is_refused_with_its_line() {
+        assert!(read_curve("").is_err() && read_curve("Value Percentile\n").is_err());
+        for row in ["1 2", "x 0.5 3 2", "inf 0.5 3 2", "1 0.5 3 nan"] {
+            let error = read_curve(&format!("Value\n\n1.0 0.0 1 1.0\n{row}\n")).unwrap_err();
+            assert!(error.starts_with("line 4: "), "{error}");
+        }
+    }
+}

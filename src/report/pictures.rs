@@ -1,0 +1,359 @@
+//! Which pictures the samples of a run give: motion, errors, V, and how late what was sent.
+
+use super::ReportError;
+use super::axis::Axis;
+use super::chart::{Line, Picture, SHADES, over_time, plane, range, strip};
+use super::columns::{Columns, Extremes};
+use super::counterpart::counterpart;
+use super::model::{Block, Section};
+use super::source::Source;
+use super::traces::{BODIES_SHOWN, MetricTrace, Traces};
+use crate::config::Scenario;
+
+/// Errors below this are drawn at the foot: less than rounding of numbers about 1.
+const ERROR_FLOOR: f64 = 1e-18;
+/// V below this is drawn at the foot: the square of that.
+const LYAPUNOV_FLOOR: f64 = 1e-34;
+/// Colour and dash pattern of the driven bodies.
+const FOLLOWERS: [&str; BODIES_SHOWN] = ["o d0 wide", "g d3 wide", "p d4 wide", "y d1 wide"];
+/// Colour and dash pattern of three components, or of several metrics.
+const COMPONENTS: [&str; 4] = ["o d0", "b d1", "g d3", "p d4"];
+/// Lateness from the lightest to the darkest shade, µs: 1 µs to 100 ms, more is as dark.
+const SHADE_DECADES: f64 = 5.0;
+
+type Figures = Vec<(Picture, String)>;
+
+/// The sections that the samples give.
+pub fn sections(source: &Source, traces: &Traces, time: &Axis) -> Result<Vec<Section>, ReportError> {
+    let Some(scenario) = &source.scenario else { return Ok(Vec::new()) };
+    let tick_s = scenario.tick_s();
+    let mut sections = vec![motion(scenario, traces, time)?];
+    sections.push(errors(source, scenario, traces, time));
+    let certificate = lyapunov(traces, time, tick_s);
+    if !certificate.is_empty() {
+        let blocks = vec![Block::Figures(certificate)];
+        sections.push(Section { id: "lyapunov", title: "V and its bound", blocks });
+    }
+    Ok(sections)
+}
+
+fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, ReportError> {
+    let orbit = traces.paths.keys().any(|(_, plane)| *plane == "x y");
+    let figures = if orbit { orbits(scenario, traces, time)? } else { rates(traces, time, scenario.tick_s()) };
+    let mut blocks = vec![Block::Text(decimation(traces, scenario.tick_s()))];
+    let hidden = traces.bodies.len().saturating_sub(BODIES_SHOWN + 1);
+    if hidden > 0 {
+        blocks.push(Block::Text(format!("{hidden} more bodies are scored and not drawn.")));
+    }
+    if scenario.rig.bodies().iter().any(|body| body.fleet.is_some()) {
+        blocks.push(Block::Text("A fleet is a band from the least to the greatest of its bodies.".to_owned()));
+    }
+    blocks.push(Block::Figures(figures));
+    Ok(Section { id: "motion", title: "Motion", blocks })
+}
+
+/// How much a column of a picture stands for.
+fn decimation(traces: &Traces, tick_s: f64) -> String {
+    let stride = traces.values.values().map(Columns::stride).max().unwrap_or(1);
+    let ticks = traces.ticks.map_or(0, |(first, last)| last - first + 1);
+    if stride == 1 {
+        return format!("Every one of {ticks} ticks is drawn.");
+    }
+    let span = stride as f64 * tick_s;
+    format!(
+        "{ticks} ticks are drawn in columns of {stride} ({span} s): each column goes from the least to the greatest value \
+         in it, so no excursion is left out, however short."
+    )
+}
+
+fn present<'a>(
+    lines: impl IntoIterator<Item = Option<(&'a Columns<Extremes>, Line)>>,
+) -> (Vec<&'a Columns<Extremes>>, Vec<Line>) {
+    lines.into_iter().flatten().unzip()
+}
+
+fn rates(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
+    let mut figures = Vec::new();
+    for (name, names) in [("ω1 ω2", ["ω1, rad/s", "ω2, rad/s"]), ("ω2 ω3", ["ω2, rad/s", "ω3, rad/s"])] {
+        let lines = paths(traces, name);
+        if !lines.is_empty() {
+            let caption = "Angular velocity in a plane. A dot is where a path begins.".to_owned();
+            figures.push((plane(&format!("angular velocities in the plane {name}"), names, &lines, false), caption));
+        }
+    }
+    for axis in 0..3 {
+        let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
+        let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
+            traces.get(body, "truth", "omega_rad_s", axis).map(|columns| line(class, body, columns))
+        });
+        let leader = traces.bodies.first().map(String::as_str).unwrap_or_default();
+        let own = traces.get(leader, "truth", "omega_rad_s", axis).map(|columns| line("k d0", leader, columns));
+        let seen = traces.get(leader, "estimate", "omega_rad_s", axis).map(|columns| line("b d1", "observer", columns));
+        let (columns, lines) = present(followers.chain([own, seen]));
+        if !lines.is_empty() {
+            let y = Axis::around(&format!("ω{}, rad/s", axis + 1), range(columns, false));
+            let title = format!("angular velocity about axis {} over time", axis + 1);
+            figures.push((
+                over_time(&title, time, &y, &lines),
+                format!("Angular velocity ω{} in the body's axes.", axis + 1),
+            ));
+        }
+    }
+    figures.extend(controls(
+        traces,
+        time,
+        tick_s,
+        "applied_rad_s2",
+        "control acceleration, rad/s²",
+        &["u1", "u2", "u3"],
+    ));
+    figures
+}
+
+/// The paths of all bodies and of the observer in a plane.
+fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
+    let path = |owner: &str, class, label: &str| {
+        traces.paths.get(&(owner.to_owned(), name)).map(|columns| Line::path(class, label, columns))
+    };
+    let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| path(body, class, body));
+    let leader = traces.bodies.first().map(String::as_str).unwrap_or_default();
+    followers.chain([path(leader, "k d0", leader), path("observer", "b d1", "observer")]).flatten().collect()
+}
+
+/// What the actuators of each driven body applied.
+fn controls(traces: &Traces, time: &Axis, tick_s: f64, field: &str, unit: &str, names: &[&str]) -> Figures {
+    let mut figures = Vec::new();
+    for body in traces.bodies.iter().take(BODIES_SHOWN + 1) {
+        let component = |(element, name): (usize, &&str)| {
+            let columns = traces.get(body, "truth", field, element)?;
+            Some((columns, Line::of(COMPONENTS[element], name, columns, tick_s)))
+        };
+        let (columns, lines) = present(names.iter().enumerate().map(component));
+        let (low, high) = range(columns, false);
+        // A body that nobody drives has nothing to show.
+        if low < 0.0 || high > 0.0 {
+            let title = format!("control of {body} over time");
+            let picture = over_time(&title, time, &Axis::around(unit, (low, high)), &lines);
+            figures.push((picture, format!("What the actuators of {body} applied.")));
+        }
+    }
+    figures
+}
+
+fn orbits(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Figures, ReportError> {
+    let full = counterpart(scenario)?;
+    let mut figures = vec![orbit_plane(traces, full.as_ref())];
+    let velocities = paths(traces, "Vr Vθ");
+    if !velocities.is_empty() {
+        let names = ["Vr, du/s", "Vθ, du/s"];
+        let caption = "Velocity as it was, and as the observer saw it, which begins at its guess.".to_owned();
+        figures.push((plane("velocities in the plane Vr Vθ", names, &velocities, false), caption));
+    }
+    figures.extend(orbit_states(traces, full.as_ref(), time, scenario.tick_s()));
+    Ok(figures)
+}
+
+/// \[S\] Fig. 1: the motion with full state in black, with the observer in blue. Where there is no such pair, the bodies.
+fn orbit_plane(traces: &Traces, full: Option<&Traces>) -> (Picture, String) {
+    let names = ["x, du", "y, du"];
+    let path = |traces: &Traces, class, label: &str| {
+        let body = traces.bodies.first().cloned().unwrap_or_default();
+        traces.paths.get(&(body, "x y")).map(|columns| Line::path(class, label, columns))
+    };
+    let Some(full) = full else {
+        let lines = paths(traces, "x y");
+        let caption = "Paths in the plane; the cross is the central body, a dot is where a path begins.".to_owned();
+        return (plane("paths in the plane", names, &lines, true), caption);
+    };
+    let pair =
+        [path(full, "k d0", "with full state (computed here)"), path(traces, "b d1", "with the observer (this run)")];
+    let lines: Vec<Line> = pair.into_iter().flatten().collect();
+    let caption = "Motion in the plane, as Fig. 1 of [S]: with full state in black, computed for this report from the same \
+                   scenario; with the observer in blue, as recorded. The cross is the central body.";
+    (plane("motion in the plane with full state and with the observer", names, &lines, true), caption.to_owned())
+}
+
+/// \[S\] Fig. 2: states and controls over time.
+fn orbit_states(traces: &Traces, full: Option<&Traces>, time: &Axis, tick_s: f64) -> Figures {
+    let states = [
+        ("radius_du", 0, "r, du", "Distance from the centre."),
+        ("velocity_du_s", 0, "Vr, du/s", "Radial velocity."),
+        ("velocity_du_s", 1, "Vθ, du/s", "Transverse velocity."),
+        ("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
+        ("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
+        ("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
+    ];
+    let first = traces.bodies.first().map(String::as_str).unwrap_or_default();
+    let mut figures = Vec::new();
+    for (field, element, unit, caption) in states {
+        let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
+        let of = |traces: &'_ Traces, body: &str, signal| traces.get(body, signal, field, element).cloned();
+        let full = full.and_then(|full| of(full, first, "truth"));
+        let full = full.as_ref().map(|columns| line("k d0", "with full state (computed here)", columns));
+        let others =
+            traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
+                traces.get(body, "truth", field, element).map(|columns| line(class, body, columns))
+            });
+        let own_class = if full.is_some() { "b d1" } else { "k d0" };
+        let own_label = if full.is_some() { "with the observer (this run)" } else { first };
+        let own = traces.get(first, "truth", field, element).map(|columns| line(own_class, own_label, columns));
+        let seen = (field == "velocity_du_s").then(|| traces.get(first, "estimate", field, element)).flatten();
+        let seen = seen.map(|columns| line("s d2", "estimate", columns));
+        let (columns, lines) = present(others.chain([full, own, seen]));
+        if !lines.is_empty() {
+            let y = Axis::around(unit, range(columns, false));
+            figures.push((over_time(&format!("{unit} over time"), time, &y, &lines), caption.to_owned()));
+        }
+    }
+    figures
+}
+
+fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) -> Section {
+    let tick_s = scenario.tick_s();
+    let told = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
+    let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(told).collect();
+    let (low, high) = range(shown.iter().map(|metric| &metric.values), true);
+    let y = Axis::decades("error, in the unit of each", (low.max(ERROR_FLOOR), high.max(ERROR_FLOOR)));
+    let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * tick_s);
+    let of = |(metric, class): (&&MetricTrace, &'static str)| Line::of(class, metric.name, &metric.values, tick_s);
+    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS).map(of).collect();
+    lines.extend(falling(scenario, &shown, y.foot(), end_s));
+    lines.extend(limits(scenario, &shown, end_s));
+    let caption = "Errors on a logarithmic axis, every tick scored as the launcher scores it. The straight lines fall at the \
+                   certified rate and at the observer's, from the first error on: what is proven is the rate of fall, \
+                   not the constant before it. Zeros are drawn at the foot.";
+    let picture = over_time("errors over time, logarithmic", time, &y, &lines);
+    let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), rescored(source, traces)];
+    Section { id: "errors", title: "Synchronisation and estimation error", blocks }
+}
+
+/// Lines from the first errors on, that fall at the certified rate and at the observer's.
+fn falling(scenario: &Scenario, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Vec<Line> {
+    let certified = scenario.rig.certificates().iter().map(|certificate| certificate.rate_per_s).reduce(f64::min);
+    let estimate = shown.iter().find(|metric| metric.name.starts_with("estimate_error"));
+    let both = [
+        ("grey d2", "certified", certified, shown.first()),
+        ("grey d4", "observer", observer_rate(scenario), estimate),
+    ];
+    let line = |(class, name, rate, metric): (&'static str, &str, Option<f64>, Option<&&MetricTrace>)| {
+        let (rate, metric) = (rate.filter(|rate| rate.is_finite() && *rate > 0.0)?, metric?);
+        let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
+        let to_s = ((from / foot).ln() / rate).min(end_s);
+        let end = (to_s, from * (-rate * to_s).exp());
+        (to_s > 0.0).then(|| Line::through(class, &format!("{name}: exp(−{rate} t)"), vec![(0.0, from), end]))
+    };
+    both.into_iter().filter_map(line).collect()
+}
+
+/// What `[accept]` allows, from when on it does.
+fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> {
+    const SETTLED: [&str; 4] = ["limit o d1", "limit b d1", "limit g d1", "limit p d1"];
+    const DECLARED: [&str; 4] = ["limit o d2", "limit b d2", "limit g d2", "limit p d2"];
+    let accept = &scenario.accept;
+    let kinds = [
+        ("limit of", &accept.metric_max, accept.settled_by_s, SETTLED),
+        ("declared bound of", &accept.metric_peak, accept.peak_from_s, DECLARED),
+    ];
+    let mut lines = Vec::new();
+    for (what, limits, from_s, classes) in kinds {
+        for (metric, class) in shown.iter().zip(classes) {
+            if let Some(limit) = limits.get(metric.name).filter(|_| from_s < end_s) {
+                let label = format!("{what} {}", metric.name);
+                lines.push(Line::through(class, &label, vec![(from_s, *limit), (end_s, *limit)]));
+            }
+        }
+    }
+    lines
+}
+
+/// The rate that the observer of first order was designed for, 1/s; the slower where there are two.
+fn observer_rate(scenario: &Scenario) -> Option<f64> {
+    let value = scenario.resolved.get("observer")?.get("decay_rate_per_s")?;
+    let rates = value.as_array().cloned().unwrap_or_else(|| vec![value.clone()]);
+    rates.iter().filter_map(toml::Value::as_float).reduce(f64::min)
+}
+
+/// The metrics as the recording's samples give them.
+fn rescored(source: &Source, traces: &Traces) -> Block {
+    let number = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.4e}"));
+    let row = |metric: &MetricTrace| {
+        let told = source.summary.as_ref().and_then(|s| s.score.metrics.iter().find(|told| told.name == metric.name));
+        vec![
+            metric.name.to_owned(),
+            number(Some(metric.last).filter(|last| !last.is_nan())),
+            number(told.and_then(|told| told.last)),
+            number(metric.settled_max),
+            number(told.and_then(|told| told.settled_max)),
+            number(told.and_then(|told| told.peak)),
+            told.and_then(|told| told.settled_at_s).map_or("–".to_owned(), |time| format!("{time:.3}")),
+        ]
+    };
+    Block::Table {
+        caption: format!("Metrics, {} ticks scored with every sample", traces.scored_ticks),
+        head: vec![
+            "metric",
+            "at the end (recording)",
+            "at the end (run)",
+            "largest settled (recording)",
+            "largest settled (run)",
+            "peak (run)",
+            "within from, s",
+        ],
+        rows: traces.metrics.iter().map(row).collect(),
+    }
+}
+
+fn lyapunov(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
+    let mut figures = Vec::new();
+    let bodies = traces.bodies.iter().skip(1).zip(COMPONENTS);
+    let v = bodies.filter_map(|(body, class)| {
+        let columns = traces.get(body, "command", "lyapunov_rad2_s2", 0)?;
+        Some((columns, Line::of(class, body, columns, tick_s)))
+    });
+    let (columns, lines): (Vec<_>, Vec<_>) = v.unzip();
+    let (low, high) = range(columns, true);
+    if high > 0.0 {
+        let y = Axis::decades("V, rad²/s²", (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let caption = "V = ½(|e|² + ε²) of [D](15) as the controller published it.".to_owned();
+        figures.push((over_time("V over time, logarithmic", time, &y, &lines), caption));
+    }
+    for (body, [fell, bound]) in &traces.falls {
+        let (low, high) = range([bound], true);
+        let y = Axis::decades("−dV/dt, rad²/s³", (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let lines =
+            [Line::of("o d0", "measured, tick to tick", fell, tick_s), Line::of("k d1", "bound", bound, tick_s)];
+        let caption = format!(
+            "How fast V of {body} fell, and the bound of [D](18) that it may not fall slower than: the certificate holds \
+             where the measured line is not below. Drawn as long as V is more than rounding; where it rose, at the foot."
+        );
+        figures.push((over_time("rate of fall of V and its bound", time, &y, &lines), caption));
+    }
+    figures
+}
+
+/// How late every role sent, over time.
+pub fn lateness(source: &Source, traces: &Traces, time: &Axis) -> Section {
+    let tick_s = source.scenario.as_ref().map_or(0.0, Scenario::tick_s);
+    let told = |row: &&super::traces::RoleTrace| row.lateness_us.iter().next().is_some();
+    let rows: Vec<(String, &Columns<Extremes>)> =
+        traces.roles.iter().filter(told).map(|row| (row.role.clone(), &row.lateness_us)).collect();
+    if rows.is_empty() {
+        let text =
+            "This clock has no due times, so nothing was late; a run in real time shows a strip here.".to_owned();
+        return Section { id: "lateness", title: "Lateness over time", blocks: vec![Block::Text(text)] };
+    }
+    let shade = |extremes: &Extremes| (!extremes.is_empty()).then(|| extremes.max.max(1.0).log10() / SHADE_DECADES);
+    let picture = strip("lateness of every role over time", time, &rows, tick_s, shade);
+    let caption = "From when a tick was due until the role's sample of it was handed to its link: the latest in each column. \
+                   Nothing is drawn where there is no sample.";
+    let scale = (0..SHADES).map(|index| {
+        let from = |index: usize| 10_f64.powf(SHADE_DECADES * index as f64 / SHADES as f64);
+        if index + 1 == SHADES {
+            format!("from {:.0} µs", from(index))
+        } else {
+            format!("{:.0}–{:.0} µs", from(index), from(index + 1))
+        }
+    });
+    let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), Block::Scale(scale.collect())];
+    Section { id: "lateness", title: "Lateness over time", blocks }
+}

@@ -1,0 +1,114 @@
+//! What a report is made of: a run's directory, or a recording alone. What is there is read, what is not is remembered.
+//!
+//! Must not guess: a file that is there and cannot be read is an error.
+
+use super::ReportError;
+use super::percentiles::{Curve, read_curve};
+use super::summary::Summary;
+use crate::config::Scenario;
+use crate::record::Recording;
+use std::fs;
+use std::io::ErrorKind;
+use std::path::Path;
+
+/// Everything that was found.
+#[derive(Debug)]
+pub struct Source {
+    pub summary: Option<Summary>,
+    pub scenario: Option<Scenario>,
+    pub recording: Option<Recording>,
+    pub curves: Vec<Curve>,
+    /// What is missing, and how to get it.
+    pub missing: Vec<String>,
+}
+
+impl Source {
+    /// Opens a run's directory, or a recording.
+    pub fn open(path: &Path) -> Result<Self, ReportError> {
+        let about = fs::metadata(path).map_err(|source| match source.kind() {
+            ErrorKind::NotFound => ReportError::Nothing { path: path.to_owned() },
+            _ => ReportError::Read { path: path.to_owned(), source },
+        })?;
+        if about.is_dir() { Self::directory(path) } else { Self::recording(path) }
+    }
+
+    fn recording(path: &Path) -> Result<Self, ReportError> {
+        let recording = Recording::open(path)?;
+        let missing = "verdict, books and latencies are not in a recording: they are in summary.json and latency/ of \
+                       the run's directory; give that to `corotate report`";
+        Ok(Self {
+            summary: None,
+            scenario: Some(recording.scenario()?),
+            recording: Some(recording),
+            curves: Vec::new(),
+            missing: vec![missing.to_owned()],
+        })
+    }
+
+    fn directory(path: &Path) -> Result<Self, ReportError> {
+        let (at, mut missing) = (|name: &str| path.join(name), Vec::new());
+        let summary = text(&at("summary.json"))?;
+        let recording = at("run.mcap").exists().then(|| Recording::open(&at("run.mcap"))).transpose()?;
+        if summary.is_none() && recording.is_none() {
+            return Err(ReportError::NoRun { path: path.to_owned() });
+        }
+        let refused = |reason| ReportError::Summary { path: at("summary.json"), reason };
+        let summary = summary.map(|text| Summary::parse(&text)).transpose().map_err(refused)?;
+        if summary.is_none() {
+            missing.push("there is no summary.json: the run did not come to its end, or not yet".to_owned());
+        }
+        let scenario = match (text(&at("scenario.toml"))?, &recording) {
+            (Some(text), _) => Some(Scenario::parse(&text, &at("scenario.toml").display().to_string(), &[])?),
+            (None, Some(recording)) => Some(recording.scenario()?),
+            (None, None) => None,
+        };
+        if recording.is_none() {
+            missing.push(
+                "motion, errors over time, V and lateness over time need the samples, which were not recorded: \
+                 `corotate run FILE --record` keeps them, in run.mcap"
+                    .to_owned(),
+            );
+        }
+        let curves = curves(&at("latency"), summary.as_ref())?;
+        if curves.is_empty() {
+            missing.push(
+                "there are no latencies: there is no latency/ in the directory (a run in one thread measures none)"
+                    .to_owned(),
+            );
+        }
+        Ok(Self { summary, scenario, recording, curves, missing })
+    }
+}
+
+/// The content of a file; none if there is no such file.
+fn text(path: &Path) -> Result<Option<String>, ReportError> {
+    match fs::read_to_string(path) {
+        Ok(text) => Ok(Some(text)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),
+    }
+}
+
+/// All `<role>.<stage>.hgrm` of a directory, in the order of the summary.
+fn curves(directory: &Path, summary: Option<&Summary>) -> Result<Vec<Curve>, ReportError> {
+    let failed = |source| ReportError::Read { path: directory.to_owned(), source };
+    let entries = match fs::read_dir(directory) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries.map_err(failed)?,
+    };
+    let mut curves = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(failed)?.path();
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if let Some((role, stage)) = name.strip_suffix(".hgrm").and_then(|stem| stem.rsplit_once('.'))
+            && let Some(text) = text(&path)?
+        {
+            let points = read_curve(&text).map_err(|reason| ReportError::Latency { path: path.clone(), reason })?;
+            curves.push(Curve { role: role.to_owned(), stage: stage.to_owned(), points });
+        }
+    }
+    let stages = summary.map_or(&[][..], |summary| &summary.latencies);
+    let place = |curve: &Curve| stages.iter().position(|told| told.role == curve.role && told.stage == curve.stage);
+    curves.sort_by_cached_key(|curve| (place(curve).unwrap_or(usize::MAX), curve.role.clone(), curve.stage.clone()));
+    Ok(curves)
+}

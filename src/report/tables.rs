@@ -1,0 +1,299 @@
+//! The tables of a report: what a run's summary, or the end of a recording, says in numbers and words.
+
+use super::model::{Block, Section};
+use super::source::Source;
+use super::traces::Traces;
+use crate::telemetry::Ticks;
+
+/// A scripted fault as it stands in the scenario.
+#[derive(Debug)]
+pub struct FaultRow {
+    /// Its number on the time axes.
+    pub number: usize,
+    pub kind: String,
+    pub role: String,
+    pub from_tick: u64,
+    pub ticks: u64,
+}
+
+/// The scripted faults in the order of time.
+pub fn faults(source: &Source) -> Vec<FaultRow> {
+    let table = source.scenario.as_ref().and_then(|scenario| scenario.resolved.get("fault"));
+    let tables = table.and_then(toml::Value::as_array).into_iter().flatten();
+    let row = |fault: &toml::Value| {
+        let text = |key: &str| fault.get(key).and_then(toml::Value::as_str).unwrap_or_default().to_owned();
+        let ticks = |key: &str| fault.get(key).and_then(toml::Value::as_integer).map_or(0, |n| n.max(0) as u64);
+        FaultRow {
+            number: 0,
+            kind: text("kind"),
+            role: text("role"),
+            from_tick: ticks("from_tick"),
+            ticks: ticks("ticks"),
+        }
+    };
+    let mut rows: Vec<FaultRow> = tables.map(row).collect();
+    rows.sort_by_key(|row| row.from_tick);
+    rows.iter_mut().enumerate().for_each(|(index, row)| row.number = index + 1);
+    rows
+}
+
+/// A number in few digits; the verdict's are told in full.
+fn number(value: Option<f64>) -> String {
+    let short = |value: f64| Some(format!("{value}")).filter(|text| text.len() <= 8);
+    value.map_or("–".to_owned(), |value| short(value).unwrap_or_else(|| format!("{value:.4e}")))
+}
+
+fn strings(cells: &[&dyn ToString]) -> Vec<String> {
+    cells.iter().map(|cell| cell.to_string()).collect()
+}
+
+fn held(holds: Option<bool>) -> &'static str {
+    match holds {
+        Some(true) => "✓ holds",
+        Some(false) => "✗ FAILS",
+        None => "not judged",
+    }
+}
+
+/// Verdict, criteria, and what a reader must know of the scenario.
+pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
+    let mut blocks = Vec::new();
+    if let Some(summary) = &source.summary {
+        let row = |criterion: &super::summary::Criterion| {
+            let value = criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:e}"));
+            vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), held(criterion.holds).to_owned()]
+        };
+        let rows: Vec<_> = summary.criteria.iter().map(row).collect();
+        if rows.is_empty() {
+            blocks.push(Block::Text("The scenario has no criteria: every run that ends is accepted.".to_owned()));
+        } else {
+            let head = vec!["criterion of [accept]", "value", "limit", "verdict"];
+            blocks.push(Block::Table { caption: String::new(), head, rows });
+        }
+        blocks.extend(summary.notes.iter().map(|note| Block::Text(format!("Note: {note}."))));
+        if summary.signal != 0 {
+            blocks.push(Block::Text(format!("The run was ended by signal {} before its last tick.", summary.signal)));
+        }
+        if summary.score.faulted_ticks > 0 {
+            let text = format!("A body met the end of its model: {} ticks are lost.", summary.score.faulted_ticks);
+            blocks.push(Block::Text(text));
+        }
+        let (scored, unscored) = (summary.score.scored_ticks, summary.score.unscored_ticks);
+        blocks.push(Block::Text(format!("{scored} of {} ticks scored.", scored + unscored)));
+    } else {
+        blocks.push(Block::Text("Nobody has judged this run: there is no summary.".to_owned()));
+    }
+    if let Some(traces) = traces.filter(|traces| traces.ticks.is_none()) {
+        blocks.push(Block::Text(format!("The recording has no sample of any of {} bodies.", traces.bodies.len())));
+    }
+    Section { id: "verdict", title: "Verdict", blocks }
+}
+
+/// What went wrong, and what was made to.
+pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
+    let mut blocks = Vec::new();
+    let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
+    let seconds = |tick: u64| format!("{:.3}", tick as f64 * tick_s);
+    let key = "On every time axis: a band with a number is a scripted fault, a dashed line with a flag an incident, a bar \
+               at the foot ticks of which some role sent no sample.";
+    blocks.push(Block::Text(key.to_owned()));
+    let row =
+        |fault: &FaultRow| strings(&[&fault.number, &seconds(fault.from_tick), &fault.ticks, &fault.kind, &fault.role]);
+    let rows: Vec<_> = faults(source).iter().map(row).collect();
+    let head = vec!["number", "from, s", "ticks", "fault", "role"];
+    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Scripted faults".to_owned(), head, rows }));
+    let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
+    let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), |s| format!("{s:.3}"));
+    let row = |incident: &super::summary::Incident| {
+        let cause = match incident.last_words.as_str() {
+            "" => incident.cause.clone(),
+            words => format!("{}; it said: {words}", incident.cause),
+        };
+        let (outage, recovery) = (time(incident.outage_s), time(incident.recovery_s));
+        strings(&[&seconds(incident.tick), &incident.role, &cause, &incident.action, &outage, &recovery])
+    };
+    let rows: Vec<_> = incidents.iter().map(row).collect();
+    let head = vec!["at, s", "role", "cause", "what was done", "back after, s", "recovered after, s"];
+    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Incidents".to_owned(), head, rows }));
+    if let Some(traces) = traces {
+        let (_, ticks) = traces.missing();
+        blocks.push(Block::Text(format!("Ticks of which a role sent no sample, all roles together: {ticks}.")));
+    }
+    if let Some(watchdog) = source.summary.as_ref().and_then(|summary| summary.watchdog.as_ref()) {
+        let row = |one: &crate::telemetry::WatchedReport| {
+            let first = one.first_tick.map_or("–".to_owned(), seconds);
+            strings(&[&one.quantity, &number(Some(one.max)), &number(one.largest), &one.judged, &one.breaches, &first])
+        };
+        let rows = watchdog.watched.iter().map(row).collect();
+        let head = vec!["watched", "bound", "largest", "judged", "beyond", "first at, s"];
+        blocks.push(Block::Table { caption: "Watchdog".to_owned(), head, rows });
+        if let Some(tick) = watchdog.latched_at_tick {
+            blocks.push(Block::Text(format!("The safe command was latched at {} s.", seconds(tick))));
+        }
+    }
+    Section { id: "events", title: "What went wrong", blocks }
+}
+
+/// The figures of every stage.
+pub fn latencies(source: &Source) -> Block {
+    let row = |stage: &super::summary::Stage| {
+        let us = |value: f64| format!("{value:.2}");
+        let [p50, p99, p999, max] = [stage.p50_us, stage.p99_us, stage.p999_us, stage.max_us].map(us);
+        strings(&[&stage.role, &stage.stage, &stage.count, &p50, &p99, &p999, &max])
+    };
+    let rows = source.summary.iter().flat_map(|summary| &summary.latencies).map(row).collect();
+    let head = vec!["role", "stage", "count", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
+    Block::Table { caption: String::new(), head, rows }
+}
+
+fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
+    strings(&[role, &ticks.elapsed, &ticks.executed, &ticks.missed, &ticks.starved, &ticks.safe, &ticks.stalled])
+}
+
+/// The books of roles and links.
+pub fn books(source: &Source) -> Section {
+    let mut blocks = Vec::new();
+    let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
+    if let Some(books) = source.summary.as_ref().map(|summary| &summary.books) {
+        let balance = if books.balanced { "The books balance." } else { "THE BOOKS DO NOT BALANCE." };
+        blocks.push(Block::Text(format!(
+            "{balance} Missed or starved: {} ticks; rejected: {} samples; scripted faults acted {} times.",
+            books.missed_ticks, books.rejected_samples, books.injected_faults
+        )));
+        blocks.extend(books.problems.iter().map(|problem| Block::Text(problem.clone())));
+        if !books.unbooked.is_empty() {
+            blocks.push(Block::Text(format!("No books of {}.", books.unbooked.join(", "))));
+        }
+        let rows = books.roles.iter().map(ticks_row).collect();
+        blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
+        let row = |link: &super::summary::Link| {
+            let [sent, received] = link.void;
+            let void = format!("{sent}, {received}");
+            strings(&[
+                &link.service,
+                &link.reader,
+                &link.published,
+                &link.received,
+                &link.gaps,
+                &void,
+                &link.unread,
+                &link.stale,
+                &link.rejected,
+            ])
+        };
+        let rows = books.links.iter().map(row).collect();
+        let head = vec![
+            "signal",
+            "reader",
+            "published",
+            "received",
+            "gaps",
+            "void sent, received",
+            "unread",
+            "stale",
+            "rejected",
+        ];
+        blocks.push(Block::Table { caption: "Samples".to_owned(), head, rows });
+    } else if let Some(end) = source.recording.as_ref().and_then(|recording| recording.info().end.as_ref()) {
+        let rows = end.ticks.iter().map(ticks_row).collect();
+        blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
+    }
+    blocks.extend(recorded(source));
+    if let Some(state) = source.summary.as_ref().map(|summary| &summary.state) {
+        let disturbed = state
+            .first_disturbed_tick
+            .map_or("every tick undisturbed".to_owned(), |tick| format!("first disturbed tick {tick}"));
+        blocks.push(Block::Text(format!("State hash {}; {disturbed}.", state.hash)));
+    }
+    Section { id: "books", title: "Books", blocks }
+}
+
+/// What was recorded.
+fn recorded(source: &Source) -> Vec<Block> {
+    let mut blocks = Vec::new();
+    if let Some(recorded) = source.summary.as_ref().and_then(|summary| summary.recording.as_ref()) {
+        let whole = if recorded.complete { "complete" } else { "not complete" };
+        let problem = recorded.problem.as_deref().map_or(String::new(), |problem| format!(": {problem}"));
+        blocks.push(Block::Text(format!(
+            "The recording is {whole}{problem}; {} samples in {} bytes.",
+            recorded.messages, recorded.bytes
+        )));
+    }
+    if let Some(end) = source.recording.as_ref().and_then(|recording| recording.info().end.as_ref()) {
+        let row = |signal: &crate::record::SignalReport| {
+            let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
+            let (published, lost) = (told(signal.published), told(signal.lost));
+            strings(&[&signal.service, &signal.recorded, &signal.void, &signal.extra, &published, &lost])
+        };
+        let rows = end.signals.iter().map(row).collect();
+        let head = vec!["signal", "recorded", "void", "extra", "published", "lost"];
+        blocks.push(Block::Table { caption: "Recording".to_owned(), head, rows });
+    }
+    blocks
+}
+
+/// What is proven, and the bounds it rests on.
+pub fn certificate(source: &Source) -> Section {
+    let mut blocks = Vec::new();
+    let Some(summary) = &source.summary else {
+        return Section { id: "certificate", title: "Certificate", blocks };
+    };
+    for certificate in &summary.certificates {
+        let row = |condition: &super::summary::Condition| {
+            let (value, required) = (number(condition.value), number(condition.required));
+            let verdict = if condition.holds { "✓ holds" } else { "✗ does not hold" };
+            strings(&[&condition.name, &value, &required, &verdict])
+        };
+        let rate = number(certificate.rate_per_s);
+        let caption = format!("{}: the error falls at least as exp(−{rate} t)", certificate.body);
+        let rows = certificate.conditions.iter().map(row).collect();
+        blocks.push(Block::Table { caption, head: vec!["condition", "value", "required", ""], rows });
+        blocks.extend(certificate.warnings.iter().map(|warning| Block::Text(format!("Warning: {warning}."))));
+    }
+    if let Some(score) = &summary.score.certificate {
+        blocks.push(Block::Text(format!(
+            "The bound on dV/dt held for {} of {} steps; {} could not be judged.",
+            score.held,
+            score.held + score.broken,
+            score.unjudged
+        )));
+    }
+    let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(limit.value)]).collect();
+    let caption = "What samples are held against".to_owned();
+    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption, head: vec!["limit", "value"], rows }));
+    Section { id: "certificate", title: "Certificate", blocks }
+}
+
+/// Where it ran, with which privileges, and the scenario.
+pub fn machine(source: &Source) -> Section {
+    let mut blocks = Vec::new();
+    let info = source.recording.as_ref().map(|recording| recording.info());
+    let told = |text: &String| serde_json::from_str::<super::summary::Host>(text).ok();
+    let recorded = info.and_then(|info| told(&info.host));
+    if let Some(host) = source.summary.as_ref().map(|summary| &summary.host).or(recorded.as_ref()) {
+        blocks.push(Block::Text(format!("{}: {}, {} cores, {}.", host.name, host.cpu, host.cores, host.kernel)));
+    }
+    let of_run = source.summary.iter().flat_map(|summary| &summary.privileges).map(|entry| (&entry.role, &entry.grant));
+    let of_file = info.and_then(|info| info.end.as_ref()).filter(|_| source.summary.is_none());
+    let of_file = of_file.into_iter().flat_map(|end| &end.privileges);
+    let of_file = of_file.flat_map(|(role, grants)| grants.iter().map(move |grant| (role, grant)));
+    let row = |(role, grant): (&String, &crate::telemetry::Grant)| {
+        let granted = if grant.granted { "✓ granted" } else { "✗ not granted" };
+        strings(&[role, &grant.privilege, &grant.asked, &granted, &grant.reason])
+    };
+    let rows: Vec<_> = of_run.chain(of_file).map(row).collect();
+    if rows.is_empty() {
+        blocks.push(Block::Text("No privileges were asked for.".to_owned()));
+    } else {
+        let head = vec!["role", "privilege", "asked for", "", "reason"];
+        blocks.push(Block::Table { caption: "Privileges".to_owned(), head, rows });
+    }
+    if let Some(info) = info {
+        let text = format!("Recorded by {}; scenario hash {}, seed {}.", info.version, info.scenario_hash, info.seed);
+        blocks.push(Block::Text(text));
+    }
+    if let Some(scenario) = &source.scenario {
+        blocks.push(Block::Details("The scenario as resolved".to_owned(), scenario.to_toml()));
+    }
+    Section { id: "machine", title: "Machine and privileges", blocks }
+}

@@ -1,0 +1,419 @@
+//! One pass over a recording: every signal that a picture shows, in columns, and the metrics as the launcher scores them.
+//!
+//! Nothing grows with the length of the run. What no role would have used (late, second and broken samples, and what a guard
+//! does not believe) is left out here too. Must not know pictures.
+
+use super::columns::{Columns, Corners, Count, Extremes};
+use crate::config::Scenario;
+use crate::launch::lyapunov_floor;
+use crate::record::{Column, RecordError, Recording, SignalInfo};
+use crate::rig::{Command, Estimate, FleetTruth, Rig, Truth};
+use crate::role::Guard;
+use crate::sample::{FieldKind, Stamp, VOID};
+use crate::with_rig;
+use std::collections::BTreeMap;
+
+/// So many ticks behind the newest, a tick is scored with the samples that it has.
+const WINDOW_TICKS: u64 = 2048;
+/// So many bodies have traces of their own; all are scored.
+pub const BODIES_SHOWN: usize = 4;
+
+/// What a recording shows.
+#[derive(Debug, Default)]
+pub struct Traces {
+    /// First and last tick of which there is a sample.
+    pub ticks: Option<(u64, u64)>,
+    /// The names of the bodies.
+    pub bodies: Vec<String>,
+    /// Values by body, signal, field and element. All bodies of a fleet have one.
+    pub values: BTreeMap<Key, Columns<Extremes>>,
+    /// Paths by body and by the two axes of the plane.
+    pub paths: BTreeMap<(String, &'static str), Columns<Corners>>,
+    /// Each metric over time.
+    pub metrics: Vec<MetricTrace>,
+    /// V's measured rate of fall, and what its bound promises, by body, as long as V is more than rounding.
+    pub falls: BTreeMap<String, [Columns<Extremes>; 2]>,
+    /// By role, in the order of a tick: its samples, and how late each was sent, µs; nothing where there was no time.
+    pub roles: Vec<RoleTrace>,
+    /// Ticks at which every sample of the metrics was there.
+    pub scored_ticks: u64,
+}
+
+/// Body, signal, field, element.
+pub type Key = (String, &'static str, String, usize);
+
+/// A role's samples.
+#[derive(Debug, Default)]
+pub struct RoleTrace {
+    pub role: String,
+    service: String,
+    pub samples: Columns<Count>,
+    pub lateness_us: Columns<Extremes>,
+}
+
+/// One metric.
+#[derive(Debug)]
+pub struct MetricTrace {
+    pub name: &'static str,
+    pub values: Columns<Extremes>,
+    pub last: f64,
+    last_tick: u64,
+    /// The largest from `accept.settled_by_s` on.
+    pub settled_max: Option<f64>,
+}
+
+/// Goes through a recording.
+///
+/// # Errors
+/// [`RecordError`], if its samples have another layout, too.
+pub fn trace(recording: &Recording, scenario: &Scenario) -> Result<Traces, RecordError> {
+    recording.check_layouts(scenario)?;
+    with_rig!(&scenario.rig, rig => Tracer::new(rig, scenario, recording).run(recording))
+}
+
+/// What is known of a signal while its samples pass.
+struct Signal<R: Rig> {
+    kind: Kind<R>,
+    body: usize,
+    role: Option<usize>,
+    last: Option<u64>,
+    /// The fields that are shown, with a trace for each element.
+    fields: Vec<Field>,
+}
+
+enum Kind<R: Rig> {
+    Truth,
+    FleetTruth,
+    Estimate(R::EstimateGuard),
+    Command(R::CommandGuard),
+    Other,
+}
+
+struct Field {
+    offset: usize,
+    count: usize,
+    /// Elements of one component: one for each body.
+    bodies: usize,
+    traces: Vec<(Key, Columns<Extremes>)>,
+}
+
+enum TruthSample<R: Rig> {
+    One(Truth<R>),
+    Fleet(Vec<u64>),
+}
+
+/// A tick of which not everything has come.
+struct Pending<R: Rig> {
+    truths: Vec<Option<TruthSample<R>>>,
+    estimate: Option<Estimate<R>>,
+}
+
+struct Tracer<R: Rig> {
+    rig: R,
+    tick_s: f64,
+    settled_by_s: f64,
+    epoch_ns: u64,
+    period_ns: u64,
+    last_tick: u64,
+    signals: Vec<Signal<R>>,
+    pending: BTreeMap<u64, Pending<R>>,
+    newest: u64,
+    /// V and the bound on its rate by body, at its last command.
+    before: BTreeMap<usize, (u64, f64, f64)>,
+    metrics: Vec<f64>,
+    traces: Traces,
+}
+
+impl<R: Rig> Tracer<R> {
+    fn new(rig: &R, scenario: &Scenario, recording: &Recording) -> Self {
+        let info = recording.info();
+        let metric = |name: &&'static str| MetricTrace {
+            name,
+            values: Columns::default(),
+            last: f64::NAN,
+            last_tick: 0,
+            settled_max: None,
+        };
+        let bodies = rig.bodies().iter().map(|body| body.name.clone()).collect();
+        let mut traces = Traces { bodies, metrics: rig.metrics().iter().map(metric).collect(), ..Traces::default() };
+        let signals = recording.signals().iter().map(|signal| Signal::new(rig, signal, &mut traces)).collect();
+        Self {
+            rig: rig.clone(),
+            tick_s: info.period_ns as f64 / 1e9,
+            settled_by_s: scenario.accept.settled_by_s,
+            epoch_ns: info.epoch_ns,
+            period_ns: info.period_ns.max(1),
+            last_tick: info.last_tick,
+            signals,
+            pending: BTreeMap::new(),
+            newest: 0,
+            before: BTreeMap::new(),
+            metrics: vec![f64::NAN; rig.metrics().len()],
+            traces,
+        }
+    }
+
+    fn run(mut self, recording: &Recording) -> Result<Traces, RecordError> {
+        recording.visit(|signal, received_ns, sample| self.take(signal, received_ns, sample))?;
+        while let Some((tick, pending)) = self.pending.pop_first() {
+            self.score(tick, &pending);
+        }
+        let mut traces = self.traces;
+        for field in self.signals.into_iter().flat_map(|signal| signal.fields) {
+            traces.values.extend(field.traces);
+        }
+        traces.roles.retain(|role| role.samples.iter().next().is_some());
+        Ok(traces)
+    }
+
+    fn take(&mut self, index: usize, received_ns: u64, sample: &[u8]) {
+        let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
+        let (tick, possible) = (stamp.tick, self.possible(index, stamp.tick, received_ns));
+        let signal = &mut self.signals[index];
+        if !possible || signal.last.is_some_and(|last| tick <= last) || stamp.generation == 0 {
+            return;
+        }
+        signal.last = Some(tick);
+        let (first, last) = self.traces.ticks.unwrap_or((tick, tick));
+        self.traces.ticks = Some((first.min(tick), last.max(tick)));
+        if stamp.generation & VOID != 0 {
+            return;
+        }
+        if let Some(role) = signal.role {
+            let role = &mut self.traces.roles[role];
+            role.samples.at(tick).0 += 1;
+            if self.epoch_ns > 0 {
+                let due_ns = self.epoch_ns as f64 + tick as f64 * self.period_ns as f64;
+                role.lateness_us.at(tick).take((stamp.sent_ns as f64 - due_ns).max(0.0) / 1e3);
+            }
+        }
+        if self.believed(index, tick, sample) {
+            self.signals[index].fields.iter_mut().for_each(|field| field.take(tick, sample));
+        }
+    }
+
+    /// Whether a sample can be of a tick: one that was due in real time, and elsewhere the next. A broken stamp can not.
+    fn possible(&self, signal: usize, tick: u64, received_ns: u64) -> bool {
+        let next = self.signals[signal].last.is_none_or(|last| last.checked_add(1) == Some(tick));
+        let due = received_ns.saturating_sub(self.epoch_ns) / self.period_ns;
+        tick <= self.last_tick && if self.epoch_ns > 0 { tick <= due.saturating_add(1) } else { next }
+    }
+
+    /// Keeps what the metrics need; tells whether the sample would be used.
+    fn believed(&mut self, index: usize, tick: u64, sample: &[u8]) -> bool {
+        let (body, newest) = (self.signals[index].body, &mut self.newest);
+        *newest = tick.max(*newest);
+        match &mut self.signals[index].kind {
+            Kind::Other => {}
+            Kind::Truth => {
+                let truth: Truth<R> = bytemuck::pod_read_unaligned(sample);
+                self.path(body, tick, sample, index);
+                self.keep(tick, |pending| pending.truths[body] = Some(TruthSample::One(truth)));
+            }
+            Kind::FleetTruth => {
+                let words = sample.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect();
+                self.keep(tick, |pending| pending.truths[body] = Some(TruthSample::Fleet(words)));
+            }
+            Kind::Estimate(guard) => {
+                let estimate: Estimate<R> = bytemuck::pod_read_unaligned(sample);
+                if !guard.accepts(&estimate) {
+                    return false;
+                }
+                self.path(body, tick, sample, index);
+                self.keep(tick, |pending| pending.estimate = Some(estimate));
+            }
+            Kind::Command(guard) => {
+                let command: Command<R> = bytemuck::pod_read_unaligned(sample);
+                if !guard.accepts(&command) {
+                    return false;
+                }
+                self.fall(body, tick, &command);
+            }
+        }
+        true
+    }
+
+    fn keep(&mut self, tick: u64, put: impl FnOnce(&mut Pending<R>)) {
+        let bodies = self.rig.bodies().len();
+        let blank = || Pending { truths: (0..bodies).map(|_| None).collect(), estimate: None };
+        let pending = self.pending.entry(tick).or_insert_with(blank);
+        put(pending);
+        if pending.estimate.is_some() && pending.truths.iter().all(Option::is_some) {
+            if let Some(whole) = self.pending.remove(&tick) {
+                self.traces.scored_ticks += 1;
+                self.score(tick, &whole);
+            }
+        } else if let Some(first) = self.pending.first_entry()
+            && first.key().saturating_add(WINDOW_TICKS) < self.newest
+        {
+            let (tick, part) = first.remove_entry();
+            self.score(tick, &part);
+        }
+    }
+
+    fn score(&mut self, tick: u64, pending: &Pending<R>) {
+        let one = |body: usize| match &pending.truths[body] {
+            Some(TruthSample::One(truth)) => Some(truth),
+            _ => None,
+        };
+        let fleet = |body: usize| match &pending.truths[body] {
+            Some(TruthSample::Fleet(words)) => Some(FleetTruth::<R>::over(words)),
+            _ => None,
+        };
+        self.rig.score(one, fleet, pending.estimate.as_ref(), &mut self.metrics);
+        let settled = tick as f64 * self.tick_s >= self.settled_by_s;
+        for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
+            metric.values.at(tick).take(value);
+            // A tick of which not all has come is scored after later ones.
+            if tick >= metric.last_tick {
+                (metric.last, metric.last_tick) = (value, tick);
+            }
+            if settled {
+                metric.settled_max = Some(metric.settled_max.map_or(value, |worst| worst.max(value)));
+            }
+        }
+    }
+
+    /// How fast V fell from the last command to this one, and how fast it had to.
+    fn fall(&mut self, body: usize, tick: u64, command: &Command<R>) {
+        let Some((v, bound)) = R::lyapunov(command) else { return };
+        let name = &self.traces.bodies[body];
+        if let Some((before, v_before, bound)) = self.before.insert(body, (tick, v, bound))
+            && before + 1 == tick
+            && v > lyapunov_floor(self.tick_s)
+        {
+            let falls = self.traces.falls.entry(name.clone()).or_default();
+            falls[0].at(before).take((v_before - v) / self.tick_s);
+            falls[1].at(before).take(-bound);
+        }
+    }
+
+    /// The paths of a body, or of an estimate, in the planes that are shown.
+    fn path(&mut self, body: usize, tick: u64, sample: &[u8], index: usize) {
+        let owner = match self.signals[index].kind {
+            Kind::Estimate(_) => "observer".to_owned(),
+            _ => self.traces.bodies[body].clone(),
+        };
+        let field = |name: &str| self.signals[index].fields.iter().find(|field| field.is(name));
+        let paths = &mut self.traces.paths;
+        let mut put = |plane, x, y| paths.entry((owner.clone(), plane)).or_default().at(tick).take(tick, x, y);
+        if let Some(omega) = field("omega_rad_s") {
+            let w = |axis| omega.value(sample, axis);
+            put("ω1 ω2", w(0), w(1));
+            put("ω2 ω3", w(1), w(2));
+        }
+        if let (Some(radius), Some(angle)) = (field("radius_du"), field("angle_rad")) {
+            let (r, angle) = (radius.value(sample, 0), angle.value(sample, 0));
+            put("x y", r * angle.cos(), r * angle.sin());
+        }
+        if let Some(velocity) = field("velocity_du_s") {
+            put("Vr Vθ", velocity.value(sample, 0), velocity.value(sample, 1));
+        }
+    }
+}
+
+impl<R: Rig> Signal<R> {
+    fn new(rig: &R, info: &SignalInfo, traces: &mut Traces) -> Self {
+        let body = rig.bodies().iter().position(|body| body.name == info.body);
+        let fleet = body.and_then(|body| rig.bodies()[body].fleet);
+        // What the scenario does not have, or has otherwise, is nothing to show; a file may hold anything.
+        let size = info.layout.size();
+        let (kind, name) = match (info.signal.as_str(), body, fleet) {
+            ("truth", Some(_), None) if size == size_of::<Truth<R>>() => (Kind::Truth, "truth"),
+            ("truth", Some(_), Some(bodies)) if size == 8 * FleetTruth::<R>::length(bodies) => {
+                (Kind::FleetTruth, "truth")
+            }
+            ("estimate", Some(0), _) if size == size_of::<Estimate<R>>() => {
+                (Kind::Estimate(rig.estimate_guard()), "estimate")
+            }
+            ("command", Some(body), None) if size == size_of::<Command<R>>() => {
+                (Kind::Command(rig.command_guard(body)), "command")
+            }
+            _ => (Kind::Other, ""),
+        };
+        let body = body.unwrap_or(0);
+        let shown = !matches!(kind, Kind::Other) && body <= BODIES_SHOWN;
+        let columns = info.layout.columns.iter().skip(Stamp::FIELDS.len());
+        let columns = columns.filter(|column| shown && column.kind == FieldKind::F64);
+        let fields = columns.map(|column| Field::new(column, info, name, fleet.unwrap_or(1))).collect();
+        Self { kind, body, role: role(info, traces), last: None, fields }
+    }
+}
+
+/// The place of the role whose samples these are; none for the truth, and beside the first signal of a role.
+fn role(info: &SignalInfo, traces: &mut Traces) -> Option<usize> {
+    if info.signal == "truth" || info.role.is_empty() {
+        return None;
+    }
+    if let Some(place) = traces.roles.iter().position(|trace| trace.role == info.role) {
+        return (traces.roles[place].service == info.service).then_some(place);
+    }
+    let (role, service) = (info.role.clone(), info.service.clone());
+    traces.roles.push(RoleTrace { role, service, ..RoleTrace::default() });
+    Some(traces.roles.len() - 1)
+}
+
+impl Field {
+    fn new(column: &Column, info: &SignalInfo, signal: &'static str, bodies: usize) -> Self {
+        let bodies = bodies.max(1);
+        let key = |element| (info.body.clone(), signal, column.name.clone(), element);
+        let traces = (0..column.count / bodies).map(|element| (key(element), Columns::default())).collect();
+        Self { offset: column.offset, count: column.count, bodies, traces }
+    }
+
+    fn is(&self, name: &str) -> bool {
+        self.traces.first().is_some_and(|(key, _)| key.2 == name)
+    }
+
+    fn value(&self, sample: &[u8], element: usize) -> f64 {
+        if element >= self.count {
+            return f64::NAN;
+        }
+        bytemuck::pod_read_unaligned(&sample[self.offset + 8 * element..][..8])
+    }
+
+    fn take(&mut self, tick: u64, sample: &[u8]) {
+        let bodies = self.bodies;
+        for component in 0..self.traces.len() {
+            for body in 0..bodies {
+                let value = self.value(sample, component * bodies + body);
+                self.traces[component].1.at(tick).take(value);
+            }
+        }
+    }
+}
+
+impl Traces {
+    /// An element of a field.
+    pub fn get(&self, body: &str, signal: &'static str, field: &str, element: usize) -> Option<&Columns<Extremes>> {
+        self.values.get(&(body.to_owned(), signal, field.to_owned(), element))
+    }
+
+    /// From when to when some role has fewer samples than ticks, in ticks; and how many ticks those are, over all roles.
+    pub fn missing(&self) -> (Vec<(u64, u64)>, u64) {
+        let Some((first, last)) = self.ticks else { return (Vec::new(), 0) };
+        let (mut spans, mut total) = (Vec::new(), 0);
+        for role in &self.roles {
+            let (stride, mut next) = (role.samples.stride(), first);
+            let counted = role.samples.iter().map(|(tick, count)| (tick, count.0));
+            // A role that fell silent has no columns any more.
+            let silent = |tick: u64| (tick, 0);
+            let beyond = role.samples.iter().last().map_or(first, |(tick, _)| tick + stride);
+            let beyond = (beyond..=last).step_by(stride.max(last / 512).max(1) as usize).map(silent);
+            let all: Vec<(u64, u64)> = counted.chain(beyond).collect();
+            for (index, (tick, count)) in all.iter().enumerate() {
+                let end = all.get(index + 1).map_or(last + 1, |(tick, _)| *tick).min(last + 1);
+                let ticks = end.saturating_sub(next.max(*tick));
+                let missing = ticks.saturating_sub(*count);
+                if missing > 0 {
+                    spans.push((*tick, end));
+                    total += missing;
+                }
+                next = end.max(next);
+            }
+        }
+        spans.sort_unstable();
+        spans.dedup();
+        (spans, total)
+    }
+}

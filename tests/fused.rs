@@ -1,0 +1,201 @@
+//! Observer and controller in one process (`launch.fused`): the same bits and the same books under every clock, one process
+//! less, one life for both, and no room for anybody else.
+
+mod common;
+
+use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use serde_json::Value;
+use std::time::Duration;
+
+const FUSED: [&str; 2] = ["--set", "launch.fused=true"];
+const SIGKILL: i32 = 9;
+const SIGTERM: i32 = 15;
+
+fn summary(done: &Done) -> Value {
+    serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("no summary: {done:?}"))
+}
+
+/// The hash after every tick.
+fn checkpoints(bench: &Bench, directory: &str) -> Vec<String> {
+    let text = std::fs::read_to_string(bench.path(directory).join("hashes.txt")).unwrap();
+    text.lines().skip(1).map(str::to_owned).collect()
+}
+
+/// One follower, two of them, a fleet, a spacecraft that is leader and driven body in one, and every kind of fault.
+#[test]
+fn the_bits_and_the_books_are_those_of_processes_apart_and_of_one_thread() {
+    for scenario in ["rigid-pair", "rigid-trio", "rigid-fleet", "orbit-hold", "faults"] {
+        let bench = Bench::new();
+        let length: &[&str] = if scenario == "faults" { &[] } else { &["--duration", "1", "--set", "accept={}"] };
+        let run = |clock: &str, more: &[&str]| bench.summary(scenario, &[length, &["--clock", clock], more].concat());
+        let (one, apart, fused) = (run("in-process", &FUSED), run("lockstep", &[]), run("lockstep", &FUSED));
+        for other in [&one, &apart] {
+            assert_eq!(fused["state"], other["state"], "{scenario}");
+            assert_eq!(fused["books"]["roles"], other["books"]["roles"], "{scenario}");
+            assert_eq!(fused["score"], other["score"], "{scenario}");
+            assert!(other["hosted"].is_null(), "{scenario}: roles in one thread are in nobody's process");
+        }
+        assert_eq!(fused["books"]["links"], apart["books"]["links"], "{scenario}");
+        assert_eq!(fused["books"]["balanced"], true, "{scenario}");
+        assert_eq!(fused["hosted"]["observer"], "controller", "{scenario}");
+        bench.assert_clean(&[]);
+    }
+}
+
+#[test]
+fn in_real_time_the_bits_are_the_same_up_to_the_first_missed_tick_and_both_roles_tell_their_latencies() {
+    let bench = Bench::new();
+    let common = ["--duration", "2", "--set", "accept={}", "--out"];
+    let run = |clock: &str| bench.summary("rigid-pair", &[&common[..], &[clock, "--clock", clock], &FUSED].concat());
+    let (reference, live) = (run("in-process"), run("realtime"));
+    assert_eq!(live["books"]["balanced"], true, "{:#}", live["books"]);
+    let clean = live["state"]["clean_ticks"].as_u64().unwrap() as usize;
+    println!("{clean} of 2001 ticks undisturbed");
+    let (expected, seen) = (checkpoints(&bench, "in-process"), checkpoints(&bench, "realtime"));
+    assert_eq!((expected.len(), &expected[..clean]), (2001, &seen[..clean]));
+    if live["state"]["first_disturbed_tick"].is_null() {
+        assert_eq!(live["state"]["hash"], reference["state"]["hash"]);
+    }
+    let stages = live["latencies"].as_array().unwrap();
+    for role in ["observer", "controller"] {
+        for stage in ["hop", "step", "age"] {
+            let found = stages.iter().find(|found| found["role"] == role && found["stage"] == stage).unwrap();
+            let executed = live["books"]["roles"][role]["executed"].as_u64().unwrap();
+            assert!(found["count"].as_u64().unwrap() <= executed && executed > 0, "{role} {stage}: {found}");
+        }
+    }
+    let asked = |role: &str| live["privileges"].as_array().unwrap().iter().any(|grant| grant["role"] == role);
+    assert!(asked("controller") && !asked("observer"), "what was asked was asked once: {}", live["privileges"]);
+    bench.assert_clean(&[]);
+}
+
+/// Starts a run and kills the one process of both roles amid the ticks.
+fn killed(bench: &Bench, arguments: &[&str]) -> Running {
+    let file = shipped("rigid-pair");
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
+    let running = bench.start(&[&common[..], &FUSED, arguments].concat());
+    let controller = bench.await_role("controller");
+    // Leader, follower, both in one, launcher, janitor.
+    await_some(|| (bench.processes().len() == 5).then_some(()));
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!(bench.processes().len(), 5, "nobody is an observer alone");
+    send_signal(controller, SIGKILL);
+    running
+}
+
+#[test]
+fn whoever_kills_the_process_kills_both_and_both_come_back() {
+    let slow: &[&str] = &["--duration=4", "--tick-hz=200", "--set=accept={settled_by_s=0,sync_error_rad_s_max=3}"];
+    let endless: &[&str] = &["--duration=100000", "--set=accept={}"];
+    for (clock, arguments) in [("realtime", slow), ("lockstep", endless)] {
+        let bench = Bench::new();
+        let running = killed(&bench, &[&["--clock", clock][..], arguments].concat());
+        if clock == "lockstep" {
+            await_some(|| (bench.processes().len() == 4).then_some(()));
+            await_some(|| (bench.processes().len() == 5).then_some(()));
+            std::thread::sleep(Duration::from_millis(1500));
+            running.signal(SIGTERM);
+        }
+        let done = running.wait();
+        assert_eq!(done.code, Some(if clock == "lockstep" { 128 + SIGTERM } else { 0 }), "{clock}: {done:?}");
+        assert!(done.stderr.contains("controller, and observer with it, died at tick "), "{clock}: {done:?}");
+        let summary = summary(&done);
+        let incident = &summary["incidents"][0];
+        assert_eq!((&incident["role"], &incident["with"][0]), (&"controller".into(), &"observer".into()), "{clock}");
+        assert_eq!(incident["action"], "restarted", "{clock}");
+        assert!(incident["outage_s"].is_number(), "{clock}: {incident}");
+        assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{clock}");
+        assert_eq!(summary["books"]["balanced"], true, "{clock}: {:#}", summary["books"]);
+        for role in ["observer", "controller"] {
+            let ticks = &summary["books"]["roles"][role];
+            let disturbed = ticks["first_disturbed"].as_u64().expect("it has had a successor");
+            assert!(ticks["executed"].as_u64().unwrap() > disturbed, "{clock}: {role} went on: {ticks}");
+            assert!(clock == "realtime" || ticks["missed"] == 0, "{role}: {ticks}");
+        }
+        bench.assert_clean(&[]);
+    }
+}
+
+/// One life: whichever of the two must not be started anew ends the run.
+#[test]
+fn the_stricter_of_both_policies_holds() {
+    let bench = Bench::new();
+    let policy = "--set=supervision.on_failure={observer=\"stop\"}";
+    let done = killed(&bench, &["--clock=realtime", "--duration=1000", "--set=accept={}", policy]).wait();
+    assert_eq!(done.code, Some(4), "{done:?}");
+    let summary = summary(&done);
+    assert_eq!(summary["incidents"][0]["action"], "stopped");
+    assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
+    assert!(
+        summary["books"]["roles"]["observer"]["executed"].as_u64().unwrap() > 0,
+        "the books of the dead are read too"
+    );
+    bench.assert_clean(&[]);
+}
+
+/// At every place of a tick, whichever of the two is there: nothing is lost that the other still needs.
+#[cfg(feature = "hooks")]
+#[test]
+fn in_lockstep_both_may_die_anywhere_in_a_tick() {
+    // Passed by the two in turn: odd is the estimate's, even the command's.
+    for place in ["loaned 901", "loaned 902", "sent 901", "sent 902", "waiting 400"] {
+        let bench = Bench::new();
+        let file = shipped("rigid-pair");
+        let mut command = bench.command();
+        command.args(["run", file.to_str().unwrap(), "--json", "--out", "out", "--clock", "lockstep"]).args(FUSED);
+        command.env("COROTATE_HOOK", format!("observer {place} KILL"));
+        let done = Running::new(&mut command).wait();
+        assert_eq!(done.code, Some(0), "{place}: {done:?}");
+        let summary = summary(&done);
+        assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{place}: {done:?}");
+        assert_eq!(summary["books"]["balanced"], true, "{place}: {:#}", summary["books"]);
+        assert_eq!(summary["books"]["missed_ticks"], 0, "{place}");
+        assert_eq!(summary["score"]["unscored_ticks"], 0, "{place}");
+        bench.assert_clean(&[]);
+    }
+}
+
+#[test]
+fn what_cannot_be_fused_is_refused_with_its_reason() {
+    let bench = Bench::new();
+    let refused = |arguments: &[&str], words: &[&str]| {
+        let done = bench.run(arguments);
+        assert_eq!(done.code, Some(2), "{arguments:?}: {done:?}");
+        for word in words {
+            assert!(done.stderr.contains(word), "{arguments:?}: `{word}` is not in {}", done.stderr);
+        }
+    };
+    let path = |name: &str| shipped(name).to_str().unwrap().to_owned();
+    let (pair, alone) = (path("rigid-pair"), path("inertia"));
+    for role in ["observer", "controller"] {
+        let why = format!("nobody else can be the {role}; set it to false");
+        refused(&["run", &pair, "--set=launch.fused=true", "--external", role], &["--external", role, &why]);
+        let list = format!("--set=launch.external=[\"{role}\"]");
+        refused(&["run", &pair, "--set=launch.fused=true", &list], &["launch.external[0]", &why]);
+        refused(&["seat", &pair, role, "--set=launch.fused=true"], &[&why]);
+    }
+    let alone = ["run", &alone, "--set=launch.fused=true"];
+    refused(&alone, &["launch.fused", "no controller to fuse the observer with", "leave it false"]);
+    refused(&["run", &pair, "--set=launch.fused=1"], &["launch.fused", "give true or false"]);
+    refused(&["run", &pair, "--set=launch.fuse=true"], &["did you mean `fused`?"]);
+}
+
+/// The follower may still be anybody's; and nobody takes the observer's seat by hand.
+#[test]
+fn a_follower_by_hand_still_joins_and_an_observer_does_not() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let arguments = ["run", file.to_str().unwrap(), "--clock=lockstep", "--duration=1", "--set=accept={}", "--json"];
+    let running = bench.start(&[&arguments[..], &FUSED, &["--external", "follower"]].concat());
+    bench.await_role("controller");
+    let domains = bench.domains();
+    let domain = domains[0].to_str().unwrap();
+    let observer = bench.run(&["observer", "--domain", domain]);
+    assert_eq!(observer.code, Some(2), "{observer:?}");
+    assert!(observer.stderr.contains("the observer is in the process of the controller"), "{observer:?}");
+    let follower = bench.run(&["plant", "--body", "follower", "--domain", domain]);
+    let done = running.wait();
+    assert_eq!((follower.code, done.code), (Some(0), Some(0)), "{follower:?} {done:?}");
+    assert_eq!(summary(&done)["books"]["balanced"], true);
+    bench.assert_clean(&domains);
+}

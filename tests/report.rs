@@ -1,0 +1,376 @@
+//! Reports of real runs: whole, well-formed, alone on the network, true to the summary; and what they say to bad input.
+
+mod common;
+
+use common::{Bench, Done, shipped};
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Bus, Signal, Write};
+use corotate::config::Scenario;
+use corotate::record::Recorder;
+use roxmltree::{Document, Node, ParsingOptions};
+use serde_json::Value;
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+
+/// Runs a shipped scenario in one thread with a recording.
+fn run(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
+    let file = shipped(scenario);
+    let common = ["run", file.to_str().unwrap(), "--clock", "in-process", "--record", "--out", scenario];
+    let done = bench.run(&[&common, options].concat());
+    assert!(matches!(done.code, Some(0 | 3)), "{done:?}");
+    bench.path(scenario)
+}
+
+fn report(bench: &Bench, source: &Path, options: &[&str]) -> Done {
+    bench.run(&[&["report", source.to_str().unwrap()], options].concat())
+}
+
+/// The page that a report wrote, which must have ended well.
+fn page(bench: &Bench, source: &Path) -> String {
+    let done = report(bench, source, &["--out", "page.html"]);
+    assert_eq!((done.code, done.stdout.as_str()), (Some(0), "page.html\n"), "{done:?}");
+    std::fs::read_to_string(bench.path("page.html")).unwrap()
+}
+
+fn parse(html: &str) -> Document<'_> {
+    Document::parse_with_options(html, ParsingOptions { allow_dtd: true, ..ParsingOptions::default() }).unwrap()
+}
+
+fn sections<'a>(page: &'a Document<'_>) -> Vec<&'a str> {
+    let sections = page.descendants().filter(|node| node.has_tag_name("section"));
+    sections.map(|node| node.attribute("id").unwrap()).collect()
+}
+
+fn section<'a, 'i>(page: &'a Document<'i>, id: &str) -> Node<'a, 'i> {
+    page.descendants().find(|node| node.has_tag_name("section") && node.attribute("id") == Some(id)).unwrap()
+}
+
+fn text(node: Node<'_, '_>) -> String {
+    node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
+}
+
+/// The rows of all tables of a section.
+fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
+    let rows = section.descendants().filter(|node| node.has_tag_name("tr"));
+    rows.map(|row| row.children().filter(Node::is_element).map(text).collect()).collect()
+}
+
+fn summary(directory: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(directory.join("summary.json")).unwrap()).unwrap()
+}
+
+/// The page needs nothing beside it, and every picture is one.
+fn check_page(html: &str) {
+    for outside in ["http:", "https:", "//", "<script", "@import", "url("] {
+        assert!(!html.contains(outside), "{outside}");
+    }
+    for not_drawn in ["NaN", "inf"] {
+        assert!(!html.contains(&format!("\"{not_drawn}")) && !html.contains(&format!(" {not_drawn}\"")), "{not_drawn}");
+    }
+    let page = parse(html);
+    for node in page.descendants().filter(|node| node.has_tag_name("a") || node.has_tag_name("use")) {
+        let target = node.attribute("href").unwrap().strip_prefix('#').unwrap();
+        assert!(page.descendants().any(|node| node.attribute("id") == Some(target)), "{target}");
+    }
+    for figure in page.descendants().filter(|node| node.has_tag_name("figure")) {
+        let drawn = figure.descendants().filter(|node| node.has_tag_name("path"));
+        assert!(drawn.filter_map(|path| path.attribute("d")).any(|path| path.len() > 12), "{}", text(figure));
+        assert!(
+            !figure
+                .descendants()
+                .find(|node| node.has_tag_name("svg"))
+                .unwrap()
+                .attribute("aria-label")
+                .unwrap()
+                .is_empty()
+        );
+    }
+}
+
+/// What the verdict says is what summary.json says, to the last digit.
+fn check_verdict(page: &Document<'_>, summary: &Value) {
+    let told = rows(section(page, "verdict"));
+    let criteria = summary["criteria"].as_array().unwrap();
+    assert_eq!(told.len(), criteria.len() + 1, "a head, and a row for each");
+    for (row, criterion) in told[1..].iter().zip(criteria) {
+        assert_eq!(row[0], criterion["name"].as_str().unwrap());
+        assert_eq!(row[1].parse::<f64>().unwrap().to_bits(), criterion["value"].as_f64().unwrap().to_bits(), "{row:?}");
+        assert_eq!(row[2].parse::<f64>().unwrap(), criterion["limit"].as_f64().unwrap());
+        assert_eq!(row[3].contains("holds"), criterion["holds"].as_bool().unwrap());
+    }
+    let heading = text(page.descendants().find(|node| node.has_tag_name("h1")).unwrap());
+    assert_eq!(heading.contains("not accepted"), summary["accepted"] == false, "{heading}");
+}
+
+/// Copies a recording with another name for a layout.
+fn relabel(from: &Path, to: &Path, old: &str, new: &str) {
+    let bytes = std::fs::read(from).unwrap();
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    for index in &mcap::Summary::read(&bytes).unwrap().unwrap().metadata_indexes {
+        writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        let mut channel = (*message.channel).clone();
+        let mut schema = (**channel.schema.as_ref().unwrap()).clone();
+        schema.data = Cow::Owned(String::from_utf8_lossy(&schema.data).replace(old, new).into_bytes());
+        channel.schema = Some(schema.into());
+        message.channel = channel.into();
+        writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+#[test]
+fn a_recorded_run_of_bodies_is_shown_whole() {
+    let bench = Bench::new();
+    let directory = run(&bench, "rigid-pair", &[]);
+    let html = page(&bench, &directory);
+    check_page(&html);
+    let (page, summary) = (parse(&html), summary(&directory));
+    let expected = ["verdict", "motion", "errors", "lyapunov", "lateness", "events", "books", "certificate", "machine"];
+    assert_eq!(sections(&page), expected);
+    check_verdict(&page, &summary);
+    // The metrics that the recording gives are those that the run was judged by.
+    let metrics = rows(section(&page, "errors"));
+    for (row, metric) in metrics[1..].iter().zip(summary["score"]["metrics"].as_array().unwrap()) {
+        assert_eq!(row[0], metric["name"].as_str().unwrap());
+        for (cell, key) in [(1, "last"), (2, "last"), (3, "settled_max"), (4, "settled_max"), (5, "peak")] {
+            assert_eq!(row[cell], format!("{:.4e}", metric[key].as_f64().unwrap()), "{row:?} {key}");
+        }
+    }
+    let motion = text(section(&page, "motion"));
+    assert!(motion.contains("10001 ticks are drawn in columns of 8"), "{motion}");
+    assert!(text(section(&page, "errors")).contains("certified: exp(−4 t)"));
+    assert!(text(section(&page, "books")).contains("The books balance."));
+}
+
+#[test]
+fn an_orbit_is_shown_beside_its_motion_with_full_state() {
+    let bench = Bench::new();
+    let directory = run(&bench, "orbit-hold", &[]);
+    let html = page(&bench, &directory);
+    check_page(&html);
+    let page = parse(&html);
+    check_verdict(&page, &summary(&directory));
+    let motion = section(&page, "motion");
+    let labels: Vec<String> =
+        motion.descendants().filter_map(|node| node.attribute("aria-label")).map(str::to_owned).collect();
+    for picture in ["motion in the plane", "r, du", "Vr, du/s", "Vθ, du/s", "Ur, du/s²", "Uθ, du/s²"] {
+        assert!(labels.iter().any(|label| label.starts_with(picture)), "{picture}: {labels:?}");
+    }
+    // Full state in black, the observer in blue; both begin at the same place and do not go the same way.
+    let plane = motion.descendants().find(|node| node.has_tag_name("svg")).unwrap();
+    let path = |class: &str| {
+        let of =
+            |node: &Node<'_, '_>| node.attribute("class") == Some(class) && node.attribute("d").unwrap().len() > 99;
+        plane.descendants().find(of).unwrap().attribute("d").unwrap()
+    };
+    let (full, observed) = (path("line k d0"), path("line b d1"));
+    assert_eq!(full.split('L').next(), observed.split('L').next());
+    assert_ne!(full, observed);
+}
+
+#[test]
+fn faults_and_incidents_are_marked_on_every_time_axis() {
+    let bench = Bench::new();
+    let kill = r#"fault.0={kind="kill",role="observer",from_tick=5000}"#;
+    let directory = run(&bench, "faults", &["--set", kill]);
+    let html = page(&bench, &directory);
+    check_page(&html);
+    let (page, summary) = (parse(&html), summary(&directory));
+    check_verdict(&page, &summary);
+    let marks = page.descendants().find(|node| node.attribute("id") == Some("marks")).unwrap();
+    let marked = |class: &str| marks.descendants().filter(|node| node.attribute("class") == Some(class)).count();
+    assert_eq!((marked("fault"), marked("incident"), marked("flag")), (12, 1, 1));
+    assert_eq!(summary["incidents"].as_array().unwrap().len(), 1);
+    let missing = marks.descendants().find(|node| node.attribute("class") == Some("missing")).unwrap();
+    assert!(missing.attribute("d").unwrap().contains('M'), "ticks without a sample");
+    let over_time =
+        |node: &Node<'_, '_>| node.attribute("aria-label").is_some_and(|label| label.ends_with("over time"));
+    for picture in page.descendants().filter(over_time) {
+        assert!(picture.children().any(|node| node.attribute("href") == Some("#marks")));
+    }
+    let events = rows(section(&page, "events"));
+    assert!(events.iter().any(|row| row[3..] == ["noise-burst", "observer"]), "{events:?}");
+    assert!(events.iter().any(|row| row[1] == "observer" && row[3] == "restarted"), "{events:?}");
+}
+
+#[test]
+fn every_shipped_scenario_has_a_report() {
+    for (scenario, _) in corotate::config::SHIPPED {
+        let bench = Bench::new();
+        let directory = run(&bench, scenario, &["--duration", "0.3", "--set", "accept={}", "--set", "fault=[]"]);
+        let html = page(&bench, &directory);
+        check_page(&html);
+        let page = parse(&html);
+        assert!(section(&page, "motion").descendants().any(|node| node.has_tag_name("figure")), "{scenario}");
+        // Without noise, axis lost or fault nothing is missing.
+        assert!(text(section(&page, "events")).ends_with("all roles together: 0.\n"), "{scenario}");
+    }
+}
+
+#[test]
+fn latencies_are_drawn_from_the_histograms_of_the_run() {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let options = ["--tick-hz", "200", "--duration", "1", "--set", "accept={}", "--record", "--out", "out"];
+    let done = bench.run(&[&["run", file.to_str().unwrap()][..], &options].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let html = page(&bench, &bench.path("out"));
+    check_page(&html);
+    let (page, summary) = (parse(&html), summary(&bench.path("out")));
+    let latency = section(&page, "latency");
+    let shown = latency.descendants().filter(|node| node.has_tag_name("figure")).count();
+    assert!(shown >= 4, "lateness, hop, step, age: {shown}");
+    assert!(text(latency).contains("baseline"));
+    let table = rows(latency);
+    assert_eq!(table.len(), summary["latencies"].as_array().unwrap().len() + 1);
+    for (row, stage) in table[1..].iter().zip(summary["latencies"].as_array().unwrap()) {
+        assert_eq!(row[2], stage["count"].to_string());
+        assert_eq!(row[6], format!("{:.2}", stage["max_us"].as_f64().unwrap()));
+    }
+    // A row for every role, and shades in it.
+    let strip = text(section(&page, "lateness"));
+    assert!(["leader", "follower", "observer", "controller"].iter().all(|role| strip.contains(role)), "{strip}");
+    let broken = bench.path("out/latency/leader.step.hgrm");
+    std::fs::write(&broken, "Value\n\n1.0 oops\n").unwrap();
+    let done = report(&bench, &bench.path("out"), &[]);
+    assert!(
+        done.code == Some(2) && done.stderr.contains("leader.step.hgrm") && done.stderr.contains("line 3"),
+        "{done:?}"
+    );
+}
+
+#[test]
+fn what_is_missing_is_said_with_the_way_to_get_it() {
+    let bench = Bench::new();
+    let directory = run(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
+    let done = report(&bench, &directory.join("run.mcap"), &["--out", "alone.html"]);
+    assert!(done.code == Some(0) && done.stderr.contains("summary.json"), "{done:?}");
+    let html = std::fs::read_to_string(bench.path("alone.html")).unwrap();
+    check_page(&html);
+    let page = parse(&html);
+    assert!(sections(&page).contains(&"motion") && text(section(&page, "verdict")).contains("Nobody has judged"));
+    std::fs::remove_file(directory.join("run.mcap")).unwrap();
+    let done = report(&bench, &directory, &[]);
+    assert!(done.code == Some(0) && done.stderr.contains("--record"), "{done:?}");
+    let html = std::fs::read_to_string(directory.join("report.html")).unwrap();
+    check_page(&html);
+    assert!(html.contains("corotate run FILE --record") && !sections(&parse(&html)).contains(&"motion"));
+}
+
+/// Everything that a file says is shown as text, whatever it is.
+#[test]
+fn nothing_of_a_file_is_read_as_markup() {
+    let bench = Bench::new();
+    let directory = run(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]);
+    let mut told = summary(&directory);
+    let evil = "</td><script>alert('\"&amp;')</script>\u{1b}";
+    for key in ["scenario", "started_utc", "clock"] {
+        told[key] = evil.into();
+    }
+    told["host"]["cpu"] = evil.into();
+    told["books"]["problems"] = vec![evil].into();
+    told["notes"] = vec![evil].into();
+    std::fs::write(directory.join("summary.json"), told.to_string()).unwrap();
+    let html = page(&bench, &directory);
+    check_page(&html);
+    let page = parse(&html);
+    assert!(page.descendants().all(|node| !node.has_tag_name("script")));
+    assert!(text(section(&page, "machine")).contains("<script>alert"));
+}
+
+#[test]
+fn bad_input_is_told_and_never_a_panic() {
+    let bench = Bench::new();
+    let directory = run(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
+    let recording = std::fs::read(directory.join("run.mcap")).unwrap();
+    let told = |source: &Path, code: i32, words: &[&str]| {
+        let done = report(&bench, source, &[]);
+        assert_eq!(done.code, Some(code), "{}: {done:?}", source.display());
+        assert!(words.iter().all(|word| done.stderr.contains(word)) && !done.stderr.contains("panicked"), "{done:?}");
+    };
+    told(&bench.path("none"), 2, &["there is no", "run.mcap"]);
+    std::fs::create_dir(bench.path("empty")).unwrap();
+    told(&bench.path("empty"), 2, &["neither summary.json nor run.mcap"]);
+    let file = |name: &str, bytes: &[u8]| {
+        std::fs::write(bench.path(name), bytes).unwrap();
+        bench.path(name)
+    };
+    told(&file("text.mcap", b"no recording"), 2, &["is no recording of corotate"]);
+    told(&file("nothing.mcap", b""), 2, &["is no recording of corotate"]);
+    relabel(&directory.join("run.mcap"), &bench.path("other.mcap"), "estimate/v2", "estimate/v9");
+    let done = report(&bench, &bench.path("other.mcap"), &[]);
+    assert!(done.code == Some(2) && done.stderr.contains("estimate/v9"), "{done:?}");
+    // Cut anywhere, it is shown as far as it goes and said to be cut, or refused.
+    for part in [1, 10, 25, 50, 75, 99] {
+        let cut = file("cut.mcap", &recording[..recording.len() * part / 100]);
+        let done = report(&bench, &cut, &["--out", "cut.html"]);
+        let refused = done.code == Some(2) && done.stderr.contains("is no recording of corotate");
+        assert!(refused || (done.code == Some(0) && done.stderr.contains("damaged")), "{part} %: {done:?}");
+        assert!(!done.stderr.contains("panicked"), "{done:?}");
+    }
+    let schema = summary(&directory).to_string().replace("summary/v1", "summary/v9");
+    for (text, word) in
+        [(schema.as_str(), "summary/v9"), ("{", "EOF"), ("{\"schema\":\"corotate/summary/v1\"}", "missing")]
+    {
+        std::fs::write(directory.join("summary.json"), text).unwrap();
+        told(&directory, 2, &["summary.json", word]);
+    }
+    let done = report(&bench, &directory.join("run.mcap"), &["--out", "no/such/directory/page.html"]);
+    assert!(done.code == Some(1) && done.stderr.contains("--out"), "{done:?}");
+}
+
+/// A million ticks, written straight to a recording: a page of less than 2 MB, in which a spike of one tick is seen.
+#[test]
+fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
+    use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
+    const TICKS: u64 = 1_000_000;
+    const SPIKE: u64 = 654_321;
+    let bench = Bench::new();
+    let overrides = ["clock=in-process", "duration_s=1000", "accept={}"].map(str::to_owned);
+    let scenario = Scenario::load(&shipped("rigid-pair"), &overrides).unwrap();
+    let bus = MemoryBus::new(corotate::runtime::depths(&scenario));
+    let file = bench.path("long.mcap");
+    let mut recorder = Recorder::open(&scenario, &bus, &file).unwrap();
+    recorder.start(0, true).unwrap();
+    let topic = |body: &str, signal| corotate::runtime::topic(&scenario, body, signal);
+    let mut truths =
+        ["leader", "follower"].map(|body| bus.writer::<RateTruth>(&topic(body, Signal::Truth), 1).unwrap());
+    let mut estimate = bus.writer::<RateEstimate>(&topic("leader", Signal::Estimate), 1).unwrap();
+    let mut measured =
+        ["leader", "follower"].map(|body| bus.writer::<RateMeasurement>(&topic(body, Signal::Measurement), 1).unwrap());
+    let mut command = bus.writer::<RateCommand>(&topic("follower", Signal::Command), 1).unwrap();
+    let noise = |tick: u64, axis: u64| ((tick * 2_654_435_761 + axis * 40_503) % 1_000_003) as f64 / 1e6 - 0.5;
+    for tick in 0..TICKS {
+        let omega = [0, 1, 2].map(|axis| noise(tick, axis));
+        let stamp = corotate::sample::Stamp { tick, generation: 1, ..Default::default() };
+        for (body, truth) in truths.iter_mut().enumerate() {
+            let mut omega = omega;
+            if body == 1 && tick == SPIKE {
+                omega[0] = 5.0;
+            }
+            let applied_rad_s2 = omega;
+            truth.send(|sample| *sample = RateTruth { stamp, omega_rad_s: omega, applied_rad_s2, status: 0 }).unwrap();
+            measured[body].send(|sample| *sample = RateMeasurement { stamp, ..RateMeasurement::default() }).unwrap();
+        }
+        estimate
+            .send(|sample| *sample = RateEstimate { stamp, omega_rad_s: omega, ..RateEstimate::default() })
+            .unwrap();
+        let v = noise(tick, 3).abs() + 1e-3;
+        let said =
+            RateCommand { stamp, acceleration_rad_s2: [0.0; 3], lyapunov_rad2_s2: v, lyapunov_rate_bound_rad2_s3: -v };
+        command.send(|sample| *sample = said).unwrap();
+        recorder.poll().unwrap();
+    }
+    recorder.finish(&[], None);
+    let html = page(&bench, &file);
+    check_page(&html);
+    assert!(html.len() < 2 << 20, "{} bytes", html.len());
+    let page = parse(&html);
+    let metrics = rows(section(&page, "errors"));
+    assert!(metrics[1][3].parse::<f64>().unwrap() > 4.4, "{metrics:?}");
+    let first = section(&page, "motion").descendants().find(|node| node.has_tag_name("svg")).unwrap();
+    assert!(text(first).contains('5'), "the axis reaches the spike");
+}
