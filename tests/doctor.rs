@@ -58,7 +58,7 @@ fn what_a_killed_run_left_is_told_and_removed_on_demand() {
     let bench = Bench::new();
     let domain =
         |bench: &Bench| await_some(|| bench.domains().pop().filter(|path| path.join("scenario.toml").exists()));
-    let killed = bench.start(&["run", "--duration", "60", "--set", "realtime.cores=\"none\""]);
+    let killed = bench.start(&["run", "--duration", "60"]);
     let dead = domain(&bench);
     bench.await_role("controller");
     let mut processes = bench.processes();

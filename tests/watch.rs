@@ -134,7 +134,7 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     // A signal is selected, and stands still while the loop goes on.
     terminal.press("Up");
     terminal.await_text(">follower/command");
-    terminal.await_text("acceleration_rad");
+    terminal.await_text("acceleration_ra");
     terminal.press("Space");
     let paused = terminal.await_text("paused");
     std::thread::sleep(std::time::Duration::from_millis(500));
