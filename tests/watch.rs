@@ -192,6 +192,25 @@ fn a_signal_gives_the_terminal_back_and_the_end_of_the_run_is_told() {
     bench.assert_clean(&[domain]);
 }
 
+/// As when a connection breaks: nobody is left to press q.
+#[test]
+fn a_watcher_ends_with_its_terminal() {
+    let bench = Bench::new();
+    let run = bench.start(&RUN);
+    let domain = await_some(|| bench.domains().pop());
+    bench.await_role("controller");
+    let terminal = Terminal::open(&bench);
+    terminal.enter(&format!("{} watch", env!("CARGO_BIN_EXE_corotate")));
+    terminal.await_text("controller");
+    let watches = |pid: &u32| arguments(*pid).get(1).is_some_and(|word| word == "watch");
+    assert!(bench.processes().iter().any(watches));
+    drop(terminal);
+    await_some(|| (!bench.processes().iter().any(watches)).then_some(()));
+    run.signal(15);
+    assert_eq!(run.wait().code, Some(143));
+    bench.assert_clean(&[domain]);
+}
+
 /// A watcher that is killed leaves nothing that outlives the run.
 #[test]
 fn a_killed_watcher_leaves_nothing() {

@@ -11,6 +11,7 @@ use super::session::Session;
 use crate::clock::monotonic_ns;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use std::io::{self, IsTerminal};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -46,7 +47,10 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
             terminal.draw(|frame| draw(model, frame)).map_err(failed)?;
             next_draw_ns = now_ns + DRAW_NS;
         }
-        if !event::poll(Duration::from_nanos(LOOK_NS)).map_err(failed)? {
+        if hung_up(LOOK_NS) {
+            return Ok(());
+        }
+        if !event::poll(Duration::ZERO).map_err(failed)? {
             continue;
         }
         let wanted = match event::read().map_err(failed)? {
@@ -66,6 +70,17 @@ fn watch(terminal: &mut DefaultTerminal, session: &mut Session, signal: &AtomicU
         next_draw_ns = 0;
     }
     Ok(())
+}
+
+/// Waits for input, at most so long, and tells whether there is nobody at the other end any more: asked for events of such a
+/// terminal, crossterm would look for them without end.
+fn hung_up(wait_ns: u64) -> bool {
+    let stdin = io::stdin();
+    let mut terminal = [PollFd::new(&stdin, PollFlags::IN)];
+    let timeout = Timespec { tv_sec: 0, tv_nsec: wait_ns as _ };
+    // Interrupted, as by a change of the window's size: the caller looks for itself.
+    let _ = poll(&mut terminal, Some(&timeout));
+    terminal[0].revents().intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL)
 }
 
 /// What is selected is so on the screen that stands still and on the one that goes on.
