@@ -6,6 +6,7 @@ use crate::bus::Carried;
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario, ScriptedFault};
 use crate::fault::{Action, Change, Fault, Interruption, Transport};
+use crate::telemetry::TickBook;
 use std::borrow::BorrowMut;
 
 /// What happens to the samples of one signal.
@@ -81,11 +82,11 @@ pub fn extra_samples(scenario: &Scenario) -> usize {
 
 /// What a role has suffered before a tick.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Suffered {
+struct Suffered {
     /// So many stalls.
-    pub stalls: u64,
+    stalls: u64,
     /// Its life is over, where it has no process that could be killed: whoever drives it builds it anew.
-    pub killed: bool,
+    killed: bool,
 }
 
 /// What happens to a role before its ticks.
@@ -108,9 +109,16 @@ impl Interruptions {
         Self { faults, first_life: generation == 1, process, next: 0 }
     }
 
-    /// Acts before `tick`, once, and tells what it did.
+    /// Acts before the next tick of a role, once, and enters it into the role's book; true if the role's life is over.
     #[inline]
-    pub fn before(&mut self, tick: u64) -> Suffered {
+    pub fn before_next(&mut self, book: &mut TickBook) -> bool {
+        let suffered = self.before(book.next());
+        book.stalled(suffered.stalls);
+        suffered.killed
+    }
+
+    #[inline]
+    fn before(&mut self, tick: u64) -> Suffered {
         if self.faults.is_empty() || tick < self.next { Suffered::default() } else { self.act(tick) }
     }
 

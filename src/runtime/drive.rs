@@ -1,7 +1,7 @@
 //! Decides when a node runs: by the time grid, or by its inputs. One driver per clock.
 //!
-//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then naps; what is late is skipped
-//! and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
+//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a bell; what is
+//! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
 use super::hooks::{self, Place};
 use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How often a role looks at the schedule and says how it is, ns.
 const TURN_NS: u64 = 20_000_000;
-/// How long a role naps between two looks where no bell rings, ns.
+/// How long a role naps between two looks where there is no input that it could sleep on, ns.
 const NAP_NS: u64 = 50_000;
 /// How long a role sleeps on the bell of the input that it lacks before it looks around, ns.
 const SLEEP_NS: u64 = 20_000_000;
@@ -166,7 +166,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         node.poll(Gate::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
-    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then naps between looks.
+    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the bell of
+    /// the input that it lacks.
     fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Option<Poll>, BusError> {
         let tick = node.next_tick();
         let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;

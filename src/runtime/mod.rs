@@ -15,7 +15,7 @@ mod process;
 mod seat;
 
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
-pub use disturb::{Disturbance, Interruptions, Suffered};
+pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};

@@ -189,9 +189,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        let suffered = self.interruptions.before(self.book.next());
-        self.book.stalled(suffered.stalls);
-        suffered.killed
+        self.interruptions.before_next(&mut self.book)
     }
 
     #[inline]

@@ -143,9 +143,7 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        let suffered = self.interruptions.before(self.book.next());
-        self.book.stalled(suffered.stalls);
-        suffered.killed
+        self.interruptions.before_next(&mut self.book)
     }
 
     #[inline]
