@@ -1,7 +1,8 @@
 //! Instructions per estimate-and-control step, counted by callgrind: a regression shows however noisy the machine is.
 //!
-//! `cargo bench --bench instructions` compares with `benches/instructions.json` and fails beyond its tolerance;
-//! `-- --save` writes it anew. Needs valgrind. The figures are those of one compiler: see `compiler` in the file.
+//! `cargo bench --features hooks --bench instructions` (the features of the tests: others inline differently) compares with
+//! `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The figures are
+//! those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
 use corotate::bench::{STEP_KINDS, repeat_step};
 use serde::{Deserialize, Serialize};
@@ -13,7 +14,7 @@ use std::process::{Command, ExitCode};
 const PASSES: [u64; 2] = [1, 51];
 const STEPS_PER_PASS: u64 = 1000;
 /// How many more instructions than were kept are a regression, %.
-const TOLERANCE_PERCENT: f64 = 2.0;
+const TOLERANCE_PERCENT: f64 = 5.0;
 
 /// What is kept.
 #[derive(Debug, Serialize, Deserialize)]
@@ -85,8 +86,9 @@ fn save() -> Result<(), String> {
 fn compare() -> Result<(), String> {
     let text = std::fs::read_to_string(path()).map_err(|error| format!("{error}; make it with -- --save"))?;
     let kept: Kept = serde_json::from_str(&text).map_err(|error| error.to_string())?;
-    if kept.compiler != compiler() {
-        println!("the kept figures are those of {}, this is {}", kept.compiler, compiler());
+    let same = kept.compiler == compiler();
+    if !same {
+        println!("not judged: the kept figures are those of {}, this is {}", kept.compiler, compiler());
     }
     let mut worse = Vec::new();
     println!("{:>14} {:>10} {:>10} {:>8}", "instructions", "kept", "now", "change");
@@ -100,7 +102,7 @@ fn compare() -> Result<(), String> {
             worse.push(kind.clone());
         }
     }
-    match worse.is_empty() {
+    match worse.is_empty() || !same {
         true => Ok(()),
         false => Err(format!("more than {} % above what was kept: {}", kept.tolerance_percent, worse.join(", "))),
     }

@@ -28,7 +28,10 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
             bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
             let (ours, floor) = (format!("ours, {hz} Hz"), format!("raw hops, {hz} Hz"));
-            let outcome = run_pair(bench, *hz, seconds)?;
+            let fused = run_pair(bench, *hz, seconds, true)?;
+            stages(&fused, "controller", "age")
+                .for_each(|latency| board.record(Row::Chain, &format!("fused, {hz} Hz"), Some(&ours), &latency));
+            let outcome = run_pair(bench, *hz, seconds, false)?;
             for (name, role, stage, beside) in [
                 (ours.clone(), "controller", "age", Some(floor.as_str())),
                 (format!("ours until the estimate is sent, {hz} Hz"), "observer", "age", None),
@@ -58,11 +61,16 @@ pub(super) fn stages<'a>(
     of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
 }
 
-/// A real-time run of the pair of bodies.
-pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64) -> Result<Outcome, BenchError> {
+/// A real-time run of the pair of bodies, with observer and controller in one process or in two.
+pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64, fused: bool) -> Result<Outcome, BenchError> {
     let (name, text) = SHIPPED[0];
-    let overrides =
-        [format!("tick_hz={hz}.0"), format!("duration_s={seconds:?}"), "accept={}".into(), "clock=realtime".into()];
+    let overrides = [
+        format!("tick_hz={hz}.0"),
+        format!("duration_s={seconds:?}"),
+        "accept={}".into(),
+        "clock=realtime".into(),
+        format!("launch.fused={fused}"),
+    ];
     let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
     let mut launch = Launch {
         program: bench.program.clone(),

@@ -13,15 +13,21 @@ pub struct Compiled {
     library: Library,
 }
 
-/// Compiles C source as `directory/name.so`, with the flags that a benchmark should have.
+/// What a benchmark should have.
+pub(super) const NATIVE: &[&str] = &["-O3", "-march=native"];
+/// The same for any machine of this kind, as the product is compiled, and with every operation rounded as it is there.
+pub(super) const PORTABLE: &[&str] = &["-O3", "-ffp-contract=off"];
+
+/// Compiles C source as `directory/name.so`, with the given flags beside those of a shared library.
 ///
 /// # Errors
 /// Why there is none, in words.
-pub(super) fn compile(source: &str, directory: &Path, name: &str) -> Result<PathBuf, String> {
+pub(super) fn compile(source: &str, flags: &[&str], directory: &Path, name: &str) -> Result<PathBuf, String> {
     let (input, output) = (directory.join(format!("{name}.c")), directory.join(format!("{name}.so")));
     fs::write(&input, source).map_err(|error| format!("cannot write {}: {error}", input.display()))?;
     let done = Command::new("cc")
-        .args(["-O3", "-march=native", "-shared", "-fPIC", "-fvisibility=hidden", "-o"])
+        .args(flags)
+        .args(["-shared", "-fPIC", "-fvisibility=hidden", "-o"])
         .arg(&output)
         .arg(&input)
         .args(["-lm", "-ldl"])
@@ -39,9 +45,9 @@ impl Compiled {
     /// # Errors
     /// Why that is not possible, in words.
     #[allow(unsafe_code)]
-    pub fn new(source: &str) -> Result<Self, String> {
+    pub fn new(source: &str, flags: &[&str]) -> Result<Self, String> {
         let directory = temporary_directory()?;
-        let path = compile(source, directory.path(), "code")?;
+        let path = compile(source, flags, directory.path(), "code")?;
         // SAFETY: our own source, which has no code that runs when it is loaded.
         let library =
             unsafe { Library::new(&path) }.map_err(|error| format!("cannot load {}: {error}", path.display()))?;

@@ -3,7 +3,7 @@
 //! Every contestant is called through a pointer, once per sample, on the same second of measurements, and hands over whole
 //! samples. Clocks are read before and after a second of them, never within. Must not know what a step computes.
 
-use super::compiled::Compiled;
+use super::compiled::{Compiled, NATIVE, PORTABLE};
 use super::ekf::Ekf;
 use super::hop::in_the_leaders_place;
 use super::recording::{CASES, Recording};
@@ -348,10 +348,16 @@ impl Agreement {
     }
 }
 
-/// The C code, compiled once.
+/// The C code, compiled once for this very machine.
 fn library() -> Result<&'static Compiled, String> {
     static LIBRARY: OnceLock<Result<Compiled, String>> = OnceLock::new();
-    LIBRARY.get_or_init(|| Compiled::new(REFERENCE)).as_ref().map_err(Clone::clone)
+    LIBRARY.get_or_init(|| Compiled::new(REFERENCE, NATIVE)).as_ref().map_err(Clone::clone)
+}
+
+/// The same for any machine: what a portable program that gives the same bits everywhere can have.
+fn portable_library() -> Result<&'static Compiled, String> {
+    static LIBRARY: OnceLock<Result<Compiled, String>> = OnceLock::new();
+    LIBRARY.get_or_init(|| Compiled::new(REFERENCE, PORTABLE)).as_ref().map_err(Clone::clone)
 }
 
 /// The same job by a textbook's filter: measured rates in, command of the same law out.
@@ -426,12 +432,15 @@ fn kind<'a>(kind: &'static str, scenario: &'a Scenario, board: &mut Board) -> Ve
     let floor = IN_C.iter().find(|(name, _)| *name == kind).map(|(_, floor)| *floor);
     let mut contestants = vec![ours(kind, floor, scenario)];
     let (prefix, parameters) = parameters(kind, scenario);
-    match library().and_then(|library| InC::new(library, prefix, parameters)) {
-        Ok(mut in_c) => contestants.push(with_rig!(&scenario.rig, rig => {
-            let samples = measurements(rig, scenario);
-            Contestant::new(floor.unwrap_or_default(), None, move || pass_in_c(rig, &mut in_c, &samples))
-        })),
-        Err(reason) => board.remark(format!("the step in C is missing: {reason}")),
+    for (library, suffix) in [(library(), ""), (portable_library(), ", for any machine")] {
+        match library.and_then(|library| InC::new(library, prefix, parameters.clone())) {
+            Ok(mut in_c) => contestants.push(with_rig!(&scenario.rig, rig => {
+                let samples = measurements(rig, scenario);
+                let name = format!("{}{suffix}", floor.unwrap_or_default());
+                Contestant::new(name, None, move || pass_in_c(rig, &mut in_c, &samples))
+            })),
+            Err(reason) => board.remark(format!("the step in C is missing: {reason}")),
+        }
     }
     contestants
 }

@@ -60,6 +60,8 @@ pub const TARGETS: &[Target] = &[
     target(Row::Hop, "ours, spin, 64 B", Some("iceoryx2, spin, 64 B"), P50, AtMost(1.1)),
     target(Row::Hop, "ours, spin, 128 B", Some("iceoryx2, spin, 128 B"), P50, AtMost(1.1)),
     target(Row::Hop, "ours, spin, 256 B", Some("iceoryx2, spin, 256 B"), P50, AtMost(1.1)),
+    target(Row::Hop, "ours, event, 64 B", Some("iceoryx2, event, 64 B"), P50, AtMost(1.1)),
+    target(Row::Hop, "ours, hybrid, 64 B", Some("iceoryx2, hybrid, 64 B"), P50, AtMost(1.1)),
     target(Row::Chain, "ours, 1000 Hz", Some("raw hops, 1000 Hz"), P50, AtMost(1.15)),
     target(Row::Chain, "ours, 1000 Hz", Some("raw hops, 1000 Hz"), P99, AtMost(1.15)),
     target(Row::Tick, "ours, in a run", Some("cyclictest"), P50, AtMost(1.1)),

@@ -3,7 +3,7 @@
 //!
 //! Counts that do not disturb each other are taken in one run; whoever watches system calls gets a run of its own.
 
-use super::compiled::{compile, temporary_directory};
+use super::compiled::{NATIVE, compile, temporary_directory};
 use super::watch::{Process, Watch, status_word};
 use super::{Bench, BenchError, Board, Row};
 use std::ffi::OsString;
@@ -71,7 +71,7 @@ fn watch(
 fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
     let directory = temporary_directory().map_err(BenchError::Peer)?;
     let mut environment = Vec::new();
-    match compile(ALLOCATIONS, directory.path(), "allocations") {
+    match compile(ALLOCATIONS, NATIVE, directory.path(), "allocations") {
         Ok(library) => {
             environment.push(("LD_PRELOAD", library.into_os_string()));
             environment.push(("COROTATE_BENCH_ALLOCATIONS", directory.path().as_os_str().to_owned()));
