@@ -4,7 +4,8 @@
 //! |---|---|
 //! | `layout` | the layout of a sample as a ROS 2 message definition |
 //! | `writer` | the MCAP file: chunks of bounded age, a full disk |
-//! | `recorder` | takes every sample of a run off a bus, and keeps count |
+//! | `taps` | takes every sample of a run off a bus, and keeps count |
+//! | `recorder` | a recording in the making, and its books |
 //! | `process` | the recorder as a process beside a loop |
 //! | `reader` | a recording as data: metadata, signals, samples, columns |
 //! | `script` | what a role did, so that it can do it again |
@@ -22,6 +23,7 @@ mod reader;
 mod recorder;
 mod replay;
 mod script;
+mod taps;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
