@@ -29,7 +29,6 @@ mod writer;
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
 pub use export::export_csv;
 pub use layout::{Column, Layout, topic_of};
-pub(crate) use process::give_way;
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::RECORDER;

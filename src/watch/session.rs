@@ -10,8 +10,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
-use crate::record::give_way;
-use crate::runtime::{RoleError, depths, hurry, join, release_priority, topic};
+use crate::runtime::{RoleError, depths, hurried, join, join_beside, topic};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -63,10 +62,7 @@ impl Session {
             tick_s: scenario.tick_s(),
             ..Model::default()
         };
-        hurry();
-        let joined = Joined::open(&domain, &scenario, end_ns, &mut model);
-        release_priority();
-        give_way(&scenario, NICENESS);
+        let joined = join_beside(&scenario, NICENESS, || Joined::open(&domain, &scenario, end_ns, &mut model));
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
@@ -111,9 +107,7 @@ impl Session {
     fn leave(&mut self) {
         self.refresh();
         if let Some(joined) = self.joined.take() {
-            hurry();
-            drop(joined);
-            release_priority();
+            hurried(|| drop(joined));
             self.model.ended = true;
             self.domain.forget();
         }
