@@ -29,12 +29,16 @@ mod writer;
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
 pub use export::export_csv;
 pub use layout::{Column, Layout, topic_of};
+#[cfg(feature = "foxglove")]
+pub(crate) use layout::{MESSAGE_ENCODING, SCHEMA_ENCODING, frame};
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::RECORDER;
 pub use recorder::{Recorder, RecordingReport, SignalReport};
 pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_process};
 pub use script::{InputScript, Item, Limit, Script, Step};
+#[cfg(feature = "foxglove")]
+pub(crate) use taps::{Channel, MessageSink, Taps};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

@@ -5,7 +5,7 @@
 use super::WatchError;
 use super::feed::{Feed, LOOK_NS};
 use super::model::Model;
-use crate::bus::domain::{Domain, domains};
+use crate::bus::domain::{Domain, newest_run};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
@@ -50,8 +50,7 @@ impl Session {
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
-        let newest = || domains().into_iter().find(|found| found.alive).map(|found| found.root);
-        let root = directory.map(Path::to_owned).or_else(newest).ok_or(WatchError::NoRun)?;
+        let root = directory.map(Path::to_owned).or_else(newest_run).ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let (domain, scenario) = insist(end_ns, || join(&root))?;
         let mut model = Model {
