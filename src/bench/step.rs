@@ -486,7 +486,12 @@ fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<
             timed(|| {
                 for index in 1..recording.truth.len() {
                     let (from, to) = (recording.sample(index - 1), black_box(recording.sample(index)));
-                    match relation.observe(&from, &to, recording.tick_s, filter.estimate().x) {
+                    match relation.observe(
+                        &relation.sight(&from),
+                        &relation.sight(&to),
+                        recording.tick_s,
+                        filter.estimate().x,
+                    ) {
                         Observation::Seen(increment) => filter.step(&increment),
                         Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),
                     }

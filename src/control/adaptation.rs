@@ -32,12 +32,15 @@ impl InertiaAdaptation {
         Self { gain, own: Vector3::zeros(), leader: Vector3::zeros() }
     }
 
+    /// Whether there is anything to correct.
+    #[inline(always)]
+    pub fn acts(&self) -> bool {
+        self.gain != 0.0
+    }
+
     /// The correction v, rad/s², of the law for the reference ω̂ and the follower's p, rad/s; learns for `dt_s` seconds.
     #[inline]
     pub fn correction(&mut self, reference: &Vector3<f64>, follower: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
-        if self.gain == 0.0 {
-            return Vector3::zeros();
-        }
         let (p, w) = (products(follower), products(reference));
         let correction = -self.own.component_mul(&p) - self.leader.component_mul(&w);
         let learned = (follower - reference) * (self.gain * dt_s);

@@ -37,7 +37,7 @@ impl Synchronizer {
         &self,
         reference: Vector3<f64>,
         follower: Vector3<f64>,
-        applied: Vector3<f64>,
+        applied: &[f64; 3],
     ) -> (Vector3<f64>, Vector3<f64>) {
         // By value, and the rest apart: without prediction nothing goes through memory.
         if self.lead_s > 0.0 { self.predicted(reference, follower, applied) } else { (reference, follower) }
@@ -48,9 +48,9 @@ impl Synchronizer {
         &self,
         reference: Vector3<f64>,
         follower: Vector3<f64>,
-        applied: Vector3<f64>,
+        applied: &[f64; 3],
     ) -> (Vector3<f64>, Vector3<f64>) {
-        (self.reference_ahead(reference), self.body.flow(&follower, &applied, self.lead_s))
+        (self.reference_ahead(reference), self.body.flow(&follower, &Vector3::from(*applied), self.lead_s))
     }
 
     /// The reference alone, rad/s.
@@ -78,20 +78,20 @@ impl Synchronizer {
 }
 
 /// A command shortened to what the actuators can do in each component, its direction kept; rad/s².
-#[inline]
+#[inline(always)]
 pub fn limited(asked: Vector3<f64>, acceleration_max_rad_s2: f64) -> Vector3<f64> {
-    let largest = asked.amax();
-    if largest > acceleration_max_rad_s2 {
-        return shortened(asked, acceleration_max_rad_s2, acceleration_max_rad_s2 / largest);
-    }
-    asked
+    // Nearly always: the sum is, and so is every component.
+    let sum = asked.x.abs() + asked.y.abs() + asked.z.abs();
+    if sum <= acceleration_max_rad_s2 { asked } else { shortened(asked, acceleration_max_rad_s2) }
 }
 
-/// Seldom, and apart, so that the division is not made where nobody needs it. The product may be rounded up beyond the
-/// limit, and an actuator would refuse it for that.
+/// Apart, so that the division is not made where nobody needs it.
 #[cold]
-fn shortened(asked: Vector3<f64>, limit: f64, factor: f64) -> Vector3<f64> {
-    asked.map(|component| (component * factor).clamp(-limit, limit))
+fn shortened(asked: Vector3<f64>, limit: f64) -> Vector3<f64> {
+    let largest = asked.amax();
+    // The product may be rounded up beyond the limit, and an actuator would refuse it for that.
+    let shorten = |component: f64| (component * (limit / largest)).clamp(-limit, limit);
+    if largest > limit { asked.map(shorten) } else { asked }
 }
 
 #[cfg(test)]
@@ -119,7 +119,7 @@ mod tests {
     fn a_synchronised_follower_needs_no_command() {
         let w = Vector3::new(0.6, -0.4, 0.8);
         assert_eq!(law(0.0).command(&w, &w), Vector3::zeros());
-        let (reference, follower) = law(0.01).ahead(w, w, Vector3::zeros());
+        let (reference, follower) = law(0.01).ahead(w, w, &[0.0; 3]);
         assert_eq!(reference, follower);
     }
 
@@ -144,7 +144,7 @@ mod tests {
             let (mut w, mut p) = (Vector3::new(0.6, -0.4, 0.8), Vector3::new(-0.3, 0.5, 0.2));
             let mut applied = Vector3::zeros();
             for _ in 0..20 {
-                let (reference, follower) = law.ahead(w, p, applied);
+                let (reference, follower) = law.ahead(w, p, applied.as_ref());
                 let next = law.command(&reference, &follower);
                 w = law.body.flow(&w, &Vector3::zeros(), h);
                 p = law.body.flow(&p, &applied, h);

@@ -65,6 +65,9 @@ pub struct MetricScore {
     pub peak_tick: Option<u64>,
     /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
     pub settled_at_s: Option<f64>,
+    /// What is accepted; infinite without a limit.
+    #[serde(skip)]
+    limit: f64,
     #[serde(skip)]
     last_above: Option<u64>,
 }
@@ -205,6 +208,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             peak: None,
             peak_tick: None,
             settled_at_s: None,
+            limit: scenario.accept.metric_max.get(*name).copied().unwrap_or(f64::INFINITY),
             last_above: None,
         };
         Ok(Self {
@@ -277,8 +281,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     /// Whether every metric that has a limit is known and within it.
     fn within(&self) -> bool {
-        let limit = |name: &str| self.accept.metric_max.get(name).copied().unwrap_or(f64::INFINITY);
-        self.rig.metrics().iter().zip(&self.values).all(|(name, value)| *value <= limit(name))
+        self.score.metrics.iter().zip(&self.values).all(|(metric, value)| *value <= metric.limit)
     }
 
     /// The sum of everybody's generation, which changes whenever one does: none ever falls.
@@ -338,7 +341,7 @@ impl MetricScore {
         if time_s >= accept.peak_from_s && self.peak.is_none_or(|peak| value > peak) {
             (self.peak, self.peak_tick) = (Some(value), Some(tick));
         }
-        if accept.metric_max.get(&self.name).is_some_and(|limit| value > *limit) {
+        if value > self.limit {
             self.last_above = Some(tick);
         }
     }

@@ -141,9 +141,8 @@ impl<const N: usize> InvariantFilter<N> {
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
-            let start = increment.start();
-            let left = self.decay.apply(increment.weight, self.estimate - start);
-            self.estimate = start + increment.drift + left;
+            let left = self.decay.apply(increment.weight, self.estimate - increment.start());
+            self.estimate = increment.reconstruction() + left;
         } else {
             self.predict(&increment.drift);
         }
@@ -153,6 +152,27 @@ impl<const N: usize> InvariantFilter<N> {
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
+    }
+}
+
+/// A filter that takes a step like its last one without computing anything anew.
+pub trait StepAgain<const N: usize> {
+    /// Moves the estimate over a step of the same positive weight as the last, in which the relation held, and gives it;
+    /// `None`, and nothing done, for any other step. The same bits as by the filter's own step.
+    fn step_again(&mut self, increment: &Increment<N>) -> Option<&SVector<f64, N>>;
+}
+
+impl<const N: usize> StepAgain<N> for InvariantFilter<N> {
+    #[inline(always)]
+    fn step_again(&mut self, increment: &Increment<N>) -> Option<&SVector<f64, N>> {
+        match &self.decay {
+            Decay::Diagonal { factor: (weight, left), .. } if *weight == increment.weight && *weight > 0.0 => {
+                let left = left.component_mul(&(self.estimate - increment.start()));
+                self.estimate = increment.reconstruction() + left;
+                Some(&self.estimate)
+            }
+            _ => None,
+        }
     }
 }
 

@@ -98,7 +98,8 @@ impl GuardedKalman {
         for index in [(self.hidden + 1) % 3, (self.hidden + 2) % 3] {
             self.correct(index, to.rate_rad_s[index]);
         }
-        let seen = self.relation.observe(from, to, dt_s, self.guard.estimate().x);
+        let [from, to] = [from, to].map(|sample| self.relation.sight(sample));
+        let seen = self.relation.observe(&from, &to, dt_s, self.guard.estimate().x);
         match &seen {
             Observation::Seen(increment) => self.guard.step(increment),
             Observation::Unobservable { drift } => self.guard.predict(drift, dt_s),

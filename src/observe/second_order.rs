@@ -7,7 +7,7 @@
 //! Components are decoupled: the filter of each is scalar. Must not store φ itself, of which only increments are known:
 //! the state is the residual r = φ − φ̂.
 
-use super::Increment;
+use super::{Increment, StepAgain};
 use nalgebra::SVector;
 
 /// Second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
@@ -46,11 +46,10 @@ impl<const N: usize> SecondOrderFilter<N> {
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
-            let gains = self.gains(increment.weight);
-            let innovation =
-                self.residual + increment.potential - (self.estimate * increment.weight + increment.drift_moment);
-            self.estimate += increment.drift + gains.unknown.component_mul(&innovation);
-            self.residual = innovation - gains.potential.component_mul(&innovation);
+            if self.gains.weight != increment.weight {
+                self.gains = self.place(increment.weight);
+            }
+            self.step_placed(increment);
         } else {
             self.predict(&increment.drift);
         }
@@ -65,14 +64,29 @@ impl<const N: usize> SecondOrderFilter<N> {
         self.residual = SVector::zeros();
     }
 
-    #[inline]
-    fn gains(&mut self, weight: f64) -> Gains<N> {
-        if self.gains.weight != weight {
-            let pairs = self.bandwidth.map(|bandwidth| place(bandwidth * weight, self.damping));
-            let (potential, unknown) = (pairs.map(|pair| pair.0), pairs.map(|pair| pair.1 / weight));
-            self.gains = Gains { weight, potential, unknown };
+    #[inline(always)]
+    fn step_placed(&mut self, increment: &Increment<N>) {
+        let innovation =
+            self.residual + increment.potential - (self.estimate * increment.weight + increment.drift_moment);
+        self.estimate += increment.drift + self.gains.unknown.component_mul(&innovation);
+        self.residual = innovation - self.gains.potential.component_mul(&innovation);
+    }
+
+    #[cold]
+    fn place(&self, weight: f64) -> Gains<N> {
+        let pairs = self.bandwidth.map(|bandwidth| place(bandwidth * weight, self.damping));
+        Gains { weight, potential: pairs.map(|pair| pair.0), unknown: pairs.map(|pair| pair.1 / weight) }
+    }
+}
+
+impl<const N: usize> StepAgain<N> for SecondOrderFilter<N> {
+    #[inline(always)]
+    fn step_again(&mut self, increment: &Increment<N>) -> Option<&SVector<f64, N>> {
+        if self.gains.weight != increment.weight || increment.weight <= 0.0 {
+            return None;
         }
-        self.gains
+        self.step_placed(increment);
+        Some(&self.estimate)
     }
 }
 

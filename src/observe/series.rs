@@ -10,16 +10,20 @@ const SHORT: f64 = 1.0 / 128.0;
 ///
 /// For |y| ≤ x/128 by arctan t = t − t³/3 + t⁵/5 − t⁷/7: what is left out is below t⁹/9, relative to t less than 2⁻⁵⁹; the
 /// rounding of the quotient and of one sum remain.
-#[inline(always)]
+#[inline]
 pub fn atan2(y: f64, x: f64) -> f64 {
-    if y.abs() <= x * SHORT {
+    short_atan2(y, x).unwrap_or_else(|| libm::atan2(y, x))
+}
+
+/// The same where the series holds.
+#[inline(always)]
+pub fn short_atan2(y: f64, x: f64) -> Option<f64> {
+    (y.abs() <= x * SHORT).then(|| {
         let t = y / x;
         let s = t * t;
         // In this order no product waits for the one before.
         t + t * s * ((s * (1.0 / 5.0) - 1.0 / 3.0) - s * s * (1.0 / 7.0))
-    } else {
-        far_atan2(y, x)
-    }
+    })
 }
 
 /// ln(1 + x), for x > −1.
@@ -27,27 +31,21 @@ pub fn atan2(y: f64, x: f64) -> f64 {
 /// For |x| ≤ 1/128 by 2 artanh s = 2 (s + s³/3 + s⁵/5 + s⁷/7) with s = x/(2 + x), |s| < 1/254: what is left out is below
 /// 2s⁹/9 and more than twice less than that, relative to x less than 2⁻⁶⁶; the rounding of the quotient and of one sum
 /// remain.
-#[inline(always)]
+#[inline]
 pub fn ln_1p(x: f64) -> f64 {
-    if x.abs() <= SHORT {
+    short_ln_1p(x).unwrap_or_else(|| libm::log1p(x))
+}
+
+/// The same where the series holds.
+#[inline(always)]
+pub fn short_ln_1p(x: f64) -> Option<f64> {
+    (x.abs() <= SHORT).then(|| {
         // x − x s = 2 s: the leading term is x itself, and so exact.
         let s = x / (2.0 + x);
         let z = s * s;
         let tail = z * ((z * (1.0 / 5.0) + 1.0 / 3.0) + z * z * (1.0 / 7.0));
         x - s * (x - 2.0 * tail)
-    } else {
-        far_ln_1p(x)
-    }
-}
-
-#[cold]
-fn far_atan2(y: f64, x: f64) -> f64 {
-    libm::atan2(y, x)
-}
-
-#[cold]
-fn far_ln_1p(x: f64) -> f64 {
-    libm::log1p(x)
+    })
 }
 
 #[cfg(test)]

@@ -32,7 +32,7 @@ impl<L: Law> Controller<L> {
     /// Turns estimate k and measurement k into command k. The caller fills the stamp's `generation` and `sent_ns`.
     ///
     /// The command continues the estimate's chain: its origin is the leader's measurement.
-    #[inline]
+    #[inline(always)]
     pub fn step(&mut self, estimate: &L::Estimate, measurement: &L::Measurement, out: &mut L::Command) {
         debug_assert_eq!(estimate.stamp().tick, measurement.stamp().tick);
         self.law.command(estimate, measurement, out);

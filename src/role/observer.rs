@@ -23,6 +23,13 @@ pub trait Estimator {
     fn coast(&mut self, dt_s: f64);
     /// Writes the estimate, with the given further status bits, everything but the stamp.
     fn write(&self, status: u64, out: &mut Self::Estimate);
+
+    /// Learns from a usable measurement `dt_s` seconds after the last one and writes the estimate, if that is the usual step
+    /// for which the estimator has a shorter way; false, and nothing done, if not. The same bits as the long way.
+    #[inline(always)]
+    fn step_usual(&mut self, _: &Self::Measurement, _dt_s: f64, _: &mut Self::Estimate) -> bool {
+        false
+    }
 }
 
 /// An estimator with its memory of which measurement it learned from last.
@@ -46,8 +53,21 @@ impl<E: Estimator> Observer<E> {
     ///
     /// The first measurement yields the initial guess. A sender that was started anew speaks of the same body, which has
     /// moved on: its first measurement is only a longer step.
-    #[inline]
+    #[inline(always)]
     pub fn step(&mut self, measurement: &E::Measurement, out: &mut E::Estimate) {
+        let stamp = measurement.stamp();
+        let next = self.last.is_some_and(|last| last.checked_add(1) == Some(stamp.tick));
+        if next && self.estimator.step_usual(measurement, self.tick_s, out) {
+            (self.last, self.said) = (Some(stamp.tick), stamp.tick);
+            Self::sign(stamp, out);
+        } else {
+            self.step_any(measurement, out);
+        }
+    }
+
+    /// Apart, so that the short way has nothing to keep for it.
+    #[inline(never)]
+    fn step_any(&mut self, measurement: &E::Measurement, out: &mut E::Estimate) {
         let status = if self.estimator.usable(measurement) {
             self.learn(measurement);
             0
@@ -65,21 +85,22 @@ impl<E: Estimator> Observer<E> {
         self.write(stamp, status::UNUSABLE | status::REJECTED, out);
     }
 
-    #[inline]
     fn write(&mut self, stamp: &Stamp, status: u64, out: &mut E::Estimate) {
         self.said = stamp.tick;
         self.estimator.write(status, out);
+        Self::sign(stamp, out);
+    }
+
+    #[inline]
+    fn sign(stamp: &Stamp, out: &mut E::Estimate) {
         let out = out.stamp_mut();
         out.tick = stamp.tick;
         out.origin_ns = stamp.origin_ns;
     }
 
-    #[inline]
     fn learn(&mut self, measurement: &E::Measurement) {
         let tick = measurement.stamp().tick;
         match self.last {
-            // Nearly every time; the product is the same.
-            Some(last) if last + 1 == tick => self.estimator.update(measurement, self.tick_s),
             Some(last) if last < tick => self.estimator.update(measurement, (tick - last) as f64 * self.tick_s),
             // The same tick again teaches nothing; an older one cannot come on an ordered link.
             Some(_) => return,

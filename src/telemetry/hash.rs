@@ -15,6 +15,8 @@ pub struct StateHash {
     words: Words,
     stride: u64,
     capacity: u64,
+    /// After how many ticks the next checkpoint is: seldom, so that a comparison must do.
+    due: u64,
 }
 
 /// The hashes of one signal after ticks stride − 1, 2·stride − 1, …
@@ -51,21 +53,27 @@ impl StateHash {
     /// Opens the hash of a run whose last tick is `last_tick`, as it was left.
     pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
         let words = ledger.take(Self::words(last_tick));
-        Self { words, stride: Self::stride(last_tick), capacity: Self::capacity(last_tick) }
+        let mut hash = Self { words, stride: Self::stride(last_tick), capacity: Self::capacity(last_tick), due: 0 };
+        hash.checkpoint(0);
+        hash
     }
 
     /// Takes in a sample. Ticks rise.
     #[inline]
     pub fn absorb(&mut self, sample: &(impl Message + ?Sized)) {
         let tick = sample.stamp().tick;
-        self.checkpoint(tick);
+        if tick >= self.due {
+            self.checkpoint(tick);
+        }
         let value = self.words.get(Self::VALUE) ^ tick.rotate_left(32);
         self.words.set(Self::VALUE, xxh3_64_with_seed(sample.content(), value));
-        self.checkpoint(tick + 1);
+        if tick.saturating_add(1) >= self.due {
+            self.checkpoint(tick.saturating_add(1));
+        }
     }
 
     /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
-    #[inline]
+    #[cold]
     fn checkpoint(&mut self, ticks: u64) {
         let mut count = self.words.get(Self::COUNT);
         while (count + 1) * self.stride <= ticks && count < self.capacity {
@@ -73,6 +81,7 @@ impl StateHash {
             count += 1;
             self.words.set(Self::COUNT, count);
         }
+        self.due = if count < self.capacity { (count + 1) * self.stride } else { u64::MAX };
     }
 
     /// What has been gathered.

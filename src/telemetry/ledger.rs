@@ -8,6 +8,7 @@ use rustix::fs::{FlockOperation, flock};
 use std::cell::Cell;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::ptr::NonNull;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -126,34 +127,47 @@ impl Ledger {
     /// If the ledger has no more: its size is computed from the same list of books that are opened in it.
     pub fn take(&self, count: usize) -> Words {
         let begin = self.taken.replace(self.taken.get() + count);
-        assert!(begin + count <= self.memory.words().len(), "the ledger is sized for all of its books");
-        Words { memory: self.memory.clone(), begin }
+        let words = self.memory.words().get(begin..begin + count).expect("the ledger is sized for all of its books");
+        Words { words: words.into(), _memory: self.memory.clone() }
     }
 }
 
 /// Some words of a ledger.
 #[derive(Debug)]
 pub struct Words {
-    memory: Rc<Memory>,
-    begin: usize,
+    /// Looked up once: the books are written many times in every tick.
+    words: NonNull<[AtomicU64]>,
+    /// What keeps them.
+    _memory: Rc<Memory>,
 }
 
 impl Words {
     #[inline]
-    fn word(&self, index: usize) -> &AtomicU64 {
-        &self.memory.words()[self.begin + index]
+    #[allow(unsafe_code)]
+    fn words(&self) -> &[AtomicU64] {
+        // SAFETY: the words lie in `_memory`, which is neither moved nor freed nor written but through atomics as long as
+        // `self` lives.
+        unsafe { self.words.as_ref() }
     }
 
     /// One word.
     #[inline]
     pub fn get(&self, index: usize) -> u64 {
-        self.word(index).load(Ordering::Relaxed)
+        self.words()[index].load(Ordering::Relaxed)
     }
 
     /// Writes one word; what was written before is seen before, by whoever outlives this process.
     #[inline]
     pub fn set(&self, index: usize, value: u64) {
-        self.word(index).store(value, Ordering::Release);
+        self.words()[index].store(value, Ordering::Release);
+    }
+
+    /// Writes words in order, from `begin` on.
+    #[inline]
+    pub fn set_all(&self, begin: usize, values: &[u64]) {
+        for (word, value) in self.words()[begin..][..values.len()].iter().zip(values) {
+            word.store(*value, Ordering::Release);
+        }
     }
 
     /// Adds to one word. There is one writer.

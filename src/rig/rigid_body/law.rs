@@ -4,6 +4,7 @@ use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use nalgebra::Vector3;
+use std::hint::black_box;
 
 /// The synchronising law of one follower.
 #[derive(Debug)]
@@ -26,15 +27,21 @@ impl Law for RateLaw {
     type Measurement = RateMeasurement;
     type Command = RateCommand;
 
-    #[inline]
+    #[inline(always)]
     fn command(&mut self, estimate: &RateEstimate, measurement: &RateMeasurement, out: &mut RateCommand) {
-        let (reference, follower) = (Vector3::from(estimate.omega_rad_s), Vector3::from(measurement.omega_rad_s));
+        // Not as a pair of neighbours: this core may have written them one by one just now, and a load of two at once would
+        // wait until both have left the store buffer.
+        let [x, y, z] = estimate.omega_rad_s;
+        let (reference, follower) = (Vector3::new(x, black_box(y), z), Vector3::from(measurement.omega_rad_s));
         if self.learned {
             self.law.learn(estimate.coefficients.into());
         }
-        let (w, p) = self.law.ahead(reference, follower, measurement.applied_rad_s2.into());
-        let correction = self.adaptation.correction(&w, &p, self.tick_s);
-        out.acceleration_rad_s2 = limited(self.law.command(&w, &p) + correction, self.acceleration_max_rad_s2).into();
+        let (w, p) = self.law.ahead(reference, follower, &measurement.applied_rad_s2);
+        let mut asked = self.law.command(&w, &p);
+        if self.adaptation.acts() {
+            asked += self.adaptation.correction(&w, &p, self.tick_s);
+        }
+        out.acceleration_rad_s2 = limited(asked, self.acceleration_max_rad_s2).into();
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
         let error = follower - reference - self.supplied * estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =

@@ -118,7 +118,7 @@ impl Learner {
         let relation = HiddenRate::new(&coefficients, component + 1, self.parts.floor_rad_s).ok();
         let observer = relation.map(|relation| {
             let begun = filter(self.parts.decay_rate_per_s, rate[component]);
-            let mut observer = HiddenObserver::new(relation, coefficients, begun, component);
+            let mut observer = HiddenObserver::new(relation, coefficients, begun);
             observer.begin(begun, self.last, 0);
             observer
         });

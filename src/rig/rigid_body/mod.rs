@@ -232,12 +232,7 @@ impl Rig for RigidBodyRig {
             }
             ObserverDesign::Hidden { relation, filter, guess_rad_s } => {
                 let begun = filter.filter(Vector1::new(*guess_rad_s));
-                RateObserver::Hidden(HiddenObserver::new(
-                    *relation,
-                    self.inertia.coefficients(),
-                    begun,
-                    self.supplied(),
-                ))
+                RateObserver::Hidden(HiddenObserver::new(*relation, self.inertia.coefficients(), begun))
             }
             ObserverDesign::Learner(parts) => RateObserver::Learner(Learner::new(parts.clone())),
         }

@@ -3,7 +3,8 @@
 use super::learner::Learner;
 use crate::model::RigidBody;
 use crate::observe::{
-    Filter, GuardedKalman, HiddenRate, InertiaRatios, InvariantFilter, Observation, RateNoise, RateSample, Span,
+    Filter, GuardedKalman, HiddenRate, InertiaRatios, Interval, InvariantFilter, Observation, RateNoise, RateSample,
+    Sight,
 };
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
@@ -31,13 +32,13 @@ impl Estimator for RateObserver {
     #[inline]
     fn usable(&self, measurement: &RateMeasurement) -> bool {
         // 0·x is 0 unless x is not finite; without a branch for every value.
-        let finite = |values: &[f64; 3]| values.iter().map(|value| value * 0.0).sum::<f64>() == 0.0;
+        let nothing = |values: &[f64; 3]| values[0] * 0.0 + values[1] * 0.0 + values[2] * 0.0;
         let needed = match self {
-            Self::Hidden(observer) => measurement.valid & observer.needed() == observer.needed(),
+            Self::Hidden(observer) => measurement.valid & observer.needed == observer.needed,
             Self::Kalman(observer) => measurement.valid & observer.needed() == observer.needed(),
             Self::Learner(_) => (measurement.valid & ALL).count_ones() >= 2,
         };
-        needed && finite(&measurement.omega_rad_s) && finite(&measurement.applied_rad_s2)
+        needed && nothing(&measurement.omega_rad_s) + nothing(&measurement.applied_rad_s2) == 0.0
     }
 
     fn start(&mut self, measurement: &RateMeasurement) {
@@ -54,6 +55,14 @@ impl Estimator for RateObserver {
             Self::Hidden(observer) => observer.update(measurement, dt_s),
             Self::Kalman(observer) => observer.update(measurement, dt_s),
             Self::Learner(observer) => observer.update(measurement, dt_s),
+        }
+    }
+
+    #[inline(always)]
+    fn step_usual(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
+        match self {
+            Self::Hidden(observer) => observer.step_usual(measurement, dt_s, out),
+            _ => false,
         }
     }
 
@@ -89,36 +98,34 @@ pub struct HiddenObserver {
     body: Knowledge,
     guess: Filter<1>,
     filter: Filter<1>,
-    hidden: usize,
-    last: RateSample,
-    /// The step of the last update, s: most are equal.
-    span: Span,
-    /// Where the model has taken the body since, while no measurement was usable.
-    coasted: Option<Vector3<f64>>,
+    /// The valid bits that it cannot do without.
+    needed: u64,
+    last: Sight,
+    /// The angular velocity with the supplied component in its place, rad/s; while no measurement is usable, where the model
+    /// has taken it since.
+    rate: Vector3<f64>,
+    /// The step of the last update: most are equal.
+    interval: Interval,
     innovation: f64,
     status: u64,
 }
 
 impl HiddenObserver {
-    /// An observer of component `hidden` (0 to 2) of a body with the given coefficients, which starts at `guess`.
-    pub(super) fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>, hidden: usize) -> Self {
-        let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
+    /// An observer of the component that `relation` tells of a body with the given coefficients, which starts at `guess`.
+    pub(super) fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>) -> Self {
+        let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
             relation,
             body: Knowledge::new(coefficients),
             guess,
             filter: guess,
-            hidden,
-            last,
-            span: 1.0.into(),
-            coasted: None,
+            needed: ALL & !(1 << relation.hidden()),
+            last: relation.sight(&nothing),
+            rate: nothing.rate_rad_s,
+            interval: 1.0.into(),
             innovation: 0.0,
             status: status::INITIAL,
         }
-    }
-
-    fn needed(&self) -> u64 {
-        ALL & !(1 << self.hidden)
     }
 
     fn start(&mut self, measurement: &RateMeasurement) {
@@ -127,16 +134,17 @@ impl HiddenObserver {
 
     /// Begins anew from a known estimate at a known instant.
     pub(super) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
-        (self.filter, self.last, self.coasted, self.innovation, self.status) = (filter, at, None, 0.0, status);
+        (self.filter, self.innovation, self.status) = (filter, 0.0, status);
+        self.keep(&at, self.relation.sight(&at));
     }
 
-    #[inline]
     pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
-        let to = seen(measurement);
-        if self.span.length() != dt_s {
-            self.span = dt_s.into();
+        let sample = seen(measurement);
+        let to = self.relation.sight(&sample);
+        if self.interval.length() != dt_s {
+            self.interval = dt_s.into();
         }
-        match self.relation.observe(&self.last, &to, self.span, self.filter.estimate().x) {
+        match self.relation.observe(&self.last, &to, self.interval, self.filter.estimate().x) {
             Observation::Seen(increment) => {
                 self.filter.step(&increment);
                 self.innovation = (increment.reconstruction() - self.filter.estimate()).x;
@@ -147,13 +155,39 @@ impl HiddenObserver {
                 self.status |= status::UNOBSERVABLE;
             }
         }
-        // From where it came, not from the copy: a copy of a copy waits until that has been written.
-        self.last = seen(measurement);
-        self.coasted = None;
+        self.keep(&sample, to);
+    }
+
+    fn keep(&mut self, sample: &RateSample, sight: Sight) {
+        (self.last, self.rate) = (sight, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
+    }
+
+    /// [`Estimator::step_usual`]: as long as the last one, with all that is needed in the measurement.
+    #[inline(always)]
+    fn step_usual(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
+        let ([x, y, z], [u, v, w]) = (measurement.omega_rad_s, measurement.applied_rad_s2);
+        // 0·x is 0 unless x is not finite. A sum that is not finite, of numbers that are, goes the long way.
+        let finite = ((x + y) + (z + u) + (v + w)) * 0.0 == 0.0;
+        if !finite || measurement.valid & self.needed != self.needed || self.interval.length() != dt_s {
+            return false;
+        }
+        let sample = seen(measurement);
+        let to = self.relation.sight(&sample);
+        let (ends, estimate) = ([&self.last, &to], self.filter.estimate().x);
+        let done = match &mut self.filter {
+            Filter::First(filter) => self.relation.step_usual(ends, &self.interval, estimate, filter),
+            Filter::Second(filter) => self.relation.step_usual(ends, &self.interval, estimate, filter),
+            Filter::Kalman(_) => None,
+        };
+        let Some((estimate, innovation)) = done else { return false };
+        (self.innovation, self.status, self.last) = (innovation, 0, to);
+        self.rate = self.relation.complete(&sample.rate_rad_s, estimate);
+        self.write(0, out);
+        true
     }
 
     fn coast(&mut self, dt_s: f64) {
-        self.coasted = Some(self.body.flow(&self.rate(), &self.last, dt_s));
+        self.rate = self.body.flow(&self.rate, &self.relation.torque(&self.last), dt_s);
     }
 
     /// What the last step did: bits of [`status`].
@@ -167,26 +201,17 @@ impl HiddenObserver {
     }
 
     /// The angular velocity with the supplied component in its place, rad/s.
-    #[inline]
     pub(super) fn rate(&self) -> Vector3<f64> {
-        self.coasted.unwrap_or_else(|| {
-            let (measured, hidden) = (&self.last.rate_rad_s, self.filter.estimate().x);
-            // Chosen bit by bit, not written at an index: three values that stay in registers.
-            let chosen = |axis: usize| if axis == self.hidden { u64::MAX } else { 0 };
-            let component = |axis: usize| {
-                f64::from_bits(hidden.to_bits() & chosen(axis) | measured[axis].to_bits() & !chosen(axis))
-            };
-            Vector3::new(component(0), component(1), component(2))
-        })
+        self.rate
     }
 
-    #[inline]
+    #[inline(always)]
     pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
-        self.body.write(&self.rate(), out);
+        self.body.write(&self.rate, out);
         out.innovation_rad_s = self.innovation;
         out.excitation = 0.0;
         out.status = self.status | status;
-        out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
+        out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed };
     }
 }
 
@@ -206,15 +231,16 @@ impl Knowledge {
         Self { coefficients, closure, inertia_ratios: ratios }
     }
 
-    /// Where a body of which this is true goes from `rate` in `dt_s` seconds, under the torque of `last`.
-    fn flow(&self, rate: &Vector3<f64>, last: &RateSample, dt_s: f64) -> Vector3<f64> {
-        RigidBody::with_coefficients(self.coefficients).flow(rate, &last.torque_rad_s2, dt_s)
+    /// Where a body of which this is true goes from `rate` in `dt_s` seconds, under this torque over inertia, rad/s².
+    fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
+        RigidBody::with_coefficients(self.coefficients).flow(rate, torque, dt_s)
     }
 
     /// Writes it beside a motion.
     #[inline]
     pub fn write(&self, rate: &Vector3<f64>, out: &mut RateEstimate) {
-        out.omega_rad_s = (*rate).into();
+        // One by one: they may have been computed just now, each for itself.
+        out.omega_rad_s = [rate.x, rate.y, rate.z];
         out.coefficients = self.coefficients.into();
         out.closure = self.closure;
         out.inertia_ratios = self.inertia_ratios;
@@ -271,7 +297,6 @@ impl KalmanObserver {
                 .ok();
     }
 
-    #[inline]
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let to = seen(measurement);
         if let Some(filter) = &mut self.filter {
@@ -282,7 +307,7 @@ impl KalmanObserver {
     }
 
     fn coast(&mut self, dt_s: f64) {
-        self.coasted = Some(self.body.flow(&self.rate(), &self.last, dt_s));
+        self.coasted = Some(self.body.flow(&self.rate(), &self.last.torque_rad_s2, dt_s));
     }
 
     fn rate(&self) -> Vector3<f64> {
@@ -290,7 +315,6 @@ impl KalmanObserver {
         self.coasted.unwrap_or_else(filtered)
     }
 
-    #[inline]
     fn write(&self, status: u64, out: &mut RateEstimate) {
         self.body.write(&self.rate(), out);
         out.innovation_rad_s = 0.0;

@@ -248,10 +248,7 @@ impl<S: Carried + ?Sized> StateBook<S> {
     #[inline]
     pub fn store(&mut self, sample: &S) {
         let copy = if self.words.get(0) == 1 { 2 } else { 1 };
-        let begin = self.begin(copy);
-        for (index, word) in sample.words().iter().enumerate() {
-            self.words.set(begin + index, *word);
-        }
+        self.words.set_all(self.begin(copy), sample.words());
         self.words.set(0, copy);
     }
 
