@@ -24,6 +24,7 @@
 //! | `bench` | what all of it costs beside its floors | no |
 //! | `doctor` | whether this machine is fit for real time | no |
 //! | `watch` | a screen on a running loop | no |
+//! | `foxglove` | a running loop on a Foxglove WebSocket, with the feature of that name | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
 //! rigid bodies*; \[SZ\] V. F. Shcherbak, N. V. Zhogoleva, *Identification of the moments of inertia of a rigid body*;
@@ -51,6 +52,8 @@ pub mod clock;
 pub mod config;
 #[cfg(feature = "runtime")]
 pub mod doctor;
+#[cfg(feature = "foxglove")]
+pub mod foxglove;
 #[cfg(feature = "runtime")]
 pub mod launch;
 #[cfg(feature = "runtime")]

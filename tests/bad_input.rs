@@ -767,6 +767,16 @@ fn options_are_checked_as_their_keys_are() {
     assert_says(&alone, "corotate: --external follower: ", &["one process", "give --clock realtime or lockstep"]);
 }
 
+#[cfg(not(feature = "foxglove"))]
+#[test]
+fn what_was_left_out_of_the_build_is_refused() {
+    for arguments in [&["run", "--foxglove"][..], &["run", "--foxglove", "0.0.0.0:9000"], &["foxglove"]] {
+        let done = Bench::new().run(arguments);
+        assert_eq!(done.code, Some(2), "{done:?}");
+        assert!(done.stderr.contains("build it with `cargo build --release --features foxglove`"), "{done:?}");
+    }
+}
+
 #[test]
 fn a_command_line_that_makes_no_sense_is_refused() {
     let bench = Bench::new();

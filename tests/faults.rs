@@ -50,6 +50,7 @@ impl Disturbed {
             program: PathBuf::new(),
             external: Vec::new(),
             record: None,
+            foxglove: None,
             require_realtime: false,
             signal: &AtomicUsize::new(0),
             progress: &mut |_| {},

@@ -6,6 +6,7 @@ mod check;
 mod diff;
 mod doctor;
 mod export;
+mod foxglove;
 mod init;
 mod record;
 mod replay;
@@ -46,6 +47,7 @@ Examples:
   corotate report runs/20261121T150000Z-rigid-pair
                                                  the run as one page, report.html
   corotate watch                                 a screen on the newest run
+  corotate run trio.toml --foxglove              live in Foxglove too, at ws://localhost:8765
   corotate doctor                                is this machine fit for real time, and what to do about it
   corotate bench step hop                        what the step and a hop cost here, beside their floors";
 
@@ -79,6 +81,8 @@ enum Command {
     Report(report::Arguments),
     /// Watch a running loop on the terminal
     Watch(watch::Arguments),
+    /// Show a running loop on a Foxglove WebSocket
+    Foxglove(foxglove::Arguments),
     /// Tell whether this machine is fit for real time, and what to do about it
     Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
@@ -159,6 +163,7 @@ fn main() -> ExitCode {
         Some(Command::Export(arguments)) => export::export(&arguments),
         Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
+        Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),

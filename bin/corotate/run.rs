@@ -1,12 +1,13 @@
 //! `corotate run`: one scenario from file to verdict.
 
-use crate::{Exit, fail, print};
-use corotate::config::{SHIPPED, Scenario};
+use crate::{Exit, fail, foxglove, print};
+use corotate::config::{ClockKind, SHIPPED, Scenario};
 use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, junit, table, write_run};
 use corotate::runtime::seat_path;
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
@@ -43,6 +44,9 @@ pub struct Arguments {
     /// Record every sample to run.mcap in the directory for the results
     #[arg(long)]
     record: bool,
+    /// Show every signal live on a Foxglove WebSocket, at IP:PORT; without ADDR at 127.0.0.1:8765
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
+    foxglove: Option<SocketAddr>,
     /// Print the summary as one JSON object on stdout, everything else on stderr
     #[arg(long)]
     json: bool,
@@ -68,8 +72,16 @@ impl Arguments {
             None => Scenario::parse(SHIPPED[0].1, &format!("{}.toml", SHIPPED[0].0), &self.overrides()),
         };
         let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
-        self.check_external(&scenario).map_err(|reason| Failure { exit: Exit::Usage, reason })?;
+        self.check_external(&scenario)
+            .and_then(|()| self.check_foxglove(&scenario))
+            .map_err(|reason| Failure { exit: Exit::Usage, reason })?;
         Ok(scenario)
+    }
+
+    fn check_foxglove(&self, scenario: &Scenario) -> Result<(), String> {
+        let in_thread = "a run in one thread has nothing that another process could show; take --clock lockstep";
+        let reason = foxglove::refusal().or((scenario.clock == ClockKind::InProcess).then_some(in_thread));
+        reason.filter(|_| self.foxglove.is_some()).map_or(Ok(()), |reason| Err(format!("--foxglove: {reason}")))
     }
 
     fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
@@ -135,6 +147,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
             program,
             external: arguments.external.clone(),
             record: scenario.record.then(|| directory.join("run.mcap")),
+            foxglove: arguments.foxglove,
             require_realtime: arguments.require_rt,
             signal: &signal,
             progress: &mut |progress| screen.show(progress),

@@ -76,6 +76,7 @@ pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64, fused: bool
         program: bench.program.clone(),
         external: Vec::new(),
         record: None,
+        foxglove: None,
         require_realtime: false,
         signal: bench.signal,
         progress: &mut |_| {},

@@ -65,6 +65,7 @@ fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Resu
         program: bench.program.clone(),
         external: Vec::new(),
         record: None,
+        foxglove: None,
         require_realtime: false,
         signal: &end,
         progress: &mut |progress| {

@@ -205,6 +205,11 @@ pub fn domains() -> Vec<Found> {
     found(&base())
 }
 
+/// The domain of the newest run of this user that is under way.
+pub fn newest_run() -> Option<PathBuf> {
+    domains().into_iter().find(|found| found.alive).map(|found| found.root)
+}
+
 fn found(base: &Path) -> Vec<Found> {
     let find = |path: PathBuf| {
         let made = fs::metadata(&path).and_then(|lock| lock.modified()).ok();

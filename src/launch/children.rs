@@ -82,6 +82,13 @@ impl RoleProcess {
         Failure { cause, last_words: self.last_words() }
     }
 
+    /// An error if the process has ended before the ticks run.
+    pub fn require_alive(&mut self, name: &str) -> Result<(), LaunchError> {
+        let Some(status) = self.ended() else { return Ok(()) };
+        let Failure { cause, last_words } = self.failure(status);
+        Err(LaunchError::Died { role: name.to_owned(), cause, last_words })
+    }
+
     /// The end of the error output of a process that has ended.
     pub fn last_words(&mut self) -> String {
         self.stop_listening();

@@ -3,6 +3,7 @@
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
 mod children;
+mod foxglove;
 mod in_process;
 mod junit;
 mod outcome;
@@ -30,6 +31,7 @@ use crate::config::{ClockKind, Scenario};
 use crate::record::RecordError;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
 
@@ -41,6 +43,8 @@ pub struct Launch<'a> {
     pub external: Vec<String>,
     /// The file to record every sample to.
     pub record: Option<PathBuf>,
+    /// Where to show the run on a Foxglove WebSocket; not in one thread, and only by a program that was built with it.
+    pub foxglove: Option<SocketAddr>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
     /// The signal that asked the run to end; 0 while none has.

@@ -3,6 +3,7 @@
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
 use super::children::{END_LIMIT, Janitor, RoleProcess};
+use super::foxglove::FoxgloveWatch;
 use super::recorder::RecorderWatch;
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
@@ -129,6 +130,7 @@ struct Crew<'a> {
     word: Schedule,
     incidents: Vec<Incident>,
     recorder: RecorderWatch,
+    foxglove: FoxgloveWatch,
 }
 
 impl<'a> Crew<'a> {
@@ -140,6 +142,7 @@ impl<'a> Crew<'a> {
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
+        let foxglove = FoxgloveWatch::start(&launch.program, launch.foxglove, domain)?;
         // All of them first: they come up while their links are opened here.
         let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
             true => Ok((role, None)),
@@ -150,7 +153,7 @@ impl<'a> Crew<'a> {
         let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
         let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
-        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder })
+        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder, foxglove })
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -200,9 +203,9 @@ impl<'a> Crew<'a> {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
-            let recording = self.recorder.ready()?;
+            let watched = self.recorder.ready()? & self.foxglove.ready()?;
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
-            if missing.is_empty() && recording {
+            if missing.is_empty() && watched {
                 return Ok(true);
             }
             if launch.signal.load(Ordering::Relaxed) != 0 {
@@ -264,6 +267,7 @@ impl<'a> Crew<'a> {
     fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
         self.recorder.supervise(self.bus);
+        self.foxglove.supervise(self.bus);
         for member in &mut self.members {
             if let Some(failure) = member.failure(self.scenario, self.bus) {
                 let incident = member.fail(failure, self.scenario, now_ns);
@@ -328,9 +332,9 @@ impl<'a> Crew<'a> {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
-        // The recorder stays until nobody sends any more.
+        // Whoever takes samples stays until nobody sends any more.
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
-        while self.recorder.lingers() && monotonic_ns() < limit_ns {
+        while (self.recorder.lingers() || self.foxglove.lingers()) && monotonic_ns() < limit_ns {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }

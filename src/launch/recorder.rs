@@ -75,11 +75,7 @@ impl RecorderWatch {
     /// Whether the ticks may run; how it failed if they never will.
     pub fn ready(&mut self) -> Result<bool, LaunchError> {
         let Some(process) = &mut self.process else { return Ok(true) };
-        if let Some(status) = process.ended() {
-            let failure = process.failure(status);
-            let (cause, last_words) = (failure.cause, failure.last_words);
-            return Err(LaunchError::Died { role: RECORDER.to_owned(), cause, last_words });
-        }
+        process.require_alive(RECORDER)?;
         Ok(self.state() >= RoleState::Ready)
     }
 

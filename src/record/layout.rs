@@ -6,8 +6,18 @@
 use crate::sample::{Field, FieldKind, Stamp};
 use std::fmt::Write;
 
+/// How definitions and messages are encoded, by the names that MCAP has for it.
+pub const SCHEMA_ENCODING: &str = "ros2msg";
+pub const MESSAGE_ENCODING: &str = "cdr";
 /// What comes before the body of a message: little-endian CDR, no options.
 pub const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
+
+/// Makes a sample's bytes the message that they are the body of.
+pub fn frame(body: &[u8], message: &mut Vec<u8>) {
+    message.clear();
+    message.extend_from_slice(&CDR_HEADER);
+    message.extend_from_slice(body);
+}
 
 /// One field of a recorded layout.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -4,7 +4,8 @@
 //! |---|---|
 //! | `layout` | the layout of a sample as a ROS 2 message definition |
 //! | `writer` | the MCAP file: chunks of bounded age, a full disk |
-//! | `recorder` | takes every sample of a run off a bus, and keeps count |
+//! | `taps` | takes every sample of a run off a bus, and keeps count |
+//! | `recorder` | a recording in the making, and its books |
 //! | `process` | the recorder as a process beside a loop |
 //! | `reader` | a recording as data: metadata, signals, samples, columns |
 //! | `script` | what a role did, so that it can do it again |
@@ -22,18 +23,22 @@ mod reader;
 mod recorder;
 mod replay;
 mod script;
+mod taps;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
 pub use export::export_csv;
 pub use layout::{Column, Layout, topic_of};
-pub(crate) use process::give_way;
+#[cfg(feature = "foxglove")]
+pub(crate) use layout::{MESSAGE_ENCODING, SCHEMA_ENCODING, frame};
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::RECORDER;
 pub use recorder::{Recorder, RecordingReport, SignalReport};
 pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_process};
 pub use script::{InputScript, Item, Limit, Script, Step};
+#[cfg(feature = "foxglove")]
+pub(crate) use taps::{Channel, MessageSink, Taps};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

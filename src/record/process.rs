@@ -1,4 +1,5 @@
-//! The recorder as a process beside a loop: never of real-time priority, and on no core that the scenario names for roles.
+//! The recorder as a process beside a loop: of no real-time priority once it has joined, and on no core that the scenario
+//! names for roles.
 //!
 //! Must not keep a role waiting: what it cannot take in time is lost and told. In lockstep the launcher gives no credit
 //! beyond what it has taken.
@@ -9,14 +10,13 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Cores, Scenario};
+use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    Backoff, RoleError, RoleId, depths, join, open_ledger, report, report_path, topic, window_ticks, write_whole,
+    Backoff, RoleError, RoleId, depths, hurried, join, join_beside, open_ledger, report, report_path, topic,
+    window_ticks, write_whole,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::RoleReport;
-use rustix::process::nice;
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -48,13 +48,11 @@ pub struct RecorderSeat {
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join(&seat.domain)?;
     // Not nice to ordinary processes: it must not lose samples because something is being compiled.
-    give_way(&scenario, 0);
-    let bus = IoxBus::enter(&domain, RECORDER, depths(&scenario)).map_err(RoleError::from)?;
-    let mut line = Line::open(&scenario, &bus)?;
-    let mut recorder = Recorder::open(&scenario, &bus, &seat.file)?;
+    let (_bus, mut line, mut recorder) = join_beside(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended = follow(&mut recorder, &mut line, credit_ticks, terminated);
+    hurried(|| recorder.leave());
     let report = recorder.finish(&books(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
     let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");
@@ -64,15 +62,12 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     Ok(report)
 }
 
-/// Nobody waits for a recorder, or a watcher, so it lets everybody pass. What is not granted is no harm.
-pub(crate) fn give_way(scenario: &Scenario, niceness: i32) {
-    let _ = nice(niceness);
-    if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
-        critical.iter().for_each(|core| allowed.unset(*core));
-        if allowed.count() > 0 {
-            let _ = sched_setaffinity(None, &CpuSet::clone(&allowed));
-        }
-    }
+/// Opens all links, and the file. The node is told first because it goes last.
+fn open(seat: &RecorderSeat, domain: &Domain, scenario: &Scenario) -> Result<(IoxBus, Line, Recorder), RecordError> {
+    let bus = IoxBus::enter(domain, RECORDER, depths(scenario)).map_err(RoleError::from)?;
+    let line = Line::open(scenario, &bus)?;
+    let recorder = Recorder::open(scenario, &bus, &seat.file)?;
+    Ok((bus, line, recorder))
 }
 
 /// Takes samples from the first tick to the last.

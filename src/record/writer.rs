@@ -5,7 +5,8 @@
 //! is cut off, and the file ends with its last whole chunk. Must not know samples.
 
 use super::RecordError;
-use super::layout::{CDR_HEADER, Layout, topic_of};
+use super::layout::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
+use super::taps::{Channel, MessageSink};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions};
 use rustix::fs::{FallocateFlags, fallocate};
@@ -27,9 +28,6 @@ const END_BYTES: u64 = 64 << 10;
 /// What the summary says of a chunk, and of each channel in it; bytes.
 const CHUNK_INDEX_BYTES: u64 = 128;
 const CHANNEL_INDEX_BYTES: u64 = 32;
-
-/// The number of a channel in its file.
-pub type Channel = u16;
 
 /// A file that is being recorded to.
 pub struct Writer {
@@ -77,24 +75,6 @@ impl Writer {
         })
     }
 
-    /// Announces a signal. `about` is told of it besides.
-    ///
-    /// # Errors
-    /// [`RecordError::Write`].
-    pub fn channel(
-        &mut self,
-        service: &str,
-        layout: &Layout,
-        about: &BTreeMap<String, String>,
-    ) -> Result<Channel, RecordError> {
-        self.channels += 1;
-        let (name, text) = (layout.message_name(), layout.definition());
-        self.attempt(|mcap| {
-            let schema = mcap.add_schema(&name, "ros2msg", text.as_bytes())?;
-            mcap.add_channel(schema, &topic_of(service), "cdr", about)
-        })
-    }
-
     /// Writes what is known of the run, and closes the chunk at hand.
     ///
     /// # Errors
@@ -103,34 +83,6 @@ impl Writer {
         let metadata = Metadata { name: name.to_owned(), metadata: entries };
         self.attempt(|mcap| mcap.write_metadata(&metadata))?;
         self.close_chunk()
-    }
-
-    /// Writes one sample as it is. Times are ns.
-    ///
-    /// # Errors
-    /// [`RecordError::Full`] if there is no room for it; the file can be finished then. [`RecordError::Write`].
-    pub fn message(
-        &mut self,
-        channel_id: Channel,
-        sequence: u32,
-        due_ns: u64,
-        received_ns: u64,
-        body: &[u8],
-    ) -> Result<(), RecordError> {
-        if self.began_ns.is_none() {
-            self.reserve(body.len())?;
-            self.began_ns = Some(received_ns);
-        }
-        self.frame.clear();
-        self.frame.extend_from_slice(&CDR_HEADER);
-        self.frame.extend_from_slice(body);
-        self.pending += self.frame.len() + MESSAGE_OVERHEAD;
-        let header = MessageHeader { channel_id, sequence, log_time: received_ns, publish_time: due_ns };
-        let frame = std::mem::take(&mut self.frame);
-        let written = self.attempt(|mcap| mcap.write_to_known_channel(&header, &frame));
-        self.frame = frame;
-        written?;
-        self.turn(received_ns)
     }
 
     /// Closes the chunk at hand if it is large or old enough.
@@ -199,6 +151,45 @@ impl Writer {
 
     fn failed(&self, source: io::Error) -> RecordError {
         RecordError::Write { path: self.path.clone(), source }
+    }
+}
+
+impl MessageSink for Writer {
+    fn channel(
+        &mut self,
+        service: &str,
+        layout: &Layout,
+        about: BTreeMap<String, String>,
+    ) -> Result<Channel, RecordError> {
+        self.channels += 1;
+        let (name, text) = (layout.message_name(), layout.definition());
+        self.attempt(|mcap| {
+            let schema = mcap.add_schema(&name, SCHEMA_ENCODING, text.as_bytes())?;
+            mcap.add_channel(schema, &topic_of(service), MESSAGE_ENCODING, &about)
+        })
+    }
+
+    /// After an error for want of room the file can still be finished.
+    fn message(
+        &mut self,
+        channel_id: Channel,
+        sequence: u32,
+        due_ns: u64,
+        received_ns: u64,
+        body: &[u8],
+    ) -> Result<(), RecordError> {
+        if self.began_ns.is_none() {
+            self.reserve(body.len())?;
+            self.began_ns = Some(received_ns);
+        }
+        frame(body, &mut self.frame);
+        self.pending += self.frame.len() + MESSAGE_OVERHEAD;
+        let header = MessageHeader { channel_id, sequence, log_time: received_ns, publish_time: due_ns };
+        let frame = std::mem::take(&mut self.frame);
+        let written = self.attempt(|mcap| mcap.write_to_known_channel(&header, &frame));
+        self.frame = frame;
+        written?;
+        self.turn(received_ns)
     }
 }
 

@@ -30,6 +30,7 @@ pub fn counterpart(scenario: &Scenario) -> Result<Option<Traces>, ReportError> {
         program: std::path::PathBuf::new(),
         external: Vec::new(),
         record: Some(file.clone()),
+        foxglove: None,
         require_realtime: false,
         signal: &AtomicUsize::new(0),
         progress: &mut |_| {},

@@ -25,7 +25,7 @@ pub use node::{
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};
-pub(crate) use privileges::{hurry, release as release_priority, take as take_privileges};
+pub(crate) use privileges::{hurried, join_beside, release as release_priority, take as take_privileges};
 pub use process::{RoleError, RoleSeat, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};

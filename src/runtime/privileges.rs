@@ -6,7 +6,7 @@ use super::node::RoleId;
 use crate::config::{Cores, NamedCores, Realtime, Scenario};
 use crate::telemetry::Grant;
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::process::{Resource, getrlimit};
+use rustix::process::{Resource, getrlimit, nice};
 use rustix::thread::{
     CapabilitySet, CpuSet, capabilities, sched_getaffinity, sched_setaffinity, set_current_timer_slack,
 };
@@ -128,13 +128,34 @@ fn set_fifo(priority: i32) -> io::Result<()> {
     set_scheduler(libc::SCHED_FIFO, priority)
 }
 
-/// Takes the least real-time priority, if it is granted, for the calling thread.
+/// Opens links to a loop that may be running, for a process that no role waits for, and gives way to everybody from then on.
+pub fn join_beside<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() -> T) -> T {
+    let opened = hurried(open);
+    give_way(scenario, niceness);
+    opened
+}
+
+/// Opens or closes links at the least real-time priority, if it is granted.
 ///
-/// For one who joins a loop that runs: a role that finds a link half made waits until it is whole, and must not wait for a
-/// process that others keep from going on.
-pub fn hurry() {
+/// A role that finds a link half made waits until it is whole, and must not wait for a process that others keep from going
+/// on.
+pub fn hurried<T>(act: impl FnOnce() -> T) -> T {
     // Not granted, it takes its chance; a role's priority is above this in any case.
     let _ = set_fifo(1);
+    let done = act();
+    release();
+    done
+}
+
+/// Lets everybody pass, and leaves the cores that the scenario names for roles. What is not granted is no harm.
+fn give_way(scenario: &Scenario, niceness: i32) {
+    let _ = nice(niceness);
+    if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
+        critical.iter().for_each(|core| allowed.unset(*core));
+        if allowed.count() > 0 {
+            let _ = sched_setaffinity(None, &allowed);
+        }
+    }
 }
 
 /// Gives the real-time priority of the calling thread back: what follows the last tick must not delay another role's.

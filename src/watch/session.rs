@@ -5,13 +5,12 @@
 use super::WatchError;
 use super::feed::{Feed, LOOK_NS};
 use super::model::Model;
-use crate::bus::domain::{Domain, domains};
+use crate::bus::domain::{Domain, newest_run};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
-use crate::record::give_way;
-use crate::runtime::{RoleError, depths, hurry, join, release_priority, topic};
+use crate::runtime::{RoleError, depths, hurried, join, join_beside, topic};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -51,8 +50,7 @@ impl Session {
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
-        let newest = || domains().into_iter().find(|found| found.alive).map(|found| found.root);
-        let root = directory.map(Path::to_owned).or_else(newest).ok_or(WatchError::NoRun)?;
+        let root = directory.map(Path::to_owned).or_else(newest_run).ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let (domain, scenario) = insist(end_ns, || join(&root))?;
         let mut model = Model {
@@ -63,10 +61,7 @@ impl Session {
             tick_s: scenario.tick_s(),
             ..Model::default()
         };
-        hurry();
-        let joined = Joined::open(&domain, &scenario, end_ns, &mut model);
-        release_priority();
-        give_way(&scenario, NICENESS);
+        let joined = join_beside(&scenario, NICENESS, || Joined::open(&domain, &scenario, end_ns, &mut model));
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
@@ -111,9 +106,7 @@ impl Session {
     fn leave(&mut self) {
         self.refresh();
         if let Some(joined) = self.joined.take() {
-            hurry();
-            drop(joined);
-            release_priority();
+            hurried(|| drop(joined));
             self.model.ended = true;
             self.domain.forget();
         }

@@ -66,4 +66,5 @@ def main():
         print(name, sum(map(len, topics.values())), len(topics))
 
 
-main()
+if __name__ == "__main__":
+    main()
