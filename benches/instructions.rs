@@ -1,6 +1,6 @@
 //! Instructions per estimate-and-control step, counted by callgrind: a regression shows however noisy the machine is.
 //!
-//! `cargo bench --features hooks --bench instructions` (the features of the tests: others inline differently) compares with
+//! `cargo bench --features hooks,foxglove --bench instructions` (the features of the tests: others inline differently) compares with
 //! `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The figures are
 //! those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
