@@ -3,7 +3,7 @@
 //!
 //! Must not know what the words mean.
 
-use memmap2::MmapRaw;
+use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, fallocate};
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -31,7 +31,8 @@ impl SharedWords {
             // Really allocated, not merely promised: a page that is missing later would kill the process.
             fallocate(&file, FallocateFlags::empty(), 0, bytes)?;
         }
-        Ok(Self { map: MmapRaw::map_raw(&file)?, file })
+        // Every page at once: who writes a little at every tick shall not come upon a new one in the midst of it.
+        Ok(Self { map: MmapOptions::new().populate().map_raw(&file)?, file })
     }
 
     /// The words in a file that must be there.

@@ -23,10 +23,11 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         }
         board.add(Row::Run, "bare process", "ms", None, bare_process(bench)?);
         board.add(Row::Run, "bare iceoryx2 node", "ms", None, bare_node()?);
-        let roles = observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
-        let largest = roles.map(|(_, mib)| *mib).fold(f64::NAN, f64::max);
-        board.add(Row::Run, "memory of the largest role", "MiB", None, largest);
-        for (name, mib) in &observed.resident_mib {
+        let roles = || observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
+        let largest = |which: usize| roles().map(|(_, mib)| mib[which]).fold(f64::NAN, f64::max);
+        board.add(Row::Run, "memory of the largest role", "MiB", None, largest(0));
+        board.add(Row::Run, "of it not the program's own file", "MiB", None, largest(1));
+        for (name, [mib, _]) in &observed.resident_mib {
             board.add(Row::Run, &format!("memory of {name}"), "MiB", None, *mib);
         }
         board.add(Row::Run, "shared memory", "MiB", None, observed.shared_mib);

@@ -10,7 +10,7 @@ use super::recording::{CASES, Recording};
 use super::{Bench, BenchError, Board, Row};
 use crate::config::{SHIPPED, Scenario};
 use crate::observe::{
-    Filter, GuardedKalman, HiddenRate, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
+    Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
 };
 use crate::rig::{AnyRig, Command, Estimate, Measurement, RateLaw, Rig};
 use crate::role::{Body, Controller, Guard, Observer};
@@ -493,17 +493,14 @@ fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<
         Contestant::new(format!("filter alone, {name}: {filter_name}"), None, move || {
             let mut filter = filter;
             timed(|| {
+                let (mut from, interval) = (relation.sight(&recording.sample(0)), Interval::from(recording.tick_s));
                 for index in 1..recording.truth.len() {
-                    let (from, to) = (recording.sample(index - 1), black_box(recording.sample(index)));
-                    match relation.observe(
-                        &relation.sight(&from),
-                        &relation.sight(&to),
-                        recording.tick_s,
-                        filter.estimate().x,
-                    ) {
+                    let to = relation.sight(&black_box(recording.sample(index)));
+                    match relation.observe(&from, &to, interval, filter.estimate().x) {
                         Observation::Seen(increment) => filter.step(&increment),
                         Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),
                     }
+                    from = to;
                 }
                 black_box(&filter);
             })

@@ -44,8 +44,8 @@ pub(super) struct Observed {
     pub start_ms: Option<f64>,
     /// From the last tick to the end of the process, ms.
     pub stop_ms: Option<f64>,
-    /// Peak resident memory by process, MiB.
-    pub resident_mib: BTreeMap<String, f64>,
+    /// Peak resident memory by process, and the part of it that is not the program's own file, MiB.
+    pub resident_mib: BTreeMap<String, [f64; 2]>,
     /// The most shared memory at any look, MiB.
     pub shared_mib: f64,
     /// How far the rate of the leader's ticks was from what it should be, %.
@@ -154,10 +154,13 @@ impl Watch<'_> {
 impl Observed {
     fn look_at_memory(&mut self, processes: &[Process], domain: Option<&Domain>) {
         for process in processes {
-            if let Some(kib) = status_word(process.pid, "VmHWM:") {
-                // The peak never falls; a process that is ending has none.
+            // The peak never falls; a process that is ending has none.
+            let words = ["VmHWM:", "RssAnon:", "RssShmem:"].map(|word| status_word(process.pid, word));
+            if let [Some(peak), Some(anonymous), Some(shared)] = words {
                 let mib = self.resident_mib.entry(process.name.clone()).or_default();
-                *mib = mib.max(kib as f64 / 1024.0);
+                for (most, kib) in mib.iter_mut().zip([peak, anonymous + shared]) {
+                    *most = most.max(kib as f64 / 1024.0);
+                }
             }
         }
         let bytes = domain.map_or(0, shared_bytes);

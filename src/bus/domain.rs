@@ -184,9 +184,9 @@ impl Domain {
     }
 }
 
-/// Removes the domains of this user whose launcher is dead.
-pub fn remove_dead_domains() {
-    remove_dead(&base());
+/// Removes the domains of this user whose launcher is dead, and tells which.
+pub fn remove_dead_domains() -> Vec<Domain> {
+    remove_dead(&base())
 }
 
 /// A domain that was found, of a run or of what is left of one.
@@ -234,12 +234,14 @@ fn require_room(needed: u64) -> Result<(), DomainError> {
     if free < needed { Err(DomainError::NoRoom { free, needed }) } else { Ok(()) }
 }
 
-fn remove_dead(base: &Path) {
-    for path in locks(base) {
-        if let Ok(Some(_held)) = lock(&path, Lock::Existing) {
-            Domain { root: path.with_extension("") }.remove();
-        }
-    }
+fn remove_dead(base: &Path) -> Vec<Domain> {
+    let remove = |path: PathBuf| {
+        let _held = lock(&path, Lock::Existing).ok().flatten()?;
+        let domain = Domain { root: path.with_extension("") };
+        domain.remove();
+        Some(domain)
+    };
+    locks(base).filter_map(remove).collect()
 }
 
 fn lock_path(root: &Path) -> PathBuf {

@@ -185,9 +185,12 @@ pub fn janitor(mut line: impl Read) {
     if io::copy(&mut line, &mut io::sink()).is_ok_and(|said| said > 0) {
         return;
     }
-    // Roles whose launcher was killed are dying at this moment; what they still hold goes in a later round.
+    // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
+    // later round.
+    let mut gone = Vec::new();
     for pause_ms in [0, 50, 500] {
         std::thread::sleep(Duration::from_millis(pause_ms));
-        domain::remove_dead_domains();
+        gone.iter().for_each(Domain::forget);
+        gone.extend(domain::remove_dead_domains());
     }
 }
