@@ -11,6 +11,7 @@ use std::time::Duration;
 
 /// Options of `corotate bench`.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll [default: all]
     #[arg(value_name = "ROW", value_parser = row)]
@@ -28,6 +29,12 @@ pub struct Arguments {
     #[arg(long)]
     json: bool,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate bench                            every row, about five minutes
+  corotate bench step hop --quick           two rows, as a smoke test
+  corotate bench step --check               exit code 3 if a target is missed";
 
 fn row(name: &str) -> Result<Row, String> {
     let known = || Row::ALL.map(|(_, name, _)| name).join(", ");

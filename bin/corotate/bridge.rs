@@ -8,6 +8,7 @@ use std::path::PathBuf;
 
 /// Options of `corotate bridge`.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
     #[arg(long, value_name = "PATH")]
@@ -28,6 +29,11 @@ pub struct Arguments {
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
 }
+
+const EXAMPLES: &str = "\
+Example:
+  corotate run pair.toml --external follower
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR      with the DIR that the run prints";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Options of `corotate check`.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// Scenario files
     #[arg(required = true)]
@@ -16,6 +17,11 @@ pub struct Arguments {
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate check pair.toml                  the scenario with every default, and its certificate
+  corotate check config/*.toml > /dev/null  are they all valid? exit code 2 if one is not";
 
 /// Checks scenarios; all of them, even if one fails.
 pub fn check(arguments: &Arguments) -> Exit {

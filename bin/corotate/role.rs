@@ -9,6 +9,7 @@ use std::sync::atomic::AtomicBool;
 
 /// Options of every role.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// The run's domain, as `corotate run --external ROLE` prints it
     #[arg(long, value_name = "DIR")]
@@ -18,8 +19,13 @@ pub struct Arguments {
     parent: Option<i32>,
 }
 
+const EXAMPLES: &str = "\
+Example:
+  corotate run pair.toml --external ROLE    prints the line to type for that role, with its domain";
+
 /// Options of `corotate plant`.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct PlantArguments {
     /// The body's name
     #[arg(long, value_name = "NAME")]

@@ -14,6 +14,7 @@ use std::sync::atomic::AtomicUsize;
 
 /// Options of `corotate run`.
 #[derive(clap::Args, Default)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// Scenario file; without one, the shipped rigid-pair
     file: Option<PathBuf>,
@@ -51,6 +52,16 @@ pub struct Arguments {
     #[arg(long)]
     json: bool,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate run pair.toml                             four processes in real time; a table, and runs/<utc>-<name>/
+  corotate run pair.toml --clock lockstep            as fast as the machine goes, the same bits
+  corotate run pair.toml --record --set follower.0.initial_rate_rad_s=[1,0,0]
+                                                     every sample to run.mcap, with another start
+  corotate run pair.toml --external follower         wait for hardware in the follower's seat
+  corotate run pair.toml --junit verdict.xml --require-rt
+                                                     as a test, on a machine that grants real time";
 
 impl Arguments {
     fn overrides(&self) -> Vec<String> {

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 /// Options of `corotate seat`.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Arguments {
     /// Scenario file
     file: PathBuf,
@@ -22,6 +23,10 @@ pub struct Arguments {
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
 }
+
+const EXAMPLES: &str = "\
+Example:
+  corotate seat pair.toml follower          services, samples and fields of the follower's seat";
 
 /// Prints a seat.
 pub fn seat(arguments: &Arguments) -> Exit {

@@ -10,7 +10,8 @@ use super::recording::{CASES, Recording};
 use super::{Bench, BenchError, Board, Row};
 use crate::config::{SHIPPED, Scenario};
 use crate::observe::{
-    Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
+    Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise,
+    SecondOrderFilter,
 };
 use crate::rig::{AnyRig, Command, Estimate, Measurement, RateLaw, Rig};
 use crate::role::{Body, Controller, Guard, Observer};

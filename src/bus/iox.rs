@@ -179,12 +179,14 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        let builder = self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?;
-        if self.makes {
-            builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
-        } else {
-            builder.open().map_err(|error| failed_to_open(topic, end, &error))
-        }
+        unbroken(|| {
+            let builder = self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?;
+            if self.makes {
+                builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
+            } else {
+                builder.open().map_err(|error| failed_to_open(topic, end, &error))
+            }
+        })
     }
 
     fn fleet_service<L: FleetLayout>(
@@ -192,12 +194,14 @@ impl IoxBus {
         topic: &Topic,
         end: &'static str,
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
-        let builder = self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?;
-        if self.makes {
-            builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
-        } else {
-            builder.open().map_err(|error| failed_to_open(topic, end, &error))
-        }
+        unbroken(|| {
+            let builder = self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?;
+            if self.makes {
+                builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
+            } else {
+                builder.open().map_err(|error| failed_to_open(topic, end, &error))
+            }
+        })
     }
 
     fn builder<P: IceoryxSend + fmt::Debug + ?Sized>(
@@ -226,6 +230,21 @@ impl IoxBus {
         // What cannot be put away now is so when the successor enters.
         let _ = self.node.try_cleanup_dead_nodes();
     }
+}
+
+/// How often signals may break off the opening of one thing.
+const BREAKS: u32 = 100;
+
+/// Opens something again that a signal broke off: what the signal asks for is done in order, by whoever looks for it.
+fn unbroken<T>(mut open: impl FnMut() -> Result<T, BusError>) -> Result<T, BusError> {
+    for _ in 0..BREAKS {
+        match open() {
+            // One of the variants of every error of the transport has this name.
+            Err(BusError::Open { reason, .. }) if reason.contains("Interrupt") => {}
+            opened => return opened,
+        }
+    }
+    open()
 }
 
 fn failed_to_open(topic: &Topic, end: &'static str, error: &impl fmt::Debug) -> BusError {
@@ -264,8 +283,9 @@ impl Bus for IoxBus {
     type FleetReader<L: FleetLayout> = IoxFleetReader<L>;
 
     fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<IoxWriter<S>, BusError> {
-        let latest = self.has_lane(topic).then(|| LatestWriter::create(&self.node, topic, generation)).transpose();
-        let latest = latest.map_err(|reason| BusError::Open { service: topic.to_string(), end: "writer", reason })?;
+        let failed = |reason| BusError::Open { service: topic.to_string(), end: "writer", reason };
+        let lane = || unbroken(|| LatestWriter::create(&self.node, topic, generation).map_err(failed));
+        let latest = self.has_lane(topic).then(lane).transpose()?;
         let publisher = self
             .service::<S>(topic, "writer")?
             .publisher_builder()
@@ -502,6 +522,9 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn refresh(&mut self) {
+        // Or the first look at the queue, once the lane is open, would connect to its writer in the midst of the loop. What
+        // is wrong with it is told by that look.
+        let _ = self.subscriber.update_connections();
         if let Lane::Wanted { generation } = self.lane {
             match LatestReader::open(&self.node, &self.topic, generation) {
                 Some(latest) => self.lane = Lane::Open(latest),

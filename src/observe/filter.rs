@@ -187,7 +187,7 @@ impl<const N: usize> Decay<N> {
                 }
                 factor.1.component_mul(&error)
             }
-            Self::Matrix(matrix) => matrix.exp(weight) * error,
+            Self::Matrix(matrix) => matrix.decayed(weight, &error),
         }
     }
 }

@@ -21,6 +21,12 @@ const TAYLOR_NORM: f64 = 0.5;
 /// Degree of the Taylor polynomial.
 const TAYLOR_DEGREE: u32 = 14;
 
+/// Up to this norm a short polynomial will do, and its remainder is below a rounding: (1/64)⁷/7! = 5e-17.
+const SHORT_NORM: f64 = 1.0 / 64.0;
+
+/// 1/k for k from 6 down to 1.
+const SHORT_INVERSES: [f64; 6] = [1.0 / 6.0, 1.0 / 5.0, 1.0 / 4.0, 1.0 / 3.0, 1.0 / 2.0, 1.0];
+
 /// The slowest mode's exponent at which all of e^{𝒜W} is below the smallest double, however far from normal 𝒜 is: with the
 /// tolerance above, the powers of W that go with it stay below 1e200 up to N = 10.
 const VANISHED: f64 = 1200.0;
@@ -81,6 +87,8 @@ pub struct Hurwitz<const N: usize> {
     eigenvalues: Eigenvalues<N>,
     /// The greatest real part of an eigenvalue.
     abscissa: f64,
+    /// ‖𝒜‖₁.
+    norm: f64,
     diagonal: bool,
 }
 
@@ -115,7 +123,7 @@ impl<const N: usize> Hurwitz<N> {
         let abscissa = eigenvalues.iter().map(|value| value.re).fold(f64::NEG_INFINITY, f64::max);
         let eigenvalues = Eigenvalues(eigenvalues);
         if eigenvalues.0.iter().all(|value| value.re < -tolerance) {
-            Ok(Self { matrix, eigenvalues, abscissa, diagonal })
+            Ok(Self { matrix, eigenvalues, abscissa, norm: norm(&matrix), diagonal })
         } else {
             Err(HurwitzError::NotHurwitz { eigenvalues, tolerance })
         }
@@ -141,6 +149,15 @@ impl<const N: usize> Hurwitz<N> {
         self.diagonal.then(|| self.matrix.diagonal())
     }
 
+    /// e^{𝒜W}·`error` for a finite `weight` W ≥ 0: for the short steps of a loop by a series on the vector alone.
+    #[inline]
+    pub fn decayed(&self, weight: f64, error: &SVector<f64, N>) -> SVector<f64, N> {
+        if self.norm * weight > SHORT_NORM {
+            return self.exp(weight) * error;
+        }
+        SHORT_INVERSES.iter().fold(*error, |sum, inverse| error + self.matrix * sum * (weight * inverse))
+    }
+
     /// e^{𝒜W} for a finite `weight` W ≥ 0; the identity for 0.
     ///
     /// Exact to rounding for a diagonal matrix. Otherwise the error is what a rounding of 𝒜's own elements causes: in relation
@@ -156,10 +173,14 @@ impl<const N: usize> Hurwitz<N> {
     }
 }
 
+/// ‖X‖₁, the largest sum of a column.
+fn norm<const N: usize>(x: &SMatrix<f64, N, N>) -> f64 {
+    x.column_iter().map(|column| column.iter().map(|value| value.abs()).sum()).fold(0.0, f64::max)
+}
+
 /// e^X by scaling and squaring. ‖X‖ is bounded by the caller, or the loop would lose all digits before it ends.
 fn exponential<const N: usize>(x: SMatrix<f64, N, N>) -> SMatrix<f64, N, N> {
-    let norm = x.column_iter().map(|column| column.iter().map(|value| value.abs()).sum()).fold(0.0, f64::max);
-    let (mut scaled, mut norm, mut squarings) = (x, norm, 0_u32);
+    let (mut scaled, mut norm, mut squarings) = (x, norm(&x), 0_u32);
     while norm > TAYLOR_NORM {
         // Halving is exact.
         (scaled, norm, squarings) = (scaled * 0.5, norm * 0.5, squarings + 1);
@@ -188,6 +209,26 @@ mod tests {
     fn turned(matrix: Matrix3<f64>) -> Matrix3<f64> {
         let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
         turn * matrix * turn.transpose()
+    }
+
+    #[test]
+    fn the_short_series_is_within_two_roundings_of_the_exponential() {
+        let matrices = [
+            Matrix3::new(-6.0, 1.0, -2.0, 0.5, -4.0, 1.0, 2.0, 0.0, -5.0),
+            turned(Matrix3::from_diagonal(&nalgebra::Vector3::new(-1.0, -3.0, -200.0))),
+            turned(jordan(1.0, -2.0)[0]),
+        ];
+        let errors = [nalgebra::Vector3::new(0.3, -1.0, 0.7), nalgebra::Vector3::new(1e-9, 1.0, -1e-3)];
+        for (matrix, error) in matrices.iter().flat_map(|matrix| errors.iter().map(move |error| (matrix, error))) {
+            let hurwitz = Hurwitz::new(*matrix).unwrap();
+            for part in (0..=200).map(|n| f64::from(n) / 200.0) {
+                let weight = SHORT_NORM * part / hurwitz.norm;
+                let (short, exact) = (hurwitz.decayed(weight, error), hurwitz.exp(weight) * error);
+                assert!((short - exact).amax() <= 4.0 * f64::EPSILON * error.amax(), "{matrix} {weight}");
+            }
+            let long = 2.0 * SHORT_NORM / hurwitz.norm;
+            assert_eq!(hurwitz.decayed(long, error), hurwitz.exp(long) * error);
+        }
     }
 
     /// e^{λt} (1, t, t²/2; 0, 1, t; 0, 0, 1).

@@ -73,7 +73,7 @@ impl InertiaRelation {
     #[inline]
     pub fn observe(&self, from: &RateSample, to: &RateSample, dt_s: f64, estimate: &Vector3<f64>) -> Identification<3> {
         let path = Path::new(from, to, dt_s, estimate);
-        let whole = path.piece(0.0, 1.0);
+        let whole = path.whole();
         // Also for a weight that is not a number. Before any look at signs: those of a component at rest are noise.
         let excites = |piece: &Piece| piece.weight > self.floor_rad3_s3 * dt_s;
         if !excites(&whole) {
@@ -130,7 +130,7 @@ impl Path {
         let estimate = estimate.map(|a| a.clamp(-1.0, 1.0));
         let torque = from.torque_rad_s2;
         let [start, end] = [from.rate_rad_s, to.rate_rad_s];
-        let third = dt_s / 3.0;
+        let third = dt_s * (1.0 / 3.0);
         let control = [
             start,
             start + velocity(&estimate, &start, &torque) * third,
@@ -148,11 +148,22 @@ impl Path {
         b0 * (left * left * left) + b1 * (3.0 * left * left * t) + b2 * (3.0 * left * t * t) + b3 * (t * t * t)
     }
 
-    /// Potential and weight between two parts of the step, the potential with the sign that holds in the middle.
+    /// Potential and weight of the whole step, whose ends need not be computed.
+    #[inline]
+    fn whole(&self) -> Piece {
+        self.between(self.control[0], self.at(0.5), self.control[3], 1.0)
+    }
+
+    /// Potential and weight between two parts of the step.
     #[inline]
     fn piece(&self, begin: f64, end: f64) -> Piece {
-        let [from, middle, to] = [self.at(begin), self.at(0.5 * (begin + end)), self.at(end)];
-        let sixth = self.dt_s * (end - begin) / 6.0;
+        self.between(self.at(begin), self.at(0.5 * (begin + end)), self.at(end), end - begin)
+    }
+
+    /// Potential and weight of a `part` of the step, the potential with the sign that holds in the middle.
+    #[inline]
+    fn between(&self, from: Vector3<f64>, middle: Vector3<f64>, to: Vector3<f64>, part: f64) -> Piece {
+        let sixth = self.dt_s * part * (1.0 / 6.0);
         // Simpson's rule, exact for the cubics themselves.
         let turned = (from + middle * 4.0 + to) * sixth;
         let [first, central, last] = [from, middle, to].map(|rate| rate.product());
@@ -164,6 +175,7 @@ impl Path {
     }
 
     /// The sum of the pieces before and after a change of sign.
+    #[inline(never)]
     fn split(&self, at: f64) -> Piece {
         let [before, after] = [self.piece(0.0, at), self.piece(at, 1.0)];
         Piece { potential: before.potential + after.potential, weight: before.weight + after.weight }
@@ -196,6 +208,7 @@ impl Path {
     }
 
     /// Whether the estimate explains the motion from one sample to the other, and thus also in between.
+    #[inline(never)]
     fn is_explained(&self) -> bool {
         let [from, middle, to] = [0.0, 0.5, 1.0].map(|t| velocity(&self.estimate, &self.at(t), &self.torque));
         let moved = self.control[3] - self.control[0];
@@ -204,6 +217,7 @@ impl Path {
     }
 
     /// The part of the step at which a component with exactly one change of sign is zero.
+    #[inline(never)]
     fn zero(&self, axis: usize) -> f64 {
         let start = self.control.iter().map(|point| point[axis]).find(|value| *value != 0.0).unwrap_or(0.0);
         let (mut low, mut high) = (0.0, 1.0);
