@@ -263,6 +263,11 @@ fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
             assert!(matches!(done.code, Some(0 | 2 | 3)), "{seed}: {done:?}");
         }
     }
+    // No sample is so long, and nobody is to make as many columns.
+    let long = |schema: String| schema.replace("float64[3] ", "float64[1000000000000] ");
+    rewrite(&file, &cut, long, |_, _, _| {});
+    let done = bench.run(&["export", cut.to_str().unwrap(), "--csv", "tables"]);
+    assert!(done.code == Some(0) && done.stderr.contains("has no samples of ours"), "{done:?}");
     let done = bench.run(&["replay", "nowhere.mcap"]);
     assert!(done.code == Some(1) && done.stderr.contains("nowhere.mcap"), "{done:?}");
 }

@@ -378,7 +378,8 @@ impl Content {
             }
             Record::Channel(channel) if !self.sizes.contains_key(&channel.id) => {
                 let (encoding, text) = self.schemas.get(&channel.schema_id).ok_or("a channel lacks its schema")?;
-                let layout = Layout::parse(text).filter(|_| encoding == "ros2msg" && channel.message_encoding == "cdr");
+                let ours = encoding == "ros2msg" && channel.message_encoding == "cdr";
+                let layout = Layout::parse(text).filter(|layout| ours && layout.size() < RECORD_BYTES);
                 let layout = layout.ok_or_else(|| format!("{} has no samples of ours", channel.topic))?;
                 let about = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
                 self.sizes.insert(channel.id, layout.size());
