@@ -1,8 +1,7 @@
 //! `corotate export`: a recording as tables.
 
-use crate::record::exit_of;
-use crate::{Exit, fail, say};
-use corotate::record::{Recording, export_csv};
+use crate::{Exit, fail, record, say};
+use corotate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 
 /// Options of `corotate export`.
@@ -26,17 +25,26 @@ Example:
 
 /// Exports.
 pub fn export(arguments: &Arguments) -> Exit {
-    let files = Recording::open(&arguments.file).and_then(|recording| {
-        if let Some(damage) = recording.damage() {
-            eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
-        }
-        export_csv(&recording, &arguments.csv)
-    });
-    match files {
+    match write(arguments) {
         Ok(files) => {
             let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
             say(&lines).err().unwrap_or(Exit::Ok)
         }
         Err(error) => fail(exit_of(&error), &error),
+    }
+}
+
+fn write(arguments: &Arguments) -> Result<Vec<PathBuf>, ExportError> {
+    let recording = Recording::open(&arguments.file)?;
+    if let Some(damage) = recording.damage() {
+        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
+    }
+    export_csv(&recording, &arguments.csv)
+}
+
+fn exit_of(error: &ExportError) -> Exit {
+    match error {
+        ExportError::Recording(error) => record::exit_of(error),
+        ExportError::Write { .. } => Exit::Failure,
     }
 }

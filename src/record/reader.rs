@@ -278,16 +278,6 @@ impl Track {
         }
     }
 
-    /// The same as a text from which the very bits can be read back.
-    pub fn text(&self, index: usize, column: usize, element: usize) -> String {
-        let column = &self.info.layout.columns[column];
-        let word = self.word(index, column.offset + 8 * element);
-        match column.kind {
-            FieldKind::F64 => format!("{:?}", f64::from_le_bytes(word)),
-            FieldKind::U64 => u64::from_le_bytes(word).to_string(),
-        }
-    }
-
     /// The samples that the loop was given: every one that is the first of its tick and no void, by their indexes.
     pub fn regular(&self) -> impl Iterator<Item = usize> + '_ {
         let mut next = 0;
