@@ -4,6 +4,8 @@
 //! a table's name, nor change a bit.
 
 mod csv;
+#[cfg(feature = "parquet")]
+mod parquet;
 
 use super::RecordError;
 use super::layout::Layout;
@@ -28,6 +30,16 @@ pub enum ExportError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
+    },
+    /// A table has more columns than its form bears.
+    #[error("{service} has {columns} columns, more than the {most} that readers of Parquet bear; export it with --csv")]
+    Wide {
+        /// The signal.
+        service: String,
+        /// How many columns its table has.
+        columns: usize,
+        /// How many are written at the most.
+        most: usize,
     },
 }
 
@@ -54,6 +66,23 @@ trait Table: Sized {
 /// [`ExportError`].
 pub fn export_csv(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
     export::<csv::Csv>(recording, directory)
+}
+
+/// Writes the same tables as Parquet, `<body>.<signal>.parquet`.
+///
+/// # Errors
+/// [`ExportError`].
+#[cfg(feature = "parquet")]
+pub fn export_parquet(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
+    use self::parquet::{COLUMNS_MAX, Parquet};
+    let width = |signal: &SignalInfo| OWN.len() + signal.layout.size() / 8;
+    match recording.signals().iter().find(|signal| width(signal) > COLUMNS_MAX) {
+        Some(signal) => {
+            let (service, columns) = (signal.service.clone(), width(signal));
+            Err(ExportError::Wide { service, columns, most: COLUMNS_MAX })
+        }
+        None => export::<Parquet>(recording, directory),
+    }
 }
 
 fn export<T: Table>(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {

@@ -11,7 +11,7 @@
 //! | `script` | what a role did, so that it can do it again |
 //! | `replay` | recorded inputs through the live roles, outputs compared bit for bit |
 //! | `diff` | two recordings beside each other |
-//! | `export` | tables for everyone else |
+//! | `export` | tables for everyone else: CSV and, with the feature of that name, Parquet |
 //!
 //! Must not change a sample, nor hold a loop up, except by the credit that it gives in lockstep.
 
@@ -27,6 +27,8 @@ mod taps;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
+#[cfg(feature = "parquet")]
+pub use export::export_parquet;
 pub use export::{ExportError, export_csv};
 pub use layout::{Column, Layout, topic_of};
 #[cfg(feature = "foxglove")]
