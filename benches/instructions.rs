@@ -1,8 +1,8 @@
 //! Instructions per estimate-and-control step, counted by callgrind: a regression shows however noisy the machine is.
 //!
-//! `cargo bench --features hooks,foxglove --bench instructions` (the features of the tests: others inline differently) compares with
-//! `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The figures are
-//! those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
+//! `cargo bench --features hooks,foxglove,parquet --bench instructions` (the features of the tests: others inline differently)
+//! compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The
+//! figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
 use corotate::bench::{STEP_KINDS, repeat_step};
 use serde::{Deserialize, Serialize};

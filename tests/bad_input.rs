@@ -769,11 +769,22 @@ fn options_are_checked_as_their_keys_are() {
 
 #[cfg(not(feature = "foxglove"))]
 #[test]
-fn what_was_left_out_of_the_build_is_refused() {
+fn foxglove_that_was_left_out_of_the_build_is_refused() {
     for arguments in [&["run", "--foxglove"][..], &["run", "--foxglove", "0.0.0.0:9000"], &["foxglove"]] {
-        let done = Bench::new().run(arguments);
-        assert_eq!(done.code, Some(2), "{done:?}");
+        let done = refused_in(&Bench::new(), arguments);
         assert!(done.stderr.contains("build it with `cargo build --release --features foxglove`"), "{done:?}");
+    }
+}
+
+#[cfg(not(feature = "parquet"))]
+#[test]
+fn parquet_that_was_left_out_of_the_build_is_refused() {
+    let bench = Bench::new();
+    for options in [&["--parquet", "tables"][..], &["--csv", "tables", "--parquet", "tables"]] {
+        let done = refused_in(&bench, &[&["export", "nosuch.mcap"], options].concat());
+        assert!(done.stderr.contains("--parquet: this program was built without Parquet; build it with"), "{done:?}");
+        assert!(done.stderr.contains("`cargo build --release --features parquet`"), "{done:?}");
+        assert!(!bench.path("tables").exists());
     }
 }
 
@@ -782,7 +793,7 @@ fn a_command_line_that_makes_no_sense_is_refused() {
     let bench = Bench::new();
     let path = bench.path("");
     let pair = shipped("rigid-pair").display().to_string();
-    let cases: [(&[&str], &str, &str); 25] = [
+    let cases: [(&[&str], &str, &str); 26] = [
         (&["nosuch"], "unrecognized subcommand 'nosuch'", "--help"),
         (&["--nosuch"], "unexpected argument '--nosuch'", "--help"),
         (&[""], "unrecognized subcommand", "--help"),
@@ -810,6 +821,7 @@ fn a_command_line_that_makes_no_sense_is_refused() {
         ),
         (&["observer", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
         (&["observer", "--domain", path.to_str().unwrap()], "not the domain of a run", "`corotate run` prints it"),
+        (&["export", "nosuch.mcap"], "<--csv <DIR>|--parquet <DIR>>", "--help"),
         (&["controller", "--domain", "."], "not the domain of a run", "`corotate run` prints it"),
         (&["controller", "--domain", ""], "a value is required for '--domain <DIR>'", "--help"),
     ];

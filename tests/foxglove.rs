@@ -2,25 +2,17 @@
 
 mod common;
 
-use common::{Bench, Running, await_some, send_signal, shipped};
+use common::{Bench, Running, await_some, python, send_signal, shipped};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::net::TcpListener;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::Path;
 
 const SIGINT: i32 = 2;
 const SIGKILL: i32 = 9;
 /// More bytes than this do not wait for one who reads.
 const ROOM: usize = 256 << 10;
 const ANY_PORT: &str = "127.0.0.1:0";
-
-/// The interpreter that has the client's requirements.
-fn python() -> PathBuf {
-    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/venv")).output().unwrap();
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
-}
 
 /// Starts our program with its error output in a file, to be read while it runs.
 fn start(bench: &Bench, errors: &str, arguments: &[&str]) -> Running {

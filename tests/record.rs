@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{Bench, Done, await_some, send_signal, shipped};
+use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Read, Reader, Topic};
 use corotate::config::Scenario;
@@ -11,10 +11,8 @@ use corotate::runtime::{RoleId, Visit, build, depths, in_turn, private_ledger, v
 use corotate::sample::{FleetLayout, FleetSample, Sample};
 use corotate::with_rig;
 use serde_json::Value;
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 const SIGKILL: i32 = 9;
@@ -82,13 +80,6 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     })
     .unwrap();
     all
-}
-
-/// The interpreter that has the readers' requirements; made by the script that says what is missing if it fails.
-fn python() -> PathBuf {
-    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/venv")).output().unwrap();
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
 }
 
 #[test]
@@ -191,29 +182,6 @@ fn faults_and_deaths_are_replayed_as_they_were() {
     }
 }
 
-/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick.
-fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
-    let bytes = std::fs::read(from).unwrap();
-    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
-    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
-    for index in &summary.metadata_indexes {
-        writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
-    }
-    for message in mcap::MessageStream::new(&bytes).unwrap() {
-        let mut message = message.unwrap();
-        let mut channel = (*message.channel).clone();
-        let mut of = (**channel.schema.as_ref().unwrap()).clone();
-        of.data = Cow::Owned(schema(String::from_utf8(of.data.to_vec()).unwrap()).into_bytes());
-        channel.schema = Some(of.into());
-        let mut data = message.data.to_vec();
-        change(&channel.topic, message.sequence, &mut data);
-        message.data = Cow::Owned(data);
-        message.channel = channel.into();
-        writer.write(&message).unwrap();
-    }
-    writer.finish().unwrap();
-}
-
 #[test]
 fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
     let bench = Bench::new();
@@ -295,6 +263,11 @@ fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
             assert!(matches!(done.code, Some(0 | 2 | 3)), "{seed}: {done:?}");
         }
     }
+    // No sample is so long, and nobody is to make as many columns.
+    let long = |schema: String| schema.replace("float64[3] ", "float64[1000000000000] ");
+    rewrite(&file, &cut, long, |_, _, _| {});
+    let done = bench.run(&["export", cut.to_str().unwrap(), "--csv", "tables"]);
+    assert!(done.code == Some(0) && done.stderr.contains("has no samples of ours"), "{done:?}");
     let done = bench.run(&["replay", "nowhere.mcap"]);
     assert!(done.code == Some(1) && done.stderr.contains("nowhere.mcap"), "{done:?}");
 }

@@ -1,42 +1,70 @@
 //! `corotate export`: a recording as tables.
 
-use crate::record::exit_of;
-use crate::{Exit, fail, say};
-use corotate::record::{Recording, export_csv};
+use crate::{Exit, fail, record, say};
+use corotate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 
 /// Options of `corotate export`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, group = clap::ArgGroup::new("forms").required(true).multiple(true))]
 pub struct Arguments {
     /// The recording
     file: PathBuf,
     /// Write one CSV file per signal into this directory
-    #[arg(long, value_name = "DIR")]
-    csv: PathBuf,
+    #[arg(long, value_name = "DIR", group = "forms")]
+    csv: Option<PathBuf>,
+    /// Write one Parquet file per signal into this directory
+    #[arg(long, value_name = "DIR", group = "forms")]
+    parquet: Option<PathBuf>,
 }
 
 const EXAMPLES: &str = "\
 Every sample is a row: time in the run in s, when it was received in ns, and every element of every field. Numbers read back
 to the same bits.
 
-Example:
+Examples:
   corotate export runs/20261121T150000Z-rigid-pair/run.mcap --csv tables
-  head -2 tables/leader.estimate.csv";
+  head -2 tables/leader.estimate.csv
+  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --parquet tables";
+
+/// What there is to say to whoever asks a program for Parquet that was built without.
+const REFUSAL: &str =
+    "--parquet: this program was built without Parquet; build it with `cargo build --release --features parquet`";
 
 /// Exports.
 pub fn export(arguments: &Arguments) -> Exit {
-    let files = Recording::open(&arguments.file).and_then(|recording| {
-        if let Some(damage) = recording.damage() {
-            eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
-        }
-        export_csv(&recording, &arguments.csv)
-    });
-    match files {
+    if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
+        return fail(Exit::Usage, &REFUSAL);
+    }
+    match write(arguments) {
         Ok(files) => {
             let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
             say(&lines).err().unwrap_or(Exit::Ok)
         }
         Err(error) => fail(exit_of(&error), &error),
+    }
+}
+
+fn write(arguments: &Arguments) -> Result<Vec<PathBuf>, ExportError> {
+    let recording = Recording::open(&arguments.file)?;
+    if let Some(damage) = recording.damage() {
+        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
+    }
+    let mut files = Vec::new();
+    if let Some(directory) = &arguments.csv {
+        files.extend(export_csv(&recording, directory)?);
+    }
+    #[cfg(feature = "parquet")]
+    if let Some(directory) = &arguments.parquet {
+        files.extend(corotate::record::export_parquet(&recording, directory)?);
+    }
+    Ok(files)
+}
+
+fn exit_of(error: &ExportError) -> Exit {
+    match error {
+        ExportError::Recording(error) => record::exit_of(error),
+        ExportError::Write { .. } => Exit::Failure,
+        ExportError::Wide { .. } => Exit::Usage,
     }
 }

@@ -1,33 +1,142 @@
-//! A recording as columns for everyone else: one CSV file per signal.
+//! A recording as tables for everyone else: one file per signal, a row per sample.
 //!
-//! Numbers are written so that the very bits are read back from them. Parquet is left out: its library weighs more than all
-//! of this program's, and every tool that reads Parquet reads CSV.
+//! All tables are written in one pass over the recording, which may be larger than memory. Must not leave half a table under
+//! a table's name, nor change a bit.
+
+mod csv;
+#[cfg(feature = "parquet")]
+mod parquet;
 
 use super::RecordError;
-use super::reader::{Recording, Track};
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use super::layout::Layout;
+use super::reader::{Recording, SignalInfo};
+use crate::sample::{FieldKind, Stamp};
+use std::fs::{File, Permissions};
+use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use tempfile::TempPath;
 
-/// Writes one file per signal, `<body>.<signal>.csv`, into a directory, which is made: the time in the run, s; when the
+/// Why a recording is not exported.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The recording cannot be read.
+    #[error(transparent)]
+    Recording(#[from] RecordError),
+    /// A table, or the directory for it, cannot be written.
+    #[error("cannot write {}: {source}; free some room, or name another directory", path.display())]
+    Write {
+        /// The table, or the directory.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A table has more columns than its form bears.
+    #[error("{service} has {columns} columns, more than the {most} that readers of Parquet bear; export it with --csv")]
+    Wide {
+        /// The signal.
+        service: String,
+        /// How many columns its table has.
+        columns: usize,
+        /// How many are written at the most.
+        most: usize,
+    },
+}
+
+/// A table in the making.
+trait Table: Sized {
+    /// How its file's name ends.
+    const EXTENSION: &'static str;
+
+    /// Begins the table of a signal.
+    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
+
+    /// Adds a row: the bits of every column.
+    fn row(&mut self, bits: &[u64]) -> io::Result<()>;
+
+    /// Writes what is left.
+    fn end(self) -> io::Result<()>;
+}
+
+/// Writes every signal as CSV, `<body>.<signal>.csv`, into a directory, which is made: the time in the run, s; when the
 /// sample was received, ns; then every element of every field, the stamp's first. All samples are in it, voids too, as they
 /// came. Returns the files.
 ///
 /// # Errors
-/// [`RecordError`].
-pub fn export_csv(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, RecordError> {
-    let failed = |path: &Path, source| RecordError::Write { path: path.to_owned(), source };
-    std::fs::create_dir_all(directory).map_err(|source| failed(directory, source))?;
-    let mut files = Vec::new();
-    for signal in recording.signals() {
-        // One signal at a time: a recording may be larger than memory.
-        for track in recording.tracks(|other| other.service == signal.service)? {
-            let path = directory.join(format!("{}.{}.csv", file_name(&signal.body), file_name(&signal.signal)));
-            write(&path, &track, recording.info().period_ns).map_err(|source| failed(&path, source))?;
-            files.push(path);
+/// [`ExportError`].
+pub fn export_csv(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
+    export::<csv::Csv>(recording, directory)
+}
+
+/// Writes the same tables as Parquet, `<body>.<signal>.parquet`.
+///
+/// # Errors
+/// [`ExportError`].
+#[cfg(feature = "parquet")]
+pub fn export_parquet(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
+    use self::parquet::{COLUMNS_MAX, Parquet};
+    let width = |signal: &SignalInfo| OWN.len() + signal.layout.size() / 8;
+    match recording.signals().iter().find(|signal| width(signal) > COLUMNS_MAX) {
+        Some(signal) => {
+            let (service, columns) = (signal.service.clone(), width(signal));
+            Err(ExportError::Wide { service, columns, most: COLUMNS_MAX })
+        }
+        None => export::<Parquet>(recording, directory),
+    }
+}
+
+fn export<T: Table>(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
+    std::fs::create_dir_all(directory).map_err(|source| ExportError::Write { path: directory.to_owned(), source })?;
+    let begin = |signal: &SignalInfo| Part::<T>::begin(recording, signal, directory);
+    let mut parts = recording.signals().iter().map(begin).collect::<Result<Vec<_>, _>>()?;
+    let (mut bits, mut written) = (Vec::new(), Ok(()));
+    recording.visit(|signal, received_ns, sample| {
+        // A pass cannot be ended before its end.
+        if written.is_ok() {
+            fill(&mut bits, recording.info().period_ns, received_ns, sample);
+            written = parts[signal].row(&bits);
+        }
+    })?;
+    written?;
+    parts.into_iter().map(Part::end).collect()
+}
+
+/// A table that does not have its name yet.
+struct Part<T> {
+    path: PathBuf,
+    file: TempPath,
+    table: T,
+}
+
+impl<T: Table> Part<T> {
+    fn begin(recording: &Recording, signal: &SignalInfo, directory: &Path) -> Result<Self, ExportError> {
+        let name = format!("{}.{}.{}", file_name(&signal.body), file_name(&signal.signal), T::EXTENSION);
+        let path = directory.join(&name);
+        // Like any file that is made, for whom the user's mask allows.
+        let permissions = Permissions::from_mode(0o666);
+        let made =
+            tempfile::Builder::new().prefix(&name).suffix(".part").permissions(permissions).tempfile_in(directory);
+        let begun = made.and_then(|made| {
+            let (file, part) = made.into_parts();
+            Ok((part, T::begin(file, recording, signal)?))
+        });
+        match begun {
+            Ok((file, table)) => Ok(Self { path, file, table }),
+            Err(source) => Err(ExportError::Write { path, source }),
         }
     }
-    Ok(files)
+
+    fn row(&mut self, bits: &[u64]) -> Result<(), ExportError> {
+        self.table.row(bits).map_err(|source| ExportError::Write { path: self.path.clone(), source })
+    }
+
+    fn end(self) -> Result<PathBuf, ExportError> {
+        let Self { path, file, table } = self;
+        match table.end().and_then(|()| file.persist(&path).map_err(io::Error::from)) {
+            Ok(()) => Ok(path),
+            Err(source) => Err(ExportError::Write { path, source }),
+        }
+    }
 }
 
 /// A name from a file is not to lead anywhere else.
@@ -35,20 +144,21 @@ fn file_name(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() || letter == '-' { letter } else { '_' }).collect()
 }
 
-fn write(path: &Path, track: &Track, period_ns: u64) -> io::Result<()> {
-    let mut out = BufWriter::new(File::create(path)?);
-    let columns = &track.info.layout.columns;
-    let names: Vec<String> = columns.iter().flat_map(|column| column.elements()).collect();
-    writeln!(out, "time_s,received_ns,{}", names.join(","))?;
-    for index in 0..track.len() {
-        let time_s = track.stamp(index).tick as f64 * (period_ns as f64 / 1e9);
-        write!(out, "{time_s},{}", track.received_ns[index])?;
-        for (column, layout) in columns.iter().enumerate() {
-            for element in 0..layout.count {
-                write!(out, ",{}", track.text(index, column, element))?;
-            }
-        }
-        writeln!(out)?;
-    }
-    out.flush()
+/// The columns that every table has beside the recorded ones, before them.
+const OWN: [(&str, FieldKind); 2] = [("time_s", FieldKind::F64), ("received_ns", FieldKind::U64)];
+
+/// The name and type of every column.
+fn columns(layout: &Layout) -> Vec<(String, FieldKind)> {
+    let own = OWN.iter().map(|(name, kind)| ((*name).to_owned(), *kind));
+    let recorded = layout.columns.iter().flat_map(|column| column.elements().map(|name| (name, column.kind)));
+    own.chain(recorded).collect()
+}
+
+/// Makes a sample a row.
+fn fill(bits: &mut Vec<u64>, period_ns: u64, received_ns: u64, sample: &[u8]) {
+    let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
+    let time_s = stamp.tick as f64 * (period_ns as f64 / 1e9);
+    bits.clear();
+    bits.extend([time_s.to_bits(), received_ns]);
+    bits.extend(sample.as_chunks().0.iter().map(|word| u64::from_le_bytes(*word)));
 }

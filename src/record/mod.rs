@@ -11,7 +11,7 @@
 //! | `script` | what a role did, so that it can do it again |
 //! | `replay` | recorded inputs through the live roles, outputs compared bit for bit |
 //! | `diff` | two recordings beside each other |
-//! | `export` | columns for everyone else |
+//! | `export` | tables for everyone else: CSV and, with the feature of that name, Parquet |
 //!
 //! Must not change a sample, nor hold a loop up, except by the credit that it gives in lockstep.
 
@@ -27,7 +27,9 @@ mod taps;
 mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
-pub use export::export_csv;
+#[cfg(feature = "parquet")]
+pub use export::export_parquet;
+pub use export::{ExportError, export_csv};
 pub use layout::{Column, Layout, topic_of};
 #[cfg(feature = "foxglove")]
 pub(crate) use layout::{MESSAGE_ENCODING, SCHEMA_ENCODING, frame};
@@ -70,7 +72,7 @@ pub enum RecordError {
     /// The file cannot be written.
     #[error("cannot write {}: {source}; it ends with its last whole chunk, readable without an index", path.display())]
     Write {
-        /// The recording, or a file made of it.
+        /// The recording.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,

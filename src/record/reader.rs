@@ -278,16 +278,6 @@ impl Track {
         }
     }
 
-    /// The same as a text from which the very bits can be read back.
-    pub fn text(&self, index: usize, column: usize, element: usize) -> String {
-        let column = &self.info.layout.columns[column];
-        let word = self.word(index, column.offset + 8 * element);
-        match column.kind {
-            FieldKind::F64 => format!("{:?}", f64::from_le_bytes(word)),
-            FieldKind::U64 => u64::from_le_bytes(word).to_string(),
-        }
-    }
-
     /// The samples that the loop was given: every one that is the first of its tick and no void, by their indexes.
     pub fn regular(&self) -> impl Iterator<Item = usize> + '_ {
         let mut next = 0;
@@ -378,7 +368,8 @@ impl Content {
             }
             Record::Channel(channel) if !self.sizes.contains_key(&channel.id) => {
                 let (encoding, text) = self.schemas.get(&channel.schema_id).ok_or("a channel lacks its schema")?;
-                let layout = Layout::parse(text).filter(|_| encoding == "ros2msg" && channel.message_encoding == "cdr");
+                let ours = encoding == "ros2msg" && channel.message_encoding == "cdr";
+                let layout = Layout::parse(text).filter(|layout| ours && layout.size() < RECORD_BYTES);
                 let layout = layout.ok_or_else(|| format!("{} has no samples of ours", channel.topic))?;
                 let about = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
                 self.sizes.insert(channel.id, layout.size());

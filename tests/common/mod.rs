@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "every test file uses its own part of this")]
 
+use std::borrow::Cow;
 use std::io::Read;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -228,6 +229,36 @@ pub fn await_some<T>(mut look: impl FnMut() -> Option<T>) -> T {
 /// A scenario that ships with the program.
 pub fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(format!("{name}.toml"))
+}
+
+/// The interpreter that has the readers' requirements; made by the script that says what is missing if it fails.
+pub fn python() -> PathBuf {
+    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/venv")).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
+}
+
+/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick.
+pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
+    let bytes = std::fs::read(from).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    for index in &summary.metadata_indexes {
+        writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        let mut channel = (*message.channel).clone();
+        let mut of = (**channel.schema.as_ref().unwrap()).clone();
+        of.data = Cow::Owned(schema(String::from_utf8(of.data.to_vec()).unwrap()).into_bytes());
+        channel.schema = Some(of.into());
+        let mut data = message.data.to_vec();
+        change(&channel.topic, message.sequence, &mut data);
+        message.data = Cow::Owned(data);
+        message.channel = channel.into();
+        writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
 }
 
 /// The rows of a reference file in `tests/data`, its header left out.

@@ -1,0 +1,135 @@
+//! A table as Parquet, by the library's writers of columns: no Arrow is in between.
+//!
+//! Every bit is kept, of what is no number too. Must not hold more than the rows of one group.
+
+use super::{Table, columns};
+use crate::record::reader::{Recording, SignalInfo};
+use crate::sample::FieldKind;
+use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
+use parquet::data_type::{DoubleType, Int64Type};
+use parquet::errors::ParquetError;
+use parquet::file::metadata::KeyValue;
+use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterVersion};
+use parquet::file::writer::SerializedFileWriter;
+use parquet::schema::types::{Type, TypePtr};
+use std::fs::File;
+use std::io;
+use std::sync::Arc;
+
+/// The rows that wait for their group, those of all tables together, come to so many bytes.
+const WAITING_BYTES: usize = 64 << 20;
+/// Every column of every group has an entry at the file's end. Beyond so many the entries weigh as much as the values, and
+/// cannot be kept in memory.
+pub const COLUMNS_MAX: usize = 1 << 14;
+
+pub struct Parquet {
+    writer: SerializedFileWriter<File>,
+    columns: Vec<Waiting>,
+    rows_per_group: usize,
+}
+
+/// The bits of one column that wait for their group.
+struct Waiting {
+    kind: FieldKind,
+    bits: Vec<u64>,
+}
+
+impl Table for Parquet {
+    const EXTENSION: &'static str = "parquet";
+
+    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
+        let columns = columns(&signal.layout);
+        let schema = schema(&signal.layout.type_name, &columns).map_err(bare)?;
+        let properties = Arc::new(properties(recording, signal));
+        let writer = SerializedFileWriter::new(file, schema, properties).map_err(bare)?;
+        let rows_per_group = rows_per_group(recording);
+        let waiting = |(_, kind)| Waiting { kind, bits: Vec::with_capacity(rows_per_group) };
+        let columns = columns.into_iter().map(waiting).collect();
+        Ok(Self { writer, columns, rows_per_group })
+    }
+
+    fn row(&mut self, bits: &[u64]) -> io::Result<()> {
+        self.columns.iter_mut().zip(bits).for_each(|(column, word)| column.bits.push(*word));
+        if self.waiting() < self.rows_per_group { Ok(()) } else { self.write_group().map_err(bare) }
+    }
+
+    fn end(mut self) -> io::Result<()> {
+        let rest = if self.waiting() == 0 { Ok(()) } else { self.write_group() };
+        rest.and_then(|()| self.writer.close()).map(drop).map_err(bare)
+    }
+}
+
+impl Parquet {
+    /// How many rows wait.
+    fn waiting(&self) -> usize {
+        self.columns.first().map_or(0, |column| column.bits.len())
+    }
+
+    fn write_group(&mut self) -> Result<(), ParquetError> {
+        let mut group = self.writer.next_row_group()?;
+        for Waiting { kind, bits } in &mut self.columns {
+            // The schema was made of these columns.
+            let Some(mut column) = group.next_column()? else { break };
+            match kind {
+                FieldKind::U64 => column.typed::<Int64Type>().write_batch(bytemuck::cast_slice(bits), None, None)?,
+                FieldKind::F64 => column.typed::<DoubleType>().write_batch(bytemuck::cast_slice(bits), None, None)?,
+            };
+            column.close()?;
+            bits.clear();
+        }
+        group.close().map(drop)
+    }
+}
+
+/// The same for all tables, for they have as many rows as there are ticks.
+fn rows_per_group(recording: &Recording) -> usize {
+    let row_bytes = recording.signals().iter().map(|signal| 8 * super::OWN.len() + signal.layout.size());
+    (WAITING_BYTES / row_bytes.sum::<usize>()).max(1)
+}
+
+fn schema(name: &str, columns: &[(String, FieldKind)]) -> Result<TypePtr, ParquetError> {
+    let field = |(name, kind): &(String, FieldKind)| {
+        let of = match kind {
+            FieldKind::U64 => {
+                let unsigned = LogicalType::integer(64, false);
+                Type::primitive_type_builder(name, Physical::INT64).with_logical_type(Some(unsigned))
+            }
+            FieldKind::F64 => Type::primitive_type_builder(name, Physical::DOUBLE),
+        };
+        of.with_repetition(Repetition::REQUIRED).build().map(Arc::new)
+    };
+    let fields = columns.iter().map(field).collect::<Result<_, _>>()?;
+    Type::group_type_builder(name).with_fields(fields).build().map(Arc::new)
+}
+
+fn properties(recording: &Recording, signal: &SignalInfo) -> WriterProperties {
+    let run = recording.info();
+    let about = [
+        ("service", signal.service.clone()),
+        ("type", signal.layout.type_name.clone()),
+        ("scenario_name", run.scenario_name.clone()),
+        ("scenario_hash", run.scenario_hash.clone()),
+        ("seed", run.seed.to_string()),
+        ("version", run.version.clone()),
+        ("revision", run.revision.clone()),
+    ];
+    let about = about.into_iter().map(|(key, value)| KeyValue::new(format!("corotate.{key}"), value));
+    WriterProperties::builder()
+        .set_key_value_metadata(Some(about.collect()))
+        // By this version unsigned numbers are written as differences: ticks and times take next to nothing.
+        .set_writer_version(WriterVersion::PARQUET_2_0)
+        // Numbers that were computed hardly repeat.
+        .set_dictionary_enabled(false)
+        .set_compression(Compression::ZSTD(ZstdLevel::default()))
+        .set_statistics_enabled(EnabledStatistics::Chunk)
+        .set_offset_index_disabled(true)
+        .build()
+}
+
+/// The system's reason without the library's words.
+fn bare(error: ParquetError) -> io::Error {
+    match error {
+        ParquetError::External(source) => source.downcast().map_or_else(io::Error::other, |system| *system),
+        other => io::Error::other(other),
+    }
+}

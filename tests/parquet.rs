@@ -1,0 +1,192 @@
+//! Recordings as Parquet, read by a library that shares no code with ours, beside the recordings themselves and the CSV.
+
+mod common;
+
+use common::{Bench, Done, python, rewrite, shipped};
+use corotate::record::{Recording, Track};
+use corotate::sample::FieldKind;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// What could lose a bit on the way: no numbers that say more, infinities, both zeros, the smallest and the largest.
+const HARD: [u64; 9] = [
+    0x7ff8_dead_beef_0001,
+    0xfff0_0000_0000_0001,
+    0x7ff0_0000_0000_0000,
+    0xfff0_0000_0000_0000,
+    0,
+    1 << 63,
+    1,
+    0x7fef_ffff_ffff_ffff,
+    u64::MAX,
+];
+
+/// Runs a shipped scenario and gives its recording.
+fn record(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
+    let file = shipped(scenario);
+    let fixed = ["run", file.to_str().unwrap(), "--record", "--out", scenario, "--set", "accept={}"];
+    let done = bench.run(&[&fixed, options].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.path(scenario).join("run.mcap")
+}
+
+fn export(bench: &Bench, file: &Path, options: &[&str]) -> Done {
+    let done = bench.run(&[&["export", file.to_str().unwrap()], options].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    done
+}
+
+/// A table as somebody else reads it: names and types of the columns, and their bits.
+type Table = (Vec<(String, FieldKind)>, Vec<Vec<u64>>);
+
+/// Everything that the recording has, by the layouts that it tells.
+fn recorded(recording: &Recording, track: &Track) -> Table {
+    let mut columns = vec![("time_s".to_owned(), FieldKind::F64), ("received_ns".to_owned(), FieldKind::U64)];
+    let fields = track.info.layout.columns.iter();
+    columns.extend(fields.flat_map(|field| field.elements().map(|name| (name, field.kind))));
+    let time = |index| track.stamp(index).tick as f64 * (recording.info().period_ns as f64 / 1e9);
+    let mut bits = vec![(0..track.len()).map(|index| time(index).to_bits()).collect(), track.received_ns.clone()];
+    let word = |index, at: usize| u64::from_le_bytes(track.sample(index)[8 * at..][..8].try_into().unwrap());
+    bits.extend((0..columns.len() - 2).map(|at| (0..track.len()).map(|index| word(index, at)).collect()));
+    (columns, bits)
+}
+
+/// What the foreign reader found of a table.
+fn read(path: &Path) -> (Table, Value) {
+    let about: Value = serde_json::from_slice(&std::fs::read(path.with_extension("json")).unwrap()).unwrap();
+    let kind = |name: &str| if name == "uint64" { FieldKind::U64 } else { FieldKind::F64 };
+    let column = |column: &Value| (column[0].as_str().unwrap().to_owned(), kind(column[1].as_str().unwrap()));
+    let columns: Vec<_> = about["columns"].as_array().unwrap().iter().map(column).collect();
+    let rows: u64 = about["groups"].as_array().unwrap().iter().map(|rows| rows.as_u64().unwrap()).sum();
+    let bytes = std::fs::read(path.with_extension("words")).unwrap();
+    let words: Vec<u64> = bytes.chunks_exact(8).map(|word| u64::from_le_bytes(word.try_into().unwrap())).collect();
+    assert_eq!(words.len(), columns.len() * rows as usize);
+    let bits = (0..columns.len()).map(|at| words[at * rows as usize..][..rows as usize].to_vec()).collect();
+    ((columns, bits), about)
+}
+
+/// Has all Parquet files of a directory read, and asserts that they are the recording; gives what else is known of each.
+fn assert_as_recorded(bench: &Bench, tables: &str, file: &Path) -> Vec<Value> {
+    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/parquet.py");
+    let done = bench.start_program(&python(), &[program.to_str().unwrap(), tables]).wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let recording = Recording::open(file).unwrap();
+    let tracks = recording.tracks(|_| true).unwrap();
+    assert!(tracks.len() >= 5, "{}", tracks.len());
+    let check = |track: &Track| {
+        let info = &track.info;
+        let path = bench.path(tables).join(format!("{}.{}.parquet", info.body, info.signal));
+        let (table, about) = read(&path);
+        assert!(table == recorded(&recording, track), "{}", info.service);
+        let metadata = &about["metadata"];
+        assert_eq!(metadata["corotate.service"], *info.service);
+        assert_eq!(metadata["corotate.scenario_hash"], *recording.info().scenario_hash);
+        about
+    };
+    tracks.iter().map(check).collect()
+}
+
+/// Asserts that a table says the same in CSV; there, what is no number has lost its bits.
+fn assert_same_csv(path: &Path) {
+    let ((columns, bits), _) = read(path);
+    let text = std::fs::read_to_string(path.with_extension("csv")).unwrap();
+    let mut lines = text.lines();
+    assert!(lines.next().unwrap().split(',').eq(columns.iter().map(|(name, _)| name)), "{}", path.display());
+    let mut rows = 0;
+    for line in lines {
+        for (at, word) in line.split(',').enumerate() {
+            let of = bits[at][rows];
+            let same = match columns[at].1 {
+                FieldKind::U64 => word.parse() == Ok(of),
+                FieldKind::F64 if f64::from_bits(of).is_nan() => word == "NaN",
+                FieldKind::F64 => word.parse().map(f64::to_bits) == Ok(of),
+            };
+            assert!(same, "{}: row {rows}, {}: {word}", path.display(), columns[at].0);
+        }
+        rows += 1;
+    }
+    assert_eq!(rows, bits[0].len());
+}
+
+/// Asserts that both forms were written and say what the recording says.
+fn assert_exported(bench: &Bench, tables: &str, done: &Done, file: &Path) {
+    let groups = assert_as_recorded(bench, tables, file);
+    assert!(groups.iter().all(|about| about["groups"].as_array().unwrap().len() <= 1));
+    let files: Vec<&Path> = done.stdout.lines().map(Path::new).collect();
+    let parquet: Vec<_> = files.iter().filter(|file| file.extension().unwrap() == "parquet").collect();
+    assert_eq!((files.len(), parquet.len()), (2 * groups.len(), groups.len()), "{files:?}");
+    parquet.iter().for_each(|file| assert_same_csv(&bench.path("").join(file)));
+    let left = std::fs::read_dir(bench.path(tables)).unwrap();
+    assert_eq!(left.count(), 4 * groups.len(), "nothing but the tables and what was found in them");
+}
+
+#[test]
+fn a_foreign_reader_finds_every_bit_of_every_signal() {
+    let bench = Bench::new();
+    for (scenario, clock) in [("rigid-pair", "lockstep"), ("orbit-rendezvous", "in-process")] {
+        let file = record(&bench, scenario, &["--clock", clock, "--duration", "1"]);
+        let tables = format!("{scenario}.tables");
+        let done = export(&bench, &file, &["--csv", &tables, "--parquet", &tables]);
+        assert_eq!(done.stderr, "");
+        assert_exported(&bench, &tables, &done, &file);
+    }
+}
+
+#[test]
+fn what_is_no_number_keeps_its_bits_and_a_file_that_was_cut_off_is_exported_as_far_as_it_goes() {
+    let bench = Bench::new();
+    let file = record(&bench, "rigid-pair", &["--clock", "in-process", "--duration", "2"]);
+    let changed = bench.path("changed.mcap");
+    let harden = |_: &str, sequence: u32, data: &mut Vec<u8>| {
+        for (at, word) in data[4..].chunks_exact_mut(8).enumerate() {
+            word.copy_from_slice(&HARD[(at + sequence as usize) % HARD.len()].to_le_bytes());
+        }
+    };
+    rewrite(&file, &changed, |schema| schema, harden);
+    let done = export(&bench, &changed, &["--parquet", "hard", "--csv", "hard"]);
+    assert_exported(&bench, "hard", &done, &changed);
+    let bytes = std::fs::read(&file).unwrap();
+    let cut = bench.path("cut.mcap");
+    std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    let done = export(&bench, &cut, &["--parquet", "cut", "--csv", "cut"]);
+    assert!(done.stderr.contains("as far as it goes"), "{done:?}");
+    assert_exported(&bench, "cut", &done, &cut);
+    let samples = |file| Recording::open(file).unwrap().signals()[0].samples;
+    assert!((1..samples(&file)).contains(&samples(&cut)));
+}
+
+#[test]
+fn a_long_recording_is_written_in_groups() {
+    let bench = Bench::new();
+    let file = record(&bench, "rigid-pair", &["--clock", "in-process", "--duration", "120"]);
+    export(&bench, &file, &["--parquet", "tables"]);
+    for about in assert_as_recorded(&bench, "tables", &file) {
+        let groups: Vec<u64> = about["groups"].as_array().unwrap().iter().map(|rows| rows.as_u64().unwrap()).collect();
+        assert!(groups.len() > 1 && groups[1..].iter().all(|rows| *rows <= groups[0]), "{groups:?}");
+    }
+}
+
+#[test]
+fn tables_that_cannot_be_written_leave_nothing_behind() {
+    let bench = Bench::new();
+    let file = record(&bench, "rigid-pair", &["--clock", "in-process", "--duration", "2"]);
+    let program = bench.command().get_program().to_str().unwrap().to_owned();
+    for form in ["parquet", "csv"] {
+        let script = format!("ulimit -f 20; exec {program} export {} --{form} {form}", file.display());
+        let done = bench.start_program(Path::new("bash"), &["-c", &script]).wait();
+        let words = format!("{form}: File too large (os error 27); free some room, or name another directory");
+        assert!(done.code == Some(1) && done.stderr.contains(&words), "{done:?}");
+        assert_eq!(std::fs::read_dir(bench.path(form)).unwrap().count(), 0);
+    }
+}
+
+#[test]
+fn a_fleet_of_too_many_columns_is_refused() {
+    let bench = Bench::new();
+    let options = ["--clock", "in-process", "--duration", "0.01", "--set", "follower.0.count=6000"];
+    let file = record(&bench, "rigid-fleet", &options);
+    let done = bench.run(&["export", file.to_str().unwrap(), "--parquet", "tables"]);
+    let words = "more than the 16384 that readers of Parquet bear; export it with --csv";
+    assert!(done.code == Some(2) && done.stderr.contains(words), "{done:?}");
+    assert!(!bench.path("tables").exists());
+}
