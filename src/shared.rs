@@ -3,13 +3,16 @@
 //!
 //! Must not know what the words mean.
 
-use memmap2::{MmapOptions, MmapRaw};
+use memmap2::MmapRaw;
 use rustix::fs::{FallocateFlags, fallocate};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
-use std::sync::atomic::{AtomicU32, AtomicU64};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+
+/// Words of the smallest page that there is.
+const PAGE_WORDS: usize = 4096 / size_of::<u64>();
 
 /// Words in a file that processes share.
 #[derive(Debug)]
@@ -31,8 +34,17 @@ impl SharedWords {
             // Really allocated, not merely promised: a page that is missing later would kill the process.
             fallocate(&file, FallocateFlags::empty(), 0, bytes)?;
         }
-        // Every page at once: who writes a little at every tick shall not come upon a new one in the midst of it.
-        Ok(Self { map: MmapOptions::new().populate().map_raw(&file)?, file })
+        let words = Self { map: MmapRaw::map_raw(&file)?, file };
+        words.touch();
+        Ok(words)
+    }
+
+    /// Writes to every page, nothing new: who writes a little at every tick shall not come upon a new one in the midst of it.
+    /// A mapping that is populated by the system is so for reading only, and faults once more when it is written.
+    fn touch(&self) {
+        for page in self.words().chunks(PAGE_WORDS) {
+            let _ = page[0].compare_exchange(0, 0, Ordering::Relaxed, Ordering::Relaxed);
+        }
     }
 
     /// The words in a file that must be there.
