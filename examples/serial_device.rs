@@ -66,7 +66,7 @@ impl Body for Follower {
     }
 
     /// Reads the gyros. `status` tells what the actuators do; it is passed on.
-    fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
+    fn measure(&mut self, _tick: u64, status: u64, out: &mut RateMeasurement) {
         out.omega_rad_s = self.rate.into();
         out.applied_rad_s2 = self.torque.into();
         (out.valid, out.status) = (ALL_VALID, status);
@@ -82,15 +82,6 @@ impl Body for Follower {
     /// Moves the body. A real one moves by itself.
     fn flow(&mut self, dt_s: f64) {
         self.rate = self.body.flow(&self.rate, &self.torque, dt_s);
-    }
-
-    fn status_of(truth: &RateTruth) -> u64 {
-        truth.status
-    }
-
-    /// A device is never put into another's state, but a simulation can be.
-    fn resume(&mut self, truth: &RateTruth, _measured: u64) {
-        (self.rate, self.torque) = (truth.omega_rad_s.into(), truth.applied_rad_s2.into());
     }
 }
 

@@ -9,6 +9,7 @@
 //! | [`control`] | control laws and their certificates | yes, `no_std` |
 //! | [`fault`] | scripted faults: what goes wrong with a sample or a role, and when | yes, `no_std` |
 //! | [`sample`] | the fixed-size samples that travel between roles | yes, `no_std` |
+//! | [`state`] | what a state machine remembers, as words: written, read back, counted | yes, `no_std` |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
@@ -38,6 +39,7 @@ pub mod model;
 pub mod observe;
 pub mod role;
 pub mod sample;
+pub mod state;
 
 #[cfg(feature = "serial")]
 pub mod serial;

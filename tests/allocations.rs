@@ -80,6 +80,7 @@ struct CountedBus(IoxBus);
 struct CountedWriter<W>(W);
 
 impl Bus for CountedBus {
+    const REPEATS: bool = <IoxBus as Bus>::REPEATS;
     type Writer<S: Sample> = CountedWriter<<IoxBus as Bus>::Writer<S>>;
     type Reader<S: Sample> = <IoxBus as Bus>::Reader<S>;
     type FleetWriter<L: FleetLayout> = CountedWriter<<IoxBus as Bus>::FleetWriter<L>>;
@@ -108,9 +109,9 @@ impl Bus for CountedBus {
 }
 
 impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
-    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+    fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         let mut real = false;
-        self.0.send(|sample| {
+        self.0.fill(|sample| {
             fill(sample);
             real = S::type_name() != Health::TYPE_NAME && sample.stamp().generation != 0;
         })?;
@@ -118,6 +119,10 @@ impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
             update(|count| (count.armed, count.of_ours_in_the_loop) = (true, count.of_ours));
         }
         Ok(())
+    }
+
+    fn deliver(&mut self) -> Result<(), BusError> {
+        self.0.deliver()
     }
 
     fn prepare(&mut self) -> Result<(), BusError> {

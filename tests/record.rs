@@ -73,7 +73,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let mut nodes: Vec<_> = roles.iter().map(node).collect();
     let none = |_| panic!("no role dies here");
     let grid = corotate::clock::Grid { epoch_ns: 0, period_ns: scenario.period_ns };
-    nodes.iter_mut().for_each(|node| node.start(grid, 0));
+    nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
     in_turn(&mut nodes, scenario.last_tick, none, |_| {
         taps.iter_mut().for_each(|(service, take)| take(all.entry(service.clone()).or_default()));
         true

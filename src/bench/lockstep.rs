@@ -114,7 +114,7 @@ fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> f64 {
             black_box(follower.apply(&command));
         }
         for (body, measured) in [&mut leader, &mut follower].into_iter().zip(&mut measured) {
-            body.measure(0, measured);
+            body.measure(0, 0, measured);
             measured.stamp_mut().tick = tick;
             body.flow(tick_s);
         }

@@ -92,7 +92,7 @@ fn measurements<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<[Measurement<R>; 2]
     let tick = |tick: usize| {
         let mut pair = [Measurement::<R>::default(); 2];
         for (body, measurement) in bodies.iter_mut().zip(&mut pair) {
-            body.measure(0, measurement);
+            body.measure(0, 0, measurement);
             (measurement.stamp_mut().tick, measurement.stamp_mut().generation) = (tick as u64, 1);
             body.flow(scenario.tick_s());
         }

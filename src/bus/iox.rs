@@ -277,6 +277,7 @@ pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
 }
 
 impl Bus for IoxBus {
+    const REPEATS: bool = true;
     type Writer<S: Sample> = IoxWriter<S>;
     type Reader<S: Sample> = IoxReader<S>;
     type FleetWriter<L: FleetLayout> = IoxFleetWriter<L>;
@@ -343,24 +344,20 @@ pub struct IoxWriter<S: Sample> {
 }
 
 impl<S: Sample> IoxWriter<S> {
-    /// A sample that is filled, and in the lane if there is one.
+    /// The sample that was filled, and is in the lane if there is one.
     #[inline]
-    fn filled(&mut self, fill: impl FnOnce(&mut S)) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
-        let mut sample = match self.loan.take() {
-            Some(sample) => sample,
-            None => self.loan()?,
-        };
-        fill(&mut sample.payload_mut().0);
+    fn filled(&mut self) -> Option<SampleMut<Ipc, Wire<S>, ()>> {
+        let sample = self.loan.take()?;
         if let Some(latest) = &self.latest {
             latest.put(&sample.payload().0);
             // Whoever looks at the lane need not sleep until the queues are served.
             self.bell.ring();
         }
-        Ok(sample)
+        Some(sample)
     }
 
     #[inline]
-    fn deliver(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
+    fn queue(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
         sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
         self.bell.ring();
         Ok(())
@@ -379,21 +376,32 @@ impl<S: Sample> IoxWriter<S> {
 
 impl<S: Sample> Write<S> for IoxWriter<S> {
     #[inline]
-    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
-        let sample = self.filled(fill)?;
-        self.deliver(sample)
+    fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        let mut sample = match self.loan.take() {
+            Some(sample) => sample,
+            None => self.loan()?,
+        };
+        fill(&mut sample.payload_mut().0);
+        self.loan = Some(sample);
+        Ok(())
     }
 
     #[inline]
-    fn show(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+    fn deliver(&mut self) -> Result<(), BusError> {
+        let sample = self.filled();
+        sample.map_or(Ok(()), |sample| self.queue(sample))
+    }
+
+    #[inline]
+    fn show(&mut self) -> Result<(), BusError> {
         self.publish()?;
-        self.shown = Some(self.filled(fill)?);
+        self.shown = self.filled();
         if self.latest.is_none() { self.publish() } else { Ok(()) }
     }
 
     #[inline]
     fn publish(&mut self) -> Result<(), BusError> {
-        self.shown.take().map_or(Ok(()), |sample| self.deliver(sample))
+        self.shown.take().map_or(Ok(()), |sample| self.queue(sample))
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.

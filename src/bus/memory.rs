@@ -56,6 +56,7 @@ impl MemoryBus {
 }
 
 impl Bus for MemoryBus {
+    const REPEATS: bool = false;
     type Writer<S: Sample> = MemoryWriter<S>;
     type Reader<S: Sample> = MemoryReader<S>;
     type FleetWriter<L: FleetLayout> = MemoryFleetWriter<L>;
@@ -70,7 +71,12 @@ impl Bus for MemoryBus {
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<MemoryFleetWriter<L>, BusError> {
-        Ok(MemoryFleetWriter { queues: self.queues(topic, "writer", L::TYPE_NAME)?, chunks: Vec::new(), bodies })
+        Ok(MemoryFleetWriter {
+            queues: self.queues(topic, "writer", L::TYPE_NAME)?,
+            chunks: Vec::new(),
+            filled: 0,
+            bodies,
+        })
     }
 
     fn fleet_reader<L: FleetLayout>(
@@ -103,8 +109,13 @@ pub struct MemoryWriter<S> {
 
 impl<S: Sample> Write<S> for MemoryWriter<S> {
     #[inline]
-    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+    fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
         fill(&mut self.slot);
+        Ok(())
+    }
+
+    #[inline]
+    fn deliver(&mut self) -> Result<(), BusError> {
         hand_out(&self.queues, &self.slot);
         Ok(())
     }
@@ -122,21 +133,28 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
 pub struct MemoryFleetWriter<L> {
     queues: Queues<Rc<FleetBuffer<L>>>,
     chunks: Vec<Rc<FleetBuffer<L>>>,
+    /// The chunk that was filled last.
+    filled: usize,
     bodies: usize,
 }
 
 impl<L: FleetLayout> Write<FleetSample<L>> for MemoryFleetWriter<L> {
-    fn send(&mut self, fill: impl FnOnce(&mut FleetSample<L>)) -> Result<(), BusError> {
+    fn fill(&mut self, fill: impl FnOnce(&mut FleetSample<L>)) -> Result<(), BusError> {
         let free = self.chunks.iter().position(|chunk| Rc::strong_count(chunk) == 1);
-        let index = free.unwrap_or(self.chunks.len());
+        self.filled = free.unwrap_or(self.chunks.len());
         if free.is_none() {
             self.chunks.push(Rc::new(FleetBuffer::new(self.bodies)));
         }
-        let chunk = &mut self.chunks[index];
-        if let Some(chunk) = Rc::get_mut(chunk) {
+        if let Some(chunk) = Rc::get_mut(&mut self.chunks[self.filled]) {
             fill(chunk.sample_mut());
         }
-        hand_out(&self.queues, chunk);
+        Ok(())
+    }
+
+    fn deliver(&mut self) -> Result<(), BusError> {
+        if let Some(chunk) = self.chunks.get(self.filled) {
+            hand_out(&self.queues, chunk);
+        }
         Ok(())
     }
 

@@ -97,6 +97,9 @@ impl Depths {
 
 /// Opens links.
 pub trait Bus {
+    /// Whether a reader that is opened anew may get samples again that its predecessor had.
+    const REPEATS: bool;
+
     /// The writing end.
     type Writer<S: Sample>: Write<S>;
     /// The reading end.
@@ -135,18 +138,32 @@ pub trait Bus {
 
 /// The writing end of a link.
 pub trait Write<S: ?Sized> {
-    /// Fills a sample in place and sends it. Never waits for a reader.
+    /// Fills the next sample in place; nobody sees it before it is delivered.
     ///
     /// # Errors
     /// [`BusError::Send`].
-    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError>;
-    /// The same, but where readers of the newest sample have a shorter way, only they see it at first, and those that sleep
-    /// are not woken; [`publish`](Self::publish) must follow.
+    fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError>;
+    /// Sends what was filled. Never waits for a reader.
     ///
     /// # Errors
     /// [`BusError::Send`].
-    fn show(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
-        self.send(fill)
+    fn deliver(&mut self) -> Result<(), BusError>;
+    /// Fills a sample in place and sends it.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        self.fill(fill)?;
+        self.deliver()
+    }
+    /// Delivers, but where readers of the newest sample have a shorter way, only they see it at first;
+    /// [`publish`](Self::publish) must follow.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    fn show(&mut self) -> Result<(), BusError> {
+        self.deliver()
     }
     /// Sends what was only shown, if anything was.
     ///

@@ -10,6 +10,7 @@
 //! e settles near (θ1 p_j p_k + θ2 ω_j ω_k)/k. In a sampled loop v acts 1.5 ticks late on average (half a tick with
 //! prediction), which leaves an error of that times |dv/dt|/k: it falls with the tick, not with time. Must not touch the hidden component's observer: e is measured less ω̂.
 
+use crate::state::persist_fields;
 use nalgebra::Vector3;
 
 /// The estimates θ̂1, θ̂2 of one follower.
@@ -19,6 +20,8 @@ pub struct InertiaAdaptation {
     own: Vector3<f64>,
     leader: Vector3<f64>,
 }
+
+persist_fields!(InertiaAdaptation, own, leader);
 
 /// The products of the other two components, for each axis.
 #[inline]

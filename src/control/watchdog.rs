@@ -3,6 +3,8 @@
 //! Must only count and say so; whoever commands decides what follows. Works on what the law itself works on, not on the
 //! truth: an estimate that breaks the physics is as bad as a body that does.
 
+use crate::state::persist_fields;
+
 /// Values from which a reference is taken: their median, so that one bad sample spoils nothing.
 const REFERENCE_SAMPLES: usize = 5;
 
@@ -90,11 +92,6 @@ impl Watchdog {
         }
     }
 
-    /// Goes on with what a predecessor counted, and with its latch. The references are taken anew.
-    pub fn resume(bounds: WatchBounds, breaches: [Breaches; 4], latched_at: Option<u64>) -> Self {
-        Self { breaches, latched_at, ..Self::new(bounds) }
-    }
-
     /// Whether anything is watched.
     #[inline]
     pub fn active(&self) -> bool {
@@ -169,22 +166,27 @@ impl Watchdog {
 #[derive(Debug, Clone, Copy, Default)]
 struct Reference {
     first: [f64; REFERENCE_SAMPLES],
-    count: usize,
+    count: u64,
 }
 
 impl Reference {
     /// The relative difference from the reference; none while that is being taken.
     fn drift(&mut self, value: f64) -> Option<f64> {
-        if self.count < REFERENCE_SAMPLES {
-            self.first[self.count] = value;
+        let taken = self.count as usize;
+        if taken < REFERENCE_SAMPLES {
+            self.first[taken] = value;
             self.count += 1;
-            self.first[..self.count].sort_unstable_by(f64::total_cmp);
+            self.first[..=taken].sort_unstable_by(f64::total_cmp);
             return None;
         }
         let reference = self.first[REFERENCE_SAMPLES / 2];
         Some(((value - reference) / reference).abs())
     }
 }
+
+persist_fields!(Watchdog, breaches, latched_at, streak, references);
+persist_fields!(Breaches, judged, count, first_tick, largest);
+persist_fields!(Reference, first, count);
 
 #[cfg(test)]
 mod tests {

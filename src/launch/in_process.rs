@@ -34,7 +34,10 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
             return Ok(None);
         }
         let mut successor = node(&seats[index])?;
-        successor.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, tick);
+        // Memory of one's own is always open.
+        if successor.restore().is_ok() {
+            successor.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, tick)?;
+        }
         Ok(Some(successor))
     };
     let mut recorder = launch.record.as_deref().map(|file| Recorder::open(scenario, &bus, file)).transpose()?;

@@ -175,8 +175,6 @@ struct RigScorer<R: Rig, B: Bus> {
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     /// Commands of the driven bodies.
     commands: Vec<DrivenBody<R, B>>,
-    /// The generations of leader, observer and controllers at the last tick: a successor begins anew, and V with it.
-    generations: u64,
     next_tick: u64,
     last_tick: u64,
     /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
@@ -220,7 +218,6 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 .collect::<Result<_, _>>()?,
             estimate,
             commands: driven.map(command).collect::<Result<_, BusError>>()?,
-            generations: 0,
             next_tick: 0,
             last_tick: scenario.last_tick,
             incidents: Vec::new(),
@@ -266,13 +263,10 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         {
             *last = tick;
         }
-        let generations = self.generations();
-        let continued = generations == self.generations;
-        self.generations = generations;
         for driven in &mut self.commands {
             // A follower that held or was safe did not apply what the certificate is about.
             let undisturbed = self.truths[driven.body].one(tick).is_some_and(|truth| R::undisturbed(truth));
-            driven.judge(tick, self.tick_s, undisturbed && continued, &mut self.score.certificate);
+            driven.judge(tick, self.tick_s, undisturbed, &mut self.score.certificate);
         }
         self.next_tick += 1;
     }
@@ -282,15 +276,6 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     /// Whether every metric that has a limit is known and within it.
     fn within(&self) -> bool {
         self.score.metrics.iter().zip(&self.values).all(|(metric, value)| *value <= metric.limit)
-    }
-
-    /// The sum of everybody's generation, which changes whenever one does: none ever falls.
-    fn generations(&self) -> u64 {
-        let of = |sample: Option<u64>| sample.unwrap_or(0);
-        let truths: u64 = self.truths.iter().map(|truth| of(truth.stamp().map(|stamp| stamp.generation))).sum();
-        let commands: u64 =
-            self.commands.iter().map(|driven| of(driven.command.sample().map(|s| s.stamp().generation))).sum();
-        truths + commands + of(self.estimate.sample().map(|s| s.stamp().generation))
     }
 
     /// The recoveries, as far as there are limits to recover to.

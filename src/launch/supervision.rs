@@ -21,6 +21,9 @@ use std::path::Path;
 /// clock of silence too: a role is only judged for the time in which it was listened to.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
+/// A successor that fails sooner than this may have died of the state that it inherited, ns.
+const DISTRUSTED_NS: u64 = 1_000_000_000;
+
 /// An external role that is seen by its samples alone may be silent for at least so many periods.
 const SILENT_PERIODS: f64 = 10.0;
 
@@ -40,6 +43,9 @@ pub struct Incident {
     pub cause: String,
     /// The end of its error output.
     pub last_words: String,
+    /// Whether its successor begins with its counters alone: the state that it had itself inherited may be what it died of.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub begins_anew: bool,
     /// What was done.
     pub action: Action,
     /// From when it was noticed until its successor ran, s.
@@ -67,6 +73,7 @@ impl fmt::Display for Incident {
             write!(f, "; it said: {}", self.last_words)?;
         }
         f.write_str(match self.action {
+            Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
             Action::Restarted => "; it is started anew",
             Action::Stopped => "; the run ends",
         })
@@ -83,6 +90,7 @@ impl Incident {
             tick: crate::runtime::next_tick(ledger),
             cause: "it was killed by the scenario".to_owned(),
             last_words: String::new(),
+            begins_anew: false,
             action,
             outage_s: None,
             recovery_s: None,
@@ -268,6 +276,11 @@ impl Member {
         let supervision = &scenario.supervision;
         let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
         let again = !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max;
+        // A state that kills must not be inherited for ever.
+        let begins_anew = again && self.generation > 1 && now_ns.saturating_sub(self.started_ns) < DISTRUSTED_NS;
+        if begins_anew {
+            self.books().for_each(|(_, ledger)| ledger.distrust());
+        }
         let incident = Incident {
             role: self.name.clone(),
             with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
@@ -275,6 +288,7 @@ impl Member {
             tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
             cause: failure.cause,
             last_words: failure.last_words,
+            begins_anew,
             action: if again { Action::Restarted } else { Action::Stopped },
             outage_s: None,
             recovery_s: None,

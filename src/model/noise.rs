@@ -3,6 +3,7 @@
 //! Must not draw from the system's randomness, nor through a mathematical library that differs between platforms: the
 //! same seed and stream give the same bits everywhere.
 
+use crate::state::{Persist, Words};
 use nalgebra::SVector;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
@@ -17,6 +18,8 @@ pub struct Noise<const N: usize> {
     deviation: SVector<f64, N>,
     bias: SVector<f64, N>,
     white: bool,
+    /// Samples drawn so far.
+    drawn: u64,
 }
 
 impl<const N: usize> Noise<N> {
@@ -27,7 +30,13 @@ impl<const N: usize> Noise<N> {
         let white = deviation.iter().any(|&deviation| deviation != 0.0);
         // Not the generator's own streams: those of one state are correlated.
         let salt = Pcg64::seed_from_u64(stream).next_u64();
-        Self { generator: Pcg64::seed_from_u64(seed ^ salt), deviation: deviation.into(), bias: bias.into(), white }
+        Self {
+            generator: Pcg64::seed_from_u64(seed ^ salt),
+            deviation: deviation.into(),
+            bias: bias.into(),
+            white,
+            drawn: 0,
+        }
     }
 
     /// The next sample. Without deviation it is the bias, exactly, and nothing is drawn.
@@ -38,14 +47,14 @@ impl<const N: usize> Noise<N> {
 
     /// Leaves out `samples` samples.
     pub fn skip(&mut self, samples: u64) {
-        if self.white {
-            // Each pair of components takes one draw for its radius and one for its angle.
-            self.generator.advance(u128::from(samples) * 2 * N.div_ceil(2) as u128);
-        }
+        // Each pair of components takes one draw for its radius and one for its angle.
+        self.generator.advance(u128::from(samples) * 2 * N.div_ceil(2) as u128);
+        self.drawn = self.drawn.wrapping_add(samples);
     }
 
     /// Every component draws, also one without deviation: setting one sensor's noise leaves the others' as they are.
     fn draw(&mut self) -> SVector<f64, N> {
+        self.drawn = self.drawn.wrapping_add(1);
         let mut sample = self.bias;
         for pair in 0..N.div_ceil(2) {
             let normals = self.two_normals();
@@ -76,6 +85,17 @@ impl<const N: usize> Noise<N> {
 pub fn uniform(seed: u64, stream: u64) -> impl FnMut() -> f64 {
     let mut noise = Noise::<1>::new(seed, stream, [0.0], [0.0]);
     move || noise.uniform()
+}
+
+/// How many samples have been drawn tells where the source is.
+impl<const N: usize> Persist for Noise<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        let mut drawn = self.drawn;
+        drawn.persist(words);
+        if drawn > self.drawn {
+            self.skip(drawn - self.drawn);
+        }
+    }
 }
 
 #[cfg(test)]

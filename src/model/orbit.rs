@@ -26,6 +26,8 @@ pub struct OrbitState {
     pub vtheta: f64,
 }
 
+crate::state::persist_fields!(OrbitState, r, vr, theta, vtheta);
+
 impl OrbitState {
     /// Whether every component is finite.
     pub fn is_finite(&self) -> bool {

@@ -5,6 +5,7 @@
 //! auxiliary variables eliminated, so that ŵ itself is the state and only *increments* of φ are ever needed.
 
 use super::Hurwitz;
+use crate::state::{Persist, Words};
 use nalgebra::SVector;
 
 /// What an invariant relation learned about its unknown w over one step from 0 to h.
@@ -152,6 +153,12 @@ impl<const N: usize> InvariantFilter<N> {
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
+    }
+}
+
+impl<const N: usize> Persist for InvariantFilter<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.estimate.persist(words);
     }
 }
 

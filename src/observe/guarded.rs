@@ -11,6 +11,7 @@
 
 use super::{HiddenRate, HiddenRateError, KalmanFilter, Observation, RateSample};
 use crate::model::{euler, rk4_step};
+use crate::state::persist_fields;
 use nalgebra::{Matrix3, Vector1, Vector3};
 
 /// How many of the guard's standard deviations the estimate may be away from it.
@@ -163,3 +164,5 @@ impl GuardedKalman {
         }
     }
 }
+
+persist_fields!(GuardedKalman, guard, state, covariance);

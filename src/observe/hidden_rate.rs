@@ -5,6 +5,7 @@
 //! between two samples is ever formed. Must not choose a branch, unwrap an angle, or divide by what may vanish unasked.
 
 use super::{Increment, Span, StepAgain, series};
+use crate::state::{Persist, Words, persist_fields};
 use nalgebra::{Vector1, Vector2, Vector3};
 
 /// How the measured components move in their plane, and thereby φ.
@@ -66,6 +67,8 @@ pub struct RateSample {
     /// Known torque over inertia held from this instant to the next, rad/s².
     pub torque_rad_s2: Vector3<f64>,
 }
+
+persist_fields!(RateSample, rate_rad_s, torque_rad_s2);
 
 /// A sample as one relation sees it. Made once, although two steps need it: the one that ends here and the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -261,6 +264,15 @@ impl HiddenRate {
         let (x, y) = (omega * i, self.a[0] * j);
         let bend = bend[0] * (j * j) + bend[1] * (i * i);
         Sight { i, j, x, y, square: x * x + y * y, drift: self.a[2] * i * j, bend, torque }
+    }
+
+    /// Passes what was made of a sample; see [`Persist`]. Of it, only what was measured is kept.
+    pub fn persist_sight<W: Words>(&self, sight: &mut Sight, words: &mut W) {
+        let Sight { mut i, mut j, mut torque, .. } = *sight;
+        i.persist(words);
+        j.persist(words);
+        torque.persist(words);
+        *sight = self.at([i, j], torque);
     }
 
     /// A measured angular velocity with `estimate` in the place of the hidden component, rad/s.

@@ -6,10 +6,11 @@
 //! eliminated here, neither appears. Must not see a measured velocity.
 
 use super::Increment;
+use crate::state::persist_fields;
 use nalgebra::Vector2;
 
 /// What the relation sees at one instant.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OrbitSample {
     /// Distance from the centre, du; positive.
     pub r: f64,
@@ -18,6 +19,8 @@ pub struct OrbitSample {
     /// Known thrust (Ur, Uθ), du/s²: its polar components are held from this instant to the next and turn with the body.
     pub thrust: Vector2<f64>,
 }
+
+persist_fields!(OrbitSample, r, theta, thrust);
 
 /// Velocity in inertial axes from its polar components, \[S\](4). `polar` is (Vr, Vθ); any one unit.
 #[inline]

@@ -3,6 +3,7 @@
 //! Must not compute anything itself: each filter answers for its own mathematics.
 
 use super::{Increment, InvariantFilter, KalmanFilter, SecondOrderFilter};
+use crate::state::{Persist, Words};
 use nalgebra::SVector;
 
 /// A filter of an unknown w in R^N.
@@ -53,6 +54,16 @@ impl<const N: usize> Filter<N> {
         match self {
             Self::Kalman(filter) => Some(filter.deviation()),
             Self::First(_) | Self::Second(_) => None,
+        }
+    }
+}
+
+impl<const N: usize> Persist for Filter<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        match self {
+            Self::First(filter) => filter.persist(words),
+            Self::Second(filter) => filter.persist(words),
+            Self::Kalman(filter) => filter.persist(words),
         }
     }
 }

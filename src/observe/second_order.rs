@@ -8,6 +8,7 @@
 //! the state is the residual r = φ − φ̂.
 
 use super::{Increment, StepAgain};
+use crate::state::{Persist, Words, persist_fields};
 use nalgebra::SVector;
 
 /// Second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
@@ -76,6 +77,13 @@ impl<const N: usize> SecondOrderFilter<N> {
     fn place(&self, weight: f64) -> Gains<N> {
         let pairs = self.bandwidth.map(|bandwidth| place(bandwidth * weight, self.damping));
         Gains { weight, potential: pairs.map(|pair| pair.0), unknown: pairs.map(|pair| pair.1 / weight) }
+    }
+}
+
+impl<const N: usize> Persist for SecondOrderFilter<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.estimate.persist(words);
+        self.residual.persist(words);
     }
 }
 
@@ -200,6 +208,17 @@ impl<const N: usize> KalmanFilter<N> {
         self.covariance[index] = covariance;
     }
 }
+
+impl<const N: usize> Persist for KalmanFilter<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.estimate.persist(words);
+        self.residual.persist(words);
+        self.covariance.persist(words);
+        self.based.persist(words);
+    }
+}
+
+persist_fields!(Covariance, potential, slope, rest);
 
 /// Covariance of the errors of (φ̂, ŵ) as L·D·Lᵀ: every operation adds and multiplies what is not negative, so that no
 /// rounding can take its positivity.

@@ -363,12 +363,17 @@ impl Stage<'_> {
     /// Builds the role anew for every life that it had.
     fn enter(&mut self, step: Step) -> Result<(), BusError> {
         while self.node.is_none() || self.ledger.generation() < step.generation {
-            self.node = None;
+            if let Some(mut left) = self.node.take() {
+                left.finish()?;
+            }
             let (script, scenario) = (self.script, self.scenario);
             let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, script.role, self.bus, self.ledger))?;
             if self.ledger.generation() >= step.generation {
                 let first_tick = if step.generation == 1 { 0 } else { step.tick };
-                node.start(script.grid, first_tick);
+                // Memory of one's own is always open.
+                if node.restore().is_ok() {
+                    node.start(script.grid, first_tick)?;
+                }
             }
             self.node = Some(node);
         }

@@ -2,6 +2,7 @@
 
 use crate::role::{Body, Guard, Law};
 use crate::sample::{CommandLayout, FleetLayout, FleetSample, MeasurementLayout, Sample, TruthLayout};
+use crate::state::{Persist, Words};
 use std::marker::PhantomData;
 
 /// Many bodies of one kind, and everything that drives and guards them as one. `E` is what the law knows of the leader.
@@ -17,13 +18,14 @@ pub trait Fleet<E: Sample>: Sized + 'static {
             Truth = FleetSample<Self::Truth>,
             Measurement = FleetSample<Self::Measurement>,
             Command = FleetSample<Self::Command>,
-        >;
+        > + Persist;
     /// What drives them.
-    type Law: Law<Estimate = E, Measurement = FleetSample<Self::Measurement>, Command = FleetSample<Self::Command>>;
+    type Law: Law<Estimate = E, Measurement = FleetSample<Self::Measurement>, Command = FleetSample<Self::Command>>
+        + Persist;
     /// What keeps measurements that cannot be from the law: one that is impossible for one body is not believed for any.
-    type MeasurementGuard: Guard<FleetSample<Self::Measurement>>;
+    type MeasurementGuard: Guard<FleetSample<Self::Measurement>> + Persist;
     /// The same of commands.
-    type CommandGuard: Guard<FleetSample<Self::Command>>;
+    type CommandGuard: Guard<FleetSample<Self::Command>> + Persist;
 
     /// The bodies at their initial states.
     fn body(&self) -> Self::Body;
@@ -69,6 +71,18 @@ impl<E: Sample> Fleet<E> for NoFleet {
     }
 }
 
+impl Persist for NoFleet {
+    fn persist<W: Words>(&mut self, _words: &mut W) {
+        match *self {}
+    }
+}
+
+impl<E> Persist for NoLaw<E> {
+    fn persist<W: Words>(&mut self, _words: &mut W) {
+        match self.0 {}
+    }
+}
+
 impl Body for NoFleet {
     type Truth = FleetSample<TruthLayout>;
     type Measurement = FleetSample<MeasurementLayout>;
@@ -86,15 +100,7 @@ impl Body for NoFleet {
         match *self {}
     }
 
-    fn status_of(truth: &Self::Truth) -> u64 {
-        truth.status()
-    }
-
-    fn measure(&mut self, _status: u64, _out: &mut Self::Measurement) {
-        match *self {}
-    }
-
-    fn resume(&mut self, _truth: &Self::Truth, _measured: u64) {
+    fn measure(&mut self, _tick: u64, _status: u64, _out: &mut Self::Measurement) {
         match *self {}
     }
 

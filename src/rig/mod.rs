@@ -16,6 +16,7 @@ use crate::control::Watched;
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use crate::role::{Body, Estimator, Guard, Law, SingleBody};
 use crate::sample::FleetSample;
+use crate::state::Persist;
 use nalgebra::SVector;
 use serde::Serialize;
 
@@ -56,17 +57,17 @@ impl BodyInfo {
 /// A plant, an observer and a control law that belong together.
 pub trait Rig: Clone + Send + Sync + 'static {
     /// The kind of body.
-    type Body: SingleBody;
+    type Body: SingleBody + Persist;
     /// What observes the first body.
-    type Estimator: Estimator<Measurement = Measurement<Self>>;
+    type Estimator: Estimator<Measurement = Measurement<Self>> + Persist;
     /// What drives a driven body.
-    type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>>;
+    type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>> + Persist;
     /// What keeps measurements that cannot be from observer and law.
-    type MeasurementGuard: Guard<Measurement<Self>>;
+    type MeasurementGuard: Guard<Measurement<Self>> + Persist;
     /// What keeps estimates that cannot be from the law.
-    type EstimateGuard: Guard<Estimate<Self>>;
+    type EstimateGuard: Guard<Estimate<Self>> + Persist;
     /// What keeps commands that cannot be from the actuators.
-    type CommandGuard: Guard<Command<Self>>;
+    type CommandGuard: Guard<Command<Self>> + Persist;
     /// Many bodies in one process; [`NoFleet`] where the rig has none.
     type Fleet: Fleet<Estimate<Self>>;
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.

@@ -3,6 +3,7 @@
 //! Must not pair samples of different ticks, and must not see the truth.
 
 use crate::sample::{Message, Sample};
+use crate::state::{Persist, Words};
 
 /// The control law of one rig for one follower.
 pub trait Law {
@@ -39,5 +40,11 @@ impl<L: Law> Controller<L> {
         let out = out.stamp_mut();
         out.tick = estimate.stamp().tick;
         out.origin_ns = estimate.stamp().origin_ns;
+    }
+}
+
+impl<L: Persist> Persist for Controller<L> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.law.persist(words);
     }
 }

@@ -4,6 +4,7 @@
 //! that is allowed grows with the time since the last sample that was believed.
 
 use crate::sample::Stamp;
+use crate::state::{Persist, Words, persist_fields};
 
 /// Judges the samples of one signal, in the order of their ticks.
 pub trait Guard<S: ?Sized> {
@@ -14,6 +15,8 @@ pub trait Guard<S: ?Sized> {
 /// Believes everything: for those who watch and do not act.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Unguarded;
+
+persist_fields!(Unguarded,);
 
 impl<S: ?Sized> Guard<S> for Unguarded {
     #[inline]
@@ -42,7 +45,6 @@ const SHORT_GAP_TICKS: u64 = 2;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plausible<const N: usize> {
     bounds: Bounds<N>,
-    generation: u64,
     /// Per component, the last value that was believed, and its tick.
     believed: [f64; N],
     believed_tick: [Option<u64>; N],
@@ -59,7 +61,6 @@ impl<const N: usize> Plausible<N> {
     pub fn new(bounds: Bounds<N>) -> Self {
         Self {
             bounds,
-            generation: 0,
             believed: [0.0; N],
             believed_tick: [None; N],
             before: [f64::NAN; N],
@@ -71,7 +72,7 @@ impl<const N: usize> Plausible<N> {
 
     /// Whether those components of a sample that `valid` has a bit for are possible; if so they are remembered.
     ///
-    /// A sender that has been started anew is a new one: nothing is concluded from what it said before.
+    /// A sender that has been started anew speaks of the same body: its samples are compared with those before.
     #[inline]
     pub fn accepts(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) -> bool {
         let slew = self.bounds.slew_per_tick;
@@ -88,9 +89,6 @@ impl<const N: usize> Plausible<N> {
         valid: u64,
         change: impl Fn(usize, &[f64; N], f64) -> f64,
     ) -> bool {
-        if stamp.generation != self.generation {
-            *self = Self { generation: stamp.generation, ..Self::new(self.bounds) };
-        }
         let counts = self.bounds.repeats != u64::MAX;
         let mut believed = true;
         for (i, &value) in values.iter().enumerate() {
@@ -129,6 +127,17 @@ impl<const N: usize> Plausible<N> {
             let smooth = self.trusted || tick.saturating_sub(since) <= SHORT_GAP_TICKS;
             within(&self.believed, since) && (smooth || within(&self.before, self.before_tick))
         })
+    }
+}
+
+impl<const N: usize> Persist for Plausible<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.believed.persist(words);
+        self.believed_tick.persist(words);
+        self.before.persist(words);
+        self.before_tick.persist(words);
+        self.repeated.persist(words);
+        self.trusted.persist(words);
     }
 }
 
@@ -185,11 +194,32 @@ mod tests {
     }
 
     #[test]
-    fn a_new_life_of_the_sender_begins_anew() {
+    fn a_new_life_of_the_sender_speaks_of_the_same_body() {
         let mut guard = guard();
-        assert!(accepts(&mut guard, 5, [0.0; 3], 7) && !accepts(&mut guard, 6, [1.0; 3], 7));
-        let stamp = Stamp { tick: 6, generation: 2, ..Stamp::default() };
-        assert!(guard.accepts(&stamp, &[1.0, 1.0, 1.0], 7));
+        assert!(accepts(&mut guard, 5, [0.0; 3], 7));
+        let stamp = |tick| Stamp { tick, generation: 2, ..Stamp::default() };
+        assert!(!guard.accepts(&stamp(6), &[1.0; 3], 7) && guard.accepts(&stamp(7), &[0.02; 3], 7));
+    }
+
+    #[test]
+    fn a_guard_that_is_restored_judges_as_the_one_before() {
+        let (mut one, samples) = (guard(), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.301)]);
+        for (tick, value) in samples {
+            accepts(&mut one, tick, [value; 3], 7);
+        }
+        let mut kept = Vec::new();
+        one.persist(&mut Kept(&mut kept));
+        let mut other = guard();
+        other.persist(&mut crate::state::Restore(&kept));
+        assert_eq!(one, other);
+    }
+
+    struct Kept<'a>(&'a mut Vec<u64>);
+
+    impl Words for Kept<'_> {
+        fn word(&mut self, value: &mut u64) {
+            self.0.push(*value);
+        }
     }
 
     #[test]

@@ -4,6 +4,7 @@
 //! filter: the estimate goes on by the model then.
 
 use crate::sample::{Message, Sample, Stamp, status};
+use crate::state::{Persist, Words};
 
 /// The estimator of one rig.
 pub trait Estimator {
@@ -40,13 +41,13 @@ pub struct Observer<E> {
     /// The tick of the last measurement learned from.
     last: Option<u64>,
     /// The tick of the last estimate.
-    said: u64,
+    last_output: u64,
 }
 
 impl<E: Estimator> Observer<E> {
     /// An observer at its initial guess. `tick_s` is the period h in seconds.
     pub fn new(estimator: E, tick_s: f64) -> Self {
-        Self { estimator, tick_s, last: None, said: 0 }
+        Self { estimator, tick_s, last: None, last_output: 0 }
     }
 
     /// Turns measurement k into estimate k. The caller fills the stamp's `generation` and `sent_ns`.
@@ -58,7 +59,7 @@ impl<E: Estimator> Observer<E> {
         let stamp = measurement.stamp();
         let next = self.last.is_some_and(|last| last.checked_add(1) == Some(stamp.tick));
         if next && self.estimator.step_usual(measurement, self.tick_s, out) {
-            (self.last, self.said) = (Some(stamp.tick), stamp.tick);
+            (self.last, self.last_output) = (Some(stamp.tick), stamp.tick);
             Self::sign(stamp, out);
         } else {
             self.step_any(measurement, out);
@@ -86,7 +87,7 @@ impl<E: Estimator> Observer<E> {
     }
 
     fn write(&mut self, stamp: &Stamp, status: u64, out: &mut E::Estimate) {
-        self.said = stamp.tick;
+        self.last_output = stamp.tick;
         self.estimator.write(status, out);
         Self::sign(stamp, out);
     }
@@ -110,8 +111,16 @@ impl<E: Estimator> Observer<E> {
     }
 
     fn coast(&mut self, tick: u64) {
-        if self.last.is_some() && tick > self.said {
-            self.estimator.coast((tick - self.said) as f64 * self.tick_s);
+        if self.last.is_some() && tick > self.last_output {
+            self.estimator.coast((tick - self.last_output) as f64 * self.tick_s);
         }
+    }
+}
+
+impl<E: Persist> Persist for Observer<E> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.estimator.persist(words);
+        self.last.persist(words);
+        self.last_output.persist(words);
     }
 }

@@ -4,6 +4,7 @@
 //! later. Must not need any other role to be alive.
 
 use crate::sample::{Message, Sample, Stamp, status};
+use crate::state::{Persist, Words};
 
 /// A body: what moves, what is measured of it, and what holds its input.
 pub trait Body {
@@ -20,12 +21,8 @@ pub trait Body {
     fn apply_safe(&mut self);
     /// Writes the full state, with the given status bits, everything but the stamp.
     fn truth(&self, status: u64, out: &mut Self::Truth);
-    /// The status bits of a truth.
-    fn status_of(truth: &Self::Truth) -> u64;
-    /// Writes the measurement, with the given status bits, everything but the stamp. Once per executed tick.
-    fn measure(&mut self, status: u64, out: &mut Self::Measurement);
-    /// Goes on from a state that was reported before, after which its sensors had reported `measured` times.
-    fn resume(&mut self, truth: &Self::Truth, measured: u64);
+    /// Writes the measurement of a tick, with the given status bits, everything but the stamp. Once per executed tick.
+    fn measure(&mut self, tick: u64, status: u64, out: &mut Self::Measurement);
     /// Moves the body by `dt_s` seconds under the held input.
     fn flow(&mut self, dt_s: f64);
 }
@@ -157,7 +154,7 @@ impl<B: Body> Plant<B> {
     #[inline]
     pub fn measure(&mut self, stamp: &Stamp, out: &mut B::Measurement) {
         let status = self.status();
-        self.body.measure(status, out);
+        self.body.measure(stamp.tick, status, out);
         *out.stamp_mut() = *stamp;
     }
 
@@ -168,21 +165,27 @@ impl<B: Body> Plant<B> {
         *out.stamp_mut() = *stamp;
     }
 
-    /// Moves the body on by `ticks` ticks, the input held.
+    /// Moves the body on by `ticks` ticks, the input held: in one flow, so that whoever has missed many ticks does not miss
+    /// more for it.
     #[inline]
     pub fn advance(&mut self, ticks: u64) {
-        // Tick by tick, not in one flow of ticks·h: what an executed and a skipped tick do to the body is the same.
-        for _ in 0..ticks {
-            self.body.flow(self.tick_s);
+        if ticks > 0 {
+            self.body.flow(ticks as f64 * self.tick_s);
         }
     }
 
-    /// Goes on from a truth that was reported before, after which `measured` measurements had been reported.
-    pub fn resume(&mut self, truth: &B::Truth, measured: u64) {
-        let was = B::status_of(truth);
-        self.safe = was & status::SAFE != 0;
-        self.silent_ticks = u64::from(was & (status::SAFE | status::HOLDING) != 0);
-        self.body.resume(truth, measured);
+    /// Moves the body on by `ticks` ticks in which no command came, with the actuators' own protection.
+    pub fn advance_alone(&mut self, ticks: u64) {
+        if !self.actuation.driven {
+            return self.advance(ticks);
+        }
+        let held = if self.safe { 0 } else { ticks.min(self.ticks_until_safe() - 1) };
+        self.advance(held);
+        self.silent_ticks += ticks;
+        if ticks > held && !self.safe {
+            self.expire();
+        }
+        self.advance(ticks - held);
     }
 
     fn status(&self) -> u64 {
@@ -193,5 +196,14 @@ impl<B: Body> Plant<B> {
                 (false, true) => status::HOLDING,
                 (false, false) => 0,
             }
+    }
+}
+
+impl<B: Persist> Persist for Plant<B> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.body.persist(words);
+        self.silent_ticks.persist(words);
+        self.safe.persist(words);
+        self.rejected.persist(words);
     }
 }

@@ -6,15 +6,16 @@ use crate::bus::Carried;
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario, ScriptedFault};
 use crate::fault::{Action, Change, Fault, Interruption, Transport};
+use crate::state::{Persist, Words};
 use crate::telemetry::TickBook;
-use std::borrow::BorrowMut;
+use std::borrow::{Borrow, BorrowMut};
 
 /// What happens to the samples of one signal.
 #[derive(Debug)]
 pub struct Disturbance<S: Carried + ?Sized> {
     faults: Vec<Fault>,
-    /// Samples on their long way, in the order of their ticks, each with the tick at which it is sent. As much room as
-    /// can ever be needed is taken at the start.
+    /// Samples that are held back, each with the tick at which it is sent, in the order in which they are sent. As much room
+    /// as can ever be needed is taken at the start.
     late: Vec<(u64, S::Owned)>,
     /// How many bodies the signal tells of.
     bodies: usize,
@@ -59,13 +60,36 @@ impl<S: Carried + ?Sized> Disturbance<S> {
     pub fn keep(&mut self, tick: u64, sample: &S) {
         let mut kept = self.blank();
         kept.borrow_mut().assign(sample);
-        self.late.push((tick, kept));
+        let at = self.late.partition_point(|(due, _)| *due <= tick);
+        self.late.insert(at, (tick, kept));
     }
 
-    /// A sample that was kept and is to be sent before that of `tick`.
-    pub fn due(&mut self, tick: u64) -> Option<S::Owned> {
-        let due = self.late.iter().position(|(due, _)| *due <= tick)?;
-        Some(self.late.remove(due).1)
+    /// How many of the samples that are kept are to be sent before that of `tick`.
+    pub fn due(&self, tick: u64) -> u64 {
+        self.late.partition_point(|(due, _)| *due <= tick) as u64
+    }
+
+    /// One of the samples that are kept, in the order in which they are sent.
+    pub fn late(&self, index: u64) -> Option<&S> {
+        self.late.get(index as usize).map(|(_, sample)| sample.borrow())
+    }
+
+    /// Lets the first samples that are kept go.
+    pub fn forget(&mut self, samples: u64) {
+        self.late.drain(..self.late.len().min(samples as usize));
+    }
+}
+
+impl<S: Carried + ?Sized> Persist for Disturbance<S> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        let (mut count, room) = (self.late.len() as u64, self.late.capacity());
+        count.persist(words);
+        self.late.resize_with(room, || (0, S::blank(self.bodies)));
+        for (due, sample) in &mut self.late {
+            due.persist(words);
+            sample.borrow_mut().words_mut().persist(words);
+        }
+        self.late.truncate(count as usize);
     }
 }
 
@@ -175,7 +199,9 @@ mod tests {
         let room = disturbance.late.capacity();
         assert_eq!(room, 3);
         for tick in 5..105_u64 {
-            let sent = std::iter::from_fn(|| disturbance.due(tick)).map(|sample| sample.stamp.tick).collect::<Vec<_>>();
+            let due = disturbance.due(tick);
+            let sent = (0..due).map(|index| disturbance.late(index).unwrap().stamp.tick).collect::<Vec<_>>();
+            disturbance.forget(due);
             assert_eq!(sent, if tick < 8 { vec![] } else { vec![tick - 3] });
             assert_eq!(disturbance.way(tick), Some(Transport::Delay { ticks: 3 }));
             let mut sample = RateCommand::default();

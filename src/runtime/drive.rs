@@ -319,8 +319,10 @@ pub fn in_turn(
         for index in 0..nodes.len() {
             if nodes[index].before_tick() {
                 // The seat is left before it is taken again, as between processes.
-                drop(nodes.remove(index));
-                let Some(successor) = revive(index)? else { return Ok(Ended::Stopped) };
+                let mut left = nodes.remove(index);
+                left.finish()?;
+                drop(left);
+                let Some(successor) = revive(index)? else { return leave(nodes, Ended::Stopped) };
                 nodes.insert(index, successor);
             }
             let node = &mut nodes[index];
@@ -329,8 +331,13 @@ pub fn in_turn(
             }
         }
         if !after_tick(tick) {
-            return Ok(Ended::Stopped);
+            return leave(nodes, Ended::Stopped);
         }
     }
-    Ok(Ended::Finished)
+    leave(nodes, Ended::Finished)
+}
+
+fn leave(nodes: &mut [ReadyNode], ended: Ended) -> Result<Ended, BusError> {
+    nodes.iter_mut().try_for_each(|node| node.finish())?;
+    Ok(ended)
 }

@@ -11,9 +11,15 @@ pub enum Place {
     Opening,
     /// All is open and warm; it waits for the word to run.
     Ready,
-    /// It has filled a sample that it has not sent.
-    Loaned,
-    /// It has just sent a sample that is not in its books yet.
+    /// It has made a sample that it has not committed itself to.
+    Staged,
+    /// It is about to commit its state, has written part of it, or has just committed it.
+    Committing,
+    /// See there.
+    InCommit,
+    /// See there.
+    Committed,
+    /// It has just sent a sample.
     Sent,
     /// It has nothing to do but to wait.
     Waiting,
@@ -66,7 +72,10 @@ mod on {
         let place = match words.next()? {
             "opening" => Place::Opening,
             "ready" => Place::Ready,
-            "loaned" => Place::Loaned,
+            "staged" => Place::Staged,
+            "committing" => Place::Committing,
+            "in-commit" => Place::InCommit,
+            "committed" => Place::Committed,
             "sent" => Place::Sent,
             "waiting" => Place::Waiting,
             _ => return None,

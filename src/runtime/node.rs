@@ -13,17 +13,26 @@ pub use ports::{Port, Ports, Visit, ports, visit_reads, visit_writes};
 
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
-use super::link::{Horizon, Input, Output};
+use super::hooks::{self, Place};
+use super::link::{self, Horizon, Input, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
+use crate::bus::memory::MemoryBus;
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
-use crate::rig::{BodyInfo, Fleet, FleetTruth, Rig, Truth};
+use crate::control::Watchdog;
+use crate::rig::{BodyInfo, Fleet, Rig};
 use crate::role::Guard;
+use crate::sample::RateTruth;
 use crate::serial::LineBook;
-use crate::telemetry::{Grant, Ledger, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchBook, WriteBook};
-use crate::with_rig;
+use crate::state::{Count, Persist, Restore, Words};
+use crate::telemetry::{Grant, Ledger, LedgerError, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchReport};
 use plant::PlantNode;
+
+/// An upper bound on the state of a role, bytes, but for samples and what is remembered of them.
+const RECORD_BYTES: usize = 8 << 10;
+/// So many times the size of what a role reads and writes is remembered at the most: samples made, bodies, guards.
+const SAMPLES_KEPT: usize = 4;
 
 /// Which role of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -158,12 +167,20 @@ pub trait Node {
     fn time_triggered(&self) -> bool;
     /// The next tick to execute.
     fn next_tick(&self) -> u64;
-    /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor left undone
-    /// before that counts as missed.
-    fn start(&mut self, grid: Grid, first_tick: u64);
+    /// Continues from where a predecessor committed its state, if there was one. Before [`start`](Self::start).
+    ///
+    /// # Errors
+    /// [`LedgerError`].
+    fn restore(&mut self) -> Result<(), LedgerError>;
+    /// Hands over the time grid, once the epoch is known, and the first tick to execute. What a predecessor was committed to
+    /// send is sent; what it left undone before that tick counts as missed.
+    ///
+    /// # Errors
+    /// [`BusError`] if a link failed.
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError>;
     /// Lets scripted interruptions of this role act: before every tick, once.
     fn before_tick(&mut self) -> bool;
-    /// Executes the next tick if the gate allows it: takes inputs, computes, sends. The critical path.
+    /// Executes the next tick if the gate allows it: takes inputs, computes, commits, sends. The critical path.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
@@ -180,13 +197,11 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn settle(&mut self) -> Result<(), BusError>;
-    /// Settles what is left of a tick that the end of the run has come upon.
+    /// Settles what is left of a tick that the end of the run has come upon, and commits the state for the last time.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
-    fn finish(&mut self) -> Result<(), BusError> {
-        Ok(())
-    }
+    fn finish(&mut self) -> Result<(), BusError>;
     /// Counts every tick before `tick` that was not executed as missed.
     fn skip_to(&mut self, tick: u64);
     /// Exercises all links with a sample that no role uses.
@@ -204,6 +219,8 @@ pub trait Node {
     fn ticks(&self) -> Ticks;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
+    /// How many words its state takes.
+    fn state_words(&mut self) -> usize;
     /// Of several roles that are driven as one, the node of this role.
     fn of(&self, _role: RoleId) -> Option<&dyn Node> {
         None
@@ -212,6 +229,76 @@ pub trait Node {
     fn line(&self) -> Option<LineBook> {
         None
     }
+}
+
+/// What of a node outlives its process.
+trait Persistent {
+    /// Where it is kept.
+    fn ledger(&self) -> &Ledger;
+    /// Passes the counters, and what is committed to be sent. Of any role in the order of its [`Ports`]: see [`report`].
+    fn counters<W: Words>(&mut self, words: &mut W);
+    /// Passes everything else.
+    fn state<W: Words>(&mut self, words: &mut W);
+
+    fn pass<W: Words>(&mut self, words: &mut W) {
+        self.counters(words);
+        self.state(words);
+    }
+}
+
+/// Commits the state of a node, where another process may have to continue from it.
+#[inline]
+fn commit(node: &mut impl Persistent) {
+    if node.ledger().is_shared() {
+        let ledger = node.ledger().reopened();
+        hooks::at(Place::Committing);
+        ledger.commit(|store| {
+            node.counters(store);
+            hooks::at(Place::InCommit);
+            node.state(store);
+        });
+        hooks::at(Place::Committed);
+    }
+}
+
+/// Commits the state of a node for the last time, wherever it is kept.
+fn commit_last(node: &mut impl Persistent) {
+    let ledger = node.ledger().reopened();
+    // Room in private memory can always be had, and that in shared memory was taken before the first tick.
+    if ledger.reserve(length(node)).is_ok() {
+        ledger.commit(|store| node.pass(store));
+    }
+}
+
+fn length(node: &mut impl Persistent) -> usize {
+    let mut count = Count::default();
+    node.pass(&mut count);
+    count.0
+}
+
+/// What a node has of its predecessor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Inherited {
+    /// There was none, or it had not begun.
+    Nothing,
+    /// The counters alone: the state is not trusted.
+    Counters,
+    /// All.
+    All,
+}
+
+/// Reads what a predecessor committed.
+fn restore(node: &mut impl Persistent) -> Result<Inherited, LedgerError> {
+    let ledger = node.ledger().reopened();
+    ledger.reserve(length(node))?;
+    let Some(record) = ledger.record() else { return Ok(Inherited::Nothing) };
+    let mut words = Restore(&record);
+    node.counters(&mut words);
+    if ledger.distrusted() {
+        return Ok(Inherited::Counters);
+    }
+    node.state(&mut words);
+    Ok(Inherited::All)
 }
 
 /// A node that can be driven.
@@ -233,7 +320,7 @@ impl<B: Bus> Seat<'_, B> {
         S: Carried + ?Sized,
     {
         let topic = topic(self.scenario, &body.name, signal);
-        let mut input = Input::open(self.bus, &topic, body.bodies(), Reader::Role, self.ledger)?.guarded(guard);
+        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?.guarded(guard);
         input.expect(horizon(self.scenario, None));
         Ok(input)
     }
@@ -264,24 +351,16 @@ pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
     }
 }
 
-/// How large the ledger of a role is, words.
+/// How many words of a role's ledger lie beside its record.
 pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
-    fn state_words<R: Rig>(rig: &R, index: usize) -> usize {
-        match rig.bodies()[index].fleet {
-            None => plant::StateBook::<Truth<R>>::words(1),
-            Some(bodies) => plant::StateBook::<FleetTruth<R>>::words(bodies),
-        }
-    }
-    let ports = ports(scenario, role);
-    let state = match role {
-        RoleId::Plant(index) => with_rig!(&scenario.rig, rig => state_words(rig, index)),
-        RoleId::Observer => 0,
-        RoleId::Controller => WatchBook::WORDS,
-    };
-    TickBook::WORDS
-        + ports.writes.len() * WriteBook::words(scenario.last_tick)
-        + ports.reads.len() * ReadBook::WORDS
-        + state
+    ports(scenario, role).writes.len() * Output::<MemoryBus, RateTruth>::words(scenario.last_tick)
+}
+
+/// An upper bound on the shared memory that a role's record takes, bytes: two copies of what it writes, and of what bodies,
+/// filters, laws and guards remember, which is at most so many times what is said of them.
+fn record_bytes(ports: &Ports) -> usize {
+    let samples: usize = ports.writes.iter().chain(&ports.reads).map(|port| port.size).sum();
+    2 * (RECORD_BYTES + SAMPLES_KEPT * samples)
 }
 
 /// A ledger for a role that no successor will need.
@@ -294,17 +373,20 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
     let depths = super::depths(scenario);
     let port = |port: &Port| footprint(&port.qos(depths), port.size);
     let role = |role: RoleId| {
-        let Ports { writes, health, .. } = ports(scenario, role);
-        writes.iter().chain([&health]).map(port).sum::<usize>() + ledger_words(scenario, role) * size_of::<u64>()
+        let ports = ports(scenario, role);
+        let signals = ports.writes.iter().chain([&ports.health]).map(port).sum::<usize>();
+        signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(&ports)
     };
     let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
     // The recorder says how it is, as the roles do.
     COMMON_BYTES + port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
-/// The tick that a role has not finished, by its ledger.
+/// The tick that a role has not executed, by its ledger.
 pub(crate) fn next_tick(ledger: &Ledger) -> u64 {
-    TickBook::open(&ledger.reopened()).next()
+    let mut ticks = TickBook::default();
+    ticks.persist(&mut Restore(&ledger.record().unwrap_or_default()));
+    ticks.next()
 }
 
 /// What a role's ledger says, with what the role itself has to add.
@@ -315,19 +397,34 @@ pub fn report(
     stages: Vec<StageReport>,
     grants: Vec<Grant>,
 ) -> RoleReport {
-    let ports = ports(scenario, role);
-    let ledger = ledger.reopened();
-    let watches = role == RoleId::Controller;
+    let (ports, ledger) = (ports(scenario, role), &ledger.reopened());
+    // Of a role that has committed nothing there are zeros.
+    let record = ledger.record().unwrap_or_default();
+    let words = &mut Restore(&record);
+    let (mut ticks, voids) = (TickBook::default(), scenario.clock != ClockKind::Realtime);
+    ticks.persist(words);
+    let written = |port: &Port| {
+        let length = port.size / size_of::<u64>();
+        link::written(words, &port.topic.to_string(), length, voids, (ledger, scenario.last_tick))
+    };
+    let written = ports.writes.iter().map(written).collect();
+    let read = |port: &Port| {
+        let mut read = ReadBook::default();
+        read.persist(words);
+        read.report(&port.topic.to_string())
+    };
+    let read = ports.reads.iter().map(read).collect();
+    let watchdog = (role == RoleId::Controller).then(|| {
+        let mut watchdog = Watchdog::new(scenario.watch);
+        watchdog.persist(words);
+        watchdog
+    });
     RoleReport {
         role: role.name(scenario).to_owned(),
-        ticks: TickBook::open(&ledger).report(),
-        written: ports
-            .writes
-            .iter()
-            .map(|port| WriteBook::open(&ledger, scenario.last_tick).report(&port.topic.to_string()))
-            .collect(),
-        read: ports.reads.iter().map(|port| ReadBook::open(&ledger).report(&port.topic.to_string())).collect(),
-        watchdog: watches.then(|| WatchBook::open(&ledger).report(&scenario.watch)).flatten(),
+        ticks: ticks.report(),
+        written,
+        read,
+        watchdog: watchdog.and_then(|watchdog| WatchReport::of(&watchdog)),
         stages,
         grants,
         line: None,
@@ -380,6 +477,7 @@ mod tests {
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
     use crate::config::SHIPPED;
+    use crate::with_rig;
 
     #[test]
     fn every_role_of_a_scenario_has_the_name_that_the_rig_gives_it() {
@@ -409,8 +507,10 @@ mod tests {
             let ours = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(&prefix);
             let files = std::fs::read_dir("/dev/shm").unwrap().filter_map(Result::ok).filter(ours);
             let signals: u64 = files.map(|file| file.metadata().unwrap().len()).sum();
-            let words: usize = RoleId::all(&scenario).into_iter().map(|role| ledger_words(&scenario, role)).sum();
-            let (taken, asked) = (signals as usize + 8 * words, shared_memory_bytes(&scenario));
+            let beside = |role| ledger_words(&scenario, role);
+            let words: usize = RoleId::all(&scenario).into_iter().map(beside).sum();
+            let records: usize = nodes.iter_mut().map(|node| 2 * node.state_words()).sum();
+            let (taken, asked) = (signals as usize + 8 * (words + records), shared_memory_bytes(&scenario));
             println!("{clock} {count}: {taken} bytes of {asked}");
             assert!(taken <= asked, "{clock} {count}: {taken} bytes of {asked}");
             assert!(count == 1 || asked < 2 * taken, "{clock} {count}: {taken} bytes of {asked}");

@@ -229,6 +229,7 @@ pub fn serve<B: Bus + 'static>(
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
     let voices = books.iter().map(voice).collect::<Result<_, BusError>>()?;
     let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
+    node.restore()?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         voices,
@@ -347,7 +348,7 @@ fn drive<B: Bus>(
     // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
     let late = scenario.clock == ClockKind::Realtime && !control.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
-    node.start(grid, first_tick.min(scenario.last_tick + 1));
+    node.start(grid, first_tick.min(scenario.last_tick + 1))?;
     let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
         ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, privileges)),

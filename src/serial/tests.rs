@@ -33,13 +33,7 @@ impl Body for Spinner {
     fn truth(&self, status: u64, out: &mut RateTruth) {
         (out.omega_rad_s[0], out.applied_rad_s2[0], out.status) = (self.rate, self.applied, status);
     }
-    fn status_of(truth: &RateTruth) -> u64 {
-        truth.status
-    }
-    fn resume(&mut self, truth: &RateTruth, _measured: u64) {
-        (self.rate, self.applied) = (truth.omega_rad_s[0], truth.applied_rad_s2[0]);
-    }
-    fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
+    fn measure(&mut self, _tick: u64, status: u64, out: &mut RateMeasurement) {
         (out.omega_rad_s[0], out.applied_rad_s2[0], out.status) = (self.rate, self.applied, status);
     }
     fn flow(&mut self, dt_s: f64) {

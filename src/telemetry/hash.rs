@@ -2,8 +2,8 @@
 //!
 //! It covers ticks and values, no generation and no time. Checkpoints make it comparable up to any tick.
 
-use super::ledger::{Ledger, Words};
-use crate::sample::Message;
+use super::ledger::{Ledger, Slots};
+use crate::state::{Persist, Words};
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
 /// The most checkpoints that a writer keeps; longer runs keep every second, third, … tick.
@@ -12,7 +12,10 @@ const MAX_CHECKPOINTS: u64 = 16_384;
 /// The hash of one signal, chained over its samples (XXH3-64, each sample's hash seeded by the last).
 #[derive(Debug)]
 pub struct StateHash {
-    words: Words,
+    value: u64,
+    /// How many checkpoints there are. Those beyond were written by somebody who died before they counted.
+    count: u64,
+    checkpoints: Slots,
     stride: u64,
     capacity: u64,
     /// After how many ticks the next checkpoint is: seldom, so that a comparison must do.
@@ -31,14 +34,9 @@ pub struct Checkpoints {
 }
 
 impl StateHash {
-    const VALUE: usize = 0;
-    /// How many checkpoints there are; they follow.
-    const COUNT: usize = 1;
-    const FIRST: usize = 2;
-
     /// Words of the ledger for a run whose last tick is `last_tick`.
     pub fn words(last_tick: u64) -> usize {
-        Self::FIRST + Self::capacity(last_tick) as usize
+        Self::capacity(last_tick) as usize
     }
 
     /// Ticks per checkpoint.
@@ -50,23 +48,20 @@ impl StateHash {
         (last_tick + 1) / Self::stride(last_tick)
     }
 
-    /// Opens the hash of a run whose last tick is `last_tick`, as it was left.
+    /// The hash of a run whose last tick is `last_tick`, over nothing yet.
     pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
-        let words = ledger.take(Self::words(last_tick));
-        let mut hash = Self { words, stride: Self::stride(last_tick), capacity: Self::capacity(last_tick), due: 0 };
-        hash.checkpoint(0);
-        hash
+        let checkpoints = ledger.take(Self::words(last_tick));
+        let (stride, capacity) = (Self::stride(last_tick), Self::capacity(last_tick));
+        Self { value: 0, count: 0, checkpoints, stride, capacity, due: stride }
     }
 
-    /// Takes in a sample. Ticks rise.
+    /// Takes in the content of the sample of a tick. Ticks rise.
     #[inline]
-    pub fn absorb(&mut self, sample: &(impl Message + ?Sized)) {
-        let tick = sample.stamp().tick;
+    pub fn absorb(&mut self, tick: u64, content: &[u8]) {
         if tick >= self.due {
             self.checkpoint(tick);
         }
-        let value = self.words.get(Self::VALUE) ^ tick.rotate_left(32);
-        self.words.set(Self::VALUE, xxh3_64_with_seed(sample.content(), value));
+        self.value = xxh3_64_with_seed(content, self.value ^ tick.rotate_left(32));
         if tick.saturating_add(1) >= self.due {
             self.checkpoint(tick.saturating_add(1));
         }
@@ -75,23 +70,33 @@ impl StateHash {
     /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
     #[cold]
     fn checkpoint(&mut self, ticks: u64) {
-        let mut count = self.words.get(Self::COUNT);
-        while (count + 1) * self.stride <= ticks && count < self.capacity {
-            self.words.set(Self::FIRST + count as usize, self.words.get(Self::VALUE));
-            count += 1;
-            self.words.set(Self::COUNT, count);
+        while self.count < self.capacity && self.due <= ticks {
+            self.checkpoints.set(self.count as usize, self.value);
+            self.count += 1;
+            self.set_due();
         }
-        self.due = if count < self.capacity { (count + 1) * self.stride } else { u64::MAX };
+    }
+
+    fn set_due(&mut self) {
+        self.due = if self.count < self.capacity { (self.count + 1) * self.stride } else { u64::MAX };
     }
 
     /// What has been gathered.
     pub fn checkpoints(&self) -> Checkpoints {
-        let count = self.words.get(Self::COUNT).min(self.capacity) as usize;
+        let count = self.count.min(self.capacity) as usize;
         Checkpoints {
             stride: self.stride,
-            hashes: (0..count).map(|index| self.words.get(Self::FIRST + index)).collect(),
-            last: self.words.get(Self::VALUE),
+            hashes: (0..count).map(|index| self.checkpoints.get(index)).collect(),
+            last: self.value,
         }
+    }
+}
+
+impl Persist for StateHash {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.value.persist(words);
+        self.count.persist(words);
+        self.set_due();
     }
 }
 
@@ -104,7 +109,8 @@ pub fn combine(hashes: impl IntoIterator<Item = u64>) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sample::{RateCommand, Stamp};
+    use crate::sample::{Message, RateCommand, Stamp};
+    use crate::state::Restore;
 
     fn sample(tick: u64, value: f64, sent_ns: u64) -> RateCommand {
         let stamp = Stamp { tick, sent_ns, origin_ns: sent_ns / 2, generation: sent_ns };
@@ -117,7 +123,7 @@ mod tests {
 
     fn hash(samples: &[(u64, f64, u64)]) -> Checkpoints {
         let mut hash = open(9);
-        samples.iter().for_each(|&(tick, value, sent)| hash.absorb(&sample(tick, value, sent)));
+        samples.iter().for_each(|&(tick, value, sent)| hash.absorb(tick, sample(tick, value, sent).content()));
         hash.checkpoints()
     }
 
@@ -146,7 +152,7 @@ mod tests {
     #[test]
     fn a_long_run_keeps_a_bounded_number_of_checkpoints() {
         let mut hash = open(MAX_CHECKPOINTS * 5);
-        (0..=MAX_CHECKPOINTS * 5).for_each(|tick| hash.absorb(&sample(tick, 0.5, 0)));
+        (0..=MAX_CHECKPOINTS * 5).for_each(|tick| hash.absorb(tick, sample(tick, 0.5, 0).content()));
         let count = hash.checkpoints().hashes.len() as u64;
         assert_eq!(count, hash.capacity);
         assert!(count <= MAX_CHECKPOINTS && hash.stride == 6);
@@ -154,14 +160,17 @@ mod tests {
 
     #[test]
     fn a_successor_continues_the_chain() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("books");
+        let ledger = Ledger::private(StateHash::words(9));
+        let mut kept = [0; 2];
         for tick in 0..4 {
-            let ledger = Ledger::shared(&path, StateHash::words(9)).unwrap();
-            StateHash::open(&ledger, 9).absorb(&sample(tick, tick as f64, 0));
+            let mut hash = StateHash::open(&ledger.reopened(), 9);
+            hash.persist(&mut Restore(&kept));
+            hash.absorb(tick, sample(tick, tick as f64, 0).content());
+            kept = [hash.value, hash.count];
         }
-        let ledger = Ledger::shared(&path, StateHash::words(9)).unwrap();
-        let whole = hash(&[(0, 0.0, 0), (1, 1.0, 0), (2, 2.0, 0), (3, 3.0, 0)]);
-        assert_eq!(StateHash::open(&ledger, 9).checkpoints(), whole);
+        let whole = self::hash(&[(0, 0.0, 0), (1, 1.0, 0), (2, 2.0, 0), (3, 3.0, 0)]);
+        let mut hash = StateHash::open(&ledger.reopened(), 9);
+        hash.persist(&mut Restore(&kept));
+        assert_eq!(hash.checkpoints(), whole);
     }
 }

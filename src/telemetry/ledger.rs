@@ -1,22 +1,23 @@
-//! Memory for a role's books that survives the role: a process that takes a dead one's seat goes on with its counters.
+//! A role's persistent state: shared memory that survives the process which writes it, so that another one continues.
 //!
-//! Words are written one by one and never locked: whoever dies in between leaves each of them whole. Must not know what
-//! is counted.
+//! There is one record, kept twice. A commit writes the copy that is not current and makes it current by a single store, so
+//! whoever looks, and whenever the writer dies, there is one whole record. Must not know what is in it.
 
 use crate::shared::SharedWords;
+use crate::state::Words;
 use rustix::fs::{FlockOperation, flock};
-use std::cell::Cell;
+use std::cell::{Cell, OnceCell};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 /// Why a ledger could not be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum LedgerError {
     /// The memory could not be had.
-    #[error("cannot keep the books in {}: {source}; is there room in /dev/shm?", path.display())]
+    #[error("cannot keep the state in {}: {source}; is there room in /dev/shm?", path.display())]
     Open {
         /// The file.
         path: PathBuf,
@@ -36,12 +37,13 @@ pub enum LedgerError {
         path: PathBuf,
         /// Its size.
         found: u64,
-        /// The size of this version's books.
+        /// The size that this version writes.
         expected: u64,
     },
 }
 
-/// A fixed number of words, handed out in order, and the count of those who have come to write in them.
+/// A role's persistent state: the record, some words beside it that are written on their own, and the count of the
+/// processes that have written.
 #[derive(Debug)]
 pub struct Ledger {
     memory: Rc<Memory>,
@@ -49,12 +51,35 @@ pub struct Ledger {
 }
 
 #[derive(Debug)]
-enum Memory {
+struct Memory {
+    words: Storage,
+    /// Where the words are, unless they die with this process.
+    path: Option<PathBuf>,
+    record: OnceCell<Record>,
+}
+
+#[derive(Debug)]
+enum Storage {
     Private(Box<[AtomicU64]>),
     Shared(SharedWords),
 }
 
-impl Memory {
+impl Storage {
+    fn private(words: usize) -> Self {
+        Self::Private((0..words).map(|_| AtomicU64::new(0)).collect())
+    }
+
+    /// The words in a file, as many as these.
+    fn shared(path: &Path, words: usize) -> Result<Self, LedgerError> {
+        let shared =
+            SharedWords::open(path, words).map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
+        let [found, expected] = [shared.words().len(), words].map(|words| (words * size_of::<u64>()) as u64);
+        if found != expected {
+            return Err(LedgerError::Size { path: path.to_owned(), found, expected });
+        }
+        Ok(Self::Shared(shared))
+    }
+
     #[inline]
     fn words(&self) -> &[AtomicU64] {
         match self {
@@ -65,12 +90,21 @@ impl Memory {
 }
 
 impl Ledger {
+    /// How many processes have entered.
     const GENERATION: usize = 0;
-    const FIRST: usize = 1;
+    /// How many commits there were; the lowest bit tells which copy is current.
+    const COMMITS: usize = 1;
+    /// How long the record is, words.
+    const LENGTH: usize = 2;
+    /// The generation that is to begin without its predecessor's state; 0 if none is.
+    const ANEW: usize = 3;
+    const FIRST: usize = 4;
+    /// How often a reader tries to read a record that is written meanwhile.
+    const TRIES: usize = 1000;
 
     /// A ledger that dies with this process: for runs in one thread.
     pub fn private(words: usize) -> Self {
-        Self::over(Memory::Private((0..Self::FIRST + words).map(|_| AtomicU64::new(0)).collect()))
+        Self::over(Storage::private(Self::FIRST + words), None)
     }
 
     /// The ledger in a file of shared memory, as it was left, or new and all zero; to be read.
@@ -78,14 +112,7 @@ impl Ledger {
     /// # Errors
     /// [`LedgerError`].
     pub fn shared(path: &Path, words: usize) -> Result<Self, LedgerError> {
-        let words = Self::FIRST + words;
-        let shared =
-            SharedWords::open(path, words).map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
-        let [found, expected] = [shared.words().len(), words].map(|words| (words * size_of::<u64>()) as u64);
-        if found != expected {
-            return Err(LedgerError::Size { path: path.to_owned(), found, expected });
-        }
-        Ok(Self::over(Memory::Shared(shared)))
+        Ok(Self::over(Storage::shared(path, Self::FIRST + words)?, Some(path.to_owned())))
     }
 
     /// The same, to be written: there is one writer at a time.
@@ -94,26 +121,43 @@ impl Ledger {
     /// [`LedgerError`].
     pub fn taken(path: &Path, words: usize) -> Result<Self, LedgerError> {
         let ledger = Self::shared(path, words)?;
-        match &*ledger.memory {
-            Memory::Shared(shared) if flock(shared.file(), FlockOperation::NonBlockingLockExclusive).is_err() => {
-                Err(LedgerError::Taken { path: path.to_owned() })
+        if let Storage::Shared(shared) = &ledger.memory.words {
+            match flock(shared.file(), FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => {}
+                Err(rustix::io::Errno::WOULDBLOCK) => return Err(LedgerError::Taken { path: path.to_owned() }),
+                Err(error) => return Err(LedgerError::Open { path: path.to_owned(), source: error.into() }),
             }
-            _ => Ok(ledger),
         }
+        Ok(ledger)
     }
 
-    fn over(memory: Memory) -> Self {
-        Self { memory: Rc::new(memory), taken: Cell::new(Self::FIRST) }
+    fn over(words: Storage, path: Option<PathBuf>) -> Self {
+        Self { memory: Rc::new(Memory { words, path, record: OnceCell::new() }), taken: Cell::new(Self::FIRST) }
+    }
+
+    #[inline]
+    fn word(&self, index: usize) -> &AtomicU64 {
+        &self.memory.words.words()[index]
     }
 
     /// Enters as the next generation of writers, and tells which: 1 for the first.
     pub fn enter(&self) -> u64 {
-        self.memory.words()[Self::GENERATION].fetch_add(1, Ordering::Relaxed) + 1
+        self.word(Self::GENERATION).fetch_add(1, Ordering::Relaxed) + 1
     }
 
     /// The generation that has entered last; 0 if none has.
     pub fn generation(&self) -> u64 {
-        self.memory.words()[Self::GENERATION].load(Ordering::Relaxed)
+        self.word(Self::GENERATION).load(Ordering::Relaxed)
+    }
+
+    /// Lets the next generation keep the counters and nothing else: the state may be what its predecessors died of.
+    pub fn distrust(&self) {
+        self.word(Self::ANEW).store(self.generation() + 1, Ordering::Relaxed);
+    }
+
+    /// Whether the present generation is to begin without its predecessor's state.
+    pub fn distrusted(&self) -> bool {
+        self.word(Self::ANEW).load(Ordering::Relaxed) == self.generation()
     }
 
     /// The same memory, to be taken anew from its beginning.
@@ -121,27 +165,123 @@ impl Ledger {
         Self { memory: self.memory.clone(), taken: Cell::new(Self::FIRST) }
     }
 
-    /// The next `count` words. Whoever takes in the same order finds the same words again.
+    /// The next `count` words beside the record. Whoever takes in the same order finds the same words again.
     ///
     /// # Panics
-    /// If the ledger has no more: its size is computed from the same list of books that are opened in it.
-    pub fn take(&self, count: usize) -> Words {
+    /// If the ledger has no more: its size is computed from the same list of what is kept in it.
+    pub fn take(&self, count: usize) -> Slots {
         let begin = self.taken.replace(self.taken.get() + count);
-        let words = self.memory.words().get(begin..begin + count).expect("the ledger is sized for all of its books");
-        Words { words: words.into(), _memory: self.memory.clone() }
+        let words =
+            self.memory.words.words().get(begin..begin + count).expect("the ledger is sized for all that it has");
+        Slots { words: words.into(), _memory: self.memory.clone() }
+    }
+
+    /// Whether another process may have to continue from here: whoever writes commits every tick.
+    #[inline]
+    pub fn is_shared(&self) -> bool {
+        self.memory.path.is_some()
+    }
+
+    /// Makes room for a record of so many words, or opens the one that is there.
+    ///
+    /// # Errors
+    /// [`LedgerError`].
+    pub fn reserve(&self, words: usize) -> Result<(), LedgerError> {
+        if self.memory.record.get().is_none() {
+            let storage = match self.record_path() {
+                Some(path) => Storage::shared(&path, 2 * words)?,
+                None => Storage::private(2 * words),
+            };
+            let _ = self.memory.record.set(Record { storage, words });
+            self.word(Self::LENGTH).store(words as u64, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+
+    fn record_path(&self) -> Option<PathBuf> {
+        self.memory.path.as_ref().map(|path| path.with_extension("state"))
+    }
+
+    /// Writes a record and makes it current. Before, room must have been [reserved](Self::reserve) for as many words as
+    /// `write` passes.
+    #[inline]
+    pub fn commit(&self, write: impl FnOnce(&mut Store<'_>)) {
+        let Some(record) = self.memory.record.get() else { return };
+        let commits = self.word(Self::COMMITS).load(Ordering::Relaxed) + 1;
+        // Readers that still read the copy which is written now must see by the count that it was replaced: the store of the
+        // last commit is not to be seen after the stores of this one.
+        fence(Ordering::Release);
+        let mut store = Store { words: record.copy(commits), at: 0 };
+        write(&mut store);
+        debug_assert_eq!(store.at, record.words, "a state always takes as many words");
+        // Whoever sees the count sees the copy.
+        self.word(Self::COMMITS).store(commits, Ordering::Release);
+    }
+
+    /// The last record that was committed; none before the first, or where none can be read.
+    pub fn record(&self) -> Option<Vec<u64>> {
+        let words = self.word(Self::LENGTH).load(Ordering::Relaxed) as usize;
+        if words == 0 || self.reserve(words).is_err() {
+            return None;
+        }
+        let record = self.memory.record.get()?;
+        for _ in 0..Self::TRIES {
+            let commits = self.word(Self::COMMITS).load(Ordering::Acquire);
+            if commits == 0 {
+                return None;
+            }
+            let copy = record.copy(commits).iter().map(|word| word.load(Ordering::Relaxed)).collect();
+            fence(Ordering::Acquire);
+            if self.word(Self::COMMITS).load(Ordering::Relaxed) == commits {
+                return Some(copy);
+            }
+        }
+        None
     }
 }
 
-/// Some words of a ledger.
+/// The two copies of a record.
 #[derive(Debug)]
-pub struct Words {
-    /// Looked up once: the books are written many times in every tick.
+struct Record {
+    storage: Storage,
+    words: usize,
+}
+
+impl Record {
+    #[inline]
+    fn copy(&self, commits: u64) -> &[AtomicU64] {
+        let begin = if commits.is_multiple_of(2) { 0 } else { self.words };
+        &self.storage.words()[begin..begin + self.words]
+    }
+}
+
+/// Writes a state into a record.
+#[derive(Debug)]
+pub struct Store<'a> {
+    words: &'a [AtomicU64],
+    at: usize,
+}
+
+impl Words for Store<'_> {
+    #[inline]
+    fn word(&mut self, value: &mut u64) {
+        if let Some(word) = self.words.get(self.at) {
+            word.store(*value, Ordering::Relaxed);
+        }
+        self.at += 1;
+    }
+}
+
+/// Some words of a ledger beside its record, each written whole and on its own.
+#[derive(Debug)]
+pub struct Slots {
+    /// Looked up once: some are written in every tick.
     words: NonNull<[AtomicU64]>,
     /// What keeps them.
     _memory: Rc<Memory>,
 }
 
-impl Words {
+impl Slots {
     #[inline]
     #[allow(unsafe_code)]
     fn words(&self) -> &[AtomicU64] {
@@ -156,49 +296,102 @@ impl Words {
         self.words()[index].load(Ordering::Relaxed)
     }
 
-    /// Writes one word; what was written before is seen before, by whoever outlives this process.
+    /// Writes one word. A commit that follows is not seen before it.
     #[inline]
     pub fn set(&self, index: usize, value: u64) {
-        self.words()[index].store(value, Ordering::Release);
-    }
-
-    /// Writes words in order, from `begin` on.
-    #[inline]
-    pub fn set_all(&self, begin: usize, values: &[u64]) {
-        for (word, value) in self.words()[begin..][..values.len()].iter().zip(values) {
-            word.store(*value, Ordering::Release);
-        }
-    }
-
-    /// Adds to one word. There is one writer.
-    #[inline]
-    pub fn add(&self, index: usize, amount: u64) {
-        self.set(index, self.get(index).wrapping_add(amount));
+        self.words()[index].store(value, Ordering::Relaxed);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::atomic::AtomicBool;
+
+    fn commit(ledger: &Ledger, values: &[u64]) {
+        ledger.commit(|store| values.iter().for_each(|value| store.word(&mut value.clone())));
+    }
 
     #[test]
-    fn whoever_opens_it_again_finds_what_was_written() {
+    fn whoever_opens_it_again_finds_what_was_committed_last() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("books");
+        let path = directory.path().join("x.books");
         let (first, second) = (Ledger::shared(&path, 5).unwrap(), Ledger::shared(&path, 5).unwrap());
         assert_eq!((first.enter(), second.enter(), first.generation()), (1, 2, 2));
-        let (_, ours) = (first.take(2), first.take(3));
-        let (_, theirs) = (second.take(2), second.take(3));
+        assert_eq!(second.record(), None);
+        first.reserve(3).unwrap();
+        assert_eq!(second.record(), None, "nothing was committed");
+        commit(&first, &[1, 2, 3]);
+        commit(&first, &[4, 5, 6]);
+        assert_eq!(second.record(), Some(vec![4, 5, 6]));
+        let (_, ours, _, theirs) = (first.take(2), first.take(3), second.take(2), second.take(3));
         ours.set(2, 7);
-        ours.add(2, 1);
-        assert_eq!((theirs.get(2), theirs.get(0)), (8, 0));
+        assert_eq!(theirs.get(2), 7);
         let writer = Ledger::taken(&path, 5).unwrap();
         assert!(matches!(Ledger::taken(&path, 5), Err(LedgerError::Taken { .. })));
         drop(writer);
-        Ledger::taken(&path, 5).unwrap();
+        let successor = Ledger::taken(&path, 5).unwrap();
         drop((first, ours));
-        assert_eq!(theirs.get(2), 8);
-        assert!(matches!(Ledger::shared(&path, 6), Err(LedgerError::Size { found: 48, expected: 56, .. })));
+        assert_eq!((successor.record(), theirs.get(2)), (Some(vec![4, 5, 6]), 7));
+        assert!(matches!(Ledger::shared(&path, 6), Err(LedgerError::Size { found: 72, expected: 80, .. })));
+        assert!(matches!(Ledger::shared(&path, 5).unwrap().reserve(4), Err(LedgerError::Size { .. })));
         assert!(matches!(Ledger::shared(directory.path(), 6), Err(LedgerError::Open { .. })));
+    }
+
+    #[test]
+    fn a_commit_that_was_not_finished_leaves_the_one_before() {
+        let ledger = Ledger::private(0);
+        ledger.reserve(2).unwrap();
+        commit(&ledger, &[1, 1]);
+        let died = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            ledger.commit(|store| {
+                store.word(&mut 2);
+                panic!("in the midst of it");
+            });
+        }));
+        assert!(died.is_err());
+        assert_eq!(ledger.record(), Some(vec![1, 1]));
+        commit(&ledger, &[3, 3]);
+        assert_eq!(ledger.record(), Some(vec![3, 3]));
+    }
+
+    #[test]
+    fn only_the_generation_that_follows_is_distrusted() {
+        let ledger = Ledger::private(0);
+        ledger.enter();
+        assert!(!ledger.distrusted());
+        ledger.distrust();
+        assert!(!ledger.distrusted());
+        ledger.enter();
+        assert!(ledger.distrusted());
+        ledger.enter();
+        assert!(!ledger.distrusted());
+    }
+
+    /// Whoever reads while somebody writes gets one record whole.
+    #[test]
+    fn no_reader_sees_parts_of_two_records() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("x.books");
+        let (done, seen) = (AtomicBool::new(false), std::sync::atomic::AtomicU64::new(0));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let ledger = Ledger::shared(&path, 0).unwrap();
+                ledger.reserve(64).unwrap();
+                let mut value = 0;
+                while seen.load(Ordering::Relaxed) < 2_000 {
+                    value += 1;
+                    commit(&ledger, &[value; 64]);
+                }
+                done.store(true, Ordering::Relaxed);
+            });
+            let ledger = Ledger::shared(&path, 0).unwrap();
+            while !done.load(Ordering::Relaxed) {
+                if let Some(record) = ledger.record() {
+                    assert!(record.iter().all(|word| *word == record[0]), "{record:?}");
+                    seen.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+        });
     }
 }

@@ -10,10 +10,10 @@ mod latency;
 mod ledger;
 mod report;
 
-pub use books::{ReadBook, TickBook, WatchBook, WriteBook};
+pub use books::{ReadBook, TickBook, WriteBook};
 pub use export::{write_hgrm, write_hlog};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};
-pub use ledger::{Ledger, LedgerError, Words};
+pub use ledger::{Ledger, LedgerError, Slots, Store};
 pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

@@ -142,13 +142,18 @@ impl Bench {
 
     /// The process of a role, once it runs.
     pub fn await_role(&self, role: &str) -> u32 {
+        await_some(|| self.role(role))
+    }
+
+    /// The process of a role, if it runs.
+    pub fn role(&self, role: &str) -> Option<u32> {
         let is_role = |pid: &u32| {
             let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
             let words: Vec<String> = line.split(|byte| *byte == 0).map(|w| String::from_utf8_lossy(w).into()).collect();
             let body = words.iter().position(|word| word == "--body").map(|index| words[index + 1].as_str());
             words.len() > 2 && words[1] != "run" && (words[1] == role || body == Some(role))
         };
-        await_some(|| self.processes().into_iter().find(is_role))
+        self.processes().into_iter().find(is_role)
     }
 }
 
@@ -179,6 +184,14 @@ impl Running {
 
     pub fn signal(&self, signal: i32) {
         send_signal(self.pid(), signal);
+    }
+
+    /// The process of a role, once it runs, unless the program ends before.
+    pub fn await_role_or_end(&mut self, bench: &Bench, role: &str) -> Option<u32> {
+        await_some(|| match bench.role(role) {
+            Some(pid) => Some(Some(pid)),
+            None => self.child.try_wait().unwrap().map(|_| None),
+        })
     }
 
     pub fn wait(mut self) -> Done {

@@ -73,12 +73,19 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
 
 impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     #[inline]
-    fn send(&mut self, fill: impl FnOnce(&mut FleetSample<L>)) -> Result<(), BusError> {
+    fn fill(&mut self, fill: impl FnOnce(&mut FleetSample<L>)) -> Result<(), BusError> {
         let mut sample = match self.loan.take() {
             Some(sample) => sample,
             None => self.loan()?,
         };
         fill(FleetSample::over_mut(Word::peel_slice_mut(sample.payload_mut())));
+        self.loan = Some(sample);
+        Ok(())
+    }
+
+    #[inline]
+    fn deliver(&mut self) -> Result<(), BusError> {
+        let Some(sample) = self.loan.take() else { return Ok(()) };
         sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
         self.bell.ring();
         Ok(())

@@ -8,6 +8,7 @@ use crate::model::{CentralField, OrbitState};
 use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
+use crate::state::persist_fields;
 use nalgebra::Vector4;
 use serde::{Deserialize, Serialize};
 
@@ -140,6 +141,8 @@ impl Limits {
     }
 }
 
+persist_fields!(MeasurementGuard, state);
+
 impl Guard<OrbitMeasurement> for MeasurementGuard {
     #[inline]
     fn accepts(&mut self, sample: &OrbitMeasurement) -> bool {
@@ -162,6 +165,8 @@ pub struct EstimateGuard {
     radius_offset: f64,
 }
 
+persist_fields!(EstimateGuard,);
+
 impl Guard<OrbitEstimate> for EstimateGuard {
     #[inline]
     fn accepts(&mut self, sample: &OrbitEstimate) -> bool {
@@ -180,6 +185,8 @@ impl Guard<OrbitEstimate> for EstimateGuard {
 pub struct CommandGuard {
     thrust_du_s2: f64,
 }
+
+persist_fields!(CommandGuard,);
 
 impl Guard<OrbitCommand> for CommandGuard {
     #[inline]

@@ -8,6 +8,7 @@ use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
 use crate::rig::FilterDesign;
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
+use crate::state::persist_fields;
 use nalgebra::Vector2;
 
 /// The bits of r and θ in a sample's `valid`.
@@ -37,6 +38,8 @@ impl OrbitPlant {
     }
 }
 
+persist_fields!(OrbitPlant, state, applied, noise, fault);
+
 impl Body for OrbitPlant {
     type Truth = OrbitTruth;
     type Measurement = OrbitMeasurement;
@@ -62,7 +65,7 @@ impl Body for OrbitPlant {
         out.status = status | self.fault;
     }
 
-    fn measure(&mut self, status: u64, out: &mut OrbitMeasurement) {
+    fn measure(&mut self, _tick: u64, status: u64, out: &mut OrbitMeasurement) {
         let noise = self.noise.sample();
         out.radius_du = self.state.r + noise[0];
         out.angle_rad = self.state.theta + noise[1];
@@ -71,18 +74,6 @@ impl Body for OrbitPlant {
         out.applied_du_s2 = self.applied.into();
         out.valid = self.measured;
         out.status = status | self.fault;
-    }
-
-    fn status_of(truth: &OrbitTruth) -> u64 {
-        truth.status
-    }
-
-    fn resume(&mut self, truth: &OrbitTruth, measured: u64) {
-        let [vr, vtheta] = truth.velocity_du_s;
-        self.state = OrbitState { r: truth.radius_du, theta: truth.angle_rad, vr, vtheta };
-        self.applied = truth.applied_du_s2.into();
-        self.fault = truth.status & status::FAULT;
-        self.noise.skip(measured);
     }
 
     /// Freezes for good at the last good state where the model ends.
@@ -137,6 +128,8 @@ impl OrbitObserver {
         OrbitSample { r: measurement.radius_du, theta: measurement.angle_rad, thrust: measurement.applied_du_s2.into() }
     }
 }
+
+persist_fields!(OrbitObserver, filter, last, coasted, status);
 
 impl Estimator for OrbitObserver {
     type Measurement = OrbitMeasurement;
@@ -237,6 +230,8 @@ fn state(r: f64, theta: f64, velocity: &[f64; 2]) -> OrbitState {
     OrbitState { r, vr: velocity[0], theta, vtheta: velocity[1] }
 }
 
+persist_fields!(OrbitLaw,);
+
 impl Law for OrbitLaw {
     type Estimate = OrbitEstimate;
     type Measurement = OrbitMeasurement;
@@ -261,7 +256,7 @@ mod tests {
 
     fn measured(plant: &mut OrbitPlant) -> OrbitMeasurement {
         let mut measurement = OrbitMeasurement::default();
-        plant.measure(0, &mut measurement);
+        plant.measure(0, 0, &mut measurement);
         measurement
     }
 

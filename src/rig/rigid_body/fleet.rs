@@ -11,6 +11,7 @@ use crate::role::{Body, Bounds, Guard, Law};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
 };
+use crate::state::{Persist, Words, persist_fields};
 use nalgebra::Vector3;
 
 /// Where a vector lies in its samples.
@@ -110,7 +111,6 @@ impl Fleet<RateEstimate> for RateFleet {
         FleetMeasurementGuard {
             bounds: self.bounds,
             acceleration_max_rad_s2: self.acceleration_max_rad_s2,
-            generation: 0,
             believed: zeros(self.count()),
             believed_tick: None,
             doubted: zeros(self.count()),
@@ -155,24 +155,26 @@ impl Body for FleetPlant {
         assign(out.vector_mut(APPLIED), all(&self.asked));
     }
 
-    fn status_of(truth: &FleetTruth) -> u64 {
-        truth.status()
-    }
-
-    fn measure(&mut self, status: u64, out: &mut FleetMeasurement) {
+    fn measure(&mut self, _tick: u64, status: u64, out: &mut FleetMeasurement) {
         out.set_status(status);
         assign(out.vector_mut(OMEGA), all(&self.rates));
         assign(out.vector_mut(APPLIED), all(&self.asked));
     }
 
-    fn resume(&mut self, truth: &FleetTruth, _measured: u64) {
-        assign(all_mut(&mut self.rates), truth.vector(OMEGA));
-        assign(all_mut(&mut self.asked), truth.vector(APPLIED));
-    }
-
     fn flow(&mut self, dt_s: f64) {
         flow_all(&self.body, all_mut(&mut self.rates), all(&self.asked), dt_s);
     }
+}
+
+impl Persist for FleetPlant {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        persist_arrays(&mut self.rates, words);
+        persist_arrays(&mut self.asked, words);
+    }
+}
+
+fn persist_arrays<W: Words>(arrays: &mut Arrays, words: &mut W) {
+    all_mut(arrays).into_iter().for_each(|array| array.persist(words));
 }
 
 /// The synchronising law of all followers of a fleet. No V is published.
@@ -184,6 +186,8 @@ pub struct FleetRateLaw {
     /// Room for the predicted rates, if there is a prediction.
     ahead: Arrays,
 }
+
+persist_fields!(FleetRateLaw,);
 
 impl Law for FleetRateLaw {
     type Estimate = RateEstimate;
@@ -213,7 +217,6 @@ impl Law for FleetRateLaw {
 pub struct FleetMeasurementGuard {
     bounds: Bounds<3>,
     acceleration_max_rad_s2: f64,
-    generation: u64,
     /// The last rates that were believed, and their tick.
     believed: Arrays,
     believed_tick: Option<u64>,
@@ -245,6 +248,15 @@ impl FleetMeasurementGuard {
     }
 }
 
+impl Persist for FleetMeasurementGuard {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        persist_arrays(&mut self.believed, words);
+        self.believed_tick.persist(words);
+        persist_arrays(&mut self.doubted, words);
+        self.doubted_tick.persist(words);
+    }
+}
+
 impl Guard<FleetMeasurement> for FleetMeasurementGuard {
     fn accepts(&mut self, sample: &FleetMeasurement) -> bool {
         let limit = self.acceleration_max_rad_s2;
@@ -253,9 +265,6 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
             return false;
         }
         let stamp = sample.stamp();
-        if stamp.generation != self.generation {
-            (self.generation, self.believed_tick, self.doubted_tick) = (stamp.generation, None, None);
-        }
         let rates = sample.vector(OMEGA);
         let believed = self.possible(rates, stamp.tick);
         if believed {
@@ -275,6 +284,8 @@ pub struct FleetCommandGuard {
     count: u64,
     acceleration_max_rad_s2: f64,
 }
+
+persist_fields!(FleetCommandGuard,);
 
 impl Guard<FleetCommand> for FleetCommandGuard {
     fn accepts(&mut self, sample: &FleetCommand) -> bool {

@@ -2,6 +2,7 @@
 
 use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
+use crate::state::{Persist, Words};
 use nalgebra::{SVector, Vector3};
 
 /// An identifier with its estimate.
@@ -64,6 +65,16 @@ impl Identifier {
     /// By how many decay times the initial error has decayed.
     pub fn decay_times(&self) -> f64 {
         self.excitation * self.slowest_decay
+    }
+}
+
+impl Persist for Identifier {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        match &mut self.kind {
+            Kind::Asymmetric { filter, .. } => filter.persist(words),
+            Kind::Axisymmetric { filter, .. } => filter.persist(words),
+        }
+        self.excitation.persist(words);
     }
 }
 

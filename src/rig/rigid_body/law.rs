@@ -3,6 +3,7 @@
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
+use crate::state::persist_fields;
 use nalgebra::Vector3;
 use std::hint::black_box;
 
@@ -21,6 +22,9 @@ pub struct RateLaw {
     pub(super) acceleration_max_rad_s2: f64,
     pub(super) tick_s: f64,
 }
+
+// What was learned of the coefficients comes anew with every estimate.
+persist_fields!(RateLaw, adaptation);
 
 impl Law for RateLaw {
     type Estimate = RateEstimate;

@@ -8,6 +8,7 @@ use super::identifier::Identifier;
 use super::observer::{ALL, HiddenObserver, Knowledge, filter, seen};
 use crate::observe::{HiddenRate, RateSample};
 use crate::sample::{RateEstimate, RateMeasurement, status};
+use crate::state::{Persist, Words};
 use nalgebra::Vector3;
 
 /// The identifier's error counts as gone after so many decay times: e^−25 is 1e-11.
@@ -16,6 +17,9 @@ const SETTLED_DECAYS: f64 = 25.0;
 const SETTLED_CLOSURE: f64 = 1e-6;
 /// A component that is supplied on poor knowledge is kept within so many times the fastest rate seen.
 const DEGRADED_BOUND: f64 = 2.0;
+
+/// Words of the state of a stand-in's observer, whose filter is of first order.
+const SUPPLIER_WORDS: usize = 11;
 
 /// What a [`Learner`] is made of.
 #[derive(Debug, Clone)]
@@ -147,5 +151,31 @@ impl Learner {
         out.excitation = self.identifier.excitation();
         out.status = self.status | status;
         out.valid = supplier.filter(|s| s.degraded).map_or(ALL, |s| ALL & !(1 << s.component));
+    }
+}
+
+impl Persist for Learner {
+    /// The stand-in is made again of the coefficients, which do not change while an axis is lost.
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.identifier.persist(words);
+        self.last.persist(words);
+        self.fastest_rad_s.persist(words);
+        self.status.persist(words);
+        let mut component = self.supplier.as_ref().map(|supplier| supplier.component as u64);
+        component.persist(words);
+        self.supplier = component.map(|component| {
+            let component = (component % 3) as usize;
+            let same = self.supplier.take().filter(|supplier| supplier.component == component);
+            same.unwrap_or_else(|| self.supplier(component, self.last.rate_rad_s, false))
+        });
+        let supplier = &mut self.supplier;
+        let (mut degraded, mut held) = supplier.as_ref().map_or(Default::default(), |s| (s.degraded, s.held));
+        degraded.persist(words);
+        held.persist(words);
+        match supplier.as_mut().and_then(|supplier| supplier.observer.as_mut()) {
+            Some(observer) => observer.persist(words),
+            None => [0_u64; SUPPLIER_WORDS].persist(words),
+        }
+        supplier.iter_mut().for_each(|supplier| (supplier.degraded, supplier.held) = (degraded, held));
     }
 }

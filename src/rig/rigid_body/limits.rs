@@ -7,6 +7,7 @@ use crate::config::{Checks, finite_positive};
 use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
+use crate::state::persist_fields;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
@@ -159,6 +160,8 @@ pub struct MeasurementGuard {
     needed: u64,
 }
 
+persist_fields!(MeasurementGuard, rate);
+
 impl Guard<RateMeasurement> for MeasurementGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateMeasurement) -> bool {
@@ -175,6 +178,8 @@ pub struct EstimateGuard {
     rate: Plausible<3>,
 }
 
+persist_fields!(EstimateGuard, rate);
+
 impl Guard<RateEstimate> for EstimateGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateEstimate) -> bool {
@@ -190,6 +195,8 @@ impl Guard<RateEstimate> for EstimateGuard {
 pub struct CommandGuard {
     acceleration_rad_s2: f64,
 }
+
+persist_fields!(CommandGuard,);
 
 impl Guard<RateCommand> for CommandGuard {
     #[inline]

@@ -209,7 +209,6 @@ impl Rig for RigidBodyRig {
             measured: if index == 0 { self.measured } else { ALL },
             noise: self.noise[index].clone(),
             outages: if index == 0 { self.outages.clone() } else { Vec::new() },
-            tick: 0,
         }
     }
 

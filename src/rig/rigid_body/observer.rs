@@ -8,6 +8,7 @@ use crate::observe::{
 };
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
+use crate::state::{Persist, Words};
 use nalgebra::{Vector1, Vector3};
 
 /// All components of a vector.
@@ -81,6 +82,16 @@ impl Estimator for RateObserver {
             Self::Hidden(observer) => observer.write(status, out),
             Self::Kalman(observer) => observer.write(status, out),
             Self::Learner(observer) => observer.write(status, out),
+        }
+    }
+}
+
+impl Persist for RateObserver {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        match self {
+            Self::Hidden(observer) => observer.persist(words),
+            Self::Kalman(observer) => observer.persist(words),
+            Self::Learner(observer) => observer.persist(words),
         }
     }
 }
@@ -215,6 +226,16 @@ impl HiddenObserver {
     }
 }
 
+impl Persist for HiddenObserver {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.filter.persist(words);
+        self.relation.persist_sight(&mut self.last, words);
+        self.rate.persist(words);
+        self.innovation.persist(words);
+        self.status.persist(words);
+    }
+}
+
 /// What coefficients say of a body. Where they are known it is computed once.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Knowledge {
@@ -290,11 +311,14 @@ impl KalmanObserver {
     fn start(&mut self, measurement: &RateMeasurement) {
         (self.last, self.coasted) = (seen(measurement), None);
         self.status = status::INITIAL;
+        self.filter = self.begun();
+    }
+
+    /// A filter that begins with the last sample. That the component can be observed was checked when the scenario was
+    /// resolved.
+    fn begun(&self) -> Option<GuardedKalman> {
         let (axis, first) = (self.hidden + 1, &self.last);
-        // That the component can be observed was checked when the scenario was resolved.
-        self.filter =
-            GuardedKalman::new(&self.body.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s)
-                .ok();
+        GuardedKalman::new(&self.body.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s).ok()
     }
 
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
@@ -321,5 +345,19 @@ impl KalmanObserver {
         out.excitation = 0.0;
         out.status = self.status | status;
         out.valid = if out.status & status::INITIAL == 0 { ALL } else { self.needed() };
+    }
+}
+
+impl Persist for KalmanObserver {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.last.persist(words);
+        self.coasted.persist(words);
+        self.status.persist(words);
+        let mut begun = self.filter.is_some();
+        begun.persist(words);
+        if let Some(mut filter) = self.filter.or_else(|| self.begun()) {
+            filter.persist(words);
+            self.filter = begun.then_some(filter);
+        }
     }
 }

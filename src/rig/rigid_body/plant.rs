@@ -3,6 +3,7 @@
 use crate::model::{Noise, RigidBody};
 use crate::role::Body;
 use crate::sample::{RateCommand, RateMeasurement, RateTruth};
+use crate::state::persist_fields;
 use nalgebra::Vector3;
 
 /// A gyro that is dead for a while.
@@ -29,7 +30,6 @@ pub struct RatePlant {
     pub(super) measured: u64,
     pub(super) noise: Noise<3>,
     pub(super) outages: Vec<Outage>,
-    pub(super) tick: u64,
 }
 
 impl RatePlant {
@@ -38,11 +38,13 @@ impl RatePlant {
     }
 
     /// Bit i set: component i is measured at this tick.
-    fn valid(&self) -> u64 {
-        let dead = |outage: &&Outage| (outage.from_tick..outage.until_tick).contains(&self.tick);
+    fn valid(&self, tick: u64) -> u64 {
+        let dead = |outage: &&Outage| (outage.from_tick..outage.until_tick).contains(&tick);
         self.outages.iter().filter(dead).fold(self.measured, |valid, outage| valid & !(1 << outage.component))
     }
 }
+
+persist_fields!(RatePlant, rate, asked, noise);
 
 impl Body for RatePlant {
     type Truth = RateTruth;
@@ -68,8 +70,8 @@ impl Body for RatePlant {
         out.status = status;
     }
 
-    fn measure(&mut self, status: u64, out: &mut RateMeasurement) {
-        let (valid, seen) = (self.valid(), self.rate + self.noise.sample());
+    fn measure(&mut self, tick: u64, status: u64, out: &mut RateMeasurement) {
+        let (valid, seen) = (self.valid(tick), self.rate + self.noise.sample());
         for component in 0..3 {
             out.omega_rad_s[component] = if valid >> component & 1 == 1 { seen[component] } else { 0.0 };
         }
@@ -78,19 +80,7 @@ impl Body for RatePlant {
         out.status = status;
     }
 
-    fn status_of(truth: &RateTruth) -> u64 {
-        truth.status
-    }
-
-    fn resume(&mut self, truth: &RateTruth, measured: u64) {
-        self.rate = truth.omega_rad_s.into();
-        self.asked = Vector3::from(truth.applied_rad_s2).component_mul(&self.inertia_factor);
-        self.tick = truth.stamp.tick;
-        self.noise.skip(measured);
-    }
-
     fn flow(&mut self, dt_s: f64) {
         self.rate = self.body.flow(&self.rate, &self.acceleration(), dt_s);
-        self.tick += 1;
     }
 }

@@ -2,8 +2,7 @@
 //!
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
-use super::plant::StateBook;
-use super::{Gate, Node, Poll, RoleId, Seat};
+use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
@@ -13,7 +12,8 @@ use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineBook, MAX_CONTENT};
-use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
+use crate::state::{Persist, Words};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
 
 /// Between two looks at the line, ns.
 const LOOK_NS: u64 = 50_000;
@@ -29,7 +29,7 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     last_tick: u64,
     book: TickBook,
     interruptions: Interruptions,
-    state: StateBook<Truth<R>>,
+    ledger: Ledger,
     /// Whether the device has been asked for the next tick, when, and when its command's chain began, ns.
     asked: bool,
     asked_ns: u64,
@@ -67,8 +67,6 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             assert!(content_length::<Truth<R>>() <= MAX_CONTENT);
         }
         let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
-        // The same books in the same order as a simulated plant's. A successor lacks nothing: the state is in the device.
-        let book = TickBook::open(seat.ledger);
         let measurement = seat.output(body, Signal::Measurement)?;
         let truth = seat.output(body, Signal::Truth)?;
         let command = seat.input(body, Signal::Command, rig.command_guard(index))?;
@@ -80,9 +78,9 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             clock: seat.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            book,
+            book: TickBook::default(),
             interruptions: seat.interruptions(),
-            state: StateBook::open(seat.ledger, 1),
+            ledger: seat.ledger.reopened(),
             asked: false,
             asked_ns: 0,
             command_origin_ns: None,
@@ -139,10 +137,16 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     fn publish(&mut self, now_ns: u64) -> Result<Poll, BusError> {
         let (tick, clock) = (self.book.next(), self.clock);
         let origin_ns = self.grid.due_ns(tick);
-        let Reply { event, measurement, .. } = &self.reply;
-        self.measurement.send(|sample| {
+        let Reply { event, measurement, truth } = &self.reply;
+        let stamp = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
+        self.measurement.stage(|sample| {
             *sample = *measurement;
-            *sample.stamp_mut() = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
+            *sample.stamp_mut() = stamp;
+        })?;
+        // A successor could not ask the device for it: it was asked for once.
+        self.truth.stage(|sample| {
+            *sample = *truth;
+            *sample.stamp_mut() = stamp;
         })?;
         if event.missed() {
             self.book.starved(tick);
@@ -157,6 +161,9 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             }
         }
         self.asked = false;
+        self.book.executed();
+        commit(self);
+        self.measurement.dispatch()?;
         Ok(Poll::Executed)
     }
 
@@ -178,13 +185,26 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         self.book.next()
     }
 
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        if restore(self)? == Inherited::Counters {
+            self.book.disturbed(self.book.next());
+        }
+        self.command.expect_repeats();
+        Ok(())
+    }
+
     /// The device is where it is: it needs nothing of what a predecessor knew.
-    fn start(&mut self, grid: Grid, first_tick: u64) {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         self.grid = grid;
         if self.clock == Clock::Monotonic {
             self.command.expect(Horizon::Due(grid));
         }
+        self.measurement.dispatch()?;
+        self.measurement.finish()?;
+        self.truth.dispatch()?;
+        self.truth.finish()?;
         self.skip_to(first_tick);
+        Ok(())
     }
 
     #[inline]
@@ -231,16 +251,14 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
-        let (tick, clock, truth) = (self.book.next(), self.clock, &self.reply.truth);
-        let origin_ns = self.grid.due_ns(tick);
-        self.truth.send(|sample| {
-            *sample = *truth;
-            *sample.stamp_mut() = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
-        })?;
-        self.measurement.settle()?;
-        self.truth.settle()?;
-        self.state.store(self.truth.sent());
-        self.book.executed();
+        self.truth.dispatch()?;
+        self.measurement.finish()?;
+        self.truth.finish()
+    }
+
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.settle()?;
+        commit_last(self);
         Ok(())
     }
 
@@ -263,6 +281,10 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         self.truth.refresh()
     }
 
+    fn state_words(&mut self) -> usize {
+        length(self)
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
     }
@@ -273,5 +295,24 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn line(&self) -> Option<LineBook> {
         Some(self.link.book())
+    }
+}
+
+/// In the order of a simulated plant's: whoever reads the counters does not know that there is a device.
+impl<R: Rig, B: Bus> Persistent for BridgeNode<R, B> {
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    fn counters<W: Words>(&mut self, words: &mut W) {
+        self.book.persist(words);
+        self.measurement.persist(words);
+        self.truth.persist(words);
+        self.command.counters().persist(words);
+    }
+
+    fn state<W: Words>(&mut self, words: &mut W) {
+        self.command.persist(words);
+        self.measurement.persist_late(words);
     }
 }

@@ -1,7 +1,7 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
 use super::ports::driven;
-use super::{Gate, Node, Poll, RoleId, Seat};
+use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::{Watchdog, Watched};
@@ -10,7 +10,8 @@ use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::Message;
-use crate::telemetry::{Latency, StageReport, TickBook, Ticks, WatchBook};
+use crate::state::{Persist, Words};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
 
 /// What drives the bodies of a rig one by one.
 type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
@@ -66,10 +67,12 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     fn pass_over(&mut self, tick: u64) -> Result<(), BusError> {
         // What is not used now will never be, and must not fill the link.
         self.measurement.seek(tick)?;
-        self.command.pass_over(tick)
+        self.ready = false;
+        self.command.stage_void(tick);
+        Ok(())
     }
 
-    /// Sends the command of this tick, begun at a time, unless the measurement is missing or the watchdog wants silence;
+    /// Makes the command of this tick, begun at a time, unless the measurement is missing or the watchdog wants silence;
     /// gives the time at which the next one is begun. Whether it was missing is added to `starved`.
     #[inline]
     fn execute(
@@ -82,11 +85,11 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         *starved |= !self.ready;
         self.ready &= !silent;
         let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
-            self.command.pass_over(estimate.stamp().tick)?;
+            self.command.stage_void(estimate.stamp().tick);
             return Ok(began_ns);
         };
         let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
-        self.command.send(|sample| {
+        self.command.stage(|sample| {
             controller.step(estimate, measurement, sample);
             *sent_ns = clock.now_ns();
             sample.stamp_mut().sent_ns = *sent_ns;
@@ -98,14 +101,21 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     /// Takes in what a command leaves to be done.
     #[inline]
     fn settle(&mut self, timed: bool, origin_ns: u64, step: &mut Latency, age: &mut Latency) -> Result<(), BusError> {
-        if !self.ready {
-            return Ok(());
-        }
-        if timed {
+        if timed && self.ready {
             step.record(self.began_ns, self.sent_ns);
             age.record(origin_ns, self.sent_ns);
         }
-        self.command.settle()
+        self.command.finish()
+    }
+
+    fn state<W: Words>(&mut self, words: &mut W)
+    where
+        L: Persist,
+        G: Persist,
+    {
+        self.controller.persist(words);
+        self.measurement.persist(words);
+        self.command.persist_late(words);
     }
 
     fn warm_up(&mut self) -> Result<(), BusError> {
@@ -128,8 +138,10 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     clock: Clock,
     book: TickBook,
     watchdog: Watchdog,
-    watch_book: WatchBook,
     interruptions: Interruptions,
+    ledger: Ledger,
+    /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
+    look: usize,
     /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
     origin_ns: u64,
     estimate_sent_ns: u64,
@@ -141,7 +153,6 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let book = TickBook::go_on(seat.ledger);
         let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
         // In the order of the books: everything written, then everything read; fleets last.
         let written = |(_, body)| seat.output(body, Signal::Command);
@@ -158,17 +169,17 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), seat))
         };
         let fleets = bodies(true).zip(fleet_commands).filter_map(channel).collect::<Result<_, BusError>>()?;
-        let watch_book = WatchBook::open(seat.ledger);
         Ok(Self {
             rig: rig.clone(),
             estimate,
             channels,
             fleets,
             clock: seat.clock,
-            book,
-            watchdog: watch_book.watchdog(seat.scenario.watch),
-            watch_book,
+            book: TickBook::default(),
+            watchdog: Watchdog::new(seat.scenario.watch),
             interruptions: seat.interruptions(),
+            ledger: seat.ledger.reopened(),
+            look: 0,
             origin_ns: 0,
             estimate_sent_ns: 0,
             received_ns: 0,
@@ -188,9 +199,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
         if self.estimate.seek(self.book.next())? == Seek::NotYet {
             if self.clock == Clock::Monotonic {
-                // Meanwhile the others, so that the newest are at hand when the estimate comes, which is the last as a rule.
-                self.channels.iter_mut().try_for_each(|channel| channel.measurement.seek(u64::MAX).map(drop))?;
-                self.fleets.iter_mut().try_for_each(|fleet| fleet.measurement.seek(u64::MAX).map(drop))?;
+                // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
+                // rule.
+                self.look_ahead()?;
             }
             return Ok(false);
         }
@@ -208,6 +219,19 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(complete || overdue)
     }
 
+    /// Takes what has come for one channel, each time for another.
+    #[inline]
+    fn look_ahead(&mut self) -> Result<(), BusError> {
+        let (single, all) = (self.channels.len(), self.channels.len() + self.fleets.len());
+        self.look = if self.look + 1 < all { self.look + 1 } else { 0 };
+        if let Some(channel) = self.channels.get_mut(self.look) {
+            channel.measurement.seek(u64::MAX)?;
+        } else if let Some(fleet) = self.fleets.get_mut(self.look - single) {
+            fleet.measurement.seek(u64::MAX)?;
+        }
+        Ok(())
+    }
+
     /// There is no estimate for the next tick that could be used, and so there are no commands.
     #[cold]
     fn pass_over(&mut self) -> Result<(), BusError> {
@@ -216,8 +240,23 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
             self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
             self.skip_to(tick + 1);
+            commit(self);
+            self.dispatch()?;
+            self.finish_commands()?;
         }
         Ok(())
+    }
+
+    /// Sends the commands that are staged.
+    #[inline]
+    fn dispatch(&mut self) -> Result<(), BusError> {
+        self.channels.iter_mut().try_for_each(|channel| channel.command.dispatch())?;
+        self.fleets.iter_mut().try_for_each(|fleet| fleet.command.dispatch())
+    }
+
+    fn finish_commands(&mut self) -> Result<(), BusError> {
+        self.channels.iter_mut().try_for_each(|channel| channel.command.finish())?;
+        self.fleets.iter_mut().try_for_each(|fleet| fleet.command.finish())
     }
 
     /// Holds the estimate against the physics. Whatever comes of it is up to the watchdog.
@@ -246,7 +285,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         for channel in &mut self.channels {
             began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved)?;
             let watched = self.watchdog.active() && channel.ready;
-            if let (true, Some((v, _))) = (watched, R::lyapunov(channel.command.sent())) {
+            if let (true, Some((v, _))) = (watched, R::lyapunov(channel.command.last())) {
                 self.watchdog.magnitude(Watched::Lyapunov, stamp.tick, v);
             }
         }
@@ -258,6 +297,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         if starved {
             self.book.starved(stamp.tick);
         }
+        self.book.executed();
+        commit(self);
+        self.dispatch()?;
         Ok(Poll::Executed)
     }
 }
@@ -271,13 +313,26 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.book.next()
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) {
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        if restore(self)? == Inherited::Counters {
+            self.book.disturbed(self.book.next());
+        }
+        self.estimate.expect_repeats();
+        self.channels.iter_mut().for_each(|channel| channel.measurement.expect_repeats());
+        self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect_repeats());
+        Ok(())
+    }
+
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(Horizon::Due(grid));
             self.channels.iter_mut().for_each(|channel| channel.measurement.expect(Horizon::Due(grid)));
             self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(Horizon::Due(grid)));
         }
+        self.dispatch()?;
+        self.finish_commands()?;
         self.skip_to(first_tick);
+        Ok(())
     }
 
     #[inline]
@@ -325,10 +380,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         for fleet in &mut self.fleets {
             fleet.settle(timed, self.origin_ns, &mut self.step, &mut self.age)?;
         }
-        if self.watchdog.active() {
-            self.watch_book.store(&self.watchdog);
-        }
-        self.book.executed();
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.finish_commands()?;
+        commit_last(self);
         Ok(())
     }
 
@@ -348,11 +405,39 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.fleets.iter_mut().try_for_each(Channel::refresh)
     }
 
+    fn state_words(&mut self) -> usize {
+        length(self)
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
         StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+    }
+}
+
+impl<R: Rig, B: Bus> Persistent for ControllerNode<R, B> {
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    #[inline]
+    fn counters<W: Words>(&mut self, words: &mut W) {
+        self.book.persist(words);
+        self.channels.iter_mut().for_each(|channel| channel.command.persist(words));
+        self.fleets.iter_mut().for_each(|fleet| fleet.command.persist(words));
+        self.estimate.counters().persist(words);
+        self.channels.iter_mut().for_each(|channel| channel.measurement.counters().persist(words));
+        self.fleets.iter_mut().for_each(|fleet| fleet.measurement.counters().persist(words));
+        self.watchdog.persist(words);
+    }
+
+    #[inline]
+    fn state<W: Words>(&mut self, words: &mut W) {
+        self.estimate.persist(words);
+        self.channels.iter_mut().for_each(|channel| channel.state(words));
+        self.fleets.iter_mut().for_each(|fleet| fleet.state(words));
     }
 }

@@ -10,36 +10,33 @@ use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError};
 use crate::clock::{Clock, Grid};
 use crate::rig::Rig;
-use crate::telemetry::{StageReport, Ticks};
+use crate::telemetry::{LedgerError, StageReport, Ticks};
 
-/// Both nodes. In lockstep the controller is never behind the observer's books: a successor of both makes every estimate
-/// again that has not been used, for nobody outlived it who could send it once more.
+/// Both nodes. What the observer had sent and the controller not used died with both: in lockstep a successor sends it again.
 pub struct FusedNode<R: Rig, B: Bus> {
     observer: ObserverNode<R, B>,
     controller: ControllerNode<R, B>,
-    /// Whether the observer has sent an estimate that it has not settled.
-    estimated: bool,
+    /// Whether no sample may be lost.
+    lossless: bool,
+    /// The tick of the estimate that the observer has sent and not settled.
+    estimated: Option<u64>,
 }
 
 impl<R: Rig, B: Bus> FusedNode<R, B> {
     pub fn open(rig: &R, observer: &Seat<'_, B>, controller: &Seat<'_, B>) -> Result<Self, BusError> {
-        let mut made = ObserverNode::open(rig, observer)?.shown_first();
+        let made = ObserverNode::open(rig, observer)?.shown_first();
         let used = ControllerNode::open(rig, controller)?;
-        if controller.clock == Clock::None {
-            // Only where there was no measurement may the observer have been ahead.
-            made.repeat_voids(used.next_tick())?;
-        }
-        Ok(Self { observer: made, controller: used, estimated: false })
+        Ok(Self { observer: made, controller: used, lossless: controller.clock == Clock::None, estimated: None })
     }
 
     /// Whether it is the observer's input that the next tick lacks: nothing else could bring the estimate.
     #[inline]
     fn lacks_measurement(&self) -> bool {
-        !self.estimated && self.controller.lacks_estimate()
+        self.estimated.is_none() && self.controller.lacks_estimate()
     }
 
     fn settle_estimate(&mut self) -> Result<(), BusError> {
-        if !std::mem::take(&mut self.estimated) {
+        if self.estimated.take().is_none() {
             return Ok(());
         }
         self.observer.publish()?;
@@ -56,9 +53,17 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
         self.observer.next_tick().min(self.controller.next_tick())
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) {
-        self.observer.start(grid, first_tick);
-        self.controller.start(grid, first_tick);
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        self.observer.restore()?;
+        self.controller.restore()
+    }
+
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+        if self.lossless {
+            self.observer.repeat(self.controller.next_tick())?;
+        }
+        self.observer.start(grid, first_tick)?;
+        self.controller.start(grid, first_tick)
     }
 
     #[inline]
@@ -69,17 +74,17 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
 
     #[inline]
     fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        if !self.estimated {
-            self.estimated = self.observer.poll(gate)? == Poll::Executed;
-            let tick = self.observer.next_tick();
-            if self.estimated && gate == Gate::Overdue && self.controller.next_tick() < tick {
+        if self.estimated.is_none() && self.observer.poll(gate)? == Poll::Executed {
+            let tick = self.observer.next_tick() - 1;
+            self.estimated = Some(tick);
+            if gate == Gate::Overdue && self.controller.next_tick() < tick {
                 // What was waited for will never come, and this tick has a cutoff of its own.
                 self.controller.skip_to(tick);
                 return Ok(Poll::Missed);
             }
         }
         let polled = self.controller.poll(gate)?;
-        let passed_over = self.controller.next_tick() > self.observer.next_tick();
+        let passed_over = self.estimated.is_some_and(|tick| self.controller.next_tick() > tick);
         if polled == Poll::Waiting && (passed_over || gate == Gate::Overdue) {
             // The estimate is of no use to anybody; the next one may be.
             self.settle_estimate()?;
@@ -99,7 +104,7 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
         if self.lacks_measurement() { self.observer.sleep(until_ns) } else { self.controller.sleep(until_ns) }
     }
 
-    /// The controller first: whoever dies in between leaves an estimate to be made again, not one that is lost.
+    /// The commands first: others wait for them.
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
         self.controller.settle()?;
@@ -108,7 +113,9 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
 
     /// The estimate may have been sent, and used, though the command waits for another input.
     fn finish(&mut self) -> Result<(), BusError> {
-        self.settle_estimate()
+        self.settle_estimate()?;
+        self.observer.finish()?;
+        self.controller.finish()
     }
 
     fn skip_to(&mut self, tick: u64) {
@@ -124,6 +131,10 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
     fn refresh(&mut self) -> Result<(), BusError> {
         self.observer.refresh()?;
         self.controller.refresh()
+    }
+
+    fn state_words(&mut self) -> usize {
+        self.observer.state_words() + self.controller.state_words()
     }
 
     fn ticks(&self) -> Ticks {
@@ -145,6 +156,7 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::commit_last;
     use super::*;
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
@@ -198,10 +210,15 @@ mod tests {
             turn(&mut fused.observer, LOST);
         }
         assert_eq!((fused.observer.next_tick(), fused.controller.next_tick()), (LOST + 1, LOST));
+        commit_last(&mut fused.observer);
+        commit_last(&mut fused.controller);
         drop((fused, first_bus));
 
         let second_bus = enter(&domain, scenario);
         let mut fused = open(rig, scenario, &second_bus, &books);
+        fused.restore().unwrap();
+        let first_tick = fused.next_tick();
+        fused.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, first_tick).unwrap();
         let mut looks = 0;
         while fused.next_tick() <= LAST {
             plants.iter_mut().for_each(|plant| turn(&mut **plant, LAST));
@@ -209,6 +226,7 @@ mod tests {
             looks += 1;
             assert!(looks < 100_000, "they wait for each other");
         }
+        fused.finish().unwrap();
         let report = report(scenario, RoleId::Controller, &books[1], Vec::new(), Vec::new());
         assert_eq!((report.read[0].void, report.read[0].gaps), (1, 0));
         assert_eq!((report.ticks.executed, report.ticks.missed), (LAST, 1));

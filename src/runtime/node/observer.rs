@@ -1,6 +1,6 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Gate, Node, Poll, RoleId, Seat};
+use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
@@ -8,7 +8,8 @@ use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::Message;
-use crate::telemetry::{Latency, StageReport, TickBook, Ticks};
+use crate::state::{Persist, Words};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -27,6 +28,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     clock: Clock,
     book: TickBook,
     interruptions: Interruptions,
+    ledger: Ledger,
     instants: Instants,
     hop: Latency,
     step: Latency,
@@ -36,15 +38,15 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0];
-        let book = TickBook::go_on(seat.ledger);
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
             observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),
             measurement: seat.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
             estimate,
             clock: seat.clock,
-            book,
+            book: TickBook::default(),
             interruptions: seat.interruptions(),
+            ledger: seat.ledger.reopened(),
             instants: Instants::default(),
             hop: Latency::default(),
             step: Latency::default(),
@@ -63,9 +65,9 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         self.estimate.publish()
     }
 
-    /// Sends the voids of the ticks from this one on again: they are in the books, and nobody has them.
-    pub fn repeat_voids(&mut self, from: u64) -> Result<(), BusError> {
-        (from..self.book.next()).try_for_each(|tick| self.estimate.repeat_void(tick))
+    /// Sends again what was sent for the ticks from this one on: nobody has it any more.
+    pub fn repeat(&mut self, from: u64) -> Result<(), BusError> {
+        (from..self.book.next()).try_for_each(|tick| self.estimate.repeat(tick))
     }
 
     #[inline]
@@ -75,7 +77,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
         let (observer, clock) = (&mut self.observer, self.clock);
         let mut done = 0;
-        self.estimate.send(|sample| {
+        self.estimate.stage(|sample| {
             match measurement {
                 Some(measurement) => observer.step(measurement, sample),
                 None => observer.reject(&stamp, sample),
@@ -85,6 +87,9 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         })?;
         self.instants = Instants { origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
         self.skip_to(stamp.tick);
+        self.book.executed();
+        commit(self);
+        self.estimate.dispatch()?;
         Ok(Poll::Executed)
     }
 
@@ -93,8 +98,11 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     fn pass_over(&mut self) -> Result<Poll, BusError> {
         let next = self.book.next();
         for tick in next..=self.measurement.last_tick().unwrap_or(next) {
-            self.estimate.pass_over(tick)?;
+            self.estimate.stage_void(tick);
             self.skip_to(tick + 1);
+            commit(self);
+            self.estimate.dispatch()?;
+            self.estimate.finish()?;
         }
         Ok(Poll::Waiting)
     }
@@ -109,11 +117,22 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.book.next()
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) {
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        if restore(self)? == Inherited::Counters {
+            self.book.disturbed(self.book.next());
+        }
+        self.measurement.expect_repeats();
+        Ok(())
+    }
+
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
             self.measurement.expect(Horizon::Due(grid));
         }
+        self.estimate.dispatch()?;
+        self.estimate.finish()?;
         self.skip_to(first_tick);
+        Ok(())
     }
 
     #[inline]
@@ -145,8 +164,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
             self.step.record(received, done);
             self.age.record(origin, done);
         }
-        self.estimate.settle()?;
-        self.book.executed();
+        self.estimate.finish()
+    }
+
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.estimate.finish()?;
+        commit_last(self);
         Ok(())
     }
 
@@ -164,11 +187,35 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.estimate.refresh()
     }
 
+    fn state_words(&mut self) -> usize {
+        length(self)
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
         StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+    }
+}
+
+impl<R: Rig, B: Bus> Persistent for ObserverNode<R, B> {
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    #[inline]
+    fn counters<W: Words>(&mut self, words: &mut W) {
+        self.book.persist(words);
+        self.estimate.persist(words);
+        self.measurement.counters().persist(words);
+    }
+
+    #[inline]
+    fn state<W: Words>(&mut self, words: &mut W) {
+        self.observer.persist(words);
+        self.measurement.persist(words);
+        self.estimate.persist_late(words);
     }
 }

@@ -1,6 +1,6 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Gate, Node, Poll, RoleId, Seat};
+use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::BodyInfo;
@@ -8,14 +8,13 @@ use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
 use crate::sample::{Message, Stamp};
-use crate::telemetry::{Latency, Ledger, StageReport, TickBook, Ticks, Words};
-use std::borrow::{Borrow, BorrowMut};
-use std::marker::PhantomData;
+use crate::state::{Persist, Words};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
 
 /// A body whose samples links carry: one, or a fleet.
-pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> {}
+pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
 
-impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried>> Hosted for P {}
+impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> Hosted for P {}
 
 /// A plant with its links and books.
 pub struct PlantNode<P: Hosted, G, B: Bus> {
@@ -28,16 +27,18 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     last_tick: u64,
     book: TickBook,
     interruptions: Interruptions,
-    state: StateBook<P::Truth>,
+    ledger: Ledger,
+    inherited: Inherited,
+    /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
+    unsettled: Option<u64>,
     lateness: Latency,
     age: Latency,
     step: Latency,
 }
 
-impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
+impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     pub fn open(body: P, guard: G, info: &BodyInfo, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let scenario = seat.scenario;
-        let book = TickBook::go_on(seat.ledger);
         let measurement = seat.output(info, Signal::Measurement)?;
         let truth = seat.output(info, Signal::Truth)?;
         let command = info.driven.then(|| seat.input(info, Signal::Command, guard)).transpose()?;
@@ -49,9 +50,11 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
             clock: seat.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            book,
+            book: TickBook::default(),
             interruptions: seat.interruptions(),
-            state: StateBook::open(seat.ledger, info.bodies()),
+            ledger: seat.ledger.reopened(),
+            inherited: Inherited::Nothing,
+            unsettled: None,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -73,16 +76,27 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
         self.skip_to(tick);
     }
 
-    /// Takes over a body from a predecessor that died: it has moved on by itself, and its actuators have protected it.
-    fn resume(&mut self, truth: &P::Truth, first_tick: u64) {
-        self.plant.resume(truth, self.measurement.made());
-        let first_tick = first_tick.max(truth.stamp().tick + 1);
-        self.plant.advance(1);
-        for tick in truth.stamp().tick + 1..first_tick {
-            self.plant.command(tick, None);
+    /// Sends what a predecessor was committed to, and takes over its body: it has moved on by itself since, and its actuators
+    /// have protected it.
+    fn take_over(&mut self, first_tick: u64) -> Result<(), BusError> {
+        self.measurement.dispatch()?;
+        self.measurement.finish()?;
+        if let Some(tick) = self.unsettled.take() {
+            self.stage_truth(tick)?;
+            self.truth.dispatch_rest()?;
+            self.truth.finish()?;
             self.plant.advance(1);
         }
+        self.plant.advance_alone(first_tick.saturating_sub(self.book.next()));
         self.book.skip_to(first_tick);
+        Ok(())
+    }
+
+    fn stage_truth(&mut self, tick: u64) -> Result<(), BusError> {
+        let (plant, clock, origin_ns) = (&self.plant, self.clock, self.grid.due_ns(tick));
+        self.truth.stage(|sample| {
+            plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
+        })
     }
 
     #[inline]
@@ -97,10 +111,14 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
         }
         let (plant, clock) = (&mut self.plant, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
-        self.measurement.send(|sample| {
+        self.measurement.stage(|sample| {
             stamp.sent_ns = clock.now_ns();
             plant.measure(&stamp, sample);
         })?;
+        self.unsettled = Some(tick);
+        self.book.executed();
+        commit(self);
+        self.measurement.dispatch()?;
         Ok(Poll::Executed)
     }
 
@@ -120,7 +138,7 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
     }
 }
 
-impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
+impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G, B> {
     fn time_triggered(&self) -> bool {
         true
     }
@@ -129,16 +147,25 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
         self.book.next()
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) {
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        self.inherited = restore(self)?;
+        self.command.iter_mut().for_each(Input::expect_repeats);
+        if self.inherited == Inherited::Counters {
+            self.book.disturbed(self.book.next());
+        }
+        Ok(())
+    }
+
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         self.grid = grid;
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
             command.expect(Horizon::Due(grid));
         }
-        if let Some(truth) = self.state.load() {
-            self.resume(truth.borrow(), first_tick);
-        } else {
-            self.skip_to(first_tick);
+        if self.inherited != Inherited::Nothing {
+            return self.take_over(first_tick);
         }
+        self.skip_to(first_tick);
+        Ok(())
     }
 
     #[inline]
@@ -176,20 +203,21 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
 
     #[inline]
     fn settle(&mut self) -> Result<(), BusError> {
-        let (plant, clock) = (&self.plant, self.clock);
-        let (tick, origin_ns) = (self.book.next(), self.grid.due_ns(self.book.next()));
-        self.truth.send(|sample| {
-            plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
-        })?;
+        let Some(tick) = self.unsettled.take() else { return Ok(()) };
+        self.stage_truth(tick)?;
+        self.truth.dispatch()?;
         let before_ns = self.clock.now_ns();
         self.plant.advance(1);
         if self.clock == Clock::Monotonic {
             self.step.record(before_ns, self.clock.now_ns());
         }
-        self.measurement.settle()?;
-        self.truth.settle()?;
-        self.state.store(self.truth.sent());
-        self.book.executed();
+        self.measurement.finish()?;
+        self.truth.finish()
+    }
+
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.settle()?;
+        commit_last(self);
         Ok(())
     }
 
@@ -214,6 +242,10 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
         self.truth.refresh()
     }
 
+    fn state_words(&mut self) -> usize {
+        length(self)
+    }
+
     fn ticks(&self) -> Ticks {
         self.book.report()
     }
@@ -223,45 +255,24 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
     }
 }
 
-/// The last state of a body, kept in the ledger so that whoever simulates it next can go on from there: a body does not
-/// vanish with the process that simulates it.
-pub struct StateBook<S: ?Sized> {
-    words: Words,
-    bodies: usize,
-    sample: PhantomData<S>,
-}
-
-impl<S: Carried + ?Sized> StateBook<S> {
-    /// Words of the ledger: which of the two copies holds, from 1, and the copies. One of them is always whole.
-    pub fn words(bodies: usize) -> usize {
-        1 + 2 * S::length(bodies)
-    }
-
-    pub fn open(ledger: &Ledger, bodies: usize) -> Self {
-        Self { words: ledger.take(Self::words(bodies)), bodies, sample: PhantomData }
-    }
-
-    fn begin(&self, copy: u64) -> usize {
-        1 + (copy as usize - 1) * S::length(self.bodies)
+impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
+    fn ledger(&self) -> &Ledger {
+        &self.ledger
     }
 
     #[inline]
-    pub fn store(&mut self, sample: &S) {
-        let copy = if self.words.get(0) == 1 { 2 } else { 1 };
-        self.words.set_all(self.begin(copy), sample.words());
-        self.words.set(0, copy);
+    fn counters<W: Words>(&mut self, words: &mut W) {
+        self.book.persist(words);
+        self.measurement.persist(words);
+        self.truth.persist(words);
+        self.command.iter_mut().for_each(|command| command.counters().persist(words));
     }
 
-    fn load(&self) -> Option<S::Owned> {
-        let copy = self.words.get(0);
-        if !(1..=2).contains(&copy) {
-            return None;
-        }
-        let mut sample = S::blank(self.bodies);
-        let begin = self.begin(copy);
-        for (index, word) in sample.borrow_mut().words_mut().iter_mut().enumerate() {
-            *word = self.words.get(begin + index);
-        }
-        Some(sample)
+    #[inline]
+    fn state<W: Words>(&mut self, words: &mut W) {
+        self.plant.persist(words);
+        self.unsettled.persist(words);
+        self.command.iter_mut().for_each(|command| command.persist(words));
+        self.measurement.persist_late(words);
     }
 }

@@ -192,6 +192,7 @@ mod tests {
     }
 
     impl Bus for Watched {
+        const REPEATS: bool = false;
         type Writer<S: Sample> = <MemoryBus as Bus>::Writer<S>;
         type Reader<S: Sample> = <MemoryBus as Bus>::Reader<S>;
         type FleetWriter<L: FleetLayout> = <MemoryBus as Bus>::FleetWriter<L>;

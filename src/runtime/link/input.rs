@@ -1,0 +1,271 @@
+//! The reading end of a link with its counters and its guard: what was received, lost, not believed.
+//!
+//! Samples of generation 0 are warm-up: they pass through the link and go no further. Must not let a sample that its guard
+//! does not believe be seen.
+
+use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
+use crate::clock::{Grid, monotonic_ns};
+use crate::role::{Guard, Unguarded};
+use crate::sample::{Stamp, VOID};
+use crate::state::{Persist, Words};
+use crate::telemetry::ReadBook;
+
+/// What a reading end has for a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Seek {
+    /// The sample of that tick is at hand.
+    Found,
+    /// Nothing so new has arrived.
+    NotYet,
+    /// Something later has arrived, or a void: that tick's will never come.
+    Passed,
+    /// That tick's has arrived and is not believed.
+    Rejected,
+}
+
+/// Which ticks a sample can have.
+#[derive(Debug, Clone, Copy)]
+pub enum Horizon {
+    /// Any.
+    Unknown,
+    /// The next only: nothing is lost on this link.
+    Next,
+    /// Those that are due.
+    Due(Grid),
+}
+
+/// What has become of the newest sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Newest {
+    /// It is at hand.
+    AtHand,
+    /// It was of the tick that was due, and is not believed.
+    Rejected,
+    /// There is none, or it was a void, or it was displaced by one of no use.
+    None,
+}
+
+/// The reading end of a signal.
+pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
+    port: S::Reader<B>,
+    guard: G,
+    horizon: Horizon,
+    /// Tick and generation of the newest tick that something is known of.
+    last: Option<(u64, u64)>,
+    /// Whatever arrives displaces what was at hand, usable or not.
+    newest: Newest,
+    /// The generation of a sample that was taken for a predecessor's: if the next says the same, it is to be believed.
+    doubted: Option<u64>,
+    /// Whether what arrives may be what a predecessor of this end has counted already.
+    pub(super) repeated: bool,
+    book: ReadBook,
+}
+
+impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
+    /// Opens a signal of one body.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn watch(bus: &B, topic: &Topic, reader: Reader) -> Result<Self, BusError> {
+        Self::watch_many(bus, topic, 1, reader)
+    }
+
+    /// The same for a signal of so many bodies.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn watch_many(bus: &B, topic: &Topic, bodies: usize, reader: Reader) -> Result<Self, BusError> {
+        Ok(Self {
+            port: S::reader(bus, topic, reader, bodies)?,
+            guard: Unguarded,
+            horizon: Horizon::Unknown,
+            last: None,
+            newest: Newest::None,
+            doubted: None,
+            repeated: false,
+            book: ReadBook::default(),
+        })
+    }
+
+    /// The same with a guard.
+    pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
+        let Self { port, horizon, last, newest, doubted, repeated, book, .. } = self;
+        Input { port, guard, horizon, last, newest, doubted, repeated, book }
+    }
+}
+
+impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
+    /// Says which ticks samples can have from now on.
+    pub fn expect(&mut self, horizon: Horizon) {
+        self.horizon = horizon;
+    }
+
+    /// Moves on to the sample of `tick`, or as far as there are older ones.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    #[inline]
+    pub fn seek(&mut self, tick: u64) -> Result<Seek, BusError> {
+        loop {
+            match (self.last, self.newest) {
+                (Some((last, _)), Newest::AtHand) if last == tick => return Ok(Seek::Found),
+                (Some((last, _)), Newest::Rejected) if last == tick => return Ok(Seek::Rejected),
+                (Some((last, _)), _) if last >= tick => return Ok(Seek::Passed),
+                _ => {}
+            }
+            if !self.take()? {
+                return Ok(Seek::NotYet);
+            }
+        }
+    }
+
+    /// Moves on to the next real sample; false if there is none.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    #[inline]
+    pub fn advance(&mut self) -> Result<bool, BusError> {
+        while self.take()? {
+            if self.newest == Newest::AtHand {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Takes one sample off the link, whatever it is worth; false if there is none.
+    #[inline]
+    fn take(&mut self) -> Result<bool, BusError> {
+        if !self.port.advance()? {
+            return Ok(false);
+        }
+        let stamp = self.port.current().map(|sample| *sample.stamp());
+        self.newest = stamp.map_or(Newest::None, |stamp| self.account(&stamp));
+        Ok(true)
+    }
+
+    /// Enters a sample into the books.
+    ///
+    /// Ticks rise also from one generation of the sender to the next: a successor goes on with the grid. It may repeat the
+    /// tick in which its predecessor died.
+    #[inline]
+    fn account(&mut self, stamp: &Stamp) -> Newest {
+        let generation = stamp.generation & !VOID;
+        let (newest_tick, known) = match self.last {
+            Some((tick, known)) => (Some(tick), known),
+            // Warm-up.
+            None if generation == 0 => return Newest::None,
+            None => (None, 0),
+        };
+        if let Some(tick) = newest_tick.filter(|tick| stamp.tick <= *tick) {
+            // What came before the last sample that a predecessor counted, and that one, are counted. Warm-up tells nothing.
+            if self.repeated {
+                self.repeated = stamp.tick < tick || generation == 0;
+            } else if generation == known {
+                self.book.stale();
+            }
+            return Newest::None;
+        }
+        self.repeated = false;
+        if !self.possible(stamp.tick) {
+            self.book.stray();
+            return Newest::None;
+        }
+        if generation < known && self.doubted.replace(generation) != Some(generation) {
+            self.last = Some((stamp.tick, known));
+            self.book.rejected(stamp.tick);
+            return Newest::Rejected;
+        }
+        self.doubted = None;
+        self.last = Some((stamp.tick, generation));
+        if stamp.generation & VOID != 0 {
+            self.book.void(stamp.tick);
+            return Newest::None;
+        }
+        if self.port.current().is_some_and(|sample| self.guard.accepts(sample)) {
+            self.book.received(stamp.tick);
+            return Newest::AtHand;
+        }
+        self.book.rejected(stamp.tick);
+        Newest::Rejected
+    }
+
+    /// Whether a sample can be of this tick, which is newer than the newest.
+    #[inline]
+    fn possible(&self, tick: u64) -> bool {
+        tick <= self.book.covered()
+            || match self.horizon {
+                Horizon::Unknown => true,
+                Horizon::Next => false,
+                Horizon::Due(grid) => grid.due_ns(tick) <= monotonic_ns(),
+            }
+    }
+
+    /// Sleeps until there may be something new, at most until `until_ns`.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        self.port.sleep(until_ns)
+    }
+
+    /// Whether something is known of this tick or of a later one: it is of no use to wait for it.
+    #[inline]
+    pub fn knows(&self, tick: u64) -> bool {
+        self.last.is_some_and(|(last, _)| last >= tick)
+    }
+
+    /// The newest tick of which something is known: there was a sample, believed or not, or a void.
+    #[inline]
+    pub fn last_tick(&self) -> Option<u64> {
+        self.last.map(|(tick, _)| tick)
+    }
+
+    /// The sample at hand, if there is one that can be used.
+    #[inline]
+    pub fn sample(&self) -> Option<&S> {
+        self.port.current().filter(|_| self.newest == Newest::AtHand)
+    }
+
+    /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
+    #[inline]
+    pub fn rejected(&self) -> Option<&Stamp> {
+        self.port.current().filter(|_| self.newest == Newest::Rejected).map(S::stamp)
+    }
+
+    /// Takes what waits and forgets it, to exercise the link. Before the first tick only.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn warm_up(&mut self) -> Result<(), BusError> {
+        self.port.refresh();
+        while self.port.advance()? {}
+        Ok(())
+    }
+
+    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    pub fn refresh(&mut self) {
+        self.port.refresh();
+    }
+}
+
+impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
+    /// The counters.
+    pub fn counters(&mut self) -> &mut ReadBook {
+        &mut self.book
+    }
+
+    /// Expects what a predecessor, which this end continues, may have had already.
+    pub fn expect_repeats(&mut self) {
+        self.repeated = B::REPEATS;
+    }
+}
+
+/// All but the counters.
+impl<B: Bus, S: Carried + ?Sized, G: Persist> Persist for Input<B, S, G> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.last.persist(words);
+        self.doubted.persist(words);
+        self.guard.persist(words);
+    }
+}

@@ -1,0 +1,394 @@
+//! The writing end of a link with its counters: what was sent, what was not, and its hash.
+//!
+//! A sample is staged, which nobody sees; the role commits its state; only then is the sample dispatched. So nothing is ever
+//! sent that is not committed, and what is committed and was perhaps not sent is sent by a successor: readers tell a repeated
+//! sample by its tick. A void stands for a sample that does not exist, where everybody waits for inputs. Must not commit.
+
+use crate::bus::{Bus, BusError, Carried, Topic, Write};
+use crate::fault::Transport;
+use crate::runtime::disturb::Disturbance;
+use crate::runtime::hooks::{self, Place};
+use crate::sample::{Stamp, VOID};
+use crate::state::{Persist, Words, persist_fields};
+use crate::telemetry::{Ledger, LinkWritten, Slots, WriteBook};
+use std::borrow::{Borrow, BorrowMut};
+
+/// The writing end of a signal.
+pub struct Output<B: Bus, S: Carried + ?Sized> {
+    port: S::Writer<B>,
+    generation: u64,
+    /// What is committed and not yet counted, and the sample that it is about, under the stamp that it was made with.
+    staged: Staged,
+    sample: S::Owned,
+    /// The tick of the last sample that was made and went out, or goes out, as that of its tick.
+    last_sample: Option<u64>,
+    /// Whether the port holds that sample already.
+    filled: bool,
+    /// Whether a void takes the place of a sample that does not go out.
+    voids: bool,
+    /// Whether samples are shown first, and published when there is time.
+    shows: bool,
+    disturbance: Option<Box<Disturbance<S>>>,
+    book: WriteBook,
+    /// How much of a tick has been sent, for a successor: the tick + 1, and 16 bits for the number of samples.
+    progress: Option<Slots>,
+}
+
+/// What a writing end is about to send for a tick.
+#[derive(Debug, Clone, Copy, Default)]
+struct Staged {
+    tick: u64,
+    /// One of the constants.
+    kind: u64,
+    /// The stamp as it goes out: a scripted fault may have broken it.
+    stamp: [u64; 4],
+    /// Samples of earlier ticks, held back by scripted faults, that go out before this tick's.
+    late: u64,
+    /// How often this tick's sample goes out.
+    copies: u64,
+}
+
+persist_fields!(Staged, tick, kind, stamp, late, copies);
+
+impl Staged {
+    /// Nothing, or what was staged is counted.
+    const NOTHING: u64 = 0;
+    /// The sample of the tick.
+    const SAMPLE: u64 = 1;
+    /// A sample was made, and does not go out as that of its tick.
+    const WITHHELD: u64 = 2;
+    /// No sample was made.
+    const ABSENT: u64 = 3;
+
+    /// Counts it, the content of the sample given.
+    #[inline]
+    fn count(&mut self, book: &mut WriteBook, content: &[u8], voids: bool) {
+        match std::mem::take(&mut self.kind) {
+            Self::SAMPLE => book.enter(self.tick, content),
+            Self::WITHHELD | Self::ABSENT => book.enter_void(self.tick, voids),
+            _ => {}
+        }
+    }
+}
+
+impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
+    /// Words of the ledger beside the record, for a run that ends with `last_tick`.
+    pub fn words(last_tick: u64) -> usize {
+        1 + WriteBook::words(last_tick)
+    }
+
+    /// Opens a signal of so many bodies for a run that ends with `last_tick`.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn open(
+        bus: &B,
+        topic: &Topic,
+        bodies: usize,
+        generation: u64,
+        ledger: &Ledger,
+        last_tick: u64,
+    ) -> Result<Self, BusError> {
+        let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
+        Ok(Self {
+            port: S::writer(bus, topic, bodies, generation)?,
+            generation,
+            staged: Staged::default(),
+            sample: S::blank(bodies),
+            last_sample: None,
+            filled: false,
+            voids: false,
+            shows: false,
+            disturbance: None,
+            book: WriteBook::open(ledger, last_tick),
+            progress,
+        })
+    }
+
+    /// With voids in the place of samples that do not go out, for readers that wait for every tick.
+    pub fn with_voids(self, voids: bool) -> Self {
+        Self { voids, ..self }
+    }
+
+    /// Whose samples are shown to readers of the newest at first, and sent to the others by [`publish`](Self::publish).
+    pub fn shown_first(self) -> Self {
+        Self { shows: true, ..self }
+    }
+
+    /// With scripted faults.
+    pub fn disturbed(self, disturbance: Option<Box<Disturbance<S>>>) -> Self {
+        Self { disturbance, ..self }
+    }
+
+    /// Makes the sample of a tick. `fill` writes everything but the generation.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn stage(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        if self.disturbance.is_some() {
+            self.stage_disturbed(fill);
+            return Ok(());
+        }
+        let (generation, kept) = (self.generation, self.sample.borrow_mut());
+        self.port.fill(|sample| {
+            fill(sample);
+            sample.stamp_mut().generation = generation;
+            kept.assign(sample);
+        })?;
+        self.filled = true;
+        let stamp = *kept.stamp();
+        self.staged =
+            Staged { tick: stamp.tick, kind: Staged::SAMPLE, stamp: bytemuck::cast(stamp), late: 0, copies: 1 };
+        self.last_sample = Some(stamp.tick);
+        hooks::at(Place::Staged);
+        Ok(())
+    }
+
+    /// Makes a sample as the scripted faults have it.
+    #[cold]
+    fn stage_disturbed(&mut self, fill: impl FnOnce(&mut S)) {
+        let Some(disturbance) = &mut self.disturbance else { return };
+        let mut made = disturbance.blank();
+        let sample: &mut S = made.borrow_mut();
+        fill(sample);
+        sample.stamp_mut().generation = self.generation;
+        let stamp = *sample.stamp();
+        let tampered = disturbance.tamper(stamp.tick, sample, self.sample.borrow());
+        let way = disturbance.way(stamp.tick);
+        if tampered || way.is_some() {
+            self.book.injected();
+        }
+        let late = disturbance.due(stamp.tick);
+        // A sample with a broken stamp goes out as it is, but not as the one of its tick.
+        let sound = (sample.stamp().tick, sample.stamp().generation) == (stamp.tick, stamp.generation);
+        let delivered = sound && !matches!(way, Some(Transport::Drop | Transport::Delay { .. }));
+        let copies = match way {
+            Some(Transport::Drop) => 0,
+            Some(Transport::Delay { ticks }) => {
+                disturbance.keep(stamp.tick + ticks, sample);
+                0
+            }
+            Some(Transport::Duplicate) => 2,
+            None => 1,
+        };
+        self.book.extra(late + copies - u64::from(delivered));
+        let kind = if delivered { Staged::SAMPLE } else { Staged::WITHHELD };
+        self.staged = Staged { tick: stamp.tick, kind, stamp: bytemuck::cast(*sample.stamp()), late, copies };
+        self.last_sample = if delivered { Some(stamp.tick) } else { self.last_sample };
+        let kept = self.sample.borrow_mut();
+        kept.assign(sample);
+        *kept.stamp_mut() = stamp;
+        hooks::at(Place::Staged);
+    }
+
+    /// Says that there is no sample for this tick, where readers wait for one: an input was missing.
+    pub fn stage_void(&mut self, tick: u64) {
+        let kind = if self.voids { Staged::ABSENT } else { Staged::NOTHING };
+        self.staged = Staged { tick, kind, ..Staged::default() };
+    }
+
+    /// Sends what was staged, or what is left of it.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn dispatch(&mut self) -> Result<(), BusError> {
+        if !std::mem::take(&mut self.filled) {
+            return self.dispatch_rest();
+        }
+        if self.shows {
+            self.port.show()?;
+        } else {
+            self.port.deliver()?;
+            hooks::at(Place::Sent);
+            self.sent(1);
+        }
+        Ok(())
+    }
+
+    /// Leaves word that so many samples of the tick have been sent.
+    #[inline]
+    fn sent(&self, samples: u64) {
+        if let Some(progress) = &self.progress {
+            progress.set(0, (self.staged.tick + 1) << 16 | samples);
+        }
+    }
+
+    /// How many samples of the tick have been sent, by a predecessor.
+    fn already_sent(&self) -> u64 {
+        let word = self.progress.as_ref().map_or(0, |progress| progress.get(0));
+        if word >> 16 == self.staged.tick + 1 { word & 0xffff } else { 0 }
+    }
+
+    /// Sends what a predecessor has not sent of what was staged.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[cold]
+    pub fn dispatch_rest(&mut self) -> Result<(), BusError> {
+        self.filled = false;
+        let Staged { kind, late, copies, .. } = self.staged;
+        if kind == Staged::NOTHING {
+            return Ok(());
+        }
+        let own = late + copies;
+        let void = self.voids && kind != Staged::SAMPLE;
+        for index in self.already_sent()..own + u64::from(void) {
+            self.port.prepare()?;
+            let late =
+                self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
+            match late {
+                Some(late) => self.port.send(|slot| slot.assign(late))?,
+                None if index < own => {
+                    let (stamp, kept): (Stamp, &S) = (bytemuck::cast(self.staged.stamp), self.sample.borrow());
+                    // In this life, also where a scripted fault has broken the generation.
+                    let generation = stamp.generation ^ kept.stamp().generation ^ self.generation;
+                    self.port.send(|slot| {
+                        slot.assign(kept);
+                        *slot.stamp_mut() = Stamp { generation, ..stamp };
+                    })?;
+                }
+                None => {
+                    let made = *self.sample.borrow().stamp();
+                    let Staged { tick, kind, .. } = self.staged;
+                    self.send_void(if kind == Staged::WITHHELD { made } else { Stamp { tick, ..Stamp::default() } })?;
+                }
+            }
+            hooks::at(Place::Sent);
+            self.sent(index + 1);
+        }
+        Ok(())
+    }
+
+    fn send_void(&mut self, stamp: Stamp) -> Result<(), BusError> {
+        self.port.send(|slot| {
+            slot.words_mut().fill(0);
+            *slot.stamp_mut() = Stamp { generation: self.generation | VOID, ..stamp };
+        })
+    }
+
+    /// Sends again what was sent for a tick, the sample or the void: who had it died with the writer.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn repeat(&mut self, tick: u64) -> Result<(), BusError> {
+        self.port.prepare()?;
+        if self.last_sample == Some(tick) {
+            let (kept, generation): (&S, u64) = (self.sample.borrow(), self.generation);
+            self.port.send(|slot| {
+                slot.assign(kept);
+                slot.stamp_mut().generation = generation;
+            })?;
+        } else {
+            self.send_void(Stamp { tick, ..Stamp::default() })?;
+        }
+        if self.staged.tick == tick {
+            self.sent(self.staged.late + self.staged.copies + 1);
+        }
+        Ok(())
+    }
+
+    /// Sends what was only shown, if anything was.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn publish(&mut self) -> Result<(), BusError> {
+        self.port.publish()?;
+        if self.shows {
+            self.sent(1);
+        }
+        Ok(())
+    }
+
+    /// Does what a dispatched sample leaves to be done: counters, hash, memory for the next. Off the critical path.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn finish(&mut self) -> Result<(), BusError> {
+        if let Some(disturbance) = &mut self.disturbance {
+            disturbance.forget(self.staged.late);
+        }
+        self.staged.late = 0;
+        self.staged.count(&mut self.book, self.sample.borrow().content(), self.voids);
+        self.port.prepare()
+    }
+
+    /// Stages, dispatches and finishes a sample.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    #[inline]
+    pub fn send(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        self.stage(fill)?;
+        self.dispatch()?;
+        self.finish()
+    }
+
+    /// Sends a sample that no role uses, to exercise the link.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn warm_up(&mut self) -> Result<(), BusError> {
+        self.port.send(|sample| *sample.stamp_mut() = Stamp::default())?;
+        self.port.prepare()
+    }
+
+    /// Lets readers that have come later know of this end. Off the critical path.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn refresh(&mut self) -> Result<(), BusError> {
+        self.port.refresh()
+    }
+
+    /// The last sample that was made.
+    #[inline]
+    pub fn last(&self) -> &S {
+        self.sample.borrow()
+    }
+
+    /// The counters, without what is staged.
+    pub fn counters(&self) -> &WriteBook {
+        &self.book
+    }
+}
+
+/// Its counters, and what it is committed to send.
+impl<B: Bus, S: Carried + ?Sized> Persist for Output<B, S> {
+    #[inline]
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.book.persist(words);
+        self.staged.persist(words);
+        self.sample.borrow_mut().words_mut().persist(words);
+        self.last_sample.persist(words);
+    }
+}
+
+impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
+    /// Passes what scripted faults hold back; see [`Persist`].
+    pub fn persist_late<W: Words>(&mut self, words: &mut W) {
+        self.disturbance.iter_mut().for_each(|disturbance| disturbance.persist(words));
+    }
+}
+
+/// What the record of a role says of a signal of `length` words that it writes; what is committed counts as sent.
+pub fn written(
+    words: &mut impl Words,
+    service: &str,
+    length: usize,
+    voids: bool,
+    (ledger, last_tick): (&Ledger, u64),
+) -> LinkWritten {
+    ledger.take(1);
+    let (mut book, mut staged) = (WriteBook::open(ledger, last_tick), Staged::default());
+    let mut sample = vec![0_u64; length];
+    book.persist(words);
+    staged.persist(words);
+    sample.persist(words);
+    None::<u64>.persist(words);
+    staged.count(&mut book, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], voids);
+    book.report(service)
+}
