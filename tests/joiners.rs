@@ -107,7 +107,8 @@ fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let still = format!("supervision.heartbeat_timeout_s={STILL_S}");
-    let run = ["run", file.to_str().unwrap(), "--clock", clock, "--tick-hz=200", "--duration=3600", "--json", "--out=out"];
+    let run =
+        ["run", file.to_str().unwrap(), "--clock", clock, "--tick-hz=200", "--duration=3600", "--json", "--out=out"];
     let run = bench.start(&[&run[..], &["--set=accept={}", "--set", &still], more].concat());
     let domain = await_some(|| bench.domains().pop());
     // The first screen is there once ticks run, and says so.
@@ -175,7 +176,8 @@ fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
     let scenario = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/pair.toml");
     let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}", "--out=out"];
     let running = bench.start(&run);
-    let is_seat = |domain: PathBuf| Some((domain.join("follower.seat.json"), domain)).filter(|(seat, _)| seat.is_file());
+    let is_seat =
+        |domain: PathBuf| Some((domain.join("follower.seat.json"), domain)).filter(|(seat, _)| seat.is_file());
     let (seat, domain) = await_some(|| bench.domains().pop().and_then(is_seat));
     (running, seat, domain)
 }

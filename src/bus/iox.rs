@@ -55,7 +55,7 @@ const OPENING_NS: u64 = 10_000_000_000;
 /// A dead process holds its place until the janitor has put away what it left: for so long a successor asks again, ns.
 const VACATE_NS: u64 = 2_000_000_000;
 /// Between two attempts at an opening, ns.
-const RETRY_NS: u64 = 2_000_000;
+const RETRY_NS: u64 = 20_000_000;
 
 /// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
 pub const VERSION: &str = "0.10.0";
@@ -704,6 +704,47 @@ mod tests {
 
     fn bus(domain: &OwnedDomain) -> IoxBus {
         IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8, history: 0 }).unwrap()
+    }
+
+    /// Opens by attempts that are refused until so many have been made; returns how many were.
+    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> Refusal) -> (u32, Result<(), BusError>) {
+        let mut made = 0;
+        let attempt = || {
+            made += 1;
+            if made > until { Ok(()) } else { Err(refusal()) }
+        };
+        let opened = bus.open(&topic(), "reader", attempt);
+        (made, opened)
+    }
+
+    #[test]
+    fn what_may_pass_is_tried_again_and_nothing_else() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let interrupted = || PublishSubscribeOpenOrCreateError::from(PublishSubscribeOpenError::Interrupt).into();
+        assert!(matches!(attempts(&bus, 2, interrupted), (3, Ok(()))));
+        let (made, refused) = attempts(&bus, 2, || Refusal::never("a signal called Interrupt"));
+        assert!(made == 1 && refused.is_err());
+    }
+
+    #[test]
+    fn an_opening_has_a_limit_and_names_the_file_that_it_waits_for() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain).within(Duration::from_millis(50));
+        let path = domain.domain().shared("begun");
+        std::fs::write(&path, "").unwrap();
+        let (_, refused) = attempts(&bus, u32::MAX, || PublishSubscribeOpenError::HangsInCreation.into());
+        let reason = refused.unwrap_err().to_string();
+        assert!(reason.contains("0.05 s") && reason.contains(path.to_str().unwrap()), "{reason}");
+    }
+
+    #[test]
+    fn what_the_dead_left_is_not_put_away_by_whoever_comes() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let config = config(domain.domain()).unwrap();
+        assert!(!config.global.node.cleanup_dead_nodes_on_creation);
+        assert!(!config.global.node.cleanup_dead_nodes_on_destruction);
+        assert!(!config.global.service.cleanup_dead_nodes_on_open);
     }
 
     #[test]
