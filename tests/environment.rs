@@ -69,6 +69,36 @@ fn too_little_shared_memory_is_told_before_anything_dies_of_it() {
     }
 }
 
+/// Found out later, a file that lacks an inode or its size is left half made, and others wait for it.
+#[test]
+fn too_few_inodes_are_told_before_anything_is_half_made() {
+    let root = rustix::process::getuid().is_root();
+    let unshare = if root { "unshare -m" } else { "unshare -rm" };
+    for (inodes, codes) in [(8, [1, 1]), (48, [1, 1]), (150, [0, 1]), (1000, [0, 0])] {
+        let bench = Bench::new();
+        let mount = format!("mount -t tmpfs -o size=64m,nr_inodes={inodes} tmpfs /dev/shm");
+        let line = format!("{mount} && {} --record", short_run("lockstep"));
+        let done = start_in_shell(&bench, &format!("exec {unshare} /bin/sh -c '{line}'")).wait();
+        assert!(done.code.is_some_and(|code| codes.contains(&code)), "{inodes}: {done:?}");
+        assert!(done.code == Some(0) || done.stderr.contains("/dev/shm has room for"), "{inodes}: {done:?}");
+        bench.assert_clean(&[]);
+    }
+}
+
+/// The disk is full for one file of the launcher's: the run says so, or does without; it never waits for the file.
+#[test]
+fn no_room_for_one_file_of_the_launcher_hangs_nobody() {
+    for n in [1, 2, 3, 5, 8, 11, 14] {
+        let bench = Bench::new();
+        let inject = format!("strace -qq -o /dev/null -e trace=ftruncate -e inject=ftruncate:error=ENOSPC:when={n}");
+        let line = short_run("lockstep").replace("exec ", &format!("exec {inject} "));
+        let done = start_in_shell(&bench, &format!("{line} --record")).wait();
+        assert_in_order(&done, &format!("file {n}"));
+        assert!(n > 2 || done.code == Some(1), "file {n}: {done:?}");
+        bench.assert_clean(&[]);
+    }
+}
+
 #[test]
 fn a_limit_on_descriptors_is_an_error_and_not_the_end_of_the_world() {
     for limit in [4, 8, 12, 16, 20, 24, 32, 48, 64, 128] {

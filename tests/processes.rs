@@ -10,6 +10,7 @@ use std::path::PathBuf;
 const SIGINT: i32 = 2;
 const SIGKILL: i32 = 9;
 const SIGTERM: i32 = 15;
+const SIGSTOP: i32 = 19;
 
 /// Starts a run that lasts until it is stopped, and waits until its ticks run.
 fn start_endless(bench: &Bench, arguments: &[&str]) -> (Running, Vec<PathBuf>) {
@@ -100,6 +101,31 @@ fn the_next_run_removes_what_a_killed_janitor_could_not() {
     assert_eq!(bench.domains(), domains, "this test is about a domain that is left");
     bench.summary("rigid-pair", &["--clock", "lockstep", "--duration", "0.1", "--set", "accept={}"]);
     bench.assert_clean(&domains);
+}
+
+/// A janitor that stands still is replaced when it is needed, and not waited for when it is not.
+#[test]
+fn a_janitor_that_stands_still_keeps_nobody() {
+    for clock in ["realtime", "lockstep"] {
+        for kills in [true, false] {
+            let bench = Bench::new();
+            let (running, domains) = start_endless(&bench, &["--clock", clock, "--json"]);
+            let janitor = bench.await_role("janitor");
+            send_signal(janitor, SIGSTOP);
+            if kills {
+                let killed = bench.await_role("controller");
+                send_signal(killed, SIGKILL);
+                await_some(|| (bench.await_role("controller") != killed).then_some(()));
+                assert_ne!(bench.await_role("janitor"), janitor);
+            }
+            running.signal(SIGTERM);
+            let done = running.wait();
+            assert_eq!(done.code, Some(128 + SIGTERM), "{clock} {kills}: {done:?}");
+            let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+            assert_eq!(summary["incidents"].as_array().unwrap().len(), usize::from(kills), "{clock}: {done:?}");
+            bench.assert_clean(&domains);
+        }
+    }
 }
 
 #[test]

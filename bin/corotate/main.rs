@@ -17,9 +17,14 @@ mod seat;
 mod watch;
 
 use clap::{Parser, Subcommand};
+use corotate::bus::domain::Domain;
+use std::fs::File;
 use std::io::{self, Write};
+use std::os::fd::AsFd;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Bodies move together although not everything about them can be measured.
 ///
@@ -90,9 +95,20 @@ enum Command {
     /// Take the other end of a hop that is measured
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
-    /// Clean up after a launcher that was killed
+    /// Clean up after processes of a run that were killed, and after its launcher
     #[command(hide = true)]
-    Janitor,
+    Janitor(JanitorArguments),
+}
+
+/// Whom the launcher's janitor cleans up after.
+#[derive(clap::Args)]
+struct JanitorArguments {
+    /// The run's domain
+    #[arg(long)]
+    domain: PathBuf,
+    /// For how long somebody may stand still while he makes a file, s
+    #[arg(long)]
+    limit_s: f64,
 }
 
 /// What the process says to its parent.
@@ -167,10 +183,21 @@ fn main() -> ExitCode {
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
-        Some(Command::Janitor) => {
-            corotate::launch::janitor(std::io::stdin());
-            Exit::Ok
-        }
+        Some(Command::Janitor(arguments)) => janitor(&arguments),
     };
     exit.into()
+}
+
+fn janitor(arguments: &JanitorArguments) -> Exit {
+    let limit = Duration::try_from_secs_f64(arguments.limit_s).map_err(|error| error.to_string());
+    let domain = Domain::join(&arguments.domain).map_err(|error| error.to_string());
+    // Without the buffers of the standard streams: what is in one is not seen by whoever waits for input.
+    let line = io::stdin().as_fd().try_clone_to_owned().map(File::from).map_err(|error| error.to_string());
+    match (limit, domain, line) {
+        (Ok(limit), Ok(domain), Ok(line)) => match corotate::launch::janitor(&domain, limit, line, io::stdout()) {
+            Ok(()) => Exit::Ok,
+            Err(error) => fail(Exit::Failure, &error),
+        },
+        (Err(error), ..) | (_, Err(error), _) | (.., Err(error)) => fail(Exit::Usage, &error),
+    }
 }

@@ -9,10 +9,10 @@ use crate::clock::monotonic_ns;
 use crate::shared::SharedWords;
 use rustix::thread::futex;
 use rustix::time::Timespec;
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use xxhash_rust::xxh3::xxh3_64;
 
 /// Bells of a run. Where there are more signals, some share one and wake each other's readers in vain.
 const BELLS: usize = 512;
@@ -64,10 +64,8 @@ impl Bells {
 
     /// The bell of a signal.
     pub fn of(&self, topic: &Topic) -> Bell {
-        // Keys are fixed, so every process of this program finds the same.
-        let mut hasher = DefaultHasher::new();
-        topic.to_string().hash(&mut hasher);
-        let hash = hasher.finish();
+        // XXH3 with seed 0 of the service's name: every build of this program must find the same.
+        let hash = xxh3_64(topic.to_string().as_bytes());
         let (home, owner) = (hash as usize % BELLS, (hash >> 32) as u32 | 1);
         let index = (home..BELLS).chain(0..home).find(|index| self.claim(*index, owner)).unwrap_or(home);
         Bell { memory: self.memory.clone(), index: index * STRIDE }
@@ -191,5 +189,16 @@ mod tests {
         assert_eq!(indices, (0..400).map(|n| other.of(&topic(&n.to_string())).index).collect::<Vec<_>>());
         let distinct: std::collections::HashSet<usize> = indices.iter().copied().collect();
         assert_eq!(distinct.len(), indices.len(), "none is shared");
+    }
+
+    /// The hash is a contract between processes, which may have been built by different compilers.
+    #[test]
+    fn a_signal_has_the_same_place_in_every_build() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bell = Bells::open(domain.domain()).unwrap().of(&topic("b"));
+        // XXH3-64 of "corotate/s/b/estimate", by the reference implementation.
+        const HASH: u64 = 0x4c41_63f9_45f3_9fcc;
+        assert_eq!(bell.index, HASH as usize % BELLS * STRIDE);
+        assert_eq!(bell.memory.halves()[bell.index + OWNER].load(Ordering::SeqCst), (HASH >> 32) as u32 | 1);
     }
 }

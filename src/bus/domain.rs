@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// Where the transport's shared memory appears as files.
-const SHARED_MEMORY: &str = "/dev/shm";
+pub const SHARED_MEMORY: &str = "/dev/shm";
 /// What the names of a domain's files in [`SHARED_MEMORY`] begin with, before its id.
 const PREFIX: &str = "corotate_";
 /// What the transport's socket paths may not exceed, less what it appends: see sockaddr_un.
@@ -47,6 +47,16 @@ pub enum DomainError {
         /// Bytes free.
         free: u64,
         /// Bytes that a run may take.
+        needed: u64,
+    },
+    /// There are too few inodes. Found out later, files are left half made, and others wait for them.
+    #[error("{} has room for {free} more files and the run may make {needed}; remove some, or mount it with more inodes (mount -o remount,nr_inodes=...)", path.display())]
+    NoInodes {
+        /// The directory.
+        path: PathBuf,
+        /// Files that may yet be made.
+        free: u64,
+        /// Files that a run may make.
         needed: u64,
     },
     /// The directory's path is too long for the transport's sockets.
@@ -165,7 +175,7 @@ impl Domain {
     }
 
     /// The domain's files in shared memory.
-    fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
+    pub(super) fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
         let prefix = self.prefix();
         let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
         entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(&prefix)).map(|entry| entry.path())
@@ -232,6 +242,24 @@ fn require_room(needed: u64) -> Result<(), DomainError> {
     // A system that does not tell how much is left is not refused for it.
     let free = statvfs(SHARED_MEMORY).map_or(u64::MAX, |room| room.f_bavail.saturating_mul(room.f_frsize));
     if free < needed { Err(DomainError::NoRoom { free, needed }) } else { Ok(()) }
+}
+
+/// Checks that so many files can be made in shared memory, and as many beside the domains.
+///
+/// # Errors
+/// [`DomainError::NoInodes`].
+pub fn require_files(needed: u64) -> Result<(), DomainError> {
+    let base = base();
+    // The directory of all domains may not be there yet.
+    let existing = base.ancestors().find(|path| path.is_dir()).unwrap_or(Path::new("/"));
+    for path in [Path::new(SHARED_MEMORY), existing] {
+        // A system that does not tell how many there are, or makes them as it needs them, is not refused for it.
+        let free = statvfs(path).ok().filter(|room| room.f_files > 0).map_or(u64::MAX, |room| room.f_favail);
+        if free < needed {
+            return Err(DomainError::NoInodes { path: path.to_owned(), free, needed });
+        }
+    }
+    Ok(())
 }
 
 fn remove_dead(base: &Path) -> Vec<Domain> {

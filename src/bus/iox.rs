@@ -12,20 +12,29 @@ use self::latest::{LatestReader, LatestWriter};
 use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
+use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::{FleetLayout, Sample, VOID};
 use iceoryx2::config::Config;
-use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::node::NodeState;
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
-use iceoryx2::service::builder::publish_subscribe::Builder;
+use iceoryx2::service::builder::blackboard::BlackboardCreateError;
+use iceoryx2::service::builder::publish_subscribe::{
+    Builder, PublishSubscribeCreateError, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
+};
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::fmt;
 use std::io;
 use std::rc::Rc;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 /// The most processes in one run: roles, launcher, recorders, watchers.
 const MAX_NODES: usize = 128;
@@ -37,6 +46,16 @@ const MAX_READERS: usize = 8;
 const MAX_FLEET_READERS: usize = 4;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
+
+/// How long one look at what somebody else has begun to make waits for it. It is finished within microseconds unless its
+/// maker stands still; then the opening looks again.
+const CREATION_TIMEOUT: Duration = Duration::from_millis(500);
+/// For so long an opening tries again where no other limit is given, ns.
+const OPENING_NS: u64 = 10_000_000_000;
+/// A dead process holds its place until the janitor has put away what it left: for so long a successor asks again, ns.
+const VACATE_NS: u64 = 2_000_000_000;
+/// Between two attempts at an opening, ns.
+const RETRY_NS: u64 = 20_000_000;
 
 /// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
 pub const VERSION: &str = "0.10.0";
@@ -138,6 +157,9 @@ pub struct IoxBus {
     depths: Depths,
     /// Whether a signal that nobody has opened yet is made.
     makes: bool,
+    domain: Domain,
+    /// For how long an opening tries again, ns.
+    opening_ns: u64,
 }
 
 impl IoxBus {
@@ -169,7 +191,12 @@ impl IoxBus {
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
         let bells = bells.map_err(|error| failed(error.to_string()))?;
         let node = Rc::new(enter(domain, name).map_err(failed)?);
-        Ok(Self { node, bells, depths, makes })
+        Ok(Self { node, bells, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
+    }
+
+    /// The same, with another limit on how long an opening may take.
+    pub fn within(self, limit: Duration) -> Self {
+        Self { opening_ns: limit.as_nanos() as u64, ..self }
     }
 
     /// Whether a signal has a fast lane: where only the newest sample counts.
@@ -179,13 +206,9 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
-        unbroken(|| {
-            let builder = self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?;
-            if self.makes {
-                builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
-            } else {
-                builder.open().map_err(|error| failed_to_open(topic, end, &error))
-            }
+        self.open(topic, end, || {
+            let builder = self.builder::<Wire<S>>(topic, &Qos::of(topic.signal, self.depths))?;
+            Ok(if self.makes { builder.open_or_create()? } else { builder.open()? })
         })
     }
 
@@ -194,24 +217,56 @@ impl IoxBus {
         topic: &Topic,
         end: &'static str,
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
-        unbroken(|| {
-            let builder = self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?;
-            if self.makes {
-                builder.open_or_create().map_err(|error| failed_to_open(topic, end, &error))
-            } else {
-                builder.open().map_err(|error| failed_to_open(topic, end, &error))
-            }
+        self.open(topic, end, || {
+            let builder = self.builder::<[fleet::Word<L>]>(topic, &Qos::of_fleet(topic.signal, self.depths))?;
+            Ok(if self.makes { builder.open_or_create()? } else { builder.open()? })
         })
+    }
+
+    /// Opens something, again and again while what is in the way may pass. A signal to this process only breaks off an
+    /// attempt: what it asks for is done in order, by whoever looks for it.
+    fn open<T>(
+        &self,
+        topic: &Topic,
+        end: &'static str,
+        mut attempt: impl FnMut() -> Result<T, Refusal>,
+    ) -> Result<T, BusError> {
+        let begun_ns = monotonic_ns();
+        loop {
+            let refusal = match attempt() {
+                Ok(opened) => return Ok(opened),
+                Err(refusal) => refusal,
+            };
+            let limit_ns = match refusal.passes {
+                Passes::Never => 0,
+                Passes::WhenFinished => self.opening_ns,
+                Passes::WhenVacated => VACATE_NS.min(self.opening_ns),
+            };
+            if monotonic_ns() - begun_ns >= limit_ns {
+                return Err(self.failed_to_open(topic, end, refusal));
+            }
+            sleep_until(monotonic_ns() + RETRY_NS);
+        }
+    }
+
+    fn failed_to_open(&self, topic: &Topic, end: &'static str, refusal: Refusal) -> BusError {
+        let Refusal { mut reason, passes } = refusal;
+        if passes == Passes::WhenFinished {
+            let limit_s = self.opening_ns as f64 / 1e9;
+            let unfinished =
+                self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
+            let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
+            reason = format!("{reason} for {limit_s} s: whoever makes it stands still{files}");
+        }
+        BusError::Open { service: topic.to_string(), end, reason }
     }
 
     fn builder<P: IceoryxSend + fmt::Debug + ?Sized>(
         &self,
         topic: &Topic,
-        end: &'static str,
         qos: &Qos,
-    ) -> Result<Builder<P, (), Ipc>, BusError> {
-        let name = topic.to_string();
-        let name: ServiceName = name.as_str().try_into().map_err(|error| failed_to_open(topic, end, &error))?;
+    ) -> Result<Builder<P, (), Ipc>, Refusal> {
+        let name: ServiceName = topic.to_string().as_str().try_into().map_err(Refusal::never)?;
         Ok(self
             .node
             .service_builder(&name)
@@ -224,31 +279,131 @@ impl IoxBus {
             .subscriber_max_borrowed_samples(qos.subscriber_max_borrowed_samples)
             .enable_safe_overflow(qos.enable_safe_overflow))
     }
+}
 
-    /// Puts away what processes of this domain left behind when they died, so that others can take their seats.
-    pub fn clear_dead(&self) {
-        // What cannot be put away now is so when the successor enters.
-        let _ = self.node.try_cleanup_dead_nodes();
+/// Puts away what processes of a domain left behind when they died, so that others can take their places. For the janitor
+/// alone: it may take long, or for ever where somebody stands still.
+pub fn clear_dead(domain: &Domain) -> Result<(), BusError> {
+    set_log_level(LogLevel::Fatal);
+    let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
+    let clear = |node: NodeState<Ipc>| {
+        if let NodeState::Dead(dead) = node {
+            // What cannot be put away now is so the next time.
+            let _ = dead.try_remove_stale_resources();
+        }
+        CallbackProgression::Continue
+    };
+    Node::<Ipc>::list(&config(domain).map_err(failed)?, clear).map_err(|error| failed(format!("{error:?}")))
+}
+
+/// Whether what keeps something from being opened may pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Passes {
+    Never,
+    /// Once somebody else has finished what he makes, or this process the handling of a signal.
+    WhenFinished,
+    /// Once the remains of a dead process are put away.
+    WhenVacated,
+}
+
+/// Why something could not be opened.
+#[derive(Debug)]
+struct Refusal {
+    reason: String,
+    passes: Passes,
+}
+
+impl Refusal {
+    fn new(error: impl fmt::Debug, passes: Passes) -> Self {
+        Self { reason: format!("{error:?}"), passes }
+    }
+
+    fn never(error: impl fmt::Debug) -> Self {
+        Self::new(error, Passes::Never)
     }
 }
 
-/// How often signals may break off the opening of one thing.
-const BREAKS: u32 = 100;
+impl From<PublishSubscribeOpenError> for Refusal {
+    fn from(error: PublishSubscribeOpenError) -> Self {
+        use PublishSubscribeOpenError as Error;
+        Self::new(
+            error,
+            match error {
+                Error::Interrupt | Error::HangsInCreation | Error::IsMarkedForDestruction => Passes::WhenFinished,
+                Error::ExceedsMaxNumberOfNodes => Passes::WhenVacated,
+                _ => Passes::Never,
+            },
+        )
+    }
+}
 
-/// Opens something again that a signal broke off: what the signal asks for is done in order, by whoever looks for it.
-fn unbroken<T>(mut open: impl FnMut() -> Result<T, BusError>) -> Result<T, BusError> {
-    for _ in 0..BREAKS {
-        match open() {
-            // One of the variants of every error of the transport has this name.
-            Err(BusError::Open { reason, .. }) if reason.contains("Interrupt") => {}
-            opened => return opened,
+impl From<PublishSubscribeOpenOrCreateError> for Refusal {
+    fn from(error: PublishSubscribeOpenOrCreateError) -> Self {
+        use PublishSubscribeCreateError as Create;
+        use PublishSubscribeOpenOrCreateError as Error;
+        match error {
+            Error::PublishSubscribeOpenError(error) => error.into(),
+            Error::PublishSubscribeCreateError(
+                Create::Interrupt
+                | Create::AlreadyExists
+                | Create::HangsInCreation
+                | Create::IsBeingCreatedByAnotherInstance,
+            )
+            | Error::SystemInFlux => Self::new(error, Passes::WhenFinished),
+            Error::PublishSubscribeCreateError(_) => Self::never(error),
         }
     }
-    open()
 }
 
-fn failed_to_open(topic: &Topic, end: &'static str, error: &impl fmt::Debug) -> BusError {
-    BusError::Open { service: topic.to_string(), end, reason: format!("{error:?}") }
+impl From<BlackboardCreateError> for Refusal {
+    fn from(error: BlackboardCreateError) -> Self {
+        use BlackboardCreateError as Error;
+        let begun = matches!(error, Error::Interrupt | Error::HangsInCreation | Error::IsBeingCreatedByAnotherInstance);
+        Self::new(error, if begun { Passes::WhenFinished } else { Passes::Never })
+    }
+}
+
+impl From<PublisherCreateError> for Refusal {
+    fn from(error: PublisherCreateError) -> Self {
+        let taken = error == PublisherCreateError::ExceedsMaxSupportedPublishers;
+        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+    }
+}
+
+impl From<SubscriberCreateError> for Refusal {
+    fn from(error: SubscriberCreateError) -> Self {
+        let taken = error == SubscriberCreateError::ExceedsMaxSupportedSubscribers;
+        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+    }
+}
+
+/// Whether an end that is being opened could be connected to every other end there is. The transport itself only logs it,
+/// and never tries again.
+#[derive(Clone, Default)]
+struct Connections {
+    failed: Arc<AtomicBool>,
+}
+
+impl Connections {
+    /// What the transport is to call if it cannot connect.
+    fn watch(&self) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
+        let failed = self.failed.clone();
+        move |_, _| {
+            failed.store(true, Ordering::Relaxed);
+            DegradationAction::Warn
+        }
+    }
+
+    /// The end, if it is connected.
+    fn whole<T>(&self, end: T) -> Result<T, Refusal> {
+        if self.failed.load(Ordering::Relaxed) {
+            return Err(Refusal {
+                reason: "not connected to every process that has it open (is /dev/shm full?)".to_owned(),
+                passes: Passes::Never,
+            });
+        }
+        Ok(end)
+    }
 }
 
 /// Whether a service has a writer. One that was killed is one until its remains are cleared.
@@ -263,6 +418,11 @@ fn config(domain: &Domain) -> Result<Config, String> {
     let root = Path::new(root.as_bytes()).map_err(|error| format!("{error:?}"))?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|error| format!("{error:?}"))?;
+    // The janitor alone puts away what the dead left: it may have to wait for somebody who stands still.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    config.global.creation_timeout = CREATION_TIMEOUT;
     Ok(config)
 }
 
@@ -284,30 +444,25 @@ impl Bus for IoxBus {
     type FleetReader<L: FleetLayout> = IoxFleetReader<L>;
 
     fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<IoxWriter<S>, BusError> {
-        let failed = |reason| BusError::Open { service: topic.to_string(), end: "writer", reason };
-        let lane = || unbroken(|| LatestWriter::create(&self.node, topic, generation).map_err(failed));
+        let lane = || self.open(topic, "writer", || LatestWriter::create(&self.node, topic, generation));
         let latest = self.has_lane(topic).then(lane).transpose()?;
-        let publisher = self
-            .service::<S>(topic, "writer")?
-            .publisher_builder()
-            .max_loaned_samples(1)
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|error| BusError::Open {
-                service: topic.to_string(),
-                end: "writer",
-                reason: format!("{error:?}"),
-            })?;
+        let service = self.service::<S>(topic, "writer")?;
+        let publisher = self.open(topic, "writer", || {
+            let connections = Connections::default();
+            let builder = service.publisher_builder().max_loaned_samples(1);
+            let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
+            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+        })?;
         Ok(IoxWriter { publisher, latest, loan: None, shown: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
         let depth = buffer_size(topic.signal, reader, self.depths);
         let service = self.service::<S>(topic, "reader")?;
-        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
-            service: topic.to_string(),
-            end: "reader",
-            reason: format!("{error:?}"),
+        let subscriber = self.open(topic, "reader", || {
+            let connections = Connections::default();
+            let builder = service.subscriber_builder().buffer_size(depth);
+            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
         })?;
         // Who reads every sample has no use for the latest.
         let lane = match reader {
@@ -557,6 +712,47 @@ mod tests {
 
     fn bus(domain: &OwnedDomain) -> IoxBus {
         IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8, history: 0 }).unwrap()
+    }
+
+    /// Opens by attempts that are refused until so many have been made; returns how many were.
+    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> Refusal) -> (u32, Result<(), BusError>) {
+        let mut made = 0;
+        let attempt = || {
+            made += 1;
+            if made > until { Ok(()) } else { Err(refusal()) }
+        };
+        let opened = bus.open(&topic(), "reader", attempt);
+        (made, opened)
+    }
+
+    #[test]
+    fn what_may_pass_is_tried_again_and_nothing_else() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let interrupted = || PublishSubscribeOpenOrCreateError::from(PublishSubscribeOpenError::Interrupt).into();
+        assert!(matches!(attempts(&bus, 2, interrupted), (3, Ok(()))));
+        let (made, refused) = attempts(&bus, 2, || Refusal::never("a signal called Interrupt"));
+        assert!(made == 1 && refused.is_err());
+    }
+
+    #[test]
+    fn an_opening_has_a_limit_and_names_the_file_that_it_waits_for() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain).within(Duration::from_millis(50));
+        let path = domain.domain().shared("begun");
+        std::fs::write(&path, "").unwrap();
+        let (_, refused) = attempts(&bus, u32::MAX, || PublishSubscribeOpenError::HangsInCreation.into());
+        let reason = refused.unwrap_err().to_string();
+        assert!(reason.contains("0.05 s") && reason.contains(path.to_str().unwrap()), "{reason}");
+    }
+
+    #[test]
+    fn what_the_dead_left_is_not_put_away_by_whoever_comes() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let config = config(domain.domain()).unwrap();
+        assert!(!config.global.node.cleanup_dead_nodes_on_creation);
+        assert!(!config.global.node.cleanup_dead_nodes_on_destruction);
+        assert!(!config.global.service.cleanup_dead_nodes_on_open);
     }
 
     #[test]

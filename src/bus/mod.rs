@@ -9,6 +9,7 @@ pub mod iox;
 pub mod memory;
 mod names;
 pub(crate) mod raw;
+mod unfinished;
 
 pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};

@@ -1,21 +1,20 @@
-//! The processes of a run: started from this program, listened to, reaped; and the janitor that outlives the launcher.
+//! The processes of a run: started from this program, listened to, reaped.
 //!
-//! A role dies with its launcher by the kernel's hand (parent-death signal); the janitor then removes what is left in
-//! shared memory. Must not leave a zombie.
+//! A role dies with its launcher by the kernel's hand (parent-death signal). Must not leave a zombie.
 
 use super::LaunchError;
 use super::supervision::Failure;
-use crate::bus::domain::{self, Domain};
+use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::runtime::RoleId;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -146,51 +145,4 @@ fn listen(name: String, stderr: impl Read + Send + 'static, last: Arc<Mutex<VecD
             }
         }
     })
-}
-
-/// The process that cleans up if the launcher cannot.
-pub(super) struct Janitor {
-    child: Child,
-    /// Held open: the kernel closes it when the launcher dies, and the janitor sees the end of its input.
-    line: Option<ChildStdin>,
-}
-
-impl Janitor {
-    /// Starts the janitor.
-    pub fn start(program: &Path) -> Result<Self, LaunchError> {
-        let mut child = Command::new(program)
-            .arg("janitor")
-            .process_group(0)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
-        let line = child.stdin.take();
-        Ok(Self { child, line })
-    }
-}
-
-impl Drop for Janitor {
-    fn drop(&mut self) {
-        if let Some(mut line) = self.line.take() {
-            let _ = line.write_all(b"all clean");
-        }
-        let _ = self.child.wait();
-    }
-}
-
-/// The janitor's work: waits for the end of `line`; if the launcher said nothing before, removes what it left behind.
-pub fn janitor(mut line: impl Read) {
-    if io::copy(&mut line, &mut io::sink()).is_ok_and(|said| said > 0) {
-        return;
-    }
-    // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
-    // later round.
-    let mut gone = Vec::new();
-    for pause_ms in [0, 50, 500] {
-        std::thread::sleep(Duration::from_millis(pause_ms));
-        gone.iter().for_each(Domain::forget);
-        gone.extend(domain::remove_dead_domains());
-    }
 }

@@ -4,13 +4,14 @@
 
 use super::LaunchError;
 use super::children::RoleProcess;
+use super::janitor::Janitor;
 use crate::bus::domain::Domain;
-use crate::bus::iox::IoxBus;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-const NAME: &str = "foxglove";
+/// The process's name.
+pub(super) const FOXGLOVE: &str = "foxglove";
 
 /// A run's process of this kind, if it has one.
 pub(super) struct FoxgloveWatch {
@@ -26,8 +27,14 @@ impl FoxgloveWatch {
         let tells = domain.root().join("foxglove.address");
         let start = |address: SocketAddr| {
             let mut command = Command::new(program);
-            command.arg(NAME).arg(domain.root()).arg("--address").arg(address.to_string()).arg("--tell").arg(&tells);
-            RoleProcess::spawn(command, NAME.to_owned())
+            command
+                .arg(FOXGLOVE)
+                .arg(domain.root())
+                .arg("--address")
+                .arg(address.to_string())
+                .arg("--tell")
+                .arg(&tells);
+            RoleProcess::spawn(command, FOXGLOVE.to_owned())
         };
         Ok(Self { process: address.map(start).transpose()?, tells, listens: false })
     }
@@ -35,7 +42,7 @@ impl FoxgloveWatch {
     /// Whether the ticks may run; how it failed if it listens nowhere. The address is told to the user.
     pub fn ready(&mut self) -> Result<bool, LaunchError> {
         let Some(process) = self.process.as_mut().filter(|_| !self.listens) else { return Ok(true) };
-        process.require_alive(NAME)?;
+        process.require_alive(FOXGLOVE)?;
         if let Ok(address) = std::fs::read_to_string(&self.tells) {
             eprintln!("foxglove: {address}");
             self.listens = true;
@@ -44,13 +51,13 @@ impl FoxgloveWatch {
     }
 
     /// Looks whether it has ended: then the run goes on without.
-    pub fn supervise(&mut self, bus: &IoxBus) {
+    pub fn supervise(&mut self, janitor: &mut Janitor) {
         let Some(process) = &mut self.process else { return };
         if let Some(status) = process.ended() {
             let cause = process.failure(status).cause;
             eprintln!("corotate: foxglove failed: {cause}; the run goes on without");
             self.process = None;
-            bus.clear_dead();
+            janitor.clear_dead();
         }
     }
 

@@ -5,6 +5,7 @@
 mod children;
 mod foxglove;
 mod in_process;
+mod janitor;
 mod junit;
 mod outcome;
 mod processes;
@@ -15,7 +16,7 @@ mod supervision;
 mod table;
 mod trace;
 
-pub use children::janitor;
+pub use janitor::janitor;
 pub use junit::junit;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use replay::replay_as_process;

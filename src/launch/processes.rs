@@ -2,17 +2,19 @@
 //!
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
-use super::children::{END_LIMIT, Janitor, RoleProcess};
-use super::foxglove::FoxgloveWatch;
+use super::children::{END_LIMIT, RoleProcess};
+use super::foxglove::{FOXGLOVE, FoxgloveWatch};
+use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
-use crate::bus::domain::{Domain, OwnedDomain};
+use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
+use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
     shared_memory_bytes, topic, write_whole,
@@ -21,8 +23,10 @@ use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::{Grant, Ledger, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 /// Between two looks at the roles, ns.
 const LOOK_NS: u64 = 1_000_000;
@@ -37,6 +41,9 @@ const CREDIT_TICKS: u64 = 16;
 /// Upper bounds on the files that the process which opens most of them, the launcher, has open.
 const DESCRIPTORS: u64 = 32;
 const DESCRIPTORS_PER_ROLE: u64 = 24;
+/// Upper bounds on the files that a run makes in shared memory, and beside it: signals, connections, tags of processes.
+const FILES: u64 = 32;
+const FILES_PER_ROLE: u64 = 32;
 /// Without any progress for so long the run counts as hung, ns, and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
@@ -44,20 +51,22 @@ const HUNG_PERIODS: u64 = 10;
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     require_descriptors(scenario)?;
+    require_files(FILES + FILES_PER_ROLE * RoleId::all(scenario).len() as u64)?;
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     describe_seats(scenario, launch, domain)?;
     // Declared before the roles, so that it is dropped, and cleans up, after them.
-    let _janitor = Janitor::start(&launch.program)?;
+    let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
+    let mut janitor = Janitor::start(&launch.program, domain, startup_limit)?;
     let (_low_latency, grants) = match scenario.clock {
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
     };
-    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?;
+    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
     domain.seal()?;
-    let mut crew = Crew::start(scenario, launch, domain, &bus)?;
+    let mut crew = Crew::start(scenario, launch, domain, &bus, &mut janitor)?;
     let mut scorer = score::open(scenario, &bus)?;
     let signal = crew.conduct(&mut *scorer, launch, &grants)?;
     let Dismissal { reports, unbooked, problems } = crew.dismiss();
@@ -123,7 +132,7 @@ fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
 struct Crew<'a> {
     scenario: &'a Scenario,
     domain: &'a Domain,
-    bus: &'a IoxBus,
+    janitor: &'a mut Janitor,
     program: PathBuf,
     members: Vec<Member>,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
@@ -139,6 +148,7 @@ impl<'a> Crew<'a> {
         launch: &Launch<'_>,
         domain: &'a Domain,
         bus: &'a IoxBus,
+        janitor: &'a mut Janitor,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
@@ -153,7 +163,7 @@ impl<'a> Crew<'a> {
         let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
         let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
-        Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder, foxglove })
+        Ok(Self { scenario, domain, janitor, program, members, schedule, word, incidents, recorder, foxglove })
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -199,20 +209,22 @@ impl<'a> Crew<'a> {
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
             for member in &mut self.members {
-                if let Some(Failure { cause, last_words }) = member.failure(self.scenario, self.bus) {
+                if let Some(Failure { cause, last_words }) = member.failure(self.scenario, self.janitor) {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
-            let watched = self.recorder.ready()? & self.foxglove.ready()?;
+            let watchers = [(RECORDER, self.recorder.ready()?), (FOXGLOVE, self.foxglove.ready()?)];
+            let absent = watchers.into_iter().filter(|(_, ready)| !ready).map(|(name, _)| name);
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
-            if missing.is_empty() && watched {
+            if missing.is_empty() && absent.clone().count() == 0 {
                 return Ok(true);
             }
             if launch.signal.load(Ordering::Relaxed) != 0 {
                 return Ok(false);
             }
             let names = |external: bool| missing.iter().filter(|m| m.external || !external).map(|m| &*m.name).collect();
-            let (roles, external): (Vec<&str>, Vec<&str>) = (names(false), names(true));
+            let (mut roles, external): (Vec<&str>, Vec<&str>) = (names(false), names(true));
+            roles.extend(absent);
             // Whoever starts a role by hand may take all the time in the world.
             if monotonic_ns() > end_ns && external.is_empty() {
                 return Err(LaunchError::StartUp { limit_s, roles: roles.join(", ") });
@@ -266,18 +278,21 @@ impl<'a> Crew<'a> {
     /// Notices roles that have failed and brings them back; false if the run is to end for that.
     fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
-        self.recorder.supervise(self.bus);
-        self.foxglove.supervise(self.bus);
+        self.recorder.supervise(self.janitor);
+        self.foxglove.supervise(self.janitor);
         for member in &mut self.members {
-            if let Some(failure) = member.failure(self.scenario, self.bus) {
+            if let Some(failure) = member.failure(self.scenario, self.janitor) {
                 let incident = member.fail(failure, self.scenario, now_ns);
                 eprintln!("corotate: {incident}");
-                self.bus.clear_dead();
+                self.janitor.clear_dead();
                 scorer.incident(incident.tick);
                 go_on &= incident.action == Action::Restarted;
                 self.incidents.push(incident);
             }
-            member.restart(&self.program, self.scenario, self.domain, now_ns)?;
+            // A successor finds its links free once the remains of its predecessor are put away.
+            if !self.janitor.is_busy() {
+                member.restart(&self.program, self.scenario, self.domain, now_ns)?;
+            }
             if let Some(outage_ns) = member.back_after_ns(now_ns) {
                 let last = self.incidents.iter_mut().rev().find(|incident| incident.role == member.name);
                 last.into_iter().for_each(|incident| incident.outage_s = Some(outage_ns as f64 / 1e9));
@@ -286,10 +301,12 @@ impl<'a> Crew<'a> {
         Ok(go_on)
     }
 
-    /// Waits until `until_ns`, or until a role's process ends: then it is true.
+    /// Waits until `until_ns`, or until a role's process ends or the janitor answers: then it is true.
     fn pause(&self, until_ns: u64) -> bool {
-        let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle());
-        let mut handles: Vec<PollFd<'_>> = handles.map(|handle| PollFd::new(handle, PollFlags::IN)).collect();
+        let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle()).map(AsFd::as_fd);
+        let handles = handles.chain(self.janitor.answers());
+        let mut handles: Vec<PollFd<'_>> =
+            handles.map(|handle| PollFd::from_borrowed_fd(handle, PollFlags::IN)).collect();
         let wait_ns = until_ns.saturating_sub(monotonic_ns());
         let timeout = Timespec { tv_sec: (wait_ns / 1_000_000_000) as i64, tv_nsec: (wait_ns % 1_000_000_000) as _ };
         // Woken early or not, the caller looks for itself.
@@ -325,8 +342,12 @@ impl<'a> Crew<'a> {
     fn dismiss(&mut self) -> Dismissal {
         self.word.phase = Phase::Stop as u64;
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
-        self.bus.clear_dead();
+        // Told first, and then nobody is waited for who is dead: an external role that was killed has left once its remains
+        // are put away.
+        let _ = self.announce();
+        self.janitor.clear_dead();
         while self.members.iter_mut().any(Member::lingers) && monotonic_ns() < limit_ns {
+            let _ = self.janitor.is_busy();
             // Again and again: who is only just coming up has not heard it yet. A link that fails now changes nothing:
             // whoever does not end by itself is ended.
             let _ = self.announce();

@@ -5,6 +5,7 @@
 
 use super::LaunchError;
 use super::children::RoleProcess;
+use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
@@ -86,7 +87,7 @@ impl RecorderWatch {
     }
 
     /// Looks whether it has failed: then the run goes on without.
-    pub fn supervise(&mut self, bus: &IoxBus) {
+    pub fn supervise(&mut self, janitor: &mut Janitor) {
         if self.problem.is_some() || self.state() == RoleState::Done {
             return;
         }
@@ -102,7 +103,7 @@ impl RecorderWatch {
         };
         eprintln!("corotate: the recorder failed: {problem}; the run goes on without");
         self.problem = Some(problem);
-        bus.clear_dead();
+        janitor.clear_dead();
     }
 
     /// Whether it still writes: a process of ours has not ended, or somebody else's has not said that it is done.

@@ -3,7 +3,8 @@
 //! One role at a time. Must not judge: [`crate::record`] says what the role gets and compares what it says.
 
 use super::LaunchError;
-use super::children::{END_LIMIT, Janitor, RoleProcess};
+use super::children::{END_LIMIT, RoleProcess};
+use super::janitor::Janitor;
 use crate::bus::domain::OwnedDomain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
@@ -14,6 +15,7 @@ use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
 
 /// Between two looks when nothing has come for a while, ns.
 const LULL_NS: u64 = 50_000;
@@ -38,7 +40,7 @@ pub fn replay_as_process(
     let path = scenario_path(domain);
     write_whole(&path, without_interruptions(scenario).as_bytes())
         .map_err(|source| LaunchError::Write { path, source })?;
-    let _janitor = Janitor::start(program)?;
+    let _janitor = Janitor::start(program, domain, Duration::from_secs_f64(scenario.startup_timeout_s))?;
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
     domain.seal()?;
     let mut prompter = Prompter {
@@ -124,7 +126,7 @@ impl Prompter<'_> {
                 self.announce()?;
                 self.inlets.refresh()?;
                 self.comparer.take(&mut self.outlets)?;
-                std::thread::sleep(std::time::Duration::from_millis(1));
+                std::thread::sleep(Duration::from_millis(1));
                 while self.health.advance()? {}
                 told = self.health.current().map_or(told, |health| RoleState::from_number(health.state));
             }
@@ -194,7 +196,7 @@ impl Prompter<'_> {
         while self.process.ended().is_none() && monotonic_ns() < limit_ns {
             // A link that fails now changes nothing: the process is ended anyway.
             let _ = self.announce();
-            std::thread::sleep(std::time::Duration::from_millis(1));
+            std::thread::sleep(Duration::from_millis(1));
         }
         self.process.kill();
     }

@@ -4,6 +4,7 @@
 
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
+use super::janitor::Janitor;
 use super::trace::Trace;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -212,9 +213,9 @@ impl Member {
     }
 
     /// Whether and how the role has failed: its process has ended, or it has been silent for too long.
-    pub fn failure(&mut self, scenario: &Scenario, bus: &IoxBus) -> Option<Failure> {
+    pub fn failure(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         if self.external {
-            return self.fell_silent(scenario, bus);
+            return self.fell_silent(scenario, janitor);
         }
         let done = self.state() == RoleState::Done;
         let process = self.process.as_mut()?;
@@ -235,7 +236,7 @@ impl Member {
 
     /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next
     /// is due; in lockstep that is when the others let it, so there it fails only by leaving.
-    fn fell_silent(&self, scenario: &Scenario, bus: &IoxBus) -> Option<Failure> {
+    fn fell_silent(&self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
@@ -247,8 +248,10 @@ impl Member {
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
         }
-        // One that was killed has left once its remains are cleared.
-        bus.clear_dead();
+        // One that was killed has left once its remains are put away.
+        if !janitor.is_busy() {
+            janitor.clear_dead();
+        }
         match (tells, state, scenario.clock) {
             (true, ..) => fail(format!("it said nothing for {limit_s} s")),
             (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),

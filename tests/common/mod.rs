@@ -194,6 +194,10 @@ impl Running {
         })
     }
 
+    pub fn has_ended(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     pub fn wait(mut self) -> Done {
         let end = Instant::now() + WATCHDOG;
         let status = loop {

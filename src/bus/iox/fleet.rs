@@ -1,6 +1,6 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
-use super::{IoxBus, Ipc, buffer_size};
+use super::{Connections, IoxBus, Ipc, buffer_size};
 use crate::bus::bell::Bell;
 use crate::bus::{BusError, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample};
@@ -46,17 +46,12 @@ pub struct IoxFleetWriter<L: FleetLayout> {
 impl<L: FleetLayout> IoxFleetWriter<L> {
     pub(super) fn open(bus: &IoxBus, service: &Service<L>, topic: &Topic, bodies: usize) -> Result<Self, BusError> {
         let length = FleetSample::<L>::length(bodies);
-        let publisher = service
-            .publisher_builder()
-            .initial_max_slice_len(length)
-            .max_loaned_samples(1)
-            .backpressure_strategy(BackpressureStrategy::DiscardData)
-            .create()
-            .map_err(|error| BusError::Open {
-                service: topic.to_string(),
-                end: "writer",
-                reason: format!("{error:?}"),
-            })?;
+        let publisher = bus.open(topic, "writer", || {
+            let connections = Connections::default();
+            let builder = service.publisher_builder().initial_max_slice_len(length).max_loaned_samples(1);
+            let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
+            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+        })?;
         Ok(Self { publisher, loan: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
 
@@ -124,10 +119,10 @@ impl<L: FleetLayout> IoxFleetReader<L> {
         bodies: usize,
     ) -> Result<Self, BusError> {
         let depth = buffer_size(topic.signal, reader, bus.depths);
-        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
-            service: topic.to_string(),
-            end: "reader",
-            reason: format!("{error:?}"),
+        let subscriber = bus.open(topic, "reader", || {
+            let connections = Connections::default();
+            let builder = service.subscriber_builder().buffer_size(depth);
+            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
         })?;
         let length = FleetSample::<L>::length(bodies);
         Ok(Self { service, subscriber, current: None, length, bell: bus.bells.of(topic), topic: topic.clone() })

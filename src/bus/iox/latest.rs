@@ -5,7 +5,7 @@
 //! blackboard that its writer died on cannot be written again while anybody reads it, so each generation of a writer has
 //! one of its own.
 
-use super::{Ipc, MAX_NODES, MAX_READERS, Topic, Wire};
+use super::{Ipc, MAX_NODES, MAX_READERS, Refusal, Topic, Wire};
 use crate::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::reader::{BlackboardValue, EntryHandle};
@@ -20,17 +20,16 @@ pub struct LatestWriter<S: Sample>(EntryHandleMut<Ipc, u64, Wire<S>>);
 
 impl<S: Sample> LatestWriter<S> {
     /// A new lane, of the writer's `generation`.
-    pub fn create(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Result<Self, String> {
+    pub fn create(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Result<Self, Refusal> {
         let service = node
-            .service_builder(&name(topic, generation)?)
+            .service_builder(&name(topic, generation).map_err(Refusal::never)?)
             .blackboard_creator::<u64>()
             .max_readers(MAX_READERS)
             .max_nodes(MAX_NODES)
             .add::<Wire<S>>(KEY, Wire(S::zeroed()))
-            .create()
-            .map_err(|error| format!("{error:?}"))?;
-        let writer = service.writer_builder().create().map_err(|error| format!("{error:?}"))?;
-        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(|error| format!("{error:?}"))
+            .create()?;
+        let writer = service.writer_builder().create().map_err(Refusal::never)?;
+        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(Refusal::never)
     }
 
     /// Puts a sample there.

@@ -1,0 +1,243 @@
+//! The janitor: a process that puts away what dead processes left in a run's domain, and removes the domain if the launcher
+//! is killed.
+//!
+//! The transport's clean-up may take long, and for ever where a maker stands still, so nobody waits for it: the launcher
+//! asks by a byte, looks for the answer when it comes by, and replaces a janitor that does not answer in time. Must not
+//! touch what belongs to the living.
+
+use super::LaunchError;
+use crate::bus::domain::{self, Domain};
+use crate::bus::iox;
+use crate::clock::monotonic_ns;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+use std::fs::{self, Metadata};
+use std::io::{self, Read, Write};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::time::{Duration, SystemTime};
+
+/// The launcher asks for what the dead left to be put away; so is answered when it is done.
+const CLEAR: u8 = b'c';
+/// The launcher is done, and removes the domain itself.
+const DONE: u8 = b'd';
+/// A janitor that has not answered for so long is replaced, ns. A clean-up takes some 5 ms per dead process.
+const ANSWER_NS: u64 = 2_000_000_000;
+/// So many janitors in a row are tried for one request.
+const ATTEMPTS: u32 = 3;
+/// A janitor may take so long to end.
+const END_LIMIT: Duration = Duration::from_secs(1);
+/// Between two looks for unfinished files and for processes that came.
+const LOOK: Duration = Duration::from_millis(50);
+/// A directory's time of change is so coarse at the most: what changed just before a look is looked at again.
+const GRAIN: Duration = Duration::from_millis(100);
+
+/// The janitor, seen from the launcher.
+pub(super) struct Janitor {
+    program: PathBuf,
+    root: PathBuf,
+    limit: Duration,
+    process: Process,
+    /// Requests without an answer, and since when the oldest waits, ns.
+    pending: u64,
+    since_ns: u64,
+    /// Janitors that have been tried for them.
+    attempts: u32,
+}
+
+struct Process {
+    child: Child,
+    /// Held open: the kernel closes it when the launcher dies, and the janitor sees the end of its input.
+    line: ChildStdin,
+    answers: ChildStdout,
+}
+
+impl Janitor {
+    /// Starts the janitor of a domain. A file that its maker does not finish for `limit` is taken for abandoned.
+    pub fn start(program: &Path, domain: &Domain, limit: Duration) -> Result<Self, LaunchError> {
+        let (program, root) = (program.to_owned(), domain.root().to_owned());
+        let process = Process::start(&program, &root, limit)
+            .map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
+        Ok(Self { program, root, limit, process, pending: 0, since_ns: 0, attempts: 0 })
+    }
+
+    /// Asks for what dead processes left to be put away.
+    pub fn clear_dead(&mut self) {
+        if self.pending == 0 {
+            (self.since_ns, self.attempts) = (monotonic_ns(), 1);
+        }
+        // A janitor that died, or whose line is full because it stands still, is found by the look for its answer.
+        let _ = self.process.line.write_all(&[CLEAR]);
+        self.pending += 1;
+    }
+
+    /// Whether what was asked for is not done. To be asked again and again: it is here that answers are looked for.
+    pub fn is_busy(&mut self) -> bool {
+        if self.pending == 0 {
+            return false;
+        }
+        let mut answers = [0; 64];
+        match self.process.answers.read(&mut answers) {
+            Ok(0) => self.replace("died"),
+            Ok(count) => {
+                self.pending = self.pending.saturating_sub(count as u64);
+                self.since_ns = monotonic_ns();
+            }
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                if monotonic_ns().saturating_sub(self.since_ns) > ANSWER_NS {
+                    self.replace("hung");
+                }
+            }
+            Err(_) => {}
+        }
+        self.pending > 0
+    }
+
+    /// What there is to wait on for an answer, if one is due.
+    pub fn answers(&self) -> Option<BorrowedFd<'_>> {
+        (self.pending > 0).then(|| self.process.answers.as_fd())
+    }
+
+    /// Starts another one in its place, and asks that one.
+    fn replace(&mut self, how: &str) {
+        let started = (self.attempts < ATTEMPTS).then(|| Process::start(&self.program, &self.root, self.limit));
+        match started {
+            Some(Ok(process)) => {
+                self.process.kill();
+                self.process = process;
+                let attempts = self.attempts + 1;
+                self.pending = 0;
+                self.clear_dead();
+                self.attempts = attempts;
+            }
+            Some(Err(_)) | None => {
+                eprintln!("corotate: the janitor {how}; what a dead process left may keep its successor out");
+                self.pending = 0;
+            }
+        }
+    }
+}
+
+impl Process {
+    fn start(program: &Path, root: &Path, limit: Duration) -> io::Result<Self> {
+        let mut command = Command::new(program);
+        command.arg("janitor").arg("--domain").arg(root).arg("--limit-s").arg(limit.as_secs_f64().to_string());
+        let mut child =
+            command.process_group(0).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
+        let pipes = child.stdin.take().zip(child.stdout.take());
+        let (line, answers) = pipes.ok_or_else(|| io::Error::other("it has no pipes"))?;
+        for end in [line.as_fd(), answers.as_fd()] {
+            fcntl_setfl(end, fcntl_getfl(end)? | OFlags::NONBLOCK)?;
+        }
+        Ok(Self { child, line, answers })
+    }
+
+    fn kill(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Drop for Janitor {
+    fn drop(&mut self) {
+        let _ = self.process.line.write_all(&[DONE]);
+        let end_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
+        while matches!(self.process.child.try_wait(), Ok(None)) && monotonic_ns() < end_ns {
+            // It closes its answers when it ends.
+            let mut ended = [PollFd::new(&self.process.answers, PollFlags::empty())];
+            let _ = poll(&mut ended, Some(&timespec(Duration::from_millis(10))));
+        }
+        self.process.kill();
+    }
+}
+
+fn timespec(duration: Duration) -> Timespec {
+    Timespec { tv_sec: duration.as_secs() as i64, tv_nsec: duration.subsec_nanos() as _ }
+}
+
+/// The janitor's work in a domain: removes unfinished files, puts away what the dead left when `line` asks for it or
+/// somebody comes, and answers. At the end of `line`, unless the launcher said that it was done, removes what is left of
+/// this domain and of every other whose launcher is dead.
+///
+/// # Errors
+/// The system's reason for not starting a thread.
+pub fn janitor(
+    domain: &Domain,
+    limit: Duration,
+    mut line: impl Read + AsFd,
+    mut answers: impl Write,
+) -> io::Result<()> {
+    let swept = domain.clone();
+    // Beside the clean-up, which waits for unfinished files itself. The thread ends with the process.
+    std::thread::Builder::new().spawn(move || sweep(&swept, limit))?;
+    let mut nodes = Watched::new(domain.root().join("nodes"));
+    loop {
+        // What cannot be put away now is so when somebody comes again.
+        let clear = || drop(iox::clear_dead(domain));
+        if nodes.changed() {
+            clear();
+        }
+        let mut input = [PollFd::new(&line, PollFlags::IN)];
+        if !poll(&mut input, Some(&timespec(LOOK))).is_ok_and(|ready| ready > 0) {
+            continue;
+        }
+        let mut requests = [0; 64];
+        let requests = match line.read(&mut requests) {
+            Ok(0) | Err(_) => break,
+            Ok(count) => &requests[..count],
+        };
+        if requests.contains(&DONE) {
+            return Ok(());
+        }
+        clear();
+        // Nobody is left to be told if this fails.
+        let _ = answers.write_all(requests).and_then(|()| answers.flush());
+    }
+    // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
+    // later round.
+    let mut gone = Vec::new();
+    for pause_ms in [0, 50, 500] {
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        gone.iter().for_each(Domain::forget);
+        gone.extend(domain::remove_dead_domains());
+    }
+    Ok(())
+}
+
+/// Removes unfinished files of a domain, for ever.
+fn sweep(domain: &Domain, limit: Duration) {
+    let mut files = Watched::new(domain::SHARED_MEMORY.into());
+    let mut services = Watched::new(domain.root().join("services"));
+    let mut unfinished = false;
+    loop {
+        // Not short-circuited: each look remembers what it saw.
+        if files.changed() | services.changed() | unfinished {
+            unfinished = domain.remove_unfinished(limit);
+        }
+        std::thread::sleep(LOOK);
+    }
+}
+
+/// A directory in which files come and go.
+struct Watched {
+    path: PathBuf,
+    /// When it had changed last, as it was seen last.
+    seen: Option<SystemTime>,
+}
+
+impl Watched {
+    fn new(path: PathBuf) -> Self {
+        Self { path, seen: None }
+    }
+
+    /// Whether a file may have come or gone since the last look.
+    fn changed(&mut self) -> bool {
+        let now = SystemTime::now();
+        let Ok(changed) = fs::metadata(&self.path).as_ref().map(Metadata::modified) else { return false };
+        // A system that does not tell is looked at every time.
+        let changed = changed.ok().filter(|changed| now.duration_since(*changed).is_ok_and(|age| age > GRAIN));
+        changed.is_none() || std::mem::replace(&mut self.seen, changed) != changed
+    }
+}

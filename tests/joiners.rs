@@ -1,0 +1,225 @@
+//! Whoever joins a run may die at any place of his joining and leaving: the run goes on and ends in order, and his place can
+//! be taken again.
+//!
+//! strace kills a joiner as it makes its n-th system call of a kind. With `COROTATE_JOINERS=all` it is every call of the
+//! kinds below (half an hour), else some of each. Nothing is judged by the machine's speed: a role that stood still is one
+//! that its launcher missed for `STILL_S` of its own attention, and in lockstep no tick may be missed at all.
+
+mod common;
+
+use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+const CALLS: [&str; 5] = ["openat", "ftruncate", "mmap", "rename", "futex"];
+/// Of each kind so many calls are tried in the short form.
+const FEW: usize = 3;
+/// For so long no role may stand still, s.
+const STILL_S: &str = "1";
+const SIGKILL: i32 = 9;
+const SIGTERM: i32 = 15;
+
+/// How a joiner is started, but for strace; `n` tells one from another.
+struct Joiner {
+    name: &'static str,
+    arguments: fn(domain: &Path, n: usize) -> Vec<String>,
+    /// It stays until it is told to leave.
+    stays: bool,
+}
+
+fn words(words: &[&str]) -> Vec<String> {
+    words.iter().map(|word| (*word).to_owned()).collect()
+}
+
+const WATCH: Joiner = Joiner {
+    name: "watch",
+    arguments: |domain, _| words(&["watch", domain.to_str().unwrap(), "--once", "1"]),
+    stays: false,
+};
+
+const RECORD: Joiner = Joiner {
+    name: "record",
+    arguments: |domain, n| words(&["record", "--domain", domain.to_str().unwrap(), "--out", &format!("{n}.mcap")]),
+    stays: true,
+};
+
+#[cfg(feature = "foxglove")]
+const FOXGLOVE: Joiner = Joiner {
+    name: "foxglove",
+    arguments: |domain, _| words(&["foxglove", domain.to_str().unwrap(), "--address", "127.0.0.1:0"]),
+    stays: true,
+};
+
+/// A command under strace, with more options for it.
+fn strace(bench: &Bench, options: &[&str], command: &[String]) -> Running {
+    let mut strace = bench.command_of("strace".as_ref());
+    strace.args(["-f", "-qq"]).args(options).args(command);
+    Running::new(&mut strace)
+}
+
+fn killed_at(bench: &Bench, call: &str, n: usize, command: &[String]) -> Running {
+    let inject = format!("inject={call}:signal=KILL:when={n}");
+    strace(bench, &["-o", "/dev/null", "-e", &format!("trace={call}"), "-e", &inject], command)
+}
+
+/// The number of calls of each kind that one thread of a traced program made, from the first one that concerns `domain` on:
+/// what comes before is the interpreter's or the loader's, and nobody else's matter.
+fn calls(trace: &Path, domain: &Path) -> Vec<(&'static str, std::ops::RangeInclusive<usize>)> {
+    let text = std::fs::read_to_string(trace).unwrap();
+    let id = domain.file_name().unwrap().to_str().unwrap();
+    let joins = text.lines().position(|line| line.contains(id) && !line.contains("execve")).unwrap();
+    let of = |call: &'static str| {
+        let is = |line: &&str| line.split_whitespace().nth(1).is_some_and(|word| word.starts_with(&format!("{call}(")));
+        let before = text.lines().take(joins).filter(is).count();
+        (call, before + 1..=text.lines().filter(is).count())
+    };
+    CALLS.map(of).into()
+}
+
+/// The deaths to be tried: kind of call, and the how manieth.
+fn deaths(trace: &Path, domain: &Path) -> Vec<(&'static str, usize)> {
+    let all = std::env::var("COROTATE_JOINERS").is_ok_and(|which| which == "all");
+    let some = |(call, numbers): (&'static str, std::ops::RangeInclusive<usize>)| {
+        let step = if all { 1 } else { numbers.clone().count().div_ceil(FEW).max(1) };
+        numbers.step_by(step).map(move |n| (call, n))
+    };
+    calls(trace, domain).into_iter().flat_map(some).collect()
+}
+
+/// Waits for a joiner under strace, telling it to leave if it stays.
+fn await_left(joiner: &Joiner, running: Running) -> Done {
+    if joiner.stays {
+        let children = format!("/proc/{0}/task/{0}/children", running.pid());
+        let end = Instant::now() + Duration::from_secs(1);
+        let children = || std::fs::read_to_string(&children).unwrap_or_default();
+        while Instant::now() < end && !(children().is_empty() && Instant::now() + Duration::from_millis(500) > end) {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        children().split_whitespace().for_each(|pid| send_signal(pid.parse().unwrap(), SIGTERM));
+    }
+    running.wait()
+}
+
+/// A run in which joiners die, one after the other.
+fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
+    let bench = Bench::new();
+    let file = shipped("rigid-pair");
+    let still = format!("supervision.heartbeat_timeout_s={STILL_S}");
+    let run =
+        ["run", file.to_str().unwrap(), "--clock", clock, "--tick-hz=200", "--duration=3600", "--json", "--out=out"];
+    let run = bench.start(&[&run[..], &["--set=accept={}", "--set", &still], more].concat());
+    let domain = await_some(|| bench.domains().pop());
+    // The first screen is there once ticks run, and says so.
+    let look = || bench.run(&["watch", domain.to_str().unwrap(), "--once", "1"]);
+    await_some(|| look().stdout.contains("running").then_some(()));
+
+    let command = |n: usize| [words(&[env!("CARGO_BIN_EXE_corotate")]), (joiner.arguments)(&domain, n)].concat();
+    let trace = bench.path("trace");
+    let traced = strace(&bench, &["-o", trace.to_str().unwrap()], &command(0));
+    let lives = await_left(joiner, traced);
+    assert!(lives.signal.is_none(), "undisturbed: {lives:?}");
+    let deaths = deaths(&trace, &domain);
+    let mut killed = 0;
+    for (number, (call, n)) in deaths.iter().enumerate() {
+        let done = await_left(joiner, killed_at(&bench, call, *n, &command(number + 1)));
+        killed += usize::from(done.signal == Some(SIGKILL));
+        assert!(done.signal == Some(SIGKILL) || done.code != Some(2), "{} at {call} {n}: {done:?}", joiner.name);
+    }
+    assert!(killed * 4 >= deaths.len() * 3, "{killed} of {} died: the counts do not fit", deaths.len());
+
+    // Their places are free again.
+    await_some(|| look().stdout.contains("running").then_some(()));
+    let told = Instant::now();
+    run.signal(SIGTERM);
+    let done = run.wait();
+    println!("{}, {clock}: {killed} deaths; the run ended {:?} after it was told", joiner.name, told.elapsed());
+    assert_eq!(done.code, Some(128 + SIGTERM), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!((&summary["incidents"], &summary["books"]["balanced"]), (&Value::Array(vec![]), &Value::Bool(true)));
+    if clock == "lockstep" {
+        assert_eq!(summary["books"]["missed_ticks"], 0);
+    }
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn a_watcher_may_die_anywhere() {
+    joiners_may_die(&WATCH, "realtime", &[]);
+}
+
+#[test]
+fn in_lockstep_a_watcher_may_die_anywhere() {
+    joiners_may_die(&WATCH, "lockstep", &[]);
+}
+
+#[test]
+fn a_recorder_may_die_anywhere() {
+    joiners_may_die(&RECORD, "realtime", &[]);
+}
+
+/// It finds the recorder's place taken, and leaves again.
+#[test]
+fn a_second_recorder_may_die_anywhere() {
+    joiners_may_die(&RECORD, "realtime", &["--record"]);
+}
+
+#[cfg(feature = "foxglove")]
+#[test]
+fn foxglove_may_die_anywhere() {
+    joiners_may_die(&FOXGLOVE, "realtime", &[]);
+}
+
+/// A run that waits for the foreign follower, and the seat.
+fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
+    let scenario = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/pair.toml");
+    let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}", "--out=out"];
+    let running = bench.start(&run);
+    let is_seat =
+        |domain: PathBuf| Some((domain.join("follower.seat.json"), domain)).filter(|(seat, _)| seat.is_file());
+    let (seat, domain) = await_some(|| bench.domains().pop().and_then(is_seat));
+    (running, seat, domain)
+}
+
+/// The seat of an external role can be taken again wherever its holder died.
+#[test]
+fn the_foreign_follower_may_die_anywhere() {
+    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/venv")).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let python = String::from_utf8(made.stdout).unwrap().trim().to_owned();
+    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/follower.py");
+    let command = |seat: &Path| words(&[&python, program.to_str().unwrap(), seat.to_str().unwrap()]);
+
+    let bench = Bench::new();
+    let trace = bench.path("trace");
+    let (running, seat, domain) = start_waiting(&bench);
+    let follower = strace(&bench, &["-o", trace.to_str().unwrap()], &command(&seat)).wait();
+    assert_eq!((running.wait().code, follower.code), (Some(0), Some(0)), "undisturbed: {follower:?}");
+
+    let mut killed = 0;
+    let mut deaths = deaths(&trace, &domain).into_iter().peekable();
+    while deaths.peek().is_some() {
+        let (mut running, seat, domain) = start_waiting(&bench);
+        // One after the other in the same run, until one gets so far that the run ends with it.
+        for (call, n) in deaths.by_ref() {
+            let done = killed_at(&bench, call, n, &command(&seat)).wait();
+            killed += usize::from(done.signal == Some(SIGKILL));
+            assert!(done.signal == Some(SIGKILL) || done.code == Some(0), "at {call} {n}: {done:?}");
+            if !domain.join("follower.seat.json").is_file() || running.has_ended() {
+                break;
+            }
+        }
+        // Nobody comes any more: the last one does.
+        if domain.is_dir() && !running.has_ended() {
+            let follower = bench.start_program(python.as_ref(), &[program.to_str().unwrap(), seat.to_str().unwrap()]);
+            follower.wait();
+        }
+        let done = running.wait();
+        assert!([Some(0), Some(4)].contains(&done.code), "{done:?}");
+        assert!(done.code == Some(0) || done.stderr.contains("follower"), "{done:?}");
+        bench.assert_clean(&[domain]);
+    }
+    println!("the foreign follower: {killed} deaths");
+    assert!(killed > 0);
+}
