@@ -3,7 +3,7 @@
 #![allow(dead_code, reason = "every test file uses its own part of this")]
 
 use std::borrow::Cow;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -224,6 +224,11 @@ pub fn await_some<T>(mut look: impl FnMut() -> Option<T>) -> T {
         assert!(Instant::now() < end, "it never came");
         std::thread::sleep(Duration::from_millis(2));
     }
+}
+
+/// Says that something is not tested here, past the harness, which keeps what a test prints: `tests/run` collects it.
+pub fn skipped(what: &str, why: &str) {
+    std::io::stderr().write_all(format!("SKIPPED: {what} because {why}\n").as_bytes()).unwrap();
 }
 
 /// A scenario that ships with the program.
