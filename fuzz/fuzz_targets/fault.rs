@@ -82,7 +82,8 @@ fuzz_target!(|tables: Vec<Table>| {
     match Scenario::parse(&text, "fault.toml", &short) {
         Ok(scenario) => {
             let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
-            assert_eq!(again.faults, scenario.faults);
+            // As text: what is not a number is unequal to itself.
+            assert_eq!(format!("{:?}", again.faults), format!("{:?}", scenario.faults));
             let launch = &mut Launch {
                 program: PathBuf::new(),
                 external: Vec::new(),

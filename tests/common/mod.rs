@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "every test file uses its own part of this")]
 
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -262,6 +263,30 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
         message.data = Cow::Owned(data);
         message.channel = channel.into();
         writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+/// Writes a recording again, as anybody could, with its metadata changed and their checksums made right again.
+pub fn rewrite_metadata(from: &Path, to: &Path, change: impl Fn(&str, &mut BTreeMap<String, String>)) {
+    let bytes = std::fs::read(from).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    for index in &summary.metadata_indexes {
+        let mut metadata = mcap::read::metadata(&bytes, index).unwrap();
+        metadata.metadata.remove("checksum");
+        change(&metadata.name, &mut metadata.metadata);
+        let mut hasher = xxhash_rust::xxh3::Xxh3::new();
+        let texts = metadata.metadata.iter().flat_map(|(key, value)| [key, value]);
+        for text in [&metadata.name].into_iter().chain(texts) {
+            hasher.update(&(text.len() as u64).to_le_bytes());
+            hasher.update(text.as_bytes());
+        }
+        metadata.metadata.insert("checksum".to_owned(), format!("{:016x}", hasher.digest()));
+        writer.write_metadata(&metadata).unwrap();
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        writer.write(&message.unwrap()).unwrap();
     }
     writer.finish().unwrap();
 }
