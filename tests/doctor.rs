@@ -5,6 +5,9 @@ mod common;
 use common::{Bench, await_some};
 use serde_json::Value;
 
+const SIGKILL: i32 = 9;
+const SIGSTOP: i32 = 19;
+
 fn checks(report: &Value) -> Vec<(&str, &str)> {
     let text = |check: &'static str, of: &Value| of[check].as_str().unwrap().to_owned();
     let checks = report["checks"].as_array().unwrap();
@@ -61,17 +64,16 @@ fn what_a_killed_run_left_is_told_and_removed_on_demand() {
     let killed = bench.start(&["run", "--duration", "60"]);
     let dead = domain(&bench);
     bench.await_role("controller");
-    let mut processes = bench.processes();
-    // The launcher first, so that it cleans up nothing.
-    processes.sort_by_key(|pid| *pid != killed.pid());
-    processes.iter().for_each(|pid| common::send_signal(*pid, 9));
+    let processes = bench.processes();
+    // All are stopped before the first is killed, so that nobody cleans up after another.
+    for signal in [SIGSTOP, SIGKILL] {
+        processes.iter().for_each(|pid| common::send_signal(*pid, signal));
+    }
     drop(killed);
     await_some(|| bench.processes().is_empty().then_some(()));
-    if dead.exists() {
-        let told = bench.run(&["doctor", "--seconds", "0"]);
-        assert!(told.stdout.contains("1 of dead runs") && told.stdout.contains("doctor --clean"), "{told:?}");
-        assert!(dead.exists(), "nothing is removed unasked");
-    }
+    let told = bench.run(&["doctor", "--seconds", "0"]);
+    assert!(told.stdout.contains("1 of dead runs") && told.stdout.contains("doctor --clean"), "{told:?}");
+    assert!(dead.exists(), "nothing is removed unasked");
     let cleaned = bench.run(&["doctor", "--seconds", "0", "--clean"]);
     assert!(cleaned.stdout.contains("leftover domains     none (0 running)"), "{cleaned:?}");
     let running = bench.start(&["run", "--duration", "60"]);

@@ -2,18 +2,18 @@
 
 mod common;
 
-use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped};
+use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped, skipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Read, Reader, Topic};
 use corotate::config::Scenario;
 use corotate::record::{Recording, topic_of};
 use corotate::runtime::{RoleId, Visit, build, depths, in_turn, private_ledger, visit_writes};
 use corotate::sample::{FleetLayout, FleetSample, Sample};
+use corotate::watch::Session;
 use corotate::with_rig;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 const SIGKILL: i32 = 9;
 const SIGSTOP: i32 = 19;
@@ -245,29 +245,17 @@ fn a_file_that_was_cut_off_is_read_as_far_as_it_goes_and_no_file_is_believed() {
     let mut replayed = 0;
     for part in 0..12 {
         std::fs::write(&cut, &bytes[..bytes.len() * part / 12]).unwrap();
-        let done = replay(&bench, &cut, &[]);
+        let done = replay(&bench, &cut, &["--accept-incomplete"]);
         let readable = done.code == Some(0) && done.stderr.contains("as far as it goes");
         assert!(readable || (done.code == Some(2) && done.stderr.contains("no recording")), "{part}: {done:?}");
         replayed += u32::from(readable);
     }
     assert!(replayed >= 8, "{replayed}");
-    for seed in 1..40_usize {
-        let mut wrong = bytes.clone();
-        for turn in 0..8 {
-            let at = seed.wrapping_mul(2_654_435_761).wrapping_add(turn * 7_919 * seed) % wrong.len();
-            wrong[at] ^= 1 << (turn % 8);
-        }
-        std::fs::write(&cut, &wrong).unwrap();
-        for command in [&["replay"][..], &["export", "--csv", "tables"]] {
-            let done = bench.run(&[command, &[cut.to_str().unwrap()]].concat());
-            assert!(matches!(done.code, Some(0 | 2 | 3)), "{seed}: {done:?}");
-        }
-    }
     // No sample is so long, and nobody is to make as many columns.
     let long = |schema: String| schema.replace("float64[3] ", "float64[1000000000000] ");
     rewrite(&file, &cut, long, |_, _, _| {});
     let done = bench.run(&["export", cut.to_str().unwrap(), "--csv", "tables"]);
-    assert!(done.code == Some(0) && done.stderr.contains("has no samples of ours"), "{done:?}");
+    assert!(done.code == Some(1) && done.stderr.contains("has no samples of ours"), "{done:?}");
     let done = bench.run(&["replay", "nowhere.mcap"]);
     assert!(done.code == Some(1) && done.stderr.contains("nowhere.mcap"), "{done:?}");
 }
@@ -294,7 +282,8 @@ fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
         assert_eq!(signal["gaps"][0][1], 6000, "{signal}");
         let file = bench.path(clock).join("run.mcap");
         assert!(Recording::open(&file).unwrap().signals()[0].samples > 1000);
-        assert_eq!(replay(&bench, &file, &[]).code, Some(0));
+        assert_eq!(replay(&bench, &file, &[]).code, Some(1));
+        assert_eq!(replay(&bench, &file, &["--accept-incomplete"]).code, Some(0));
     }
 }
 
@@ -313,8 +302,7 @@ fn on_a_full_disk_the_recording_has_an_end() {
     let options = ["--user", "--map-root-user", "--mount", "bash", "-c", &script];
     let done = bench.start_program(Path::new("unshare"), &options).wait();
     if done.code == Some(77) || done.stderr.contains("unshare failed") {
-        eprintln!("not tested: this user may not mount a disk of its own");
-        return;
+        return skipped("a recording on a full disk", "this user may not mount a disk of its own");
     }
     assert!(done.code == Some(1) && done.stderr.contains("the disk is full"), "{done:?}");
     let recording = Recording::open(&bench.path("kept.mcap")).unwrap();
@@ -322,7 +310,8 @@ fn on_a_full_disk_the_recording_has_an_end() {
     let end = recording.info().end.as_ref().unwrap();
     assert!(!end.complete && end.problem.contains("the disk is full"), "{}", end.problem);
     assert!(mcap::Summary::read(&std::fs::read(bench.path("kept.mcap")).unwrap()).unwrap().is_some());
-    assert_eq!(replay(&bench, &bench.path("kept.mcap"), &[]).code, Some(0));
+    let done = replay(&bench, &bench.path("kept.mcap"), &["--accept-incomplete"]);
+    assert!(done.code == Some(0) && done.stderr.contains("the disk is full"), "{done:?}");
 }
 
 #[test]
@@ -350,8 +339,8 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
         let scored = &summary["score"];
         assert_eq!(scored["scored_ticks"].as_u64().unwrap() + scored["unscored_ticks"].as_u64().unwrap(), ticks + 1);
         assert_eq!(summary["recording"]["complete"], false);
-        let done = replay(&bench, &file, &[]);
-        assert_eq!(done.code, Some(0), "{out}: {done:?}");
+        let done = replay(&bench, &file, &["--accept-incomplete"]);
+        assert!(done.code == Some(0) && done.stderr.contains("it has no end"), "{out}: {done:?}");
         assert!(Recording::open(&file).unwrap().signals()[0].samples > 100, "{out}");
         bench.assert_clean(&[domain]);
     }
@@ -369,14 +358,17 @@ fn shared_bytes(domain: &Path) -> u64 {
 #[test]
 fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_mebibytes() {
     let bench = Bench::new();
-    for (clock, seconds) in [("realtime", "3"), ("lockstep", "60")] {
+    for (clock, seconds) in [("realtime", "6"), ("lockstep", "60")] {
         let scenario = shipped("rigid-pair");
         let fixed = ["run", scenario.to_str().unwrap(), "--out", clock, "--set", "accept={}", "--clock", clock];
         let running = bench.start(&[&fixed[..], &["--duration", seconds]].concat());
-        let controller = bench.await_role("controller");
         let domain = await_some(|| bench.domains().pop());
-        // The controller's process is up long before the ticks end; by then they run.
-        std::thread::sleep(Duration::from_millis(if clock == "realtime" { 700 } else { 100 }));
+        // The watcher sees a tick; it is gone again before the recorder comes.
+        await_some(|| {
+            let mut session = Session::open(Some(&domain)).ok()?;
+            session.follow(200_000_000, || false).ok()?;
+            (session.model.tick > 0).then_some(())
+        });
         let file = format!("{clock}.mcap");
         let recorder = bench.start(&["record", "--domain", domain.to_str().unwrap(), "--out", &file]);
         await_some(|| std::fs::metadata(bench.path(&file)).ok().filter(|file| file.len() > 0));
@@ -385,15 +377,11 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
             assert!(shared > 0 && shared <= 4 << 20, "{shared} bytes");
         }
         let (done, recorded) = (running.wait(), recorder.wait());
-        assert_eq!(done.code, Some(0), "{done:?} {controller}");
+        assert_eq!(done.code, Some(0), "{done:?}");
         assert!(!recorded.stdout.is_empty(), "{recorded:?}");
         let recording = Recording::open(&bench.path(&file)).unwrap();
         let end = recording.info().end.as_ref().unwrap();
-        if recording.info().whole {
-            // On a slow machine it came before the first tick.
-            continue;
-        }
-        assert!(!end.complete && recorded.code == Some(0), "{recorded:?}");
+        assert!(!recording.info().whole && !end.complete && recorded.code == Some(0), "{recorded:?}");
         assert!(recorded.stdout.contains("from the midst of the run on"), "{recorded:?}");
         let track = recording.tracks(|info| info.signal == "truth").unwrap().swap_remove(0);
         let ticks = track.ticks();
@@ -401,7 +389,7 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
             assert!(ticks.windows(2).all(|pair| pair[0] + 1 == pair[1]), "lockstep loses nothing");
         }
         assert!(ticks.last().is_some_and(|tick| *tick == recording.info().last_tick), "{:?}", ticks.last());
-        let done = replay(&bench, &bench.path(&file), &[]);
+        let done = replay(&bench, &bench.path(&file), &["--accept-incomplete"]);
         assert!(done.code == Some(0) && done.stdout.contains("in the midst of the run"), "{done:?}");
         bench.assert_clean(&[domain]);
     }

@@ -1,8 +1,8 @@
 //! `corotate diff`: two recordings beside each other.
 
-use crate::record::exit_of;
-use crate::{Exit, fail, say};
-use corotate::record::{Comparison, Recording, Tolerances, diff as compare};
+use crate::record::{exit_of, exit_with, open};
+use crate::{Exit, fail, harmless, say};
+use corotate::record::{Comparison, Tolerances, diff as compare};
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -20,6 +20,9 @@ pub struct Arguments {
     /// So much may numbers differ, as a part of the larger one
     #[arg(long, value_name = "X", default_value_t = 0.0)]
     relative: f64,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -38,20 +41,18 @@ pub fn diff(arguments: &Arguments) -> Exit {
     if let Some((name, value)) = bad {
         return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
     }
-    let both = Recording::open(&arguments.a).and_then(|a| Ok((a, Recording::open(&arguments.b)?)));
+    let open = |file| open(file, arguments.accept_incomplete);
+    let both = open(&arguments.a).and_then(|a| Ok((a, open(&arguments.b)?)));
     let (a, b) = match both {
         Ok(both) => both,
         Err(error) => return fail(exit_of(&error), &error),
     };
-    for recording in [&a, &b] {
-        if let Some(damage) = recording.damage() {
-            eprintln!("corotate: {} is read as far as it goes: {damage}", recording.path().display());
-        }
-    }
     match compare(&a, &b, tolerances) {
-        Ok(comparison) => match say(&table(&comparison)) {
-            Ok(()) if comparison.same() => Exit::Ok,
-            Ok(()) => Exit::NotAccepted,
+        Ok(comparison) => match say(&harmless(&table(&comparison))) {
+            Ok(()) => {
+                let exit = if comparison.same() { Exit::Ok } else { Exit::NotAccepted };
+                exit_with(&a, exit_with(&b, exit))
+            }
             Err(exit) => exit,
         },
         Err(error) => fail(exit_of(&error), &error),

@@ -16,6 +16,9 @@ pub struct Arguments {
     /// Write one Parquet file per signal into this directory
     #[arg(long, value_name = "DIR", group = "forms")]
     parquet: Option<PathBuf>,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -36,27 +39,27 @@ pub fn export(arguments: &Arguments) -> Exit {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
         return fail(Exit::Usage, &REFUSAL);
     }
-    match write(arguments) {
+    let recording = match record::open(&arguments.file, arguments.accept_incomplete) {
+        Ok(recording) => recording,
+        Err(error) => return fail(record::exit_of(&error), &error),
+    };
+    match write(arguments, &recording) {
         Ok(files) => {
             let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
-            say(&lines).err().unwrap_or(Exit::Ok)
+            say(&lines).err().unwrap_or(record::exit_with(&recording, Exit::Ok))
         }
         Err(error) => fail(exit_of(&error), &error),
     }
 }
 
-fn write(arguments: &Arguments) -> Result<Vec<PathBuf>, ExportError> {
-    let recording = Recording::open(&arguments.file)?;
-    if let Some(damage) = recording.damage() {
-        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
-    }
+fn write(arguments: &Arguments, recording: &Recording) -> Result<Vec<PathBuf>, ExportError> {
     let mut files = Vec::new();
     if let Some(directory) = &arguments.csv {
-        files.extend(export_csv(&recording, directory)?);
+        files.extend(export_csv(recording, directory)?);
     }
     #[cfg(feature = "parquet")]
     if let Some(directory) = &arguments.parquet {
-        files.extend(corotate::record::export_parquet(&recording, directory)?);
+        files.extend(corotate::record::export_parquet(recording, directory)?);
     }
     Ok(files)
 }

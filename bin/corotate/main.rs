@@ -139,11 +139,30 @@ impl From<Exit> for ExitCode {
 
 /// Prints an error, one paragraph per line of it, and gives the exit code.
 fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
-    for line in error.to_string().lines() {
+    remark(error);
+    exit
+}
+
+/// Prints what there is to be said beside the results.
+fn remark(text: &dyn std::fmt::Display) {
+    for line in harmless(&text.to_string()).lines() {
         // Without a stderr the exit code is all there is to say.
         let _ = writeln!(io::stderr(), "corotate: {line}");
     }
-    exit
+}
+
+/// A text that may come from a file, as it may stand on a terminal: what would command it, or turn the order of letters, is
+/// shown by its number.
+fn harmless(text: &str) -> String {
+    let shown = |letter: char| match letter {
+        '\n' => letter.to_string(),
+        '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+            letter.escape_unicode().to_string()
+        }
+        _ if letter.is_control() => letter.escape_unicode().to_string(),
+        _ => letter.to_string(),
+    };
+    text.chars().map(shown).collect()
 }
 
 /// Prints to stdout, or says why not; a reader that has gone is an error, where `print!` would panic.

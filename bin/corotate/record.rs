@@ -1,9 +1,9 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
 use crate::role::{die_with, terminated_by_signals};
-use crate::{Exit, fail, say};
-use corotate::record::{RecordError, RecorderSeat, RecordingReport, run_recorder};
-use std::path::PathBuf;
+use crate::{Exit, fail, remark, say};
+use corotate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use std::path::{Path, PathBuf};
 
 /// Options of `corotate record`.
 #[derive(clap::Args)]
@@ -51,6 +51,27 @@ fn told(report: &RecordingReport, child: bool) -> Exit {
     report.problem.as_ref().map_or(Exit::Ok, |problem| fail(Exit::Failure, problem))
 }
 
+/// Opens a recording that is all there; another one too where the user says so, with a remark.
+pub fn open(file: &Path, accept_incomplete: bool) -> Result<Recording, RecordError> {
+    let recording = Recording::open(file)?;
+    match recording.require_whole() {
+        Err(error) if !accept_incomplete => return Err(error),
+        Err(RecordError::Damaged { reason, .. }) => {
+            remark(&format!("{} is damaged, and read as far as it can be believed: {reason}", file.display()));
+        }
+        Err(RecordError::Incomplete { missing, .. }) => {
+            remark(&format!("{} is not complete, and read as far as it goes: {missing}", file.display()));
+        }
+        _ => {}
+    }
+    Ok(recording)
+}
+
+/// The exit code of what was done with a recording: a damaged one is a failure, however much of it could be read.
+pub fn exit_with(recording: &Recording, exit: Exit) -> Exit {
+    if recording.damage().is_some() { Exit::Failure } else { exit }
+}
+
 /// Whether it lies with the file, or with what was asked.
 pub fn exit_of(error: &RecordError) -> Exit {
     match error {
@@ -58,6 +79,7 @@ pub fn exit_of(error: &RecordError) -> Exit {
             Exit::Usage
         }
         RecordError::Layout { .. } | RecordError::Missing { .. } => Exit::Usage,
+        RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,
         RecordError::Bus(_) | RecordError::Full { .. } | RecordError::Write { .. } | RecordError::Read { .. } => {
             Exit::Failure
         }

@@ -1,7 +1,7 @@
 //! `corotate replay`: a recording through the live roles.
 
-use crate::record::exit_of;
-use crate::{Exit, fail, say};
+use crate::record::{exit_of, exit_with, open};
+use crate::{Exit, fail, harmless, say};
 use corotate::config::Scenario;
 use corotate::launch::{LaunchError, replay_as_process};
 use corotate::record::{RecordError, Recording, RoleReplay, replay_in_process};
@@ -21,6 +21,9 @@ pub struct Arguments {
     /// Replay each role as a process of its own, as it takes part in runs, instead of in one thread
     #[arg(long)]
     processes: bool,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
 }
 
 const EXAMPLES: &str = "\
@@ -33,13 +36,17 @@ Examples:
 
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Exit {
-    match attempt(arguments) {
+    let recording = match open(&arguments.file, arguments.accept_incomplete) {
+        Ok(recording) => recording,
+        Err(error) => return fail(exit_of(&error), &error),
+    };
+    match attempt(arguments, &recording) {
         Ok(replays) => {
             let text: String = replays.iter().map(words).collect();
-            match say(&text) {
+            let differs = replays.iter().any(|replay| replay.difference.is_some());
+            match say(&harmless(&text)) {
                 Err(exit) => exit,
-                Ok(()) if replays.iter().any(|replay| replay.difference.is_some()) => Exit::NotAccepted,
-                Ok(()) => Exit::Ok,
+                Ok(()) => exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }),
             }
         }
         Err(LaunchError::Record(error)) => fail(exit_of(&error), &error),
@@ -47,18 +54,14 @@ pub fn replay(arguments: &Arguments) -> Exit {
     }
 }
 
-fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, LaunchError> {
-    let recording = Recording::open(&arguments.file)?;
-    if let Some(damage) = recording.damage() {
-        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
-    }
+fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleReplay>, LaunchError> {
     let scenario = recording.scenario_for_replay()?;
     recording.check_layouts(&scenario)?;
     let roles = roles(&arguments.role, &scenario)?;
     if !arguments.processes {
         return Ok(roles
             .into_iter()
-            .map(|role| replay_in_process(&recording, &scenario, role))
+            .map(|role| replay_in_process(recording, &scenario, role))
             .collect::<Result<_, _>>()?);
     }
     let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
@@ -66,7 +69,7 @@ fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, LaunchError> {
     let signal = crate::run::catch_signals().map_err(spawn)?;
     let mut replays = Vec::new();
     for role in roles {
-        replays.push(replay_as_process(&recording, &scenario, role, &program, &signal)?);
+        replays.push(replay_as_process(recording, &scenario, role, &program, &signal)?);
         if signal.load(Ordering::Relaxed) != 0 {
             return Err(RecordError::Missing { reason: "ended by a signal before all was replayed".to_owned() }.into());
         }

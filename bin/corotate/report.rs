@@ -1,7 +1,7 @@
 //! `corotate report`: a run, or a recording, as one page.
 
 use crate::record;
-use crate::{Exit, fail, say};
+use crate::{Exit, fail, remark, say};
 use corotate::report::{ReportError, report as compose};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
@@ -38,11 +38,11 @@ pub fn report(arguments: &Arguments) -> Exit {
     let composed = compose(source);
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
-        report.remarks().iter().for_each(|remark| eprintln!("corotate: {remark}"));
-        report.write(&out)
+        report.remarks().iter().for_each(|text| remark(text));
+        report.write(&out).map(|()| if report.is_damaged() { Exit::Failure } else { Exit::Ok })
     });
     match written {
-        Ok(()) => say(&format!("{}\n", out.display())).err().unwrap_or(Exit::Ok),
+        Ok(exit) => say(&format!("{}\n", out.display())).err().unwrap_or(exit),
         Err(error) => fail(exit_of(&error), &error),
     }
 }

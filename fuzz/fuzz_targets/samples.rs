@@ -37,9 +37,9 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
         node
     };
     let mut nodes = [role(RoleId::Observer), role(RoleId::Controller), role(RoleId::Plant(1))];
-    let mut measurement = bus.writer::<RateMeasurement>(&of("leader", Signal::Measurement)).unwrap();
-    let mut estimate = bus.writer::<RateEstimate>(&of("leader", Signal::Estimate)).unwrap();
-    let mut command = bus.writer::<RateCommand>(&of("follower", Signal::Command)).unwrap();
+    let mut measurement = bus.writer::<RateMeasurement>(&of("leader", Signal::Measurement), 1).unwrap();
+    let mut estimate = bus.writer::<RateEstimate>(&of("leader", Signal::Estimate), 1).unwrap();
+    let mut command = bus.writer::<RateCommand>(&of("follower", Signal::Command), 1).unwrap();
     let mut estimates = Input::<_, RateEstimate>::watch(&bus, &of("leader", Signal::Estimate), Reader::Role).unwrap();
     let mut commands = Input::<_, RateCommand>::watch(&bus, &of("follower", Signal::Command), Reader::Role).unwrap();
     for (index, (which, raw)) in pieces.iter().enumerate() {

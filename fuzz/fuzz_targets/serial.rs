@@ -22,7 +22,9 @@ fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
             (true, Ok(frame)) => frame,
             _ => piece,
         };
-        decode(bytes, |message| drop(message));
+        decode(bytes, |message| {
+            let _ = message;
+        });
         // What the device says to that, its host hears too.
         let mut said = Vec::new();
         device.receive(bytes, now_ns, |frame| said.extend_from_slice(frame));

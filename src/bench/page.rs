@@ -1,8 +1,8 @@
-//! A page of shared memory between a sender and a receiver: two mailboxes and two bells, the least that two processes need.
+//! Shared memory between a sender and a receiver: two mailboxes and two bells, the least that two processes need.
 //!
-//! Every access is atomic; nobody locks. Must not outlive its domain: the file is one of the domain's.
+//! Every access is atomic; nobody locks. Must not outlive its domain: the files are two of the domain's.
 
-use crate::shared::SharedWords;
+use crate::shared::{SharedHalves, SharedWords};
 use rustix::thread::futex;
 use std::io;
 use std::path::Path;
@@ -10,30 +10,38 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering, fence};
 
 /// Words of one mailbox with what belongs to it, a multiple of a cache line's.
 const BOX_WORDS: usize = 64;
-/// Where a mailbox has its number, the bell, and the samples' words: each on cache lines of its own.
+/// Where a mailbox has its number and the samples' words: each on cache lines of its own.
 const NUMBER: usize = 0;
-const BELL: usize = 8;
 const CONTENT: usize = 16;
+/// Bells are a cache line apart.
+const BELL_STRIDE: usize = 16;
 
-/// The mapped page.
+/// The mapped mailboxes and bells.
 #[derive(Debug)]
-pub(super) struct Page(SharedWords);
+pub(super) struct Page {
+    boxes: SharedWords,
+    bells: SharedHalves,
+}
 
 impl Page {
-    /// Maps the page at a path, made if it is not there.
+    /// Maps the mailboxes at a path and the bells beside them, made if they are not there.
     pub fn open(path: &Path) -> io::Result<Self> {
-        SharedWords::open(path, 2 * BOX_WORDS).map(Self)
+        let mut bells = path.as_os_str().to_owned();
+        bells.push("_bells");
+        Ok(Self {
+            boxes: SharedWords::open(path, 2 * BOX_WORDS)?,
+            bells: SharedHalves::open(bells.as_ref(), 2 * BELL_STRIDE)?,
+        })
     }
 
     #[inline]
     fn word(&self, direction: usize, index: usize) -> &AtomicU64 {
-        &self.0.words()[(direction & 1) * BOX_WORDS + index]
+        &self.boxes.words()[(direction & 1) * BOX_WORDS + index]
     }
 
-    /// Half of a word of which nobody uses the whole.
     #[inline]
     fn bell(&self, direction: usize) -> &AtomicU32 {
-        &self.0.halves()[2 * ((direction & 1) * BOX_WORDS + BELL)]
+        &self.bells.halves()[(direction & 1) * BELL_STRIDE]
     }
 
     /// Puts words into the mailbox of a direction.

@@ -6,7 +6,7 @@
 use super::Topic;
 use super::domain::Domain;
 use crate::clock::monotonic_ns;
-use crate::shared::SharedWords;
+use crate::shared::SharedHalves;
 use rustix::thread::futex;
 use rustix::time::Timespec;
 use std::io;
@@ -35,7 +35,7 @@ pub const BELLS_BYTES: usize = BELLS * STRIDE * size_of::<u32>();
 /// The bells of a run.
 #[derive(Debug, Clone)]
 pub struct Bells {
-    memory: Rc<SharedWords>,
+    memory: Rc<SharedHalves>,
 }
 
 impl Bells {
@@ -44,7 +44,7 @@ impl Bells {
     /// # Errors
     /// The system's reason.
     pub fn open(domain: &Domain) -> io::Result<Self> {
-        Self::over(SharedWords::open(&domain.shared("bells"), BELLS_BYTES / size_of::<u64>())?)
+        Self::over(SharedHalves::open(&domain.shared("bells"), BELLS * STRIDE)?)
     }
 
     /// Those of a domain that has some already.
@@ -52,10 +52,10 @@ impl Bells {
     /// # Errors
     /// The system's reason.
     pub fn join(domain: &Domain) -> io::Result<Self> {
-        Self::over(SharedWords::existing(&domain.shared("bells"))?)
+        Self::over(SharedHalves::existing(&domain.shared("bells"))?)
     }
 
-    fn over(memory: SharedWords) -> io::Result<Self> {
+    fn over(memory: SharedHalves) -> io::Result<Self> {
         if memory.halves().len() < BELLS * STRIDE {
             return Err(io::Error::other("the bells of this run are another version's"));
         }
@@ -86,7 +86,7 @@ impl Bells {
 /// The bell of one signal.
 #[derive(Debug)]
 pub struct Bell {
-    memory: Rc<SharedWords>,
+    memory: Rc<SharedHalves>,
     index: usize,
 }
 

@@ -93,6 +93,25 @@ pub enum RecordError {
         /// What is wrong with it.
         reason: String,
     },
+    /// The file is not what was written.
+    #[error(
+        "{} is damaged: {reason}; take another copy of it. --accept-incomplete uses what comes before, and still fails",
+        path.display()
+    )]
+    Damaged {
+        /// The recording.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The file has not all of its run.
+    #[error("{} is not complete: {missing}; go on with what there is by --accept-incomplete", path.display())]
+    Incomplete {
+        /// The recording.
+        path: PathBuf,
+        /// What is missing.
+        missing: String,
+    },
     /// The scenario in the recording is refused.
     #[error("the scenario in {} is refused by this version: {source}", path.display())]
     Scenario {

@@ -1,24 +1,35 @@
 //! A recording as data: what is known of the run, its signals, and their samples as bytes, stamps and columns of numbers.
 //!
-//! Reads the file from its beginning, so that one without an end is read as far as it goes; what is wrong with it is told in
-//! [`Recording::damage`]. Must not believe anything that the file says of its own size.
+//! Reads the file from its beginning, so that one without an end is read as far as it goes. Every byte is under a checksum: a
+//! chunk's is looked at before its samples are used, metadata has its own, and the whole file's is looked at last. What was
+//! changed is told by [`Recording::damage`], what is missing by [`Recording::incomplete`]. Must not ask for memory that the
+//! file is too short for, nor use a sample whose checksum is wrong.
 
 use super::RecordError;
 use super::layout::{CDR_HEADER, Layout};
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
+use super::writer::{CHECKSUM, checksum};
 use crate::config::{Scenario, ScriptedFault};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
-use mcap::records::Record;
+use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use std::borrow::Cow;
+use mcap::{MAGIC, McapError};
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::Read;
+use std::io::{self, Read};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::xxh3_64;
 
-/// No record of ours, chunks apart, is longer, bytes.
-const RECORD_BYTES: usize = 64 << 20;
+/// No sample of ours is longer, bytes.
+const SAMPLE_BYTES: usize = 64 << 20;
+/// No record of ours is longer, packed or not: a chunk may hold one sample beyond its size.
+const RECORD_BYTES: usize = 2 * SAMPLE_BYTES;
+/// How much is read at once, if nothing larger is asked for, bytes.
+const READ_BYTES: usize = 64 << 10;
+/// An opcode and a length, before every record; bytes.
+const RECORD_HEAD: usize = 9;
 
 /// A recording that was opened.
 #[derive(Debug)]
@@ -26,7 +37,18 @@ pub struct Recording {
     path: PathBuf,
     info: RunInfo,
     signals: Vec<SignalInfo>,
-    damage: Option<String>,
+    flaw: Option<Flaw>,
+    /// The last tick of which there is a sample.
+    last_tick: Option<u64>,
+}
+
+/// Why a file is not read to its end.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Flaw {
+    /// It was cut off: what there is of it is as it was written.
+    Cut(&'static str),
+    /// It was changed.
+    Damaged(String),
 }
 
 /// What a recording says of its run.
@@ -109,22 +131,33 @@ impl Recording {
     /// Opens a recording: reads all of it once.
     ///
     /// # Errors
-    /// [`RecordError::Read`], [`RecordError::NotOurs`].
+    /// [`RecordError::Read`], [`RecordError::NotOurs`], [`RecordError::Damaged`] if nothing of it can be believed.
     pub fn open(path: &Path) -> Result<Self, RecordError> {
         let mut content = Content::default();
-        let mut counts = BTreeMap::<u16, u64>::new();
-        let damage = scan(path, &mut content, |channel, _, _| *counts.entry(channel).or_default() += 1)?;
+        let (mut counts, mut ticks) = (BTreeMap::<u16, u64>::new(), BTreeMap::<u16, u64>::new());
+        let flaw = scan(path, &mut content, |channel, _, sample| {
+            let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
+            *counts.entry(channel).or_default() += 1;
+            ticks.insert(channel, stamp.tick);
+        })?;
         let not_ours = |reason: String| RecordError::NotOurs { path: path.to_owned(), reason };
-        let run = content.metadata.remove(RUN).ok_or_else(|| {
-            let why = damage.clone().unwrap_or_else(|| "it says nothing of a run".to_owned());
-            not_ours(why)
+        let run = content.metadata.remove(RUN).ok_or_else(|| match flaw.clone() {
+            Some(Flaw::Damaged(reason)) if content.begun => RecordError::Damaged { path: path.to_owned(), reason },
+            Some(Flaw::Damaged(reason)) => not_ours(reason),
+            Some(Flaw::Cut(reason)) => not_ours(format!("{reason}, before it says anything of a run")),
+            None => not_ours("it says nothing of a run".to_owned()),
         })?;
         let info = RunInfo::read(&run, content.metadata.get(END)).map_err(not_ours)?;
+        if info.scenario_hash != format!("{:016x}", xxh3_64(info.scenario.as_bytes())) {
+            let reason = "the scenario is not the one of which it has the hash".to_owned();
+            return Err(RecordError::Damaged { path: path.to_owned(), reason });
+        }
         let mut signals = content.signals;
         for signal in &mut signals {
             signal.samples = counts.get(&signal.channel).copied().unwrap_or(0);
         }
-        Ok(Self { path: path.to_owned(), info, signals, damage })
+        let last_tick = ticks.into_values().filter(|tick| *tick <= info.last_tick).max();
+        Ok(Self { path: path.to_owned(), info, signals, flaw, last_tick })
     }
 
     /// Where it lies.
@@ -142,9 +175,43 @@ impl Recording {
         &self.signals
     }
 
-    /// What is wrong with the file, if anything is: it was cut off, or changed. What comes before that is read.
+    /// What was changed in the file, if anything was. What comes before that, and has a checksum that is right, is read.
     pub fn damage(&self) -> Option<&str> {
-        self.damage.as_deref()
+        match &self.flaw {
+            Some(Flaw::Damaged(reason)) => Some(reason),
+            Some(Flaw::Cut(_)) | None => None,
+        }
+    }
+
+    /// What the recording lacks of its run, if it lacks anything. What it has is as it was recorded.
+    pub fn incomplete(&self) -> Option<String> {
+        let mut missing = Vec::new();
+        if !self.info.whole {
+            missing.push("it was begun in the midst of the run".to_owned());
+        }
+        match (&self.flaw, &self.info.end) {
+            (Some(Flaw::Cut(reason)), _) => missing.push((*reason).to_owned()),
+            (None, None) => missing.push("it does not say how it ended".to_owned()),
+            (None, Some(end)) if !end.problem.is_empty() => missing.push(end.problem.clone()),
+            // Begun late is all that is wrong.
+            (None, Some(end)) if !end.complete && self.info.whole => missing.push("it says so itself".to_owned()),
+            _ => {}
+        }
+        let last_tick = self.last_tick.map_or("it has no sample".to_owned(), |tick| format!("its last tick is {tick}"));
+        let text = missing.join("; ");
+        (!text.is_empty()).then(|| format!("{text}; {last_tick} of {}", self.info.last_tick))
+    }
+
+    /// Refuses a recording that is not what was recorded, or not all of it.
+    ///
+    /// # Errors
+    /// [`RecordError::Damaged`], [`RecordError::Incomplete`].
+    pub fn require_whole(&self) -> Result<(), RecordError> {
+        let path = || self.path.clone();
+        if let Some(reason) = self.damage() {
+            return Err(RecordError::Damaged { path: path(), reason: reason.to_owned() });
+        }
+        self.incomplete().map_or(Ok(()), |missing| Err(RecordError::Incomplete { path: path(), missing }))
     }
 
     /// Its scenario, to be run again.
@@ -180,12 +247,12 @@ impl Recording {
     /// The samples of some signals, of all of them if `wanted` says so, in memory.
     ///
     /// # Errors
-    /// [`RecordError::Read`], [`RecordError::NotOurs`].
+    /// [`RecordError::Read`], [`RecordError::Damaged`] if the file has changed since it was opened.
     pub fn tracks(&self, wanted: impl Fn(&SignalInfo) -> bool) -> Result<Vec<Track>, RecordError> {
         let chosen = self.signals.iter().filter(|signal| wanted(signal));
         let track = |info: &SignalInfo| Track { info: info.clone(), received_ns: Vec::new(), bytes: Vec::new() };
         let mut tracks: Vec<Track> = chosen.map(track).collect();
-        scan(&self.path, &mut Content::default(), |channel, received_ns, sample| {
+        self.again(|channel, received_ns, sample| {
             if let Some(track) = tracks.iter_mut().find(|track| track.info.channel == channel) {
                 track.received_ns.push(received_ns);
                 track.bytes.extend_from_slice(sample);
@@ -198,13 +265,24 @@ impl Recording {
     /// recorder's monotonic clock, its bytes.
     ///
     /// # Errors
-    /// [`RecordError::Read`], [`RecordError::NotOurs`].
+    /// [`RecordError::Read`], [`RecordError::Damaged`] if the file has changed since it was opened.
     pub fn visit(&self, mut each: impl FnMut(usize, u64, &[u8])) -> Result<(), RecordError> {
-        scan(&self.path, &mut Content::default(), |channel, received_ns, sample| {
+        self.again(|channel, received_ns, sample| {
             if let Some(index) = self.signals.iter().position(|signal| signal.channel == channel) {
                 each(index, received_ns, sample);
             }
-        })?;
+        })
+    }
+
+    /// Reads the file once more, which must be what it was.
+    fn again(&self, sample: impl FnMut(u16, u64, &[u8])) -> Result<(), RecordError> {
+        let mut content = Content::default();
+        let flaw = scan(&self.path, &mut content, sample)?;
+        let same = |(now, then): (&SignalInfo, &SignalInfo)| (now.channel, &now.layout) == (then.channel, &then.layout);
+        if flaw != self.flaw || !content.signals.iter().zip(&self.signals).all(same) {
+            let reason = "it has changed since it was opened".to_owned();
+            return Err(RecordError::Damaged { path: self.path.clone(), reason });
+        }
         Ok(())
     }
 
@@ -344,23 +422,82 @@ impl EndInfo {
     }
 }
 
-/// A sample as it lies in the file: channel, time of receipt in ns, CDR header and body.
-type Message<'a> = (u16, u64, Cow<'a, [u8]>);
-
 /// What a file has besides samples.
 #[derive(Default)]
 struct Content {
+    /// Whether it begins as a file of this kind.
+    begun: bool,
     schemas: BTreeMap<u16, (String, String)>,
     signals: Vec<SignalInfo>,
     /// The length of a sample by channel.
     sizes: BTreeMap<u16, usize>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
+    data_ended: bool,
     ended: bool,
 }
 
 impl Content {
-    /// Takes a record in; gives back what it is if it is a sample: channel, time, bytes.
-    fn take<'a>(&mut self, record: Record<'a>) -> Result<Option<Message<'a>>, String> {
+    /// Takes in a record that is in no chunk. Samples and what describes them are not: outside, nothing vouches for them.
+    fn record(&mut self, record: Record<'_>) -> Result<(), String> {
+        match record {
+            Record::Header(_) => self.begun = true,
+            Record::Metadata(mut metadata) => {
+                let name = metadata.name;
+                let kept = metadata.metadata.remove(CHECKSUM);
+                // Another version's may have none, and is refused as such.
+                let other = metadata.metadata.get("schema").is_some_and(|schema| schema != SCHEMA);
+                let without = kept.is_none() && name == RUN && other;
+                if !without && kept.as_ref() != Some(&checksum(&name, &metadata.metadata)) {
+                    return Err(format!("the checksum of its metadata `{name}` is wrong"));
+                }
+                if self.metadata.contains_key(&name) {
+                    return Err(format!("it has its metadata `{name}` twice"));
+                }
+                self.metadata.insert(name, metadata.metadata);
+            }
+            Record::DataEnd(_) if std::mem::replace(&mut self.data_ended, true) => {
+                return Err("its data end twice".to_owned());
+            }
+            Record::Footer(_) if !self.data_ended => return Err("it ends before its data do".to_owned()),
+            Record::Footer(_) => self.ended = true,
+            Record::Message { .. } => return Err("it has a sample outside of a chunk".to_owned()),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Takes in a chunk: nothing of it before its checksum is known to be right.
+    fn chunk(
+        &mut self,
+        reader: &mut LinearReader,
+        record: &[u8],
+        sample: &mut impl FnMut(u16, u64, &[u8]),
+    ) -> Result<(), String> {
+        let words = |error: McapError| error.to_string();
+        let Record::Chunk { header, .. } = mcap::parse_record(op::CHUNK, record).map_err(words)? else {
+            return Err("a chunk is none".to_owned());
+        };
+        if header.compression != "zstd" || header.uncompressed_crc == 0 || self.data_ended {
+            return Err("it has a chunk that this program does not write".to_owned());
+        }
+        let room = reader.insert(RECORD_HEAD + record.len());
+        room[0] = op::CHUNK;
+        room[1..RECORD_HEAD].copy_from_slice(&(record.len() as u64).to_le_bytes());
+        room[RECORD_HEAD..].copy_from_slice(record);
+        reader.notify_read(RECORD_HEAD + record.len());
+        while let Some(event) = reader.next_event() {
+            match event.map_err(words)? {
+                LinearReadEvent::ReadRequest(_) => break,
+                LinearReadEvent::Record { data, opcode } => {
+                    self.content(mcap::parse_record(opcode, data).map_err(words)?, sample)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes in a record of a chunk.
+    fn content(&mut self, record: Record<'_>, sample: &mut impl FnMut(u16, u64, &[u8])) -> Result<(), String> {
         match record {
             Record::Schema { header, data } => {
                 let text = String::from_utf8_lossy(&data).into_owned();
@@ -369,19 +506,17 @@ impl Content {
             Record::Channel(channel) if !self.sizes.contains_key(&channel.id) => {
                 let (encoding, text) = self.schemas.get(&channel.schema_id).ok_or("a channel lacks its schema")?;
                 let ours = encoding == "ros2msg" && channel.message_encoding == "cdr";
-                let layout = Layout::parse(text).filter(|layout| ours && layout.size() < RECORD_BYTES);
+                let layout = Layout::parse(text).filter(|layout| ours && layout.size() < SAMPLE_BYTES);
                 let layout = layout.ok_or_else(|| format!("{} has no samples of ours", channel.topic))?;
                 let about = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
+                let (body, signal) = (about("body"), about("signal"));
+                if self.signals.iter().any(|other| (&other.body, &other.signal) == (&body, &signal)) {
+                    return Err(format!("{} is of the same signal as another channel", channel.topic));
+                }
                 self.sizes.insert(channel.id, layout.size());
-                self.signals.push(SignalInfo {
-                    service: about("service"),
-                    body: about("body"),
-                    signal: about("signal"),
-                    role: about("role"),
-                    layout,
-                    samples: 0,
-                    channel: channel.id,
-                });
+                let (service, role) = (about("service"), about("role"));
+                let channel = channel.id;
+                self.signals.push(SignalInfo { service, body, signal, role, layout, samples: 0, channel });
             }
             Record::Message { header, data } => {
                 let size = self.sizes.get(&header.channel_id).ok_or("a sample is of no channel")?;
@@ -391,13 +526,11 @@ impl Content {
                         header.sequence, header.channel_id
                     ));
                 }
-                return Ok(Some((header.channel_id, header.log_time, data)));
+                sample(header.channel_id, header.log_time, &data[CDR_HEADER.len()..]);
             }
-            Record::Metadata(metadata) => drop(self.metadata.insert(metadata.name, metadata.metadata)),
-            Record::Footer(_) => self.ended = true,
             _ => {}
         }
-        Ok(None)
+        Ok(())
     }
 }
 
@@ -406,33 +539,64 @@ fn scan(
     path: &Path,
     content: &mut Content,
     mut sample: impl FnMut(u16, u64, &[u8]),
-) -> Result<Option<String>, RecordError> {
+) -> Result<Option<Flaw>, RecordError> {
     let failed = |source| RecordError::Read { path: path.to_owned(), source };
     let mut file = File::open(path).map_err(failed)?;
-    let options = LinearReaderOptions::default()
-        .with_skip_end_magic(true)
-        .with_validate_chunk_crcs(true)
-        .with_record_length_limit(RECORD_BYTES);
-    let mut reader = LinearReader::new_with_options(options);
+    let mut unread = file.metadata().map_err(failed)?.len();
+    let mut last = [0; MAGIC.len()];
+    // What has its end was not cut off, whatever lengths it tells.
+    let whole = match unread.checked_sub(MAGIC.len() as u64) {
+        Some(at) => {
+            file.read_exact_at(&mut last, at).map(|()| last == *MAGIC).or_else(cut_meanwhile).map_err(failed)?
+        }
+        None => false,
+    };
+    let cut = |reason| match whole {
+        true => Flaw::Damaged("a record is longer than the rest of the file".to_owned()),
+        false => Flaw::Cut(reason),
+    };
+    let limited = LinearReaderOptions::default().with_record_length_limit(RECORD_BYTES);
+    let mut reader = LinearReader::new_with_options(
+        limited
+            .clone()
+            .with_emit_chunks(true)
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            .with_check_finishes_after_end_magic(true),
+    );
+    let mut chunks = LinearReader::new_with_options(
+        limited.with_skip_start_magic(true).with_skip_end_magic(true).with_prevalidate_chunk_crcs(true),
+    );
     while let Some(event) = reader.next_event() {
-        match event {
-            Ok(LinearReadEvent::ReadRequest(wanted)) => {
-                let read = file.read(reader.insert(wanted.min(RECORD_BYTES))).map_err(failed)?;
+        let taken = match event {
+            // Behind the end it asks whether there is anything else.
+            Ok(LinearReadEvent::ReadRequest(wanted)) if wanted as u64 <= unread || content.ended => {
+                let wanted = wanted.max(READ_BYTES).min(unread.max(1) as usize);
+                let read = file.read(reader.insert(wanted)).map_err(failed)?;
+                unread = unread.saturating_sub(read as u64);
                 reader.notify_read(read);
+                Ok(())
             }
+            Ok(LinearReadEvent::ReadRequest(_)) => return Ok(Some(cut(CUT))),
+            Ok(LinearReadEvent::Record { data, opcode: op::CHUNK }) => content.chunk(&mut chunks, data, &mut sample),
             Ok(LinearReadEvent::Record { data, opcode }) => {
                 let record = mcap::parse_record(opcode, data).map_err(|error| error.to_string());
-                match record.and_then(|record| content.take(record)) {
-                    Ok(Some((channel, received_ns, data))) => sample(channel, received_ns, &data[CDR_HEADER.len()..]),
-                    Ok(None) => {}
-                    Err(reason) => return Ok(Some(reason)),
-                }
-                if content.ended {
-                    return Ok(None);
-                }
+                record.and_then(|record| content.record(record))
             }
-            Err(error) => return Ok(Some(error.to_string())),
+            // So a chunk is begun; its length is written when it is closed.
+            Err(McapError::RecordTooLarge { opcode: op::CHUNK, len: u64::MAX }) => return Ok(Some(cut(CUT))),
+            Err(error) => Err(error.to_string()),
+        };
+        if let Err(reason) = taken {
+            return Ok(Some(Flaw::Damaged(reason)));
         }
     }
-    Ok((!content.ended).then(|| "it has no end: its recorder was killed, or there was no room".to_owned()))
+    Ok(None)
+}
+
+const CUT: &str = "it has no end: its recorder was killed, or there was no room";
+
+/// A file that becomes shorter while it is read has no end.
+fn cut_meanwhile(error: io::Error) -> io::Result<bool> {
+    if error.kind() == io::ErrorKind::UnexpectedEof { Ok(false) } else { Err(error) }
 }

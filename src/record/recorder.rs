@@ -17,7 +17,7 @@ use xxhash_rust::xxh3::xxh3_64;
 /// The recorder's name where a role would have its own.
 pub(crate) const RECORDER: &str = "recorder";
 /// Layout version of the metadata.
-pub const SCHEMA: &str = "corotate/recording/v1";
+pub const SCHEMA: &str = "corotate/recording/v2";
 /// The metadata record that is written first, and the one that is written last.
 pub const RUN: &str = "corotate.run";
 pub const END: &str = "corotate.end";

@@ -2,7 +2,8 @@
 //!
 //! Room for a chunk, and for the summary that ends the file, is asked for before the chunk is begun: a full disk is then
 //! noticed while the file can still be ended as it should. Where the system cannot promise room, what a failed write left
-//! is cut off, and the file ends with its last whole chunk. Must not know samples.
+//! is cut off, and the file ends with its last whole chunk. Every metadata record has a checksum of its own, since it is in no
+//! chunk, and a file that was cut off has none of the whole. Must not know samples.
 
 use super::RecordError;
 use super::layout::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
@@ -16,6 +17,21 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::Xxh3;
+
+/// The key of a metadata record's checksum.
+pub const CHECKSUM: &str = "checksum";
+
+/// The checksum of a metadata record: over its name and all of its other entries, each with its length before it.
+pub fn checksum(name: &str, entries: &BTreeMap<String, String>) -> String {
+    let mut hasher = Xxh3::new();
+    let texts = entries.iter().flat_map(|(key, value)| [key.as_str(), value.as_str()]);
+    for text in [name].into_iter().chain(texts) {
+        hasher.update(&(text.len() as u64).to_le_bytes());
+        hasher.update(text.as_bytes());
+    }
+    format!("{:016x}", hasher.digest())
+}
 
 /// A chunk is closed when it holds so many bytes.
 const CHUNK_BYTES: usize = 256 << 10;
@@ -75,11 +91,12 @@ impl Writer {
         })
     }
 
-    /// Writes what is known of the run, and closes the chunk at hand.
+    /// Writes what is known of the run, with its checksum, and closes the chunk at hand.
     ///
     /// # Errors
     /// [`RecordError::Write`].
-    pub fn metadata(&mut self, name: &str, entries: BTreeMap<String, String>) -> Result<(), RecordError> {
+    pub fn metadata(&mut self, name: &str, mut entries: BTreeMap<String, String>) -> Result<(), RecordError> {
+        entries.insert(CHECKSUM.to_owned(), checksum(name, &entries));
         let metadata = Metadata { name: name.to_owned(), metadata: entries };
         self.attempt(|mcap| mcap.write_metadata(&metadata))?;
         self.close_chunk()

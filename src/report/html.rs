@@ -1,6 +1,6 @@
 //! Text for a page: nothing that comes from a file is ever read as markup.
 
-/// A text as it stands in markup and in its attributes. What XML cannot hold is replaced.
+/// A text as it stands in markup and in its attributes. What XML cannot hold is replaced, and what commands a terminal.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for letter in text.chars() {
@@ -10,7 +10,9 @@ pub fn escape(text: &str) -> String {
             '&' => escaped.push_str("&amp;"),
             '"' => escaped.push_str("&quot;"),
             '\'' => escaped.push_str("&#39;"),
-            '\t' | '\n' | ' '..='\u{d7ff}' | '\u{e000}'..='\u{fffd}' | '\u{10000}'.. => escaped.push(letter),
+            '\t' | '\n' | ' '..='~' | '\u{a0}'..='\u{d7ff}' | '\u{e000}'..='\u{fffd}' | '\u{10000}'.. => {
+                escaped.push(letter);
+            }
             _ => escaped.push(char::REPLACEMENT_CHARACTER),
         }
     }
@@ -28,6 +30,6 @@ mod tests {
         let document = roxmltree::Document::parse(&page).unwrap();
         assert_eq!(document.root_element().text(), Some(text));
         assert_eq!(document.root_element().attribute("title"), Some(text));
-        assert_eq!(escape("\u{1b}\0\u{ffff}"), "\u{fffd}".repeat(3));
+        assert_eq!(escape("\u{1b}\0\u{ffff}\u{7f}\u{9b}"), "\u{fffd}".repeat(5));
     }
 }

@@ -105,9 +105,15 @@ pub enum ReportError {
 pub struct Report {
     html: String,
     remarks: Vec<String>,
+    damaged: bool,
 }
 
 impl Report {
+    /// Whether its recording is damaged, and shown as far as it can be believed.
+    pub fn is_damaged(&self) -> bool {
+        self.damaged
+    }
+
     /// The page: HTML that is well-formed XML too.
     pub fn html(&self) -> &str {
         &self.html
@@ -134,5 +140,6 @@ impl Report {
 pub fn report(path: &Path) -> Result<Report, ReportError> {
     let source = Source::open(path)?;
     let model = model::model(&source)?;
-    Ok(Report { html: page::page(&model), remarks: model.remarks })
+    let damaged = source.recording.as_ref().is_some_and(|recording| recording.damage().is_some());
+    Ok(Report { html: page::page(&model), remarks: model.remarks, damaged })
 }

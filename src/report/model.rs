@@ -6,7 +6,6 @@ use super::chart::{Marks, Picture, marks};
 use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
-use crate::record::RunInfo;
 
 /// A page.
 #[derive(Debug)]
@@ -68,8 +67,8 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
     if let Some(damage) = source.recording.as_ref().and_then(|recording| recording.damage()) {
         remarks.push(format!("the recording is damaged, and shown as far as it goes: {damage}"));
     }
-    if let Some(info) = source.recording.as_ref().map(|recording| recording.info()) {
-        remarks.extend(incomplete(info));
+    if let Some(missing) = source.recording.as_ref().and_then(|recording| recording.incomplete()) {
+        remarks.push(format!("the recording is not complete: {missing}"));
     }
     let (time, events) = times(source, traces.as_ref());
     let mut sections = vec![tables::verdict(source, traces.as_ref())];
@@ -94,16 +93,6 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
         false => ("not accepted".to_owned(), Some(false)),
     });
     Ok(Model { title, subtitle, verdict, remarks, marks: marks(&time, &events), sections })
-}
-
-fn incomplete(info: &RunInfo) -> Vec<String> {
-    let end = info.end.as_ref();
-    let part = (!info.whole).then(|| "the recording was begun in the midst of the run".to_owned());
-    let lost = end.filter(|end| !end.complete).map(|end| match end.problem.as_str() {
-        "" => "the recording is not complete".to_owned(),
-        problem => format!("the recording is not complete: {problem}"),
-    });
-    part.into_iter().chain(lost).collect()
 }
 
 fn headings(source: &Source) -> (String, String) {

@@ -3,7 +3,8 @@
 #![allow(dead_code, reason = "every test file uses its own part of this")]
 
 use std::borrow::Cow;
-use std::io::Read;
+use std::collections::BTreeMap;
+use std::io::{Read, Write};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -243,6 +244,11 @@ pub fn await_some<T>(mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
+/// Says that something is not tested here, past the harness, which keeps what a test prints: `tests/run` collects it.
+pub fn skipped(what: &str, why: &str) {
+    std::io::stderr().write_all(format!("SKIPPED: {what} because {why}\n").as_bytes()).unwrap();
+}
+
 /// A scenario that ships with the program.
 pub fn shipped(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(format!("{name}.toml"))
@@ -274,6 +280,30 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
         message.data = Cow::Owned(data);
         message.channel = channel.into();
         writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+/// Writes a recording again, as anybody could, with its metadata changed and their checksums made right again.
+pub fn rewrite_metadata(from: &Path, to: &Path, change: impl Fn(&str, &mut BTreeMap<String, String>)) {
+    let bytes = std::fs::read(from).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    for index in &summary.metadata_indexes {
+        let mut metadata = mcap::read::metadata(&bytes, index).unwrap();
+        metadata.metadata.remove("checksum");
+        change(&metadata.name, &mut metadata.metadata);
+        let mut hasher = xxhash_rust::xxh3::Xxh3::new();
+        let texts = metadata.metadata.iter().flat_map(|(key, value)| [key, value]);
+        for text in [&metadata.name].into_iter().chain(texts) {
+            hasher.update(&(text.len() as u64).to_le_bytes());
+            hasher.update(text.as_bytes());
+        }
+        metadata.metadata.insert("checksum".to_owned(), format!("{:016x}", hasher.digest()));
+        writer.write_metadata(&metadata).unwrap();
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        writer.write(&message.unwrap()).unwrap();
     }
     writer.finish().unwrap();
 }
