@@ -314,7 +314,8 @@ impl Bus for IoxBus {
             _ => Lane::None,
         };
         let (node, bell, topic) = (self.node.clone(), self.bells.of(topic), topic.clone());
-        Ok(IoxReader { node, service, subscriber, current: Current::None, newest: (0, 0), lane, idle: 0, bell, topic })
+        let (current, pending, newest) = (Current::None, None, (0, 0));
+        Ok(IoxReader { node, service, subscriber, current, pending, newest, lane, idle: 0, bell, topic })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {
@@ -422,6 +423,8 @@ pub struct IoxReader<S: Sample> {
     /// Looks at the lane that found nothing.
     idle: u32,
     current: Current<S>,
+    /// Taken from the queue before a sleep, and not told of yet.
+    pending: Option<Received<Ipc, Wire<S>, ()>>,
     /// Generation and tick of the last sample told of.
     newest: (u64, u64),
     bell: Bell,
@@ -466,10 +469,13 @@ impl<S: Sample> IoxReader<S> {
 
     /// Takes the next sample from the queue, unless the lane has had it.
     fn receive(&mut self) -> Result<bool, BusError> {
-        let received = match self.subscriber.receive() {
-            Ok(Some(sample)) => sample,
-            Ok(None) => return Ok(false),
-            Err(error) => return Err(self.failed(format!("{error:?}"))),
+        let received = match self.pending.take() {
+            Some(sample) => sample,
+            None => match self.subscriber.receive() {
+                Ok(Some(sample)) => sample,
+                Ok(None) => return Ok(false),
+                Err(error) => return Err(self.failed(format!("{error:?}"))),
+            },
         };
         let key = key(&received.payload().0);
         let (generation, _) = key;
@@ -514,11 +520,26 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let news = || match &self.lane {
-            Lane::Open(latest) if latest.has_news() => Ok(true),
-            _ => self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}"))),
+        let Self { subscriber, lane, idle, pending, bell, topic, .. } = self;
+        let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
+        let Lane::Open(latest) = lane else {
+            return bell.sleep(until_ns, || subscriber.has_samples().map_err(|error| failed(format!("{error:?}"))));
         };
-        self.bell.sleep(until_ns, news)
+        bell.sleep(until_ns, || {
+            // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
+            while !latest.has_news() && pending.is_none() {
+                match subscriber.receive() {
+                    Ok(Some(sample)) => {
+                        *pending = Some(sample).filter(|sample| key(&sample.payload().0) > key(latest.sample()))
+                    }
+                    Ok(None) => return Ok(false),
+                    Err(error) => return Err(failed(format!("{error:?}"))),
+                }
+            }
+            // The next look goes to the queue, if nothing is in the lane.
+            *idle = u32::MAX;
+            Ok(true)
+        })
     }
 
     fn refresh(&mut self) {

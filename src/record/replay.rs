@@ -367,7 +367,9 @@ impl Stage<'_> {
             let (script, scenario) = (self.script, self.scenario);
             let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, script.role, self.bus, self.ledger))?;
             if self.ledger.generation() >= step.generation {
-                let first_tick = if step.generation == 1 { 0 } else { step.tick };
+                // Others than a body pass over what the outage took tick by tick: of a long one the links would not hold all.
+                let body = matches!(script.role, RoleId::Plant(_));
+                let first_tick = if body && step.generation > 1 { step.tick } else { node.next_tick() };
                 node.start(script.grid, first_tick);
             }
             self.node = Some(node);

@@ -396,10 +396,11 @@ impl Reading<'_> {
         ticks
     }
 
-    /// Whether a body applied the command that was due at a tick, or had one that it did not believe.
+    /// Whether a body applied the command that was due at a tick, or had one that it did not believe. Its truth says so, or,
+    /// where it died before that, its measurement.
     fn applied(&self, tick: u64) -> bool {
-        let Some(truth) = self.outputs.get(1) else { return true };
-        let word = first_of(truth, tick).and_then(|index| truth.unsigned(index, "status"));
+        let status = |output: &Track| first_of(output, tick).and_then(|index| output.unsigned(index, "status"));
+        let word = self.outputs.iter().rev().find_map(status);
         word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
     }
 
