@@ -562,6 +562,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
 mod tests {
     use super::super::domain::OwnedDomain;
     use super::*;
+    use crate::clock::monotonic_ns;
     use crate::sample::{RateCommand, RateTruth};
 
     fn topic() -> Topic {
@@ -618,6 +619,61 @@ mod tests {
         })
         .unwrap();
         assert_eq!(versions, [VERSION]);
+    }
+
+    /// A signal with a fast lane, whose bus has links of the newest sample.
+    fn fast() -> Topic {
+        Topic { signal: Signal::Command, ..topic() }
+    }
+
+    fn send(writer: &mut IoxWriter<RateCommand>, tick: u64, generation: u64) {
+        writer.send(|sample| (sample.stamp.tick, sample.stamp.generation) = (tick, generation)).unwrap();
+    }
+
+    /// The queue still holds what the lane has given: that must not keep the reader awake.
+    #[test]
+    fn a_reader_of_the_lane_sleeps_at_once_when_there_is_nothing_new() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut writer = bus.writer::<RateCommand>(&fast(), 1).unwrap();
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        send(&mut writer, 0, 1);
+        assert!(reader.advance().unwrap());
+        reader.refresh();
+        assert!(matches!(reader.lane, Lane::Open(_)));
+        for tick in 1..20 {
+            send(&mut writer, tick, 1);
+            assert!(reader.advance().unwrap());
+            assert!(matches!(reader.current, Current::InLane));
+            let (until_ns, mut sleeps) = (monotonic_ns() + 2_000_000, 0);
+            while monotonic_ns() < until_ns {
+                reader.sleep(until_ns).unwrap();
+                assert!(!reader.advance().unwrap());
+                sleeps += 1;
+            }
+            assert!(sleeps <= 2, "tick {tick}: {sleeps} sleeps in 2 ms");
+        }
+    }
+
+    /// A successor of the writer has a lane of its own, which is looked for only later.
+    #[test]
+    fn what_only_the_queue_has_ends_the_sleep_and_is_found_at_the_next_look() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        for generation in 1..4 {
+            let mut writer = bus.writer::<RateCommand>(&fast(), generation).unwrap();
+            for tick in 0..3 {
+                let tick = 10 * generation + tick;
+                send(&mut writer, tick, generation);
+                reader.sleep(monotonic_ns() + 1_000_000).unwrap();
+                assert!(reader.advance().unwrap(), "generation {generation}, tick {tick}");
+                assert_eq!(key(reader.current().unwrap()), (generation, tick));
+                assert!(!reader.advance().unwrap(), "once");
+            }
+            reader.refresh();
+            assert!(!reader.advance().unwrap(), "what is in the lane now was in the queue");
+        }
     }
 
     #[test]
