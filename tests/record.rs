@@ -567,13 +567,51 @@ fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: 
 fn whatever_a_loaded_machine_made_of_a_run_is_replayed() {
     let bench = Bench::new();
     let file = bench.path("run.mcap");
-    for seed in 0..200 {
-        let scenario = scenario_in_real_time("rigid-pair", 1000, &[]);
-        run_at_random(&scenario, &file, &mut Random(seed), seed % 2 == 1);
-        for replay in replays(&file) {
-            println!("{seed} {replay:?}");
-            assert_eq!((replay.difference, replay.limit), (None, None), "seed {seed}, {}", replay.role);
+    let faults = "fault=[{kind=\"noise-burst\",role=\"leader\",deviation=0.3,from_tick=200,ticks=50,probability=0.5},\
+                  {kind=\"drop\",role=\"observer\",from_tick=300,ticks=50,probability=0.5},\
+                  {kind=\"delay\",role=\"controller\",delay_ticks=3,from_tick=400,ticks=50},\
+                  {kind=\"bit-flip\",role=\"follower\",from_tick=500,ticks=50}]";
+    for (name, overrides, limited) in
+        [("rigid-pair", &[][..], false), ("rigid-trio", &[], true), ("rigid-pair", &[faults], true)]
+    {
+        let scenario = scenario_in_real_time(name, 1000, overrides);
+        let mut told = 0;
+        for seed in 0..30 {
+            run_at_random(&scenario, &file, &mut Random(seed), seed % 2 == 1);
+            for replay in replays(&file) {
+                println!("{name} {seed} {replay:?}");
+                assert_eq!(replay.difference, None, "{name}, seed {seed}: {}, {} lives", replay.role, replay.lives);
+                assert!(limited || seed % 2 == 1 || replay.limit.is_none(), "{name}, seed {seed}: {replay:?}");
+                told += u64::from(replay.limit.is_none());
+            }
         }
+        assert!(told > 50, "{name}: {told} of 120 and more to their end");
+    }
+}
+
+/// Samples that a fault keeps back do not tell that they were made; the counters of a role that missed none do.
+#[test]
+fn what_neither_samples_nor_counters_tell_is_not_claimed() {
+    let bench = Bench::new();
+    let file = bench.path("run.mcap");
+    let fault = "fault=[{kind=\"drop\",role=\"observer\",from_tick=300,ticks=100}]";
+    let scenario = scenario_in_real_time("rigid-pair", 1000, &[fault]);
+    for (held, limit) in [(0..0, None), (350..360, Some(300)), (700..710, None)] {
+        let bus = MemoryBus::new(depths(&scenario));
+        let mut run = Scheduled::new(&scenario, &bus, &file);
+        for tick in 0..=scenario.last_tick {
+            for index in 0..4 {
+                if run.roles[index] != RoleId::Observer || !held.contains(&tick) {
+                    run.turn(index, tick, false);
+                }
+            }
+            run.record();
+        }
+        run.finish();
+        let replays = replays(&file);
+        let observer = replays.iter().find(|replay| replay.role == "observer").unwrap();
+        let told = observer.limit.as_ref().map(|limit| limit.tick);
+        assert_eq!((&observer.difference, told), (&None, limit), "{held:?}: {observer:?}");
     }
 }
 

@@ -3,20 +3,24 @@
 //!
 //! A role's inputs are those of a lockstep run: one sample or one void per tick. A recording of lockstep has them as they
 //! were. In real time a role that missed a tick, or an input, must miss it again: what it executed is told by what it
-//! published, and what a body applied by its status word; everything else becomes a void. From where the recording does not
+//! published, and what a body applied by its status word; everything else becomes a void. Where a fault kept samples back, or a
+//! process died within a tick, its counters at the end of the recording decide. From where the recording does not
 //! tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
 
 use super::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
 use crate::clock::Grid;
-use crate::config::{ClockKind, Scenario};
-use crate::fault::Action;
+use crate::config::{ClockKind, Scenario, ScriptedFault};
+use crate::fault::{Action, Change, Tamper, Transport};
 use crate::runtime::{Port, RoleId, ports};
 use crate::sample::{Stamp, VOID, status};
-use std::collections::BTreeMap;
+use crate::telemetry::Ticks;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A role's successor is not counted further up than this; what says so has a broken stamp.
 const LIVES_MAX: u64 = 1000;
+/// Words of a stamp, the first of a sample.
+const STAMP_WORDS: usize = size_of::<Stamp>() / size_of::<u64>();
 
 /// One executed tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -88,6 +92,8 @@ pub struct Script {
     pub outputs: Vec<Track>,
     /// How far it can be told.
     pub limit: Option<Limit>,
+    /// By how many ticks a fault sends a sample late, at the most.
+    pub late_ticks: u64,
     /// The time grid of the run.
     pub grid: Grid,
     /// Whether its links lost what came too late.
@@ -134,7 +140,12 @@ impl Script {
         reading.lost();
         let Reading { outputs, limit, .. } = reading;
         let name = role.name(scenario).to_owned();
-        Ok(Self { role, name, steps, inputs, outputs, limit, grid, realtime })
+        let late = |scripted: &ScriptedFault| match scripted.fault.action {
+            Action::Transport(Transport::Delay { ticks }) if scripted.role == name => Some(ticks),
+            _ => None,
+        };
+        let late_ticks = scenario.faults.iter().filter_map(late).max().unwrap_or(0);
+        Ok(Self { role, name, steps, inputs, outputs, limit, late_ticks, grid, realtime })
     }
 }
 
@@ -191,14 +202,21 @@ impl Reading<'_> {
 
     /// Whether a scripted fault touches what the role publishes of a body at a tick.
     fn disturbed(&self, output: &Track, tick: u64) -> bool {
+        self.touched(output, tick, |action| !matches!(action, Action::Role(_)))
+    }
+
+    /// Whether one may have changed the stamp.
+    fn forged(&self, output: &Track, tick: u64) -> bool {
+        let flips = |tamper: &Tamper| matches!(tamper.change, Change::Flip(_)) && tamper.words.first < STAMP_WORDS;
+        self.touched(output, tick, |action| matches!(action, Action::Content(tamper) if flips(tamper)))
+    }
+
+    fn touched(&self, output: &Track, tick: u64, by: impl Fn(&Action) -> bool) -> bool {
         let name = self.role.name(self.scenario);
         let here = |body: &Option<String>| body.as_ref() == Some(&output.info.body);
         output.info.signal != "truth"
             && self.scenario.faults.iter().any(|scripted| {
-                scripted.role == name
-                    && here(&scripted.body)
-                    && !matches!(scripted.fault.action, Action::Role(_))
-                    && scripted.fault.acts(tick)
+                scripted.role == name && here(&scripted.body) && by(&scripted.fault.action) && scripted.fault.acts(tick)
             })
     }
 
@@ -296,23 +314,31 @@ impl Reading<'_> {
             self.inputs[index].by_tick = by_tick;
         }
         let mut ticks = BTreeMap::new();
+        let mut withheld = BTreeSet::new();
         // A plant's truth is what really happened; it is written after the measurement.
         let telling = if self.delay() == 1 { 1..2 } else { 0..self.outputs.len() };
         for output in &self.outputs[telling] {
             for index in 0..output.len() {
                 let stamp = output.stamp(index);
-                if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
-                    ticks.entry(stamp.tick).or_insert((stamp.generation, true));
+                if self.possible(&stamp) {
+                    let generation = if self.forged(output, stamp.tick) { 0 } else { stamp.generation };
+                    ticks.entry(stamp.tick).or_insert((generation, true));
                 }
             }
-            // Where a fault kept the sample back or changed its stamp, it was made as long as there was something to make.
             if let Some(first) = self.inputs.first() {
-                for tick in first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)) {
-                    ticks.entry(*tick).or_insert((0, true));
-                }
+                withheld.extend(first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)));
             }
         }
+        withheld.retain(|tick| !ticks.contains_key(tick));
         self.unsettled(&mut ticks);
+        if let Some(first) = withheld.first().filter(|_| !self.executed_all(&ticks, withheld.len() as u64)) {
+            let first = *first;
+            self.limit(first, || {
+                "a fault kept samples back, and the outputs do not tell which of them were made".to_owned()
+            });
+        } else {
+            ticks.extend(withheld.into_iter().map(|tick| (tick, (0, true))));
+        }
         let mut life = 1;
         let step = |(tick, (generation, settled)): (u64, (u64, bool))| {
             if (life + 1..life + LIVES_MAX).contains(&generation) {
@@ -320,23 +346,79 @@ impl Reading<'_> {
             }
             Step { tick, generation: life, settled }
         };
-        ticks.into_iter().map(step).collect()
+        let mut steps: Vec<Step> = ticks.into_iter().map(step).collect();
+        self.uncommitted(&mut steps);
+        steps
+    }
+
+    /// What the role counted, if it came to its end.
+    fn counted(&self) -> Option<Ticks> {
+        let ticks = self.recording.info().end.as_ref()?.ticks.get(self.role.name(self.scenario))?;
+        Some(*ticks).filter(|ticks| ticks.elapsed > self.scenario.last_tick)
+    }
+
+    /// Whether a role executed, beside the ticks of which there is a sample, so many others, by its own counters. What a
+    /// death or a missing input did to these is not known.
+    fn executed_all(&self, told: &BTreeMap<u64, (u64, bool)>, others: u64) -> bool {
+        let one_life = told.values().all(|(generation, _)| *generation <= 1);
+        let undisturbed = |ticks: Ticks| one_life && ticks.starved == 0;
+        self.counted().is_some_and(|ticks| undisturbed(ticks) && ticks.executed == told.len() as u64 + others)
+    }
+
+    /// Who died between sending and committing left a tick that it had not counted. Where one life of several did and
+    /// another did not, the counters do not tell which.
+    fn uncommitted(&mut self, steps: &mut [Step]) {
+        let last = |index: &usize| steps[*index].settled && steps[index + 1].generation > steps[*index].generation;
+        let deaths: Vec<usize> = (0..steps.len().saturating_sub(1)).filter(last).collect();
+        let Some(first) = deaths.first().map(|index| steps[*index].tick) else { return };
+        let told = steps.iter().filter(|step| step.settled).count() as u64;
+        match self
+            .counted()
+            .and_then(|ticks| told.checked_sub(ticks.executed.saturating_sub(self.hidden(steps, &ticks))))
+        {
+            Some(0) => {}
+            Some(lost) if lost == deaths.len() as u64 => deaths.iter().for_each(|index| steps[*index].settled = false),
+            _ => self.limit(first, || {
+                "the counters do not tell whether that tick was finished before its process died".to_owned()
+            }),
+        }
+    }
+
+    /// The executed ticks of which nothing was published: a controller had an estimate, and no measurement.
+    fn hidden(&self, steps: &[Step], ticks: &Ticks) -> u64 {
+        if self.role != RoleId::Controller {
+            return 0;
+        }
+        let lacks = |output: &Track, tick| first_of(output, tick).is_none() && !self.disturbed(output, tick);
+        let shown = steps.iter().filter(|step| self.outputs.iter().any(|output| lacks(output, step.tick))).count();
+        ticks.starved.saturating_sub(shown as u64)
     }
 
     /// A plant that died between its measurement and its truth had moved nothing.
-    fn unsettled(&self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
-        let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) else { return };
-        for index in 0..output.len() {
-            let stamp = output.stamp(index);
-            if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
-                ticks.entry(stamp.tick).or_insert((stamp.generation, false));
+    fn unsettled(&mut self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
+        let mut untold = None;
+        if let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) {
+            for index in 0..output.len() {
+                let stamp = output.stamp(index);
+                if !self.possible(&stamp) || ticks.contains_key(&stamp.tick) {
+                    continue;
+                }
+                if self.forged(output, stamp.tick) {
+                    untold.get_or_insert(stamp.tick);
+                } else {
+                    ticks.insert(stamp.tick, (stamp.generation, false));
+                }
             }
+        }
+        if let Some(tick) = untold {
+            self.limit(tick, || "a fault changed stamps, and nothing tells whether that tick was executed".to_owned());
         }
     }
 
     /// Real time: the inputs that the role used, by what it made of them.
     fn used(&mut self, steps: &[Step]) -> Vec<InputScript> {
         let delay = self.delay();
+        let starves = self.counted().is_none_or(|ticks| ticks.starved > 0);
         let mut scripts = Vec::new();
         let sources = std::mem::take(&mut self.inputs);
         for (input, source) in sources.into_iter().enumerate() {
@@ -361,6 +443,14 @@ impl Reading<'_> {
                     (None, _) => true,
                     (Some(ticks), _) => ticks.binary_search(&step.tick).is_ok(),
                 };
+                let withheld = |output: usize| {
+                    self.outputs.get(output).is_some_and(|output| first_of(output, step.tick).is_none())
+                };
+                if used && starves && told_by.is_some_and(withheld) {
+                    self.limit(step.tick, || {
+                        "a fault kept a sample back, and nothing tells whether its input was there".to_owned()
+                    });
+                }
                 match source.by_tick.get(&needed).filter(|_| used) {
                     Some(index) => {
                         generation = source.track.stamp(*index).generation;

@@ -29,6 +29,8 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     book: TickBook,
     interruptions: Interruptions,
     state: StateBook<P::Truth>,
+    /// The last state that a predecessor left, until this one executes a tick: until then nobody served the body.
+    predecessor: Option<<P::Truth as Carried>::Owned>,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -52,6 +54,7 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
             book,
             interruptions: seat.interruptions(),
             state: StateBook::open(seat.ledger, info.bodies()),
+            predecessor: None,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -70,7 +73,15 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> PlantNode<P, G, B> {
         for missed in self.book.next()..tick {
             self.lateness.record(self.grid.due_ns(missed), now_ns);
         }
-        self.skip_to(tick);
+        self.take_over(tick);
+    }
+
+    /// Serves the body from `tick` on.
+    fn take_over(&mut self, tick: u64) {
+        match self.predecessor.take() {
+            Some(truth) => self.resume(truth.borrow(), tick),
+            None => self.skip_to(tick),
+        }
     }
 
     /// Takes over a body from a predecessor that died: it has moved on by itself, and its actuators have protected it.
@@ -134,10 +145,12 @@ impl<P: Hosted, G: Guard<P::Command>, B: Bus> Node for PlantNode<P, G, B> {
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
             command.expect(Horizon::Due(grid));
         }
-        if let Some(truth) = self.state.load() {
-            self.resume(truth.borrow(), first_tick);
+        self.predecessor = self.state.load();
+        if self.clock == Clock::Monotonic && self.predecessor.is_some() {
+            // Whether that tick will be missed too is not known yet.
+            self.book.skip_to(first_tick);
         } else {
-            self.skip_to(first_tick);
+            self.take_over(first_tick);
         }
     }
 
