@@ -3,9 +3,9 @@
 //!
 //! A role's inputs are those of a lockstep run: one sample or one void per tick. A recording of lockstep has them as they
 //! were. In real time a role that missed a tick, or an input, must miss it again: what it executed is told by what it
-//! published, and what a body applied by its status word; everything else becomes a void. Where a fault kept samples back, or a
-//! process died within a tick, its counters at the end of the recording decide. From where the recording does not
-//! tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
+//! published, and what a body applied by its status word; everything else becomes a void. Where a fault kept samples back,
+//! or a process died within a tick, the role's counters at the end of the recording decide. From where the recording does
+//! not tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
 
 use super::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
