@@ -102,7 +102,7 @@ fn the_step_and_the_hop_stand_beside_all_their_floors() {
 #[test]
 fn whole_runs_stand_beside_theirs() {
     let bench = Bench::new();
-    let rows = ["chain", "tick", "lockstep", "run", "toll"];
+    let rows = ["chain", "tick", "lockstep", "run", "toll", "processor"];
     let results = measure(&bench, &rows);
     assert_rows(&bench, &results, &rows);
     for (row, name) in [
@@ -121,6 +121,10 @@ fn whole_runs_stand_beside_theirs() {
         ("toll", "page faults, leader"),
         ("toll", "allocations, controller"),
         ("toll", "voluntary context switches, follower"),
+        ("processor", "bare sleep"),
+        ("processor", "observer, event"),
+        ("processor", "controller, spin"),
+        ("processor", "leader, auto"),
     ] {
         assert!(has(&results, row, name), "{row}: {name}");
     }

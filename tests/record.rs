@@ -5,10 +5,14 @@ mod common;
 use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped, skipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Read, Reader, Topic};
+use corotate::clock::{Grid, monotonic_ns};
 use corotate::config::Scenario;
-use corotate::record::{Recording, topic_of};
-use corotate::runtime::{RoleId, Visit, build, depths, in_turn, private_ledger, visit_writes};
+use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process, topic_of};
+use corotate::runtime::{
+    Gate, Poll, ReadyNode, RoleId, Visit, build, depths, in_turn, private_ledger, report, shared_ledger, visit_writes,
+};
 use corotate::sample::{FleetLayout, FleetSample, Sample};
+use corotate::telemetry::Ledger;
 use corotate::watch::Session;
 use corotate::with_rig;
 use serde_json::Value;
@@ -72,7 +76,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     };
     let mut nodes: Vec<_> = roles.iter().map(node).collect();
     let none = |_| panic!("no role dies here");
-    let grid = corotate::clock::Grid { epoch_ns: 0, period_ns: scenario.period_ns };
+    let grid = Grid { epoch_ns: 0, period_ns: scenario.period_ns };
     nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
     in_turn(&mut nodes, scenario.last_tick, none, |_| {
         taps.iter_mut().for_each(|(service, take)| take(all.entry(service.clone()).or_default()));
@@ -392,5 +396,245 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
         let done = replay(&bench, &bench.path(&file), &["--accept-incomplete"]);
         assert!(done.code == Some(0) && done.stdout.contains("in the midst of the run"), "{done:?}");
         bench.assert_clean(&[domain]);
+    }
+}
+
+/// Numbers that look random, the same in every run.
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, end: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ z >> 31) % end
+    }
+
+    fn one_in(&mut self, count: u64) -> bool {
+        self.below(count) == 0
+    }
+
+    /// Ticks that a role stands still; one in so many is longer than links are deep in a replay.
+    fn pause(&mut self, long: u64) -> u64 {
+        let most = if self.one_in(long) { 300 } else { 8 };
+        self.below(most)
+    }
+}
+
+/// A run in real time whose schedule the test decides: real nodes, recorded, in one thread. All ticks are due already, so no
+/// node waits for the time and nothing depends on the machine.
+struct Scheduled<'a> {
+    scenario: &'a Scenario,
+    bus: &'a MemoryBus,
+    roles: Vec<RoleId>,
+    ledgers: Vec<Ledger>,
+    _memory: tempfile::TempDir,
+    nodes: Vec<Option<ReadyNode>>,
+    grid: Grid,
+    recorder: Recorder,
+}
+
+impl<'a> Scheduled<'a> {
+    fn new(scenario: &'a Scenario, bus: &'a MemoryBus, file: &Path) -> Self {
+        let length_ns = (scenario.last_tick + 1) * scenario.period_ns;
+        let grid = Grid { epoch_ns: monotonic_ns() - length_ns, period_ns: scenario.period_ns };
+        let mut recorder = Recorder::open(scenario, bus, file).unwrap();
+        recorder.start(grid.epoch_ns, true).unwrap();
+        let roles = RoleId::all(scenario);
+        let memory = tempfile::tempdir().unwrap();
+        let ledger = |role: &RoleId| shared_ledger(scenario, *role, &memory.path().join(role.name(scenario))).unwrap();
+        let ledgers = roles.iter().map(ledger).collect();
+        let nodes = roles.iter().map(|_| None).collect();
+        let mut run = Self { scenario, bus, roles, ledgers, _memory: memory, nodes, grid, recorder };
+        (0..run.roles.len()).for_each(|index| run.begin(index, 0));
+        run
+    }
+
+    /// A role takes its seat, and executes no tick before this one.
+    fn begin(&mut self, index: usize, first_tick: u64) {
+        let (scenario, role, bus, ledger) = (self.scenario, self.roles[index], self.bus, &self.ledgers[index]);
+        let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, role, bus, ledger)).unwrap();
+        node.restore().unwrap();
+        let first_tick = first_tick.max(node.next_tick());
+        node.start(self.grid, first_tick).unwrap();
+        self.nodes[index] = Some(node);
+    }
+
+    /// A role dies without a word.
+    fn die(&mut self, index: usize) {
+        self.nodes[index] = None;
+    }
+
+    /// One look of a role at its inputs, at a tick; whether it executed.
+    fn look(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
+        let gate = match (self.roles[index], overdue) {
+            (RoleId::Plant(_), _) => Gate::Now { tick, now_ns: self.grid.due_ns(tick) },
+            (_, true) => Gate::Overdue,
+            (_, false) => Gate::Arrived,
+        };
+        let Some(node) = &mut self.nodes[index] else { return false };
+        if node.next_tick() > tick {
+            return false;
+        }
+        node.poll(gate).unwrap() == Poll::Executed
+    }
+
+    fn settle(&mut self, index: usize) {
+        if let Some(node) = &mut self.nodes[index] {
+            node.settle().unwrap();
+        }
+    }
+
+    /// One look, and what an executed tick leaves to be done.
+    fn turn(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
+        let executed = self.look(index, tick, overdue);
+        if executed {
+            self.settle(index);
+        }
+        executed
+    }
+
+    /// The recording takes what has come.
+    fn record(&mut self) {
+        self.recorder.poll().unwrap();
+    }
+
+    fn finish(mut self) {
+        self.nodes.iter_mut().flatten().for_each(|node| node.finish().unwrap());
+        self.record();
+        let of = |(role, ledger)| report(self.scenario, role, ledger, Vec::new(), Vec::new());
+        let reports: Vec<_> = self.roles.into_iter().zip(&self.ledgers).map(of).collect();
+        let report = self.recorder.finish(&reports, None);
+        assert!(report.complete, "{report:?}");
+    }
+}
+
+/// Replays every role of a recording in this thread.
+fn replays(file: &Path) -> Vec<RoleReplay> {
+    let recording = Recording::open(file).unwrap();
+    let scenario = recording.scenario_for_replay().unwrap();
+    RoleId::all(&scenario).into_iter().map(|role| replay_in_process(&recording, &scenario, role).unwrap()).collect()
+}
+
+fn scenario_in_real_time(name: &str, ticks: u64, overrides: &[&str]) -> Scenario {
+    let fixed = ["clock=realtime".to_owned(), format!("duration_s={:?}", ticks as f64 / 1e3), "accept={}".to_owned()];
+    let overrides: Vec<String> = fixed.into_iter().chain(overrides.iter().map(|text| (*text).to_owned())).collect();
+    Scenario::load(&shipped(name), &overrides).unwrap()
+}
+
+/// A run on a machine that is busy with something else: roles look seldom and in any order, stand still, and die.
+fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: bool) {
+    let bus = MemoryBus::new(depths(scenario));
+    let mut run = Scheduled::new(scenario, &bus, file);
+    let mut held_until = vec![0; run.roles.len()];
+    for tick in 0..=scenario.last_tick {
+        for index in 0..run.roles.len() {
+            if run.nodes[index].is_none() && held_until[index] <= tick {
+                run.begin(index, tick);
+            }
+            if random.one_in(60) {
+                held_until[index] = tick + random.pause(4);
+            }
+        }
+        for _ in 0..3 * run.roles.len() {
+            let index = random.below(run.roles.len() as u64) as usize;
+            let overdue = random.one_in(2);
+            if held_until[index] > tick || !run.look(index, tick, overdue) {
+                continue;
+            }
+            let dies = deaths && random.one_in(150);
+            if !dies || random.one_in(2) {
+                run.settle(index);
+            }
+            if dies {
+                run.die(index);
+                held_until[index] = tick + 1 + random.pause(2);
+            }
+        }
+        run.record();
+    }
+    run.finish();
+}
+
+#[test]
+fn whatever_a_loaded_machine_made_of_a_run_is_replayed() {
+    let bench = Bench::new();
+    let file = bench.path("run.mcap");
+    let faults = "fault=[{kind=\"noise-burst\",role=\"leader\",deviation=0.3,from_tick=200,ticks=50,probability=0.5},\
+                  {kind=\"drop\",role=\"observer\",from_tick=300,ticks=50,probability=0.5},\
+                  {kind=\"delay\",role=\"controller\",delay_ticks=3,from_tick=400,ticks=50},\
+                  {kind=\"bit-flip\",role=\"follower\",from_tick=500,ticks=50}]";
+    for (name, overrides, limited) in
+        [("rigid-pair", &[][..], false), ("rigid-trio", &[], true), ("rigid-pair", &[faults], true)]
+    {
+        let scenario = scenario_in_real_time(name, 1000, overrides);
+        let mut told = 0;
+        for seed in 0..30 {
+            run_at_random(&scenario, &file, &mut Random(seed), seed % 2 == 1);
+            for replay in replays(&file) {
+                println!("{name} {seed} {replay:?}");
+                assert_eq!(replay.difference, None, "{name}, seed {seed}: {}, {} lives", replay.role, replay.lives);
+                assert!(limited || seed % 2 == 1 || replay.limit.is_none(), "{name}, seed {seed}: {replay:?}");
+                told += u64::from(replay.limit.is_none());
+            }
+        }
+        assert!(told > 50, "{name}: {told} of 120 and more to their end");
+    }
+}
+
+/// Samples that a fault keeps back do not tell that they were made; the counters of a role that missed none do.
+#[test]
+fn what_neither_samples_nor_counters_tell_is_not_claimed() {
+    let bench = Bench::new();
+    let file = bench.path("run.mcap");
+    let fault = "fault=[{kind=\"drop\",role=\"observer\",from_tick=300,ticks=100}]";
+    let scenario = scenario_in_real_time("rigid-pair", 1000, &[fault]);
+    for (held, limit) in [(0..0, None), (350..360, Some(300)), (700..710, None)] {
+        let bus = MemoryBus::new(depths(&scenario));
+        let mut run = Scheduled::new(&scenario, &bus, &file);
+        for tick in 0..=scenario.last_tick {
+            for index in 0..4 {
+                if run.roles[index] != RoleId::Observer || !held.contains(&tick) {
+                    run.turn(index, tick, false);
+                }
+            }
+            run.record();
+        }
+        run.finish();
+        let replays = replays(&file);
+        let observer = replays.iter().find(|replay| replay.role == "observer").unwrap();
+        let told = observer.limit.as_ref().map(|limit| limit.tick);
+        assert_eq!((&observer.difference, told), (&None, limit), "{held:?}: {observer:?}");
+    }
+}
+
+/// A controller whose successor is ready after more ticks than links are deep in a replay.
+#[test]
+fn an_outage_of_any_length_is_replayed() {
+    let bench = Bench::new();
+    let file = bench.path("run.mcap");
+    let scenario = scenario_in_real_time("rigid-pair", 1000, &[]);
+    for victim in 0..4 {
+        for outage in [1, 20, 127, 128, 129, 500] {
+            let bus = MemoryBus::new(depths(&scenario));
+            let mut run = Scheduled::new(&scenario, &bus, &file);
+            for tick in 0..=scenario.last_tick {
+                match tick.checked_sub(400) {
+                    Some(0) => run.die(victim),
+                    Some(dead) if dead == outage => run.begin(victim, tick),
+                    _ => {}
+                }
+                (0..4).for_each(|index| {
+                    run.turn(index, tick, false);
+                });
+                run.record();
+            }
+            run.finish();
+            for replay in replays(&file) {
+                let told = format!("{victim} {outage} {replay:?}");
+                assert_eq!((replay.difference, replay.limit), (None, None), "{told}");
+            }
+        }
     }
 }

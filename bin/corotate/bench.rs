@@ -13,7 +13,7 @@ use std::time::Duration;
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Arguments {
-    /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll [default: all]
+    /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll, processor [default: all]
     #[arg(value_name = "ROW", value_parser = row)]
     rows: Vec<Row>,
     /// A smoke run of a few seconds, whose figures mean nothing

@@ -24,11 +24,13 @@ pub enum Row {
     Run,
     /// What a tick takes of the system: calls, faults, switches, allocations.
     Toll,
+    /// What a tick takes of the processor, by how roles wait.
+    Processor,
 }
 
 impl Row {
     /// Every row with its name and what it is.
-    pub const ALL: [(Self, &str, &str); 8] = [
+    pub const ALL: [(Self, &str, &str); 9] = [
         (Self::Step, "step", "estimate-and-control step: samples in, command out"),
         (Self::Fleet, "fleet", "the law of N followers in one controller's step, per follower"),
         (Self::Hop, "hop", "one hop between two processes on two cores"),
@@ -37,6 +39,7 @@ impl Row {
         (Self::Lockstep, "lockstep", "ticks per second where nobody waits for the time"),
         (Self::Run, "run", "a whole `corotate run`: start, stop, memory"),
         (Self::Toll, "toll", "system calls, faults, context switches and allocations per tick"),
+        (Self::Processor, "processor", "processor time per tick of every role, by how roles wait"),
     ];
 
     /// The row of this name.

@@ -16,6 +16,7 @@ mod lockstep;
 
 mod page;
 mod peer;
+mod processor;
 pub mod recording;
 mod report;
 mod run;
@@ -106,6 +107,7 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
             Row::Lockstep => lockstep::measure(bench, &mut board)?,
             Row::Run => run::measure(bench, &mut board)?,
             Row::Toll => toll::measure(bench, &mut board)?,
+            Row::Processor => processor::measure(bench, &mut board)?,
         }
     }
     let taken = board.take_grants();

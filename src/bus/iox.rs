@@ -470,7 +470,8 @@ impl Bus for IoxBus {
             _ => Lane::None,
         };
         let (node, bell, topic) = (self.node.clone(), self.bells.of(topic), topic.clone());
-        Ok(IoxReader { node, service, subscriber, current: Current::None, newest: (0, 0), lane, idle: 0, bell, topic })
+        let (current, pending, newest) = (Current::None, None, (0, 0));
+        Ok(IoxReader { node, service, subscriber, current, pending, newest, lane, idle: 0, bell, topic })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {
@@ -585,6 +586,8 @@ pub struct IoxReader<S: Sample> {
     /// Looks at the lane that found nothing.
     idle: u32,
     current: Current<S>,
+    /// Taken from the queue before a sleep, and not told of yet.
+    pending: Option<Received<Ipc, Wire<S>, ()>>,
     /// Generation and tick of the last sample told of.
     newest: (u64, u64),
     bell: Bell,
@@ -629,10 +632,13 @@ impl<S: Sample> IoxReader<S> {
 
     /// Takes the next sample from the queue, unless the lane has had it.
     fn receive(&mut self) -> Result<bool, BusError> {
-        let received = match self.subscriber.receive() {
-            Ok(Some(sample)) => sample,
-            Ok(None) => return Ok(false),
-            Err(error) => return Err(self.failed(format!("{error:?}"))),
+        let received = match self.pending.take() {
+            Some(sample) => sample,
+            None => match self.subscriber.receive() {
+                Ok(Some(sample)) => sample,
+                Ok(None) => return Ok(false),
+                Err(error) => return Err(self.failed(format!("{error:?}"))),
+            },
         };
         let key = key(&received.payload().0);
         let (generation, _) = key;
@@ -677,11 +683,26 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let news = || match &self.lane {
-            Lane::Open(latest) if latest.has_news() => Ok(true),
-            _ => self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}"))),
+        let Self { subscriber, lane, idle, pending, bell, topic, .. } = self;
+        let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
+        let Lane::Open(latest) = lane else {
+            return bell.sleep(until_ns, || subscriber.has_samples().map_err(|error| failed(format!("{error:?}"))));
         };
-        self.bell.sleep(until_ns, news)
+        bell.sleep(until_ns, || {
+            // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
+            while !latest.has_news() && pending.is_none() {
+                match subscriber.receive() {
+                    Ok(Some(sample)) => {
+                        *pending = Some(sample).filter(|sample| key(&sample.payload().0) > key(latest.sample()))
+                    }
+                    Ok(None) => return Ok(false),
+                    Err(error) => return Err(failed(format!("{error:?}"))),
+                }
+            }
+            // The next look goes to the queue, if nothing is in the lane.
+            *idle = u32::MAX;
+            Ok(true)
+        })
     }
 
     fn refresh(&mut self) {
@@ -704,6 +725,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
 mod tests {
     use super::super::domain::OwnedDomain;
     use super::*;
+    use crate::clock::monotonic_ns;
     use crate::sample::{RateCommand, RateTruth};
 
     fn topic() -> Topic {
@@ -801,6 +823,61 @@ mod tests {
         })
         .unwrap();
         assert_eq!(versions, [VERSION]);
+    }
+
+    /// A signal with a fast lane, whose bus has links of the newest sample.
+    fn fast() -> Topic {
+        Topic { signal: Signal::Command, ..topic() }
+    }
+
+    fn send(writer: &mut IoxWriter<RateCommand>, tick: u64, generation: u64) {
+        writer.send(|sample| (sample.stamp.tick, sample.stamp.generation) = (tick, generation)).unwrap();
+    }
+
+    /// The queue still holds what the lane has given: that must not keep the reader awake.
+    #[test]
+    fn a_reader_of_the_lane_sleeps_at_once_when_there_is_nothing_new() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut writer = bus.writer::<RateCommand>(&fast(), 1).unwrap();
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        send(&mut writer, 0, 1);
+        assert!(reader.advance().unwrap());
+        reader.refresh();
+        assert!(matches!(reader.lane, Lane::Open(_)));
+        for tick in 1..20 {
+            send(&mut writer, tick, 1);
+            assert!(reader.advance().unwrap());
+            assert!(matches!(reader.current, Current::InLane));
+            let (until_ns, mut sleeps) = (monotonic_ns() + 2_000_000, 0);
+            while monotonic_ns() < until_ns {
+                reader.sleep(until_ns).unwrap();
+                assert!(!reader.advance().unwrap());
+                sleeps += 1;
+            }
+            assert!(sleeps <= 2, "tick {tick}: {sleeps} sleeps in 2 ms");
+        }
+    }
+
+    /// A successor of the writer has a lane of its own, which is looked for only later.
+    #[test]
+    fn what_only_the_queue_has_ends_the_sleep_and_is_found_at_the_next_look() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        for generation in 1..4 {
+            let mut writer = bus.writer::<RateCommand>(&fast(), generation).unwrap();
+            for tick in 0..3 {
+                let tick = 10 * generation + tick;
+                send(&mut writer, tick, generation);
+                reader.sleep(monotonic_ns() + 1_000_000).unwrap();
+                assert!(reader.advance().unwrap(), "generation {generation}, tick {tick}");
+                assert_eq!(key(reader.current().unwrap()), (generation, tick));
+                assert!(!reader.advance().unwrap(), "once");
+            }
+            reader.refresh();
+            assert!(!reader.advance().unwrap(), "what is in the lane now was in the queue");
+        }
     }
 
     #[test]

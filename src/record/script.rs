@@ -3,20 +3,24 @@
 //!
 //! A role's inputs are those of a lockstep run: one sample or one void per tick. A recording of lockstep has them as they
 //! were. In real time a role that missed a tick, or an input, must miss it again: what it executed is told by what it
-//! published, and what a body applied by its status word; everything else becomes a void. From where the recording does not
-//! tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
+//! published, and what a body applied by its status word; everything else becomes a void. Where a fault kept samples back,
+//! the role's counters at the end of the recording decide. From where the recording does
+//! not tell enough on, nothing is claimed ([`Limit`]). Must not run anything.
 
 use super::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
 use crate::clock::Grid;
-use crate::config::{ClockKind, Scenario};
-use crate::fault::Action;
+use crate::config::{ClockKind, Scenario, ScriptedFault};
+use crate::fault::{Action, Change, Tamper, Transport};
 use crate::runtime::{Port, RoleId, ports};
 use crate::sample::{Stamp, VOID, status};
-use std::collections::BTreeMap;
+use crate::telemetry::Ticks;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A role's successor is not counted further up than this; what says so has a broken stamp.
 const LIVES_MAX: u64 = 1000;
+/// Words of a stamp, the first of a sample.
+const STAMP_WORDS: usize = size_of::<Stamp>() / size_of::<u64>();
 
 /// One executed tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -88,6 +92,8 @@ pub struct Script {
     pub outputs: Vec<Track>,
     /// How far it can be told.
     pub limit: Option<Limit>,
+    /// By how many ticks a fault sends a sample late, at the most.
+    pub late_ticks: u64,
     /// The time grid of the run.
     pub grid: Grid,
     /// Whether its links lost what came too late.
@@ -134,7 +140,12 @@ impl Script {
         reading.lost();
         let Reading { outputs, limit, .. } = reading;
         let name = role.name(scenario).to_owned();
-        Ok(Self { role, name, steps, inputs, outputs, limit, grid, realtime })
+        let late = |scripted: &ScriptedFault| match scripted.fault.action {
+            Action::Transport(Transport::Delay { ticks }) if scripted.role == name => Some(ticks),
+            _ => None,
+        };
+        let late_ticks = scenario.faults.iter().filter_map(late).max().unwrap_or(0);
+        Ok(Self { role, name, steps, inputs, outputs, limit, late_ticks, grid, realtime })
     }
 }
 
@@ -191,14 +202,21 @@ impl Reading<'_> {
 
     /// Whether a scripted fault touches what the role publishes of a body at a tick.
     fn disturbed(&self, output: &Track, tick: u64) -> bool {
+        self.touched(output, tick, |action| !matches!(action, Action::Role(_)))
+    }
+
+    /// Whether one may have changed the stamp.
+    fn forged(&self, output: &Track, tick: u64) -> bool {
+        let flips = |tamper: &Tamper| matches!(tamper.change, Change::Flip(_)) && tamper.words.first < STAMP_WORDS;
+        self.touched(output, tick, |action| matches!(action, Action::Content(tamper) if flips(tamper)))
+    }
+
+    fn touched(&self, output: &Track, tick: u64, by: impl Fn(&Action) -> bool) -> bool {
         let name = self.role.name(self.scenario);
         let here = |body: &Option<String>| body.as_ref() == Some(&output.info.body);
         output.info.signal != "truth"
             && self.scenario.faults.iter().any(|scripted| {
-                scripted.role == name
-                    && here(&scripted.body)
-                    && !matches!(scripted.fault.action, Action::Role(_))
-                    && scripted.fault.acts(tick)
+                scripted.role == name && here(&scripted.body) && by(&scripted.fault.action) && scripted.fault.acts(tick)
             })
     }
 
@@ -296,23 +314,31 @@ impl Reading<'_> {
             self.inputs[index].by_tick = by_tick;
         }
         let mut ticks = BTreeMap::new();
+        let mut withheld = BTreeSet::new();
         // A plant's truth is what really happened; it is written after the measurement.
         let telling = if self.delay() == 1 { 1..2 } else { 0..self.outputs.len() };
         for output in &self.outputs[telling] {
             for index in 0..output.len() {
                 let stamp = output.stamp(index);
-                if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
-                    ticks.entry(stamp.tick).or_insert((stamp.generation, true));
+                if self.possible(&stamp) {
+                    let generation = if self.forged(output, stamp.tick) { 0 } else { stamp.generation };
+                    ticks.entry(stamp.tick).or_insert((generation, true));
                 }
             }
-            // Where a fault kept the sample back or changed its stamp, it was made as long as there was something to make.
             if let Some(first) = self.inputs.first() {
-                for tick in first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)) {
-                    ticks.entry(*tick).or_insert((0, true));
-                }
+                withheld.extend(first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)));
             }
         }
+        withheld.retain(|tick| !ticks.contains_key(tick));
         self.unsettled(&mut ticks);
+        if let Some(first) = withheld.first().filter(|_| !self.executed_all(&ticks, withheld.len() as u64)) {
+            let first = *first;
+            self.limit(first, || {
+                "a fault kept samples back, and the outputs do not tell which of them were made".to_owned()
+            });
+        } else {
+            ticks.extend(withheld.into_iter().map(|tick| (tick, (0, true))));
+        }
         let mut life = 1;
         let step = |(tick, (generation, settled)): (u64, (u64, bool))| {
             if (life + 1..life + LIVES_MAX).contains(&generation) {
@@ -320,23 +346,57 @@ impl Reading<'_> {
             }
             Step { tick, generation: life, settled }
         };
-        ticks.into_iter().map(step).collect()
+        let steps: Vec<Step> = ticks.into_iter().map(step).collect();
+        self.anew(&steps);
+        steps
+    }
+
+    /// What the role counted, if it came to its end.
+    fn counted(&self) -> Option<Ticks> {
+        let ticks = self.recording.info().end.as_ref()?.ticks.get(self.role.name(self.scenario))?;
+        Some(*ticks).filter(|ticks| ticks.elapsed > self.scenario.last_tick)
+    }
+
+    /// Whether a role executed, beside the ticks of which there is a sample, so many others, by its own counters. What a
+    /// missing input did to these is not known.
+    fn executed_all(&self, told: &BTreeMap<u64, (u64, bool)>, others: u64) -> bool {
+        self.counted().is_some_and(|ticks| ticks.starved == 0 && ticks.executed == told.len() as u64 + others)
+    }
+
+    /// A life that began without its predecessor's state began somewhere else; which of several did is not told.
+    fn anew(&mut self, steps: &[Step]) {
+        let successor = steps.iter().find(|step| step.generation > 1).map(|step| step.tick);
+        let ticks = self.recording.info().end.as_ref().and_then(|end| end.ticks.get(self.role.name(self.scenario)));
+        if let Some(tick) = successor.filter(|_| ticks.is_some_and(|ticks| ticks.anew > 0)) {
+            self.limit(tick, || "a successor began there without the state of its predecessor".to_owned());
+        }
     }
 
     /// A plant that died between its measurement and its truth had moved nothing.
-    fn unsettled(&self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
-        let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) else { return };
-        for index in 0..output.len() {
-            let stamp = output.stamp(index);
-            if self.possible(&stamp) && !self.disturbed(output, stamp.tick) {
-                ticks.entry(stamp.tick).or_insert((stamp.generation, false));
+    fn unsettled(&mut self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
+        let mut untold = None;
+        if let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) {
+            for index in 0..output.len() {
+                let stamp = output.stamp(index);
+                if !self.possible(&stamp) || ticks.contains_key(&stamp.tick) {
+                    continue;
+                }
+                if self.forged(output, stamp.tick) {
+                    untold.get_or_insert(stamp.tick);
+                } else {
+                    ticks.insert(stamp.tick, (stamp.generation, false));
+                }
             }
+        }
+        if let Some(tick) = untold {
+            self.limit(tick, || "a fault changed stamps, and nothing tells whether that tick was executed".to_owned());
         }
     }
 
     /// Real time: the inputs that the role used, by what it made of them.
     fn used(&mut self, steps: &[Step]) -> Vec<InputScript> {
         let delay = self.delay();
+        let starves = self.counted().is_none_or(|ticks| ticks.starved > 0);
         let mut scripts = Vec::new();
         let sources = std::mem::take(&mut self.inputs);
         for (input, source) in sources.into_iter().enumerate() {
@@ -361,6 +421,14 @@ impl Reading<'_> {
                     (None, _) => true,
                     (Some(ticks), _) => ticks.binary_search(&step.tick).is_ok(),
                 };
+                let withheld = |output: usize| {
+                    self.outputs.get(output).is_some_and(|output| first_of(output, step.tick).is_none())
+                };
+                if used && starves && told_by.is_some_and(withheld) {
+                    self.limit(step.tick, || {
+                        "a fault kept a sample back, and nothing tells whether its input was there".to_owned()
+                    });
+                }
                 match source.by_tick.get(&needed).filter(|_| used) {
                     Some(index) => {
                         generation = source.track.stamp(*index).generation;
@@ -396,10 +464,11 @@ impl Reading<'_> {
         ticks
     }
 
-    /// Whether a body applied the command that was due at a tick, or had one that it did not believe.
+    /// Whether a body applied the command that was due at a tick, or had one that it did not believe. Its truth says so, or,
+    /// where it died before that, its measurement.
     fn applied(&self, tick: u64) -> bool {
-        let Some(truth) = self.outputs.get(1) else { return true };
-        let word = first_of(truth, tick).and_then(|index| truth.unsigned(index, "status"));
+        let status = |output: &Track| first_of(output, tick).and_then(|index| output.unsigned(index, "status"));
+        let word = self.outputs.iter().rev().find_map(status);
         word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
     }
 

@@ -28,6 +28,7 @@ use crate::serial::LineBook;
 use crate::state::{Count, Persist, Restore, Words};
 use crate::telemetry::{Grant, Ledger, LedgerError, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchReport};
 use plant::PlantNode;
+use std::path::Path;
 
 /// An upper bound on the state of a role, bytes, but for samples and what is remembered of them.
 const RECORD_BYTES: usize = 8 << 10;
@@ -366,6 +367,14 @@ fn record_bytes(ports: &Ports) -> usize {
 /// A ledger for a role that no successor will need.
 pub fn private_ledger(scenario: &Scenario, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
+}
+
+/// A ledger in a file, for a role that a successor may continue.
+///
+/// # Errors
+/// [`LedgerError`].
+pub fn shared_ledger(scenario: &Scenario, role: RoleId, path: &Path) -> Result<Ledger, LedgerError> {
+    Ledger::shared(path, ledger_words(scenario, role))
 }
 
 /// An upper bound on the shared memory that a run takes, bytes.

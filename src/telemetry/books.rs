@@ -16,10 +16,11 @@ pub struct TickBook {
     starved: u64,
     safe: u64,
     stalled: u64,
+    anew: u64,
     first_disturbed: Option<u64>,
 }
 
-persist_fields!(TickBook, next, executed, missed, starved, safe, stalled, first_disturbed);
+persist_fields!(TickBook, next, executed, missed, starved, safe, stalled, anew, first_disturbed);
 
 impl TickBook {
     /// The next tick to execute.
@@ -66,6 +67,12 @@ impl TickBook {
         self.stalled += stalls;
     }
 
+    /// Counts a life that began without the state of the one before: nothing from here on is as it would have been.
+    pub fn began_anew(&mut self) {
+        self.anew += 1;
+        self.disturbed(self.next);
+    }
+
     /// Notes a tick whose result may differ from an undisturbed run's.
     pub fn disturbed(&mut self, tick: u64) {
         self.first_disturbed.get_or_insert(tick);
@@ -80,6 +87,7 @@ impl TickBook {
             starved: self.starved,
             safe: self.safe,
             stalled: self.stalled,
+            anew: self.anew,
             first_disturbed: self.first_disturbed,
         }
     }

@@ -72,6 +72,9 @@ pub struct Ticks {
     /// Scripted stalls.
     #[serde(default)]
     pub stalled: u64,
+    /// Lives that began without the state of the one before.
+    #[serde(default)]
+    pub anew: u64,
     /// The first tick whose result differs from an undisturbed run's, if any does.
     pub first_disturbed: Option<u64>,
 }

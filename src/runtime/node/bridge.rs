@@ -187,7 +187,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.disturbed(self.book.next());
+            self.book.began_anew();
         }
         self.command.expect_repeats();
         Ok(())

@@ -315,7 +315,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.disturbed(self.book.next());
+            self.book.began_anew();
         }
         self.estimate.expect_repeats();
         self.channels.iter_mut().for_each(|channel| channel.measurement.expect_repeats());

@@ -119,7 +119,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.disturbed(self.book.next());
+            self.book.began_anew();
         }
         self.measurement.expect_repeats();
         Ok(())

@@ -31,6 +31,8 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
     unsettled: Option<u64>,
+    /// The first tick that no predecessor served, until this one executes its first: until then the body was alone.
+    alone_since: Option<u64>,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -55,6 +57,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             ledger: seat.ledger.reopened(),
             inherited: Inherited::Nothing,
             unsettled: None,
+            alone_since: None,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -76,9 +79,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         self.skip_to(tick);
     }
 
-    /// Sends what a predecessor was committed to, and takes over its body: it has moved on by itself since, and its actuators
-    /// have protected it.
-    fn take_over(&mut self, first_tick: u64) -> Result<(), BusError> {
+    /// Does what a predecessor was committed to. From then on its body moved by itself, and its actuators protected it.
+    fn take_over(&mut self) -> Result<(), BusError> {
         self.measurement.dispatch()?;
         self.measurement.finish()?;
         if let Some(tick) = self.unsettled.take() {
@@ -87,8 +89,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             self.truth.finish()?;
             self.plant.advance(1);
         }
-        self.plant.advance_alone(first_tick.saturating_sub(self.book.next()));
-        self.book.skip_to(first_tick);
+        self.alone_since = Some(self.book.next());
         Ok(())
     }
 
@@ -151,7 +152,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         self.inherited = restore(self)?;
         self.command.iter_mut().for_each(Input::expect_repeats);
         if self.inherited == Inherited::Counters {
-            self.book.disturbed(self.book.next());
+            self.book.began_anew();
         }
         Ok(())
     }
@@ -162,9 +163,14 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
             command.expect(Horizon::Due(grid));
         }
         if self.inherited != Inherited::Nothing {
-            return self.take_over(first_tick);
+            self.take_over()?;
         }
-        self.skip_to(first_tick);
+        if self.clock == Clock::Monotonic && self.alone_since.is_some() {
+            // Whether that tick will be missed too is not known yet.
+            self.book.skip_to(first_tick);
+        } else {
+            self.skip_to(first_tick);
+        }
         Ok(())
     }
 
@@ -223,7 +229,10 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
 
     fn skip_to(&mut self, tick: u64) {
         let missed = self.book.skip_to(tick);
-        self.plant.advance(missed);
+        match self.alone_since.take() {
+            Some(from) => self.plant.advance_alone(tick.saturating_sub(from)),
+            None => self.plant.advance(missed),
+        }
     }
 
     fn warm_up(&mut self) -> Result<(), BusError> {

@@ -1,0 +1,98 @@
+//! What a tick takes of the processor, per role and by how roles wait, in whole runs; beside a thread that only sleeps to
+//! each tick.
+//!
+//! The kernel's own account of each process. Must not ask a process of the run for anything.
+
+use super::hop::in_the_leaders_place;
+use super::watch::{Process, Watch};
+use super::{Bench, BenchError, Board, Row};
+use crate::clock::{Grid, monotonic_ns, wait_until};
+use rustix::time::{ClockId, clock_gettime};
+use std::fs;
+use std::time::{Duration, Instant};
+
+/// How roles wait, as `realtime.wake` has it.
+const WAKES: [&str; 3] = ["event", "spin", "auto"];
+const PERIOD_NS: u64 = 1_000_000;
+/// How long before a tick a plant wakes to spin, ns.
+const LEAD_NS: u64 = 60_000;
+
+/// Measures the row.
+pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+    let (rounds, window) = (bench.size(3, 1), bench.size(Duration::from_secs(2), Duration::from_millis(300)));
+    for round in 1..=rounds {
+        for wake in WAKES {
+            bench.next(&format!("processor: {wake}, round {round} of {rounds}"))?;
+            for (process, us) in per_tick(bench, wake, window)? {
+                board.add(Row::Processor, &format!("{process}, {wake}"), "us/tick", Some("bare sleep"), us);
+            }
+        }
+        let ticks = window.as_nanos() as u64 / PERIOD_NS;
+        for (name, lead_ns) in [("bare sleep", 0), ("bare sleep and spin", LEAD_NS)] {
+            let us = bare(board, ticks, lead_ns)?;
+            board.add(Row::Processor, name, "us/tick", None, us);
+        }
+    }
+    Ok(())
+}
+
+/// What each process of a run takes per tick, µs.
+fn per_tick(bench: &mut Bench<'_>, wake: &str, window: Duration) -> Result<Vec<(String, f64)>, BenchError> {
+    let duration = format!("duration_s={:?}", window.as_secs_f64() + bench.size(2.0, 1.0));
+    let wake = format!("realtime.wake={wake}");
+    let mut taken = Vec::new();
+    let mut midway = |processes: &[Process], period_ns: u64| {
+        let began = Instant::now();
+        let before: Vec<_> = processes.iter().map(|process| processor_ns(process.pid)).collect();
+        std::thread::sleep(window);
+        let ticks = began.elapsed().as_nanos() as f64 / period_ns as f64;
+        let after = processes.iter().zip(before).filter_map(|(process, before)| {
+            let ns = processor_ns(process.pid)?.checked_sub(before?)?;
+            Some((process.name.clone(), ns as f64 / 1e3 / ticks))
+        });
+        taken = after.collect();
+    };
+    Watch { overrides: &[&duration, "clock=realtime", &wake], environment: Vec::new(), midway: &mut midway }
+        .run(bench)?;
+    Ok(taken)
+}
+
+/// The processor time of all threads of a process so far, ns; none if there is no such process or the kernel keeps no account.
+fn processor_ns(pid: i32) -> Option<u64> {
+    let tasks = fs::read_dir(format!("/proc/{pid}/task")).ok()?.flatten();
+    let of = |task: fs::DirEntry| {
+        let account = fs::read_to_string(task.path().join("schedstat")).ok()?;
+        account.split_whitespace().next()?.parse::<u64>().ok()
+    };
+    tasks.map(of).sum()
+}
+
+/// What a thread in the leader's place takes that only waits for each tick, with this lead, µs per tick.
+fn bare(board: &mut Board, ticks: u64, lead_ns: u64) -> Result<f64, BenchError> {
+    in_the_leaders_place(board, |_| {
+        let grid = Grid { epoch_ns: monotonic_ns() + PERIOD_NS, period_ns: PERIOD_NS };
+        let before = clock_gettime(ClockId::ThreadCPUTime);
+        for tick in 0..ticks {
+            wait_until(grid.due_ns(tick), lead_ns);
+        }
+        let after = clock_gettime(ClockId::ThreadCPUTime);
+        let ns = (after.tv_sec - before.tv_sec) * 1_000_000_000 + after.tv_nsec - before.tv_nsec;
+        Ok(ns as f64 / 1e3 / ticks as f64)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_works_has_an_account_and_one_that_is_none_has_not() {
+        let own = std::process::id() as i32;
+        let before = processor_ns(own).unwrap();
+        let own_time = || clock_gettime(ClockId::ThreadCPUTime).tv_nsec;
+        let began = own_time();
+        while own_time().abs_diff(began) < 20_000_000 {}
+        assert!(processor_ns(own).unwrap() > before + 10_000_000);
+        assert_eq!(processor_ns(-1), None);
+    }
+}
