@@ -56,6 +56,7 @@ pub fn line_words(body: &str, book: &LineBook) -> String {
         },
     );
     let ill = [
+        (book.restarts, "times the device lost the run, its body at the initial state again"),
         (book.crc_errors, "CRC errors"),
         (book.malformed, "malformed blocks"),
         (book.dropped_bytes, "bytes dropped"),
