@@ -6,7 +6,7 @@
 use super::RecordError;
 use super::layout::{CDR_HEADER, Layout};
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
-use crate::config::{Scenario, ScriptedFault};
+use crate::config::{RunId, Scenario, ScriptedFault};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::Record;
@@ -32,6 +32,8 @@ pub struct Recording {
 /// What a recording says of its run.
 #[derive(Debug, Clone, Default)]
 pub struct RunInfo {
+    /// The run's identifier, if it has one.
+    pub run: Option<RunId>,
     /// The program's version and source revision.
     pub version: String,
     /// The source revision.
@@ -311,7 +313,9 @@ impl RunInfo {
         if text("schema")? != SCHEMA {
             return Err(format!("it is laid out as {}, and this version reads {SCHEMA}", text("schema")?));
         }
+        let run = run.get("run").map(|id| id.parse()).transpose().map_err(|_| "`run` is no identifier".to_owned())?;
         Ok(Self {
+            run,
             version: text("version")?,
             revision: text("revision")?,
             scenario: text("scenario")?,

@@ -30,7 +30,7 @@ mod summary;
 mod tables;
 mod traces;
 
-use crate::config::ConfigError;
+use crate::config::{ConfigError, RunId};
 use crate::record::RecordError;
 use source::Source;
 use std::io;
@@ -78,6 +78,17 @@ pub enum ReportError {
         /// What is wrong with it.
         reason: String,
     },
+    /// The directory holds files of two runs.
+    #[error(
+        "{} is of {} and {} of {}: a page shows one run; remove the files of one, or give its run.mcap alone",
+        first.0.display(), named(first.1), second.0.display(), named(second.1)
+    )]
+    TwoRuns {
+        /// A file and its run.
+        first: (PathBuf, Option<RunId>),
+        /// A file of another run.
+        second: (PathBuf, Option<RunId>),
+    },
     /// The scenario is refused.
     #[error("the run's scenario is refused by this version: {0}")]
     Scenario(#[from] ConfigError),
@@ -98,6 +109,10 @@ pub enum ReportError {
         /// The system's reason.
         source: io::Error,
     },
+}
+
+fn named(run: Option<RunId>) -> String {
+    run.map_or("a run without an identifier".to_owned(), |run| format!("run {run}"))
 }
 
 /// A page.

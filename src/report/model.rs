@@ -6,6 +6,7 @@ use super::chart::{Marks, Picture, marks};
 use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
+use crate::config::RunId;
 use crate::record::RunInfo;
 
 /// A page.
@@ -13,6 +14,8 @@ use crate::record::RunInfo;
 pub struct Model {
     /// What it is of.
     pub title: String,
+    /// The run, if it is known.
+    pub run: Option<RunId>,
     /// When and how that was made.
     pub subtitle: String,
     /// The verdict in a word, and whether it is a good one; none where nobody judged.
@@ -93,7 +96,7 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
         true => ("accepted".to_owned(), Some(true)),
         false => ("not accepted".to_owned(), Some(false)),
     });
-    Ok(Model { title, subtitle, verdict, remarks, marks: marks(&time, &events), sections })
+    Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks: marks(&time, &events), sections })
 }
 
 fn incomplete(info: &RunInfo) -> Vec<String> {
