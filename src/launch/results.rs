@@ -25,6 +25,9 @@ const RECORDING_HEAD: u64 = 64;
 const RECORDING_PROFILE: &[u8] = b"\x04\0\0\0ros2";
 const RECORDING_LIBRARY: &[u8] = b"corotate ";
 
+/// Whether a file's content is an older run's.
+type IsOurs = fn(&[u8]) -> bool;
+
 /// Why a directory cannot take a run's results.
 #[derive(Debug, thiserror::Error)]
 pub enum ResultsError {
@@ -81,7 +84,7 @@ fn failed(path: &Path) -> impl FnOnce(io::Error) -> ResultsError {
 
 /// The files in the place of a run's, all of which are an older run's.
 fn older(directory: &Path) -> Result<Vec<PathBuf>, ResultsError> {
-    let kinds: [(&str, fn(&[u8]) -> bool); 5] = [
+    let kinds: [(&str, IsOurs); 5] = [
         (SUMMARY, is_summary),
         (SCENARIO, names_run),
         (HASHES, names_run),
@@ -110,7 +113,7 @@ fn older(directory: &Path) -> Result<Vec<PathBuf>, ResultsError> {
 }
 
 /// The file if it exists and is ours.
-fn known(path: PathBuf, limit: u64, is_ours: fn(&[u8]) -> bool) -> Result<Option<PathBuf>, ResultsError> {
+fn known(path: PathBuf, limit: u64, is_ours: IsOurs) -> Result<Option<PathBuf>, ResultsError> {
     let about = match fs::symlink_metadata(&path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
         about => about.map_err(failed(&path))?,

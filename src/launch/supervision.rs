@@ -240,13 +240,14 @@ impl Member {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
-        if state == RoleState::Running && !present {
-            return fail("it left before its last tick".to_owned());
-        }
         let timeout_s = scenario.supervision.heartbeat_timeout_s;
         let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
+        }
+        // Not before: a program that was started again in its seat is not there for a moment.
+        if state == RoleState::Running && !present {
+            return fail("it left before its last tick".to_owned());
         }
         // One that was killed has left once its remains are cleared.
         bus.clear_dead();

@@ -251,6 +251,46 @@ mod tests {
     use crate::runtime::{depths, topic};
     use crate::sample::{RateMeasurement, RateTruth};
 
+    fn seen(ticks: &[u64]) -> Seen {
+        let mut seen = Seen::default();
+        ticks.iter().for_each(|&tick| seen.take(Stamp { tick, generation: 1, ..Stamp::default() }));
+        seen
+    }
+
+    /// What keeps a reader waiting is missing, whatever comes after it; what it could still take is there.
+    #[test]
+    fn a_tick_is_missing_if_it_was_not_among_the_last_in_a_row() {
+        let has = |ticks: &[u64], tick| seen(ticks).has(tick);
+        assert!(!has(&[], 0));
+        assert!(has(&[0, 1, 2], 2) && has(&[0, 1, 2], 0) && !has(&[0, 1, 2], 3));
+        assert!(!has(&[0, 1, 3], 2) && !has(&[0, 1, 3, 4, 5], 2), "instead came the next");
+        assert!(has(&[0, 1, 3, 2], 2), "it came late");
+        assert!(has(&[0, 1, 2, 1], 2), "an old one came again");
+        assert!(has(&[7, 8, 9], 8), "the launcher looked too late for the first");
+        assert!(!has(&[u64::MAX, u64::MAX], 0) && has(&[u64::MAX], u64::MAX));
+    }
+
+    /// Before the first sample generation 0 is a warm-up; after it readers take it for a sample, and do not wait.
+    #[test]
+    fn a_warm_up_is_no_sample_and_a_fallen_generation_is_one() {
+        let mut seen = Seen::default();
+        seen.take(Stamp::default());
+        assert!(!seen.has(0) && seen.next_tick == 0);
+        seen.take(Stamp { generation: 1 | VOID, ..Stamp::default() });
+        seen.take(Stamp { tick: 1, ..Stamp::default() });
+        assert!(seen.has(0) && seen.has(1) && seen.came.is_some_and(|came| came.generation == 0));
+    }
+
+    #[test]
+    fn the_words_say_what_is_missing_and_what_came() {
+        let stamp = |tick, generation| Some(Stamp { tick, generation, ..Stamp::default() });
+        let words = |came| Lack::Sample { signal: Signal::Measurement, tick: 41, came }.to_string();
+        assert_eq!(words(None), "its measurement of tick 41 is missing; none has come");
+        assert!(words(stamp(40, 1)).ends_with("; the last that came is of tick 40"));
+        assert!(words(stamp(43, 1)).ends_with("; instead came tick 43"));
+        assert!(words(stamp(41, 0)).ends_with("; instead came tick 41 of generation 0, which marks a warm-up"));
+    }
+
     #[test]
     fn a_silent_role_is_there_runs_and_is_done_by_its_samples() {
         let overrides = ["clock=lockstep", "duration_s=0.002", "accept={}"].map(str::to_owned);

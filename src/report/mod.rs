@@ -81,13 +81,11 @@ pub enum ReportError {
     /// The directory holds files of two runs.
     #[error(
         "{} is of {} and {} of {}: a page shows one run; remove the files of one, or give its run.mcap alone",
-        first.0.display(), named(first.1), second.0.display(), named(second.1)
+        files[0].0.display(), named(files[0].1), files[1].0.display(), named(files[1].1)
     )]
     TwoRuns {
-        /// A file and its run.
-        first: (PathBuf, Option<RunId>),
-        /// A file of another run.
-        second: (PathBuf, Option<RunId>),
+        /// Two of them, each with its run.
+        files: Box<[(PathBuf, Option<RunId>); 2]>,
     },
     /// The scenario is refused.
     #[error("the run's scenario is refused by this version: {0}")]

@@ -95,7 +95,7 @@ impl Source {
         files.extend(self.curves.iter().map(curve));
         let Some((first, others)) = files.split_first() else { return Ok(()) };
         match others.iter().find(|other| other.1 != first.1) {
-            Some(second) => Err(ReportError::TwoRuns { first: first.clone(), second: second.clone() }),
+            Some(second) => Err(ReportError::TwoRuns { files: Box::new([first.clone(), second.clone()]) }),
             None => Ok(()),
         }
     }
