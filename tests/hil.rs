@@ -10,7 +10,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::config::Scenario;
 use corotate::runtime::{
-    Gate, Input, Poll, RoleId, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
+    Gate, Input, Poll, RoleId, Seek, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
 };
 use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
@@ -19,7 +19,9 @@ use corotate::with_rig;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// By how much a value that the foreign follower published, or that our controller made of it, may differ from the run
@@ -80,7 +82,7 @@ fn run_with_follower(bench: &Bench, clock: &str, options: &[&str]) -> Done {
 }
 
 /// The cases of a JUnit file: name, and the element and message of what is not well.
-fn cases(bench: &Bench) -> Vec<(String, Option<String>)> {
+fn cases_of(bench: &Bench) -> Vec<(String, Option<String>)> {
     let text = std::fs::read_to_string(bench.path("verdict.xml")).unwrap();
     let document = roxmltree::Document::parse(&text).unwrap();
     let case = |node: roxmltree::Node<'_, '_>| {
@@ -96,7 +98,7 @@ fn cases(bench: &Bench) -> Vec<(String, Option<String>)> {
 /// Asserts that the run was accepted as a CI would see it.
 fn assert_accepted(bench: &Bench) {
     let expected = ["run", "books", "estimate_error_rad_s_max", "sync_error_rad_s_max"];
-    assert_eq!(cases(bench), expected.map(|name| (name.to_owned(), None)));
+    assert_eq!(cases_of(bench), expected.map(|name| (name.to_owned(), None)));
 }
 
 fn tell(clock: &str, run: &Done) -> Value {
@@ -332,7 +334,7 @@ fn a_waiting_run_leaves_the_seat_that_the_command_prints_and_ends_in_order() {
     let done = running.wait();
     assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");
     assert!(done.stderr.contains("waiting for follower") && done.stderr.contains(seat.to_str().unwrap()), "{done:?}");
-    assert_eq!(cases(&bench)[0], ("run".to_owned(), Some("error: ended by signal 2 before its last tick".into())));
+    assert_eq!(cases_of(&bench)[0], ("run".to_owned(), Some("error: ended by signal 2 before its last tick".into())));
     bench.assert_clean(&domains);
 }
 
@@ -382,14 +384,200 @@ fn a_follower_that_is_killed_ends_the_run() {
         follower.signal(SIGKILL);
         let (done, _) = (running.wait(), follower.wait());
         assert_eq!(done.code, Some(4), "{clock} {options:?}: {done:?}");
-        let died = done.stderr.lines().find(|line| line.contains("follower died at tick ")).unwrap();
+        let died = done.stderr.lines().find(|line| line.contains("follower failed at tick ")).unwrap();
         assert!(died.contains(cause) && died.contains("the run ends"), "{clock} {options:?}: {died}");
-        let (name, trouble) = cases(&bench).remove(0);
+        let (name, trouble) = cases_of(&bench).remove(0);
         assert!(name == "run" && trouble.is_some_and(|trouble| trouble.contains(cause)), "{clock} {options:?}");
         let summary: Value = serde_json::from_str(&done.stdout).unwrap();
         assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
         bench.assert_clean(&domains);
     }
+}
+
+/// A program in the follower's seat that says nothing of itself. `misbehave` changes its measurement of a tick before it is
+/// sent, and tells whether measurement and truth are sent.
+struct Partner {
+    on: Arc<AtomicBool>,
+    /// The tick that it is at.
+    tick: Arc<AtomicU64>,
+    thread: Option<JoinHandle<()>>,
+}
+
+type Misbehave = fn(u64, &mut RateMeasurement) -> (bool, bool);
+
+impl Partner {
+    fn new(domain: &Path, misbehave: Misbehave) -> Self {
+        let (on, tick) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicU64::new(0)));
+        let (domain, flag, told) = (domain.to_owned(), on.clone(), tick.clone());
+        let thread = std::thread::spawn(move || Self::serve(&domain, misbehave, &flag, &told));
+        Self { on, tick, thread: Some(thread) }
+    }
+
+    fn serve(domain: &Path, misbehave: Misbehave, on: &AtomicBool, told: &AtomicU64) {
+        let scenario = Scenario::load(&domain.join("scenario.toml"), &[]).unwrap();
+        let bus = IoxBus::enter(&Domain::join(domain).unwrap(), "partner", depths(&scenario)).unwrap();
+        let signal = |signal| topic(&scenario, "follower", signal);
+        let mut command = Input::<IoxBus, RateCommand>::watch(&bus, &signal(Signal::Command), Reader::Role).unwrap();
+        let mut schedule = bus.reader::<Schedule>(&topic(&scenario, "run", Signal::Schedule), Reader::Role).unwrap();
+        let mut measurement = bus.writer::<RateMeasurement>(&signal(Signal::Measurement), 1).unwrap();
+        let mut truth = bus.writer::<RateTruth>(&signal(Signal::Truth), 1).unwrap();
+        let (mut next, mut phase) = (0, Phase::Gather);
+        while on.load(Ordering::Relaxed) {
+            while schedule.advance().unwrap() {
+                phase = Phase::from_number(schedule.current().unwrap().phase);
+            }
+            let ready = next == 0 || command.seek(next - 1).unwrap() != Seek::NotYet;
+            if phase != Phase::Run || !ready || next > scenario.last_tick {
+                std::thread::sleep(Duration::from_micros(50));
+                continue;
+            }
+            let mut sample = RateMeasurement { valid: 0b111, ..RateMeasurement::default() };
+            (sample.stamp.tick, sample.stamp.generation) = (next, 1);
+            let (measures, tells) = misbehave(next, &mut sample);
+            if measures {
+                measurement.send(|slot| *slot = sample).unwrap();
+            }
+            if tells {
+                truth.send(|slot| (slot.stamp.tick, slot.stamp.generation) = (next, 1)).unwrap();
+            }
+            next += 1;
+            told.store(next, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Drop for Partner {
+    fn drop(&mut self) {
+        self.on.store(false, Ordering::Relaxed);
+        let ended = self.thread.take().unwrap().join();
+        assert!(std::thread::panicking() || ended.is_ok(), "the partner failed");
+    }
+}
+
+/// From this tick on partners misbehave.
+const BAD_TICK: u64 = 41;
+
+/// Lockstep waits for a sample that will never come: the run says for whose, and for which, and ends within the limit.
+#[test]
+fn a_partner_that_keeps_the_run_waiting_is_named_with_what_came_instead() {
+    let cases: [(Misbehave, &str, u64, &str); 4] = [
+        (|tick, _| (tick < BAD_TICK, tick < BAD_TICK), "measurement", BAD_TICK, "the last that came is of tick 40"),
+        (|tick, _| (true, tick < BAD_TICK), "truth", BAD_TICK, "the last that came is of tick 40"),
+        (
+            |tick, sample| {
+                sample.stamp.tick += if tick < BAD_TICK { 0 } else { 2 };
+                (true, true)
+            },
+            "measurement",
+            BAD_TICK,
+            "instead came tick 43",
+        ),
+        (
+            |_, sample| {
+                sample.stamp.generation = 0;
+                (true, true)
+            },
+            "measurement",
+            0,
+            "instead came tick 0 of generation 0, which marks a warm-up",
+        ),
+    ];
+    for (misbehave, signal, tick, instead) in cases {
+        let bench = Bench::new();
+        let (running, _) = start_waiting(&bench, &["--clock", "lockstep", "--set", "launch.external_timeout_s=6"]);
+        let domains = bench.domains();
+        let partner = Partner::new(&domains[0], misbehave);
+        let done = running.wait();
+        drop(partner);
+        assert_eq!(done.code, Some(4), "{signal}: {done:?}");
+        let lack = format!("its {signal} of tick {tick} is missing; {instead}");
+        let cause = format!("it kept the run waiting for 6 s: {lack}");
+        for line in [
+            format!("waiting for follower (external) for 5 s: {lack}"),
+            format!("corotate: follower failed at tick {tick}: {cause}; the run ends"),
+        ] {
+            assert_eq!(done.stderr.lines().filter(|told| *told == line).count(), 1, "{line}: {done:?}");
+        }
+        assert!(!done.stderr.contains("every tick undisturbed"), "{done:?}");
+        assert!(done.stderr.contains(" of 10001 ticks)"), "{done:?}");
+        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        let incident = &summary["incidents"][0];
+        let told = (incident["role"].as_str(), incident["tick"].as_u64(), incident["cause"].as_str());
+        assert_eq!(told, (Some("follower"), Some(tick), Some(&*cause)), "{incident}");
+        assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+        let (name, trouble) = cases_of(&bench).remove(0);
+        assert!(name == "run" && trouble.is_some_and(|trouble| trouble.contains(&lack)));
+        bench.assert_clean(&domains);
+    }
+}
+
+/// A signal ends such a run as any other; what never ran is not called undisturbed.
+#[test]
+fn a_run_that_was_interrupted_while_it_waited_is_not_called_undisturbed() {
+    let bench = Bench::new();
+    let (running, _) = start_waiting(&bench, &["--clock", "lockstep"]);
+    let domains = bench.domains();
+    let partner = Partner::new(&domains[0], |tick, _| (tick < BAD_TICK, tick < BAD_TICK));
+    await_some(|| (partner.tick.load(Ordering::Relaxed) >= BAD_TICK).then_some(()));
+    running.signal(SIGINT);
+    let done = running.wait();
+    drop(partner);
+    assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");
+    assert!(done.stderr.contains("(the run ended after ") && !done.stderr.contains("undisturbed"), "{done:?}");
+    bench.assert_clean(&domains);
+}
+
+/// Nobody comes: the others wait with the launcher, however long, and with a limit the run ends by name.
+#[test]
+fn a_partner_that_never_connects_is_named_and_waited_for_as_long_as_allowed() {
+    let bench = Bench::new();
+    let limits = ["--set", "launch.external_timeout_s=8", "--set", "launch.startup_timeout_s=3"];
+    let (running, _) = start_waiting(&bench, &[&["--clock", "lockstep"], &limits[..]].concat());
+    let domains = bench.domains();
+    let done = running.wait();
+    assert_eq!(done.code, Some(4), "{done:?}");
+    assert!(done.stderr.contains("waiting for follower (external) for 5 s: it has not connected"), "{done:?}");
+    let cause = "follower failed at tick 0: it kept the run waiting for 8 s: it has not connected";
+    assert!(done.stderr.contains(cause), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{summary:#}");
+    assert!(cases_of(&bench)[0].1.as_ref().is_some_and(|trouble| trouble.contains(cause)));
+    bench.assert_clean(&domains);
+}
+
+/// Nothing that is rejected goes unseen, whoever sent it: where a writer keeps no books, its reader's are told.
+#[test]
+fn what_a_partner_without_books_sends_is_counted_where_it_is_read() {
+    let bench = Bench::new();
+    let (running, _) = start_waiting(&bench, &["--clock", "lockstep", "--duration", "0.1", "--set", "accept={}"]);
+    let domains = bench.domains();
+    let partner = Partner::new(&domains[0], |tick, sample| {
+        sample.omega_rad_s[1] = if tick < BAD_TICK { 0.0 } else { f64::NAN };
+        // A generation that falls is another restarted sender's, and no reason to wait.
+        sample.stamp.generation = u64::from(tick < BAD_TICK);
+        (true, true)
+    });
+    let done = running.wait();
+    drop(partner);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let links = summary["books"]["links"].as_array().unwrap();
+    let link = links.iter().find(|link| link["service"] == "corotate/hil-pair/follower/measurement").unwrap();
+    let expected = serde_json::json!({
+        "service": "corotate/hil-pair/follower/measurement", "reader": "controller", "published": null, "received": 101,
+        "skipped": null, "gaps": 0, "unread": null, "void": [null, 0], "stale": 0, "rejected": 60, "injected": null,
+    });
+    assert_eq!(*link, expected);
+    assert_eq!(summary["books"]["rejected_samples"], 60);
+    assert_eq!(summary["books"]["balanced"], true);
+    assert_eq!(summary["state"]["first_disturbed_tick"], BAD_TICK);
+    let told = "corotate/hil-pair/follower/measurement at controller: 60 rejected, 0 stale, 0 void of 101 received";
+    assert!(done.stderr.contains(told), "{done:?}");
+    let verdict = std::fs::read_to_string(bench.path("verdict.xml")).unwrap();
+    for name in ["rejected_samples", "rejected_samples of corotate/hil-pair/follower/measurement at controller"] {
+        assert!(verdict.contains(&format!("<property name=\"{name}\" value=\"60\"/>")), "{verdict}");
+    }
+    bench.assert_clean(&domains);
 }
 
 /// A program that leaves before the ticks run is waited for again.
@@ -419,7 +607,7 @@ fn a_report_that_is_none_is_told() {
     let follower = start_follower(&bench, &seat, &["--silent"]);
     let (done, follower) = (running.wait(), follower.wait());
     assert_eq!((done.code, follower.code), (Some(1), Some(0)), "{done:?} {follower:?}");
-    let books = cases(&bench).into_iter().find(|(name, _)| name == "books").unwrap().1.unwrap();
+    let books = cases_of(&bench).into_iter().find(|(name, _)| name == "books").unwrap().1.unwrap();
     assert!(books.starts_with("failure: ") && books.contains("follower: its report is none: missing field"), "{books}");
 }
 

@@ -242,6 +242,101 @@ fn latencies_are_drawn_from_the_histograms_of_the_run() {
     );
 }
 
+/// Every file under a directory.
+fn files(directory: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
+    entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
+}
+
+fn run_id(directory: &Path) -> String {
+    summary(directory)["run"].as_str().unwrap().to_owned()
+}
+
+/// A run of half a second in real time, which has every kind of file.
+fn realtime(bench: &Bench, out: &str, options: &[&str]) -> Done {
+    let file = shipped("rigid-pair");
+    let common = ["run", file.to_str().unwrap(), "--tick-hz", "200", "--duration", "0.5", "--set", "accept={}"];
+    bench.run(&[&common[..], &["--out", out], options].concat())
+}
+
+/// Each file names its run, and the next run into the directory leaves nothing of the one before.
+#[test]
+fn a_directory_holds_one_run_whose_files_name_it() {
+    let bench = Bench::new();
+    let out = bench.path("out");
+    let verdict = out.join("verdict.xml");
+    let done = realtime(&bench, "out", &["--record", "--junit", verdict.to_str().unwrap()]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert_eq!(report(&bench, &out, &[]).code, Some(0));
+    let first = run_id(&out);
+    let names = |run: &str| {
+        let mut files = files(&out);
+        files.sort();
+        for file in &files {
+            let bytes = std::fs::read(file).unwrap();
+            assert!(bytes.windows(32).any(|window| window == run.as_bytes()), "{} names its run", file.display());
+        }
+        files
+    };
+    let found = names(&first);
+    for name in ["summary.json", "scenario.toml", "hashes.txt", "run.mcap", "report.html", "latency/latency.hlog"] {
+        assert!(found.contains(&out.join(name)), "{name}: {found:?}");
+    }
+    assert!(found.contains(&out.join("latency/controller.step.hgrm")), "{found:?}");
+    std::fs::remove_file(verdict).unwrap();
+    std::fs::write(out.join("latency/nobody.step.hgrm"), format!("# run {first}\n")).unwrap();
+    let again =
+        bench.run(&["run", out.join("scenario.toml").to_str().unwrap(), "--out", "out", "--set", "record=false"]);
+    assert_eq!(again.code, Some(0), "{again:?}");
+    let second = run_id(&out);
+    assert_ne!(first, second);
+    let found = names(&second);
+    assert!(!found.iter().any(|file| file.ends_with("run.mcap") || file.ends_with("report.html")), "{found:?}");
+    assert!(!out.join("latency/nobody.step.hgrm").exists());
+}
+
+/// Files of two runs are never joined, whichever they are; the error names both.
+#[test]
+fn files_of_two_runs_are_not_shown_as_one() {
+    let bench = Bench::new();
+    for out in ["a", "b"] {
+        assert_eq!(realtime(&bench, out, &["--record"]).code, Some(0));
+    }
+    let (a, b) = (bench.path("a"), bench.path("b"));
+    assert_eq!(report(&bench, &a, &[]).code, Some(0));
+    for name in ["run.mcap", "scenario.toml", "latency/controller.step.hgrm"] {
+        let own = std::fs::read(a.join(name)).unwrap();
+        std::fs::copy(b.join(name), a.join(name)).unwrap();
+        let done = report(&bench, &a, &[]);
+        assert_eq!(done.code, Some(2), "{name}: {done:?}");
+        for word in [name, "summary.json", &run_id(&a), &run_id(&b)] {
+            assert!(done.stderr.contains(word), "{name}: {word}: {done:?}");
+        }
+        std::fs::write(a.join(name), own).unwrap();
+    }
+    // One that does not say is not of this run either.
+    let scenario = Scenario::load(&a.join("scenario.toml"), &[]).unwrap();
+    std::fs::write(a.join("scenario.toml"), scenario.to_toml()).unwrap();
+    let done = report(&bench, &a, &[]);
+    assert!(done.code == Some(2) && done.stderr.contains("a run without an identifier"), "{done:?}");
+}
+
+/// A directory with somebody's own files of these names is refused before anything is removed or started.
+#[test]
+fn a_directory_with_a_file_of_somebody_else_is_refused() {
+    let bench = Bench::new();
+    let (out, own) = (bench.path("out"), "# my own scenario\nname = \"mine\"\n");
+    assert_eq!(realtime(&bench, "out", &["--record"]).code, Some(0));
+    std::fs::write(out.join("scenario.toml"), own).unwrap();
+    let before = files(&out);
+    let file = shipped("rigid-pair");
+    let done = bench.run(&["run", file.to_str().unwrap(), "--clock", "in-process", "--out", "out"]);
+    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(done.stderr.contains("scenario.toml") && done.stderr.contains("--out"), "{done:?}");
+    assert_eq!(files(&out), before);
+    assert_eq!(std::fs::read_to_string(out.join("scenario.toml")).unwrap(), own);
+}
+
 #[test]
 fn what_is_missing_is_said_with_the_way_to_get_it() {
     let bench = Bench::new();

@@ -521,6 +521,31 @@ fn a_bridge_that_was_killed_can_be_started_again() {
     bench.assert_clean(&[domain]);
 }
 
+/// A device that loses the run in the midst begins its body anew: the loop goes on, and is told what happened.
+#[test]
+fn a_device_that_was_restarted_is_told_as_that() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let device = Powered::reference(&cable.device.path);
+    let arguments = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "60", "--set", "accept={}"];
+    let (run, domain) = start(&bench, &shipped("rigid-pair"), &arguments);
+    let bridge = bridge(&bench, &cable.host.path, &domain, &["--patience", "60"]);
+    cable.await_ticks();
+    drop(device);
+    let _device = Powered::reference(&cable.device.path);
+    let (run, bridge) = (run.wait(), bridge.wait());
+    assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
+    let told = "1 times the device lost the run, its body at the initial state again";
+    for text in [&bridge.stderr, &run.stderr] {
+        assert!(text.contains(told) && text.contains("2 handshakes") && !text.contains("no fault"), "{text}");
+    }
+    let summary = summary(&run);
+    assert_eq!(number(&summary["lines"]["follower"]["restarts"]), 1);
+    assert!(number(&summary["state"]["first_disturbed_tick"]) > 0, "{}", summary["state"]);
+    assert_ne!(summary["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
+    bench.assert_clean(&[domain]);
+}
+
 /// The device hears of the end, and is safe at once.
 #[test]
 fn a_bridge_that_is_interrupted_leaves_its_device_safe() {

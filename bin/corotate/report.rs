@@ -55,6 +55,7 @@ fn exit_of(error: &ReportError) -> Exit {
         | ReportError::NoRun { .. }
         | ReportError::Summary { .. }
         | ReportError::Latency { .. }
+        | ReportError::TwoRuns { .. }
         | ReportError::Scenario(_) => Exit::Usage,
     }
 }

@@ -1,8 +1,10 @@
 //! `corotate run`: one scenario from file to verdict.
 
 use crate::{Exit, fail, foxglove, print};
-use corotate::config::{ClockKind, SHIPPED, Scenario};
-use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, junit, table, write_run};
+use corotate::config::{ClockKind, RunId, SHIPPED, Scenario};
+use corotate::launch::{
+    Action, Launch, LaunchError, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
+};
 use corotate::runtime::seat_path;
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -116,9 +118,13 @@ impl Failure {
 
 /// Runs a scenario.
 pub fn run(arguments: &Arguments) -> Exit {
-    let loaded = arguments.scenario();
+    let run = match new_run() {
+        Ok(run) => run,
+        Err(error) => return fail(Exit::Failure, &format!("no random numbers for the run's identifier: {error}")),
+    };
+    let loaded = arguments.scenario().map(|scenario| Scenario { run: Some(run), ..scenario });
     let name = loaded.as_ref().map_or_else(|_| arguments.stem(), |scenario| scenario.name.clone());
-    let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, ended));
+    let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, ended));
     // Whoever reads the file finds no older verdict, however this run ends.
     if let Err(exit) = write_verdict(Err("the run did not come to an end")) {
         return exit;
@@ -135,10 +141,10 @@ pub fn run(arguments: &Arguments) -> Exit {
     }
 }
 
-fn write_junit(path: &Path, name: &str, ended: Result<&Summary, &str>) -> Result<(), Exit> {
+fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str>) -> Result<(), Exit> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let made = directory.map_or(Ok(()), std::fs::create_dir_all);
-    made.and_then(|()| std::fs::write(path, junit(name, ended)))
+    made.and_then(|()| std::fs::write(path, junit(name, run, ended)))
         .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
 }
 
@@ -147,6 +153,12 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
     let started = jiff::Timestamp::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    if arguments.out.is_some() {
+        claim(&directory).map_err(|error| match error {
+            ResultsError::Foreign { .. } => Failure::new(Exit::Usage, error),
+            ResultsError::Directory { .. } => Failure::new(Exit::Failure, error),
+        })?;
+    }
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
@@ -267,6 +279,10 @@ impl Screen {
                 }
             }
             Progress::Waiting { .. } => {}
+            Progress::External(words) => match &self.bar {
+                Some(bar) => bar.suspend(|| eprintln!("{words}")),
+                None => eprintln!("{words}"),
+            },
             Progress::Running { tick, last_tick, metric } => {
                 let bar = self.bar.get_or_insert_with(|| bar(*last_tick));
                 bar.set_position(*tick);

@@ -159,7 +159,7 @@ pub fn write_results(directory: &Path, results: &Results) -> io::Result<()> {
         if let Some(pooled) = &figure.pooled {
             let name = figure.name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
             let mut out = BufWriter::new(fs::File::create(latency.join(format!("{}.{name}.hgrm", figure.row.name())))?);
-            write_hgrm(pooled, &mut out)?;
+            write_hgrm(pooled, None, &mut out)?;
             out.flush()?;
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! Must not know what any key means.
 
-use super::ConfigError;
+use super::{ConfigError, RunId};
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -26,6 +26,8 @@ pub struct Document {
     /// Key path, as `follower[0].name`, to `file:line` or `--set …`.
     places: BTreeMap<String, String>,
     origin: String,
+    /// The run whose file it is, as its first line says.
+    run: Option<RunId>,
     /// Top-level keys that were split off: as good as known.
     elsewhere: Vec<String>,
 }
@@ -76,9 +78,15 @@ impl Document {
             let line = 1 + ends.partition_point(|end| *end < offset);
             places.insert(path, format!("{origin}:{line}"));
         });
-        let document = Self { table, places, origin: origin.to_owned(), elsewhere: Vec::new() };
+        let run = text.lines().next().and_then(RunId::in_comments_of);
+        let document = Self { table, places, origin: origin.to_owned(), run, elsewhere: Vec::new() };
         document.refuse_absurd()?;
         Ok(document)
+    }
+
+    /// The run whose file it is.
+    pub fn run(&self) -> Option<RunId> {
+        self.run
     }
 
     /// Applies one override of the form `key=value`; the value is TOML, or a bare word taken as a string.
@@ -114,7 +122,7 @@ impl Document {
     pub fn split_off(&mut self, keys: &[&str]) -> Self {
         let table = keys.iter().filter_map(|key| self.table.remove_entry(*key)).collect();
         self.elsewhere.extend(keys.iter().map(|key| (*key).to_owned()));
-        Self { table, places: self.places.clone(), origin: self.origin.clone(), elsewhere: Vec::new() }
+        Self { table, places: self.places.clone(), origin: self.origin.clone(), run: None, elsewhere: Vec::new() }
     }
 
     /// Refuses a list, as `[[key]]` makes one, at top-level keys that hold one table each: serde would take its elements

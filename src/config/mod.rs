@@ -7,6 +7,7 @@ mod document;
 mod error;
 mod fault;
 mod raw;
+mod run_id;
 mod scenario;
 mod watchdog;
 
@@ -15,6 +16,7 @@ pub use document::Document;
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
+pub use run_id::{NoRunId, RunId};
 pub use scenario::Scenario;
 
 pub(crate) use document::nearest;

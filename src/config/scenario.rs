@@ -2,7 +2,7 @@
 
 use super::fault::{self, ScriptedFault};
 use super::raw::{Launch, Policy, Raw};
-use super::{ClockKind, ConfigError, Document, Problem, Realtime, Supervision, accept, nearest, watchdog};
+use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
 use crate::control::WatchBounds;
 use crate::rig::{self, AnyRig, Frame};
 use crate::role::{Actuation, Rearm};
@@ -58,6 +58,8 @@ pub struct Scenario {
     pub realtime: Realtime,
     /// How long the roles may take until all are ready, s.
     pub startup_timeout_s: f64,
+    /// For how long an external role may keep the run waiting, s; if none, for ever until the ticks run, and then 30 s.
+    pub external_timeout_s: Option<f64>,
     /// Whether observer and controller share a process, where roles are processes.
     pub fused: bool,
     /// Roles that somebody else starts: hardware, or a foreign program.
@@ -74,6 +76,8 @@ pub struct Scenario {
     pub rig: AnyRig,
     /// The scenario as a file that resolves to itself.
     pub resolved: toml::Table,
+    /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
+    pub run: Option<RunId>,
 }
 
 impl Scenario {
@@ -132,6 +136,7 @@ impl Scenario {
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
+            external_timeout_s: raw.launch.external_timeout_s,
             fused: raw.launch.fused,
             external: raw.launch.external,
             supervision: raw.supervision,
@@ -140,6 +145,7 @@ impl Scenario {
             accept,
             rig,
             resolved,
+            run: document.run(),
         })
     }
 
@@ -171,6 +177,11 @@ impl Scenario {
     /// How the actuators of a body treat their commands.
     pub fn actuation(&self, driven: bool) -> Actuation {
         Actuation { driven, timeout_ticks: self.command_timeout_ticks, rearm: self.rearm }
+    }
+
+    /// The scenario as the file of its run, which the first line names.
+    pub fn to_file(&self) -> String {
+        self.run.map_or(String::new(), |run| format!("# {}\n", run.comment())) + &self.to_toml()
     }
 
     /// The scenario as the text of a file.
@@ -252,6 +263,11 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
         format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
     });
+    if let Some(timeout_s) = raw.launch.external_timeout_s {
+        checks.require((0.1..=604_800.0).contains(&timeout_s), "launch.external_timeout_s", || {
+            format!("{timeout_s} s is no time to wait for an external role; give 0.1 to 604800, or leave it out")
+        });
+    }
 }
 
 fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {

@@ -3,6 +3,7 @@
 //! Must not be more lenient than the exit code, nor ever be without a case: what did not run is an error.
 
 use super::{Action, Criterion, Summary};
+use crate::config::RunId;
 use quick_xml::Writer;
 use std::io;
 
@@ -25,14 +26,14 @@ struct Case {
 }
 
 /// The verdict on a run of the scenario of that name: its summary, or why there is none.
-pub fn junit(scenario: &str, run: Result<&Summary, &str>) -> String {
+pub fn junit(scenario: &str, run: RunId, ended: Result<&Summary, &str>) -> String {
     let mut xml = Writer::new_with_indent(Vec::new(), b' ', 2);
-    write(&mut xml, scenario, run).expect("memory takes every text");
+    write(&mut xml, scenario, run, ended).expect("memory takes every text");
     String::from_utf8_lossy(&xml.into_inner()).into_owned() + "\n"
 }
 
-fn write(xml: &mut Xml, scenario: &str, run: Result<&Summary, &str>) -> io::Result<()> {
-    let cases = run.map_or_else(|reason| vec![Case::new("run", Verdict::Error(reason.to_owned()))], cases);
+fn write(xml: &mut Xml, scenario: &str, run: RunId, ended: Result<&Summary, &str>) -> io::Result<()> {
+    let cases = ended.map_or_else(|reason| vec![Case::new("run", Verdict::Error(reason.to_owned()))], cases);
     let count = |matches: fn(&Verdict) -> bool| cases.iter().filter(|case| matches(&case.verdict)).count().to_string();
     let counts = [
         ("tests", cases.len().to_string()),
@@ -45,11 +46,11 @@ fn write(xml: &mut Xml, scenario: &str, run: Result<&Summary, &str>) -> io::Resu
     xml.create_element("testsuites").with_attributes(counts()).write_inner_content(|xml| {
         let name = printable(scenario);
         let mut suite = xml.create_element("testsuite").with_attribute(("name", &*name)).with_attributes(counts());
-        if let Ok(summary) = run {
+        if let Ok(summary) = ended {
             suite = suite.with_attribute(("timestamp", &*summary.started_utc));
         }
         suite.write_inner_content(|xml| {
-            run.map_or(Ok(()), |summary| properties(xml, summary))?;
+            properties(xml, run, ended.ok())?;
             cases.iter().try_for_each(|case| case.write(xml, &name))
         })?;
         Ok(())
@@ -57,20 +58,29 @@ fn write(xml: &mut Xml, scenario: &str, run: Result<&Summary, &str>) -> io::Resu
     Ok(())
 }
 
-/// What tells this run from another one of the same scenario.
-fn properties(xml: &mut Xml, summary: &Summary) -> io::Result<()> {
-    let (tick_hz, incidents) = (summary.tick_hz.to_string(), summary.incidents.len().to_string());
-    let properties = [
-        ("clock", summary.clock),
-        ("tick_hz", &tick_hz),
-        ("state_hash", &summary.state.hash),
-        ("incidents", &incidents),
-        ("version", summary.version),
-        ("revision", summary.revision),
-    ];
+/// What tells this run from another one of the same scenario, and where samples were rejected.
+fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Result<()> {
+    let mut properties = vec![("run".to_owned(), run.to_string())];
+    if let Some(summary) = summary {
+        let told = [
+            ("clock", summary.clock.to_owned()),
+            ("tick_hz", summary.tick_hz.to_string()),
+            ("state_hash", summary.state.hash.clone()),
+            ("incidents", summary.incidents.len().to_string()),
+            ("rejected_samples", summary.books.rejected_samples.to_string()),
+            ("version", summary.version.to_owned()),
+            ("revision", summary.revision.to_owned()),
+        ];
+        properties.extend(told.map(|(name, value)| (name.to_owned(), value)));
+        let rejected = summary.books.links.iter().filter(|link| link.rejected > 0);
+        properties.extend(rejected.map(|link| {
+            (format!("rejected_samples of {} at {}", link.service, link.reader), link.rejected.to_string())
+        }));
+    }
     xml.create_element("properties").write_inner_content(|xml| {
         properties.iter().try_for_each(|(name, value)| {
-            xml.create_element("property").with_attributes([("name", *name), ("value", *value)]).write_empty().map(drop)
+            let attributes = [("name", name.as_str()), ("value", value)];
+            xml.create_element("property").with_attributes(attributes).write_empty().map(drop)
         })
     })?;
     Ok(())
@@ -155,11 +165,14 @@ mod tests {
     #[test]
     fn a_run_that_failed_is_one_error_whatever_its_reason_holds() {
         let reason = "follower died: \u{1b}[31m<oops> & \"gone\"\0\u{ffff}\nline 2 ]]> é";
-        let text = junit("a<b", Err(reason));
+        let run = RunId::from_bits([7; 16]);
+        let text = junit("a<b", run, Err(reason));
         let document = roxmltree::Document::parse(&text).unwrap();
         let suite = document.root_element().first_element_child().unwrap();
         assert_eq!((suite.tag_name().name(), suite.attribute("name")), ("testsuite", Some("a<b")));
         assert_eq!((suite.attribute("tests"), suite.attribute("errors")), (Some("1"), Some("1")));
+        let property = document.descendants().find(|node| node.has_tag_name("property")).unwrap();
+        assert_eq!((property.attribute("name"), property.attribute("value")), (Some("run"), Some(&*run.to_string())));
         let error = document.descendants().find(|node| node.has_tag_name("error")).unwrap();
         let message = error.attribute("message").unwrap();
         assert!(message.starts_with("follower died: \u{fffd}[31m<oops> & \"gone\"\u{fffd}\u{fffd}"), "{message:?}");

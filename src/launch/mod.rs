@@ -3,6 +3,7 @@
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
 mod children;
+mod external;
 mod foxglove;
 mod in_process;
 mod janitor;
@@ -11,6 +12,7 @@ mod outcome;
 mod processes;
 mod recorder;
 mod replay;
+mod results;
 mod score;
 mod supervision;
 mod table;
@@ -18,8 +20,11 @@ mod trace;
 
 pub use janitor::janitor;
 pub use junit::junit;
+pub(crate) use outcome::State;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use replay::replay_as_process;
+pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
+pub use results::{ResultsError, claim, new_run};
 pub(crate) use score::lyapunov_floor;
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub use supervision::{Action, Incident};
@@ -66,6 +71,8 @@ pub enum Progress<'a> {
         /// The domain's directory; it holds a file with the seat of each external role.
         domain: PathBuf,
     },
+    /// An external role keeps the run waiting: who, since when, for what. Told now and then.
+    External(&'a str),
     /// Ticks run.
     Running {
         /// The last tick scored.

@@ -2,8 +2,9 @@
 //!
 //! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
 
+use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
-use crate::config::Scenario;
+use crate::config::{RunId, Scenario};
 use crate::record::RecordingReport;
 use crate::rig::{CertificateReport, Figure};
 use crate::runtime::RoleId;
@@ -50,6 +51,8 @@ pub struct Summary {
     schema: &'static str,
     pub(super) version: &'static str,
     pub(super) revision: &'static str,
+    /// The run's identifier, which all of its files carry.
+    pub run: Option<RunId>,
     /// The scenario's name.
     pub scenario: String,
     /// The clock's name.
@@ -132,7 +135,7 @@ pub struct Books {
     pub injected_faults: u64,
 }
 
-/// One reading end beside its writing end.
+/// One reading end beside its writing end. Of a writer that keeps no books nothing is known but what its reader met.
 #[derive(Debug, Serialize)]
 pub struct LinkBook {
     /// The service.
@@ -140,23 +143,23 @@ pub struct LinkBook {
     /// The reading role.
     pub reader: String,
     /// Samples sent.
-    pub published: u64,
+    pub published: Option<u64>,
     /// Samples received.
     pub received: u64,
     /// Ticks for which the writer sent none.
-    pub skipped: u64,
+    pub skipped: Option<u64>,
     /// Ticks for which the reader received none, up to its last.
     pub gaps: u64,
     /// Sent after the reader's last look.
-    pub unread: u64,
+    pub unread: Option<u64>,
     /// Ticks for which the writer sent a void, and voids received.
-    pub void: [u64; 2],
+    pub void: (Option<u64>, u64),
     /// Samples that were not newer than the one before.
     pub stale: u64,
     /// Samples received and not believed.
     pub rejected: u64,
     /// Samples that scripted faults touched on the writing end.
-    pub injected: u64,
+    pub injected: Option<u64>,
 }
 
 /// The state hash of a run, comparable between clocks.
@@ -164,6 +167,8 @@ pub struct LinkBook {
 pub struct State {
     /// The hash over everything that was published.
     pub hash: String,
+    /// How many ticks the run came to: those that every role with books executed or missed.
+    pub elapsed_ticks: u64,
     /// The first tick whose samples may differ from an undisturbed run's, if any.
     pub first_disturbed_tick: Option<u64>,
     /// How many ticks from the first on are covered by `clean_hash`.
@@ -198,6 +203,17 @@ pub struct RoleGrant {
     pub grant: Grant,
 }
 
+impl State {
+    /// How far the hash covers the run, in words, where no tick is known to be disturbed.
+    pub(crate) fn undisturbed_words(elapsed_ticks: u64, all_ticks: u64, unbooked: bool) -> String {
+        match (elapsed_ticks < all_ticks, unbooked) {
+            (true, _) => format!("the run ended after {elapsed_ticks} of {all_ticks} ticks"),
+            (false, true) => "every tick of the roles that keep books undisturbed".to_owned(),
+            (false, false) => "every tick undisturbed".to_owned(),
+        }
+    }
+}
+
 impl Summary {
     /// Draws up the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
@@ -213,6 +229,7 @@ impl Summary {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
             revision: env!("COROTATE_REVISION"),
+            run: scenario.run,
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),
             tick_hz: 1e9 / scenario.period_ns as f64,
@@ -258,11 +275,12 @@ impl Books {
         }
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
-            if let Some((writer, written)) = written.iter().find(|(_, written)| written.service == read.service) {
-                // A role that died may have sent a sample that it had no time to book: whoever received it knows.
-                let in_flight = lost.contains(writer) && read.last_tick > written.last_tick;
-                links.push(LinkBook::new(&report.role, written, in_flight, read, scenario, &mut problems));
-            }
+            let written = written.iter().find(|(_, written)| written.service == read.service);
+            // A role that died may have sent a sample that it had no time to book: whoever received it knows.
+            let in_flight =
+                written.is_some_and(|(writer, written)| lost.contains(writer) && read.last_tick > written.last_tick);
+            let written = written.map(|(_, written)| *written);
+            links.push(LinkBook::new(&report.role, written, in_flight, read, scenario, &mut problems));
         }
         Self {
             balanced: problems.is_empty(),
@@ -281,45 +299,45 @@ impl Books {
 impl LinkBook {
     fn new(
         reader: &str,
-        written: &LinkWritten,
+        written: Option<&LinkWritten>,
         in_flight: bool,
         read: &LinkRead,
         scenario: &Scenario,
         problems: &mut Vec<String>,
     ) -> Self {
         let covered = read.last_tick.map_or(0, |tick| tick + 1);
-        let sent = written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
+        let sent = |written: &LinkWritten| written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
         let book = Self {
             service: read.service.clone(),
             reader: reader.to_owned(),
-            published: written.published + u64::from(in_flight),
+            published: written.map(|written| written.published + u64::from(in_flight)),
             received: read.received,
-            skipped: written.skipped,
+            skipped: written.map(|written| written.skipped),
             gaps: read.gaps,
-            unread: sent.saturating_sub(covered),
-            void: [written.void, read.void],
+            unread: written.map(|written| sent(written).saturating_sub(covered)),
+            void: (written.map(|written| written.void), read.void),
             stale: read.stale,
             rejected: read.rejected,
-            injected: written.injected,
+            injected: written.map(|written| written.injected),
         };
         let lossless = scenario.clock != crate::config::ClockKind::Realtime;
+        let read_balances = read.received + read.void + read.gaps == covered && (!lossless || read.gaps == 0);
         // Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
-        let balanced = read.received + read.void + read.gaps == covered
-            && covered <= sent
-            && read.stale <= written.extra
-            && book.published + written.void + book.skipped == book.received + read.void + book.gaps + book.unread
-            && (!lossless || read.gaps == 0);
+        let balanced = read_balances
+            && written.is_none_or(|written| {
+                let published = written.published + u64::from(in_flight);
+                let unread = sent(written).saturating_sub(covered);
+                covered <= sent(written)
+                    && read.stale <= written.extra
+                    && published + written.void + written.skipped == read.received + read.void + read.gaps + unread
+            });
         if !balanced {
+            let writer = written.map_or("its writer keeps no books".to_owned(), |written| {
+                format!("{} published, {} extra, {} void", written.published, written.extra, written.void)
+            });
             problems.push(format!(
-                "{} at {reader}: {} published, {} received, {} gaps, {} stale of {} extra, {} of {} void",
-                book.service,
-                book.published,
-                book.received,
-                book.gaps,
-                read.stale,
-                written.extra,
-                read.void,
-                written.void
+                "{} at {reader}: {} received, {} gaps, {} stale, {} void; {writer}",
+                book.service, book.received, book.gaps, read.stale, read.void
             ));
         }
         book
@@ -343,6 +361,7 @@ impl State {
         let hash = combine(links.iter().map(|(_, hash)| hash.last));
         Self {
             hash: format!("{hash:016x}"),
+            elapsed_ticks: books.roles.values().map(|ticks| ticks.elapsed).min().unwrap_or(0),
             first_disturbed_tick,
             clean_ticks,
             clean_hash: format!("{clean_hash:016x}"),
@@ -433,30 +452,33 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
 /// # Errors
 /// Those of the file system, with the file's name.
 pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io::Result<()> {
-    write(&directory.join("scenario.toml"), |out| out.write_all(scenario.to_toml().as_bytes()))?;
-    write(&directory.join("summary.json"), |out| {
+    let run = summary.run.map(RunId::comment);
+    write(&directory.join(SCENARIO), |out| out.write_all(scenario.to_file().as_bytes()))?;
+    write(&directory.join(SUMMARY), |out| {
         serde_json::to_writer_pretty(&mut *out, summary)?;
         writeln!(out)
     })?;
-    write(&directory.join("hashes.txt"), |out| {
-        writeln!(out, "# ticks covered, hash over everything published in them")?;
+    write(&directory.join(HASHES), |out| {
+        let run = run.as_ref().map_or(String::new(), |run| format!("{run}: "));
+        writeln!(out, "# {run}ticks covered, hash over everything published in them")?;
         summary.state.checkpoints.iter().try_for_each(|(ticks, hash)| writeln!(out, "{ticks} {hash:016x}"))
     })?;
     if summary.latencies.is_empty() {
         return Ok(());
     }
-    let latency = directory.join("latency");
+    let latency = directory.join(LATENCY);
     fs::create_dir_all(&latency).map_err(|error| named(&latency, &error))?;
     for stage in &summary.latencies {
         let path = latency.join(format!("{}.{}.hgrm", stage.role, stage.stage));
-        write(&path, |out| write_hgrm(&stage.latency, out))?;
+        write(&path, |out| write_hgrm(&stage.latency, run.as_deref(), out))?;
     }
     let names: Vec<String> = summary.latencies.iter().map(|stage| format!("{}.{}", stage.role, stage.stage)).collect();
     let run_s = summary.last_tick as f64 / summary.tick_hz;
-    write(&latency.join("latency.hlog"), |out| {
+    write(&latency.join(LATENCY_LOG), |out| {
         write_hlog(
             names.iter().map(String::as_str).zip(summary.latencies.iter().map(|stage| &stage.latency)),
             run_s,
+            run.as_deref(),
             out,
         )
     })

@@ -3,6 +3,7 @@
 //! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
 
 use super::children::{END_LIMIT, RoleProcess};
+use super::external::{ExternalWatch, Waiting};
 use super::foxglove::{FOXGLOVE, FoxgloveWatch};
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
@@ -55,7 +56,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
-    write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     describe_seats(scenario, launch, domain)?;
     // Declared before the roles, so that it is dropped, and cleans up, after them.
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
@@ -135,6 +136,7 @@ struct Crew<'a> {
     janitor: &'a mut Janitor,
     program: PathBuf,
     members: Vec<Member>,
+    externals: ExternalWatch,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
     word: Schedule,
     incidents: Vec<Incident>,
@@ -161,9 +163,22 @@ impl<'a> Crew<'a> {
         let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
         let started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
         let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
-        let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
+        let members = started.into_iter().map(member).collect::<Result<Vec<_>, _>>()?;
+        let externals = ExternalWatch::new(members.len());
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
-        Ok(Self { scenario, domain, janitor, program, members, schedule, word, incidents, recorder, foxglove })
+        Ok(Self {
+            scenario,
+            domain,
+            janitor,
+            program,
+            members,
+            externals,
+            schedule,
+            word,
+            incidents,
+            recorder,
+            foxglove,
+        })
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -213,6 +228,10 @@ impl<'a> Crew<'a> {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
+            let waiting = self.externals.before_ticks(self.scenario, &self.members, state, monotonic_ns());
+            if !self.tell(waiting, scorer, launch) {
+                return Ok(false);
+            }
             let watchers = [(RECORDER, self.recorder.ready()?), (FOXGLOVE, self.foxglove.ready()?)];
             let absent = watchers.into_iter().filter(|(_, ready)| !ready).map(|(name, _)| name);
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
@@ -257,7 +276,12 @@ impl<'a> Crew<'a> {
                 if !self.supervise(scorer, now_ns)? {
                     return Ok(0);
                 }
-                stall.look(&self.members, now_ns)?;
+                let waiting = self.externals.in_ticks(self.scenario, &self.members, scorer.next_tick(), now_ns);
+                if !self.tell(waiting, scorer, launch) {
+                    return Ok(0);
+                }
+                // An external role that is waited for has its own limit.
+                stall.look(&self.members, now_ns, lockstep && self.externals.waits())?;
                 let signal = launch.signal.load(Ordering::Relaxed);
                 if signal != 0 {
                     return Ok(signal);
@@ -299,6 +323,26 @@ impl<'a> Crew<'a> {
             }
         }
         Ok(go_on)
+    }
+
+    /// Tells which external roles keep the run waiting; false if the run is to end for one.
+    fn tell(&mut self, waiting: Vec<Waiting>, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> bool {
+        let mut go_on = true;
+        for waiting in waiting {
+            match waiting {
+                Waiting::Say(words) => (launch.progress)(&Progress::External(&words)),
+                Waiting::TooLong { member, tick, cause } => {
+                    let failure = Failure { cause, last_words: String::new() };
+                    let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
+                    let incident = Incident { tick, ..incident };
+                    eprintln!("corotate: {incident}");
+                    scorer.incident(incident.tick);
+                    self.incidents.push(incident);
+                    go_on = false;
+                }
+            }
+        }
+        go_on
     }
 
     /// Waits until `until_ns`, or until a role's process ends or the janitor answers: then it is true.
@@ -395,8 +439,9 @@ impl Stall {
         Self { limit_ns, moved_ns: monotonic_ns(), ticks: Vec::new() }
     }
 
-    fn look(&mut self, members: &[Member], now_ns: u64) -> Result<(), LaunchError> {
-        let moved = self.ticks.len() != members.len()
+    fn look(&mut self, members: &[Member], now_ns: u64, excused: bool) -> Result<(), LaunchError> {
+        let moved = excused
+            || self.ticks.len() != members.len()
             || members.iter().zip(&self.ticks).any(|(member, tick)| member.last.stamp.tick != *tick);
         if moved {
             self.moved_ns = now_ns;

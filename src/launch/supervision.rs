@@ -33,6 +33,8 @@ const SILENT_PERIODS: f64 = 10.0;
 pub struct Incident {
     /// The role.
     pub role: String,
+    /// Whether it is somebody else's program: then nobody knows whether it died.
+    pub external: bool,
     /// Other roles in the same process, which failed with it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
@@ -69,7 +71,8 @@ pub enum Action {
 impl fmt::Display for Incident {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let with: String = self.with.iter().map(|role| format!(", and {role} with it,")).collect();
-        write!(f, "{}{with} died at tick {}: {}", self.role, self.tick, self.cause)?;
+        let failed = if self.external { "failed" } else { "died" };
+        write!(f, "{}{with} {failed} at tick {}: {}", self.role, self.tick, self.cause)?;
         if !self.last_words.is_empty() {
             write!(f, "; it said: {}", self.last_words)?;
         }
@@ -86,6 +89,7 @@ impl Incident {
     pub(super) fn without_process(role: &str, ledger: &Ledger, action: Action) -> Self {
         Self {
             role: role.to_owned(),
+            external: false,
             with: Vec::new(),
             generation: ledger.generation(),
             tick: crate::runtime::next_tick(ledger),
@@ -116,7 +120,7 @@ pub(super) struct Member {
     pub ledger: Ledger,
     /// The other roles in its process, all earlier in a tick, with their books.
     hosted: Vec<(RoleId, Ledger)>,
-    /// What there is to go by where an external role says nothing of itself.
+    /// What an external role sends; all there is to go by where it says nothing of itself.
     trace: Option<Trace>,
     health: <IoxBus as Bus>::Reader<Health>,
     /// Health of an earlier generation is a dead role's.
@@ -194,14 +198,19 @@ impl Member {
                 self.silent_ns = 0;
             }
         }
-        if let Some(trace) = self.trace.as_mut().filter(|_| !self.health.written()) {
+        if let Some(trace) = &mut self.trace {
             let told = trace.look()?;
-            if told != self.last {
+            if !self.health.written() && told != self.last {
                 self.last = told;
                 self.silent_ns = 0;
             }
         }
         Ok(())
+    }
+
+    /// What it sends, if it is external.
+    pub fn trace(&self) -> Option<&Trace> {
+        self.trace.as_ref()
     }
 
     /// Whether it is on its way out: its process has not ended, or, if it is external, it still has its line open.
@@ -240,13 +249,14 @@ impl Member {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
-        if state == RoleState::Running && !present {
-            return fail("it left before its last tick".to_owned());
-        }
         let timeout_s = scenario.supervision.heartbeat_timeout_s;
         let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
+        }
+        // Not before: a program that was started again in its seat is not there for a moment.
+        if state == RoleState::Running && !present {
+            return fail("it left before its last tick".to_owned());
         }
         // One that was killed has left once its remains are put away.
         if !janitor.is_busy() {
@@ -286,6 +296,7 @@ impl Member {
         }
         let incident = Incident {
             role: self.name.clone(),
+            external: self.external,
             with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
             generation: self.generation,
             tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },

@@ -1,6 +1,6 @@
 //! The end of a run on the screen.
 
-use super::outcome::LinkBook;
+use super::outcome::{LinkBook, State};
 use super::{Incident, Summary};
 use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
@@ -56,6 +56,7 @@ pub fn line_words(body: &str, book: &LineBook) -> String {
         },
     );
     let ill = [
+        (book.restarts, "times the device lost the run, its body at the initial state again"),
         (book.crc_errors, "CRC errors"),
         (book.malformed, "malformed blocks"),
         (book.dropped_bytes, "bytes dropped"),
@@ -152,25 +153,33 @@ fn books(summary: &Summary, text: &mut String) {
         summary.score.scored_ticks,
         summary.score.scored_ticks + summary.score.unscored_ticks,
     );
-    if books.injected_faults + books.rejected_samples > 0 {
-        let _ = writeln!(
-            text,
-            "scripted faults: acted {} times; {} samples rejected",
-            books.injected_faults, books.rejected_samples
-        );
+    if books.injected_faults > 0 {
+        let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);
     }
-    for link in books.links.iter().filter(|link| link.rejected + link.stale + link.void[1] > 0) {
-        let LinkBook { service, reader, rejected, stale, void, .. } = link;
-        let _ = writeln!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void[1]);
+    if books.rejected_samples > 0 {
+        let _ = writeln!(text, "{} samples rejected by their readers", books.rejected_samples);
+    }
+    let met = |link: &&LinkBook| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
+    for link in books.links.iter().filter(met) {
+        let LinkBook { service, reader, received, rejected, stale, void, .. } = link;
+        let _ = write!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void.1);
+        let _ = match link.published {
+            Some(_) => writeln!(text),
+            None => writeln!(text, " of {received} received"),
+        };
     }
     for problem in &books.problems {
         let _ = writeln!(text, "  {problem}");
     }
     if !books.unbooked.is_empty() {
-        let _ = writeln!(text, "no books of {}, nor of the signals there", books.unbooked.join(", "));
+        let _ = writeln!(text, "no books of {}: its signals are counted by their readers", books.unbooked.join(", "));
     }
     let _ = match state.first_disturbed_tick {
-        None => writeln!(text, "state hash {} (every tick undisturbed)", state.hash),
+        None => {
+            let words =
+                State::undisturbed_words(state.elapsed_ticks, summary.last_tick + 1, !books.unbooked.is_empty());
+            writeln!(text, "state hash {} ({words})", state.hash)
+        }
         Some(tick) => writeln!(
             text,
             "state hash {}; first disturbed tick {tick}, hash of the {} ticks before {}",

@@ -1,37 +1,124 @@
-//! How far an external role is that says nothing of itself: told by the signals that it writes.
+//! What an external role sends, as seen by the launcher.
 //!
-//! Hardware need not know of health. It is there once all its signals have a writer, runs once they carry samples, and is
-//! done when all of them have reached the last tick. Must not judge a role that reports its health.
+//! It tells how far a role is that says nothing of itself: hardware need not know of health. Such a role is there once all
+//! its signals have a writer, runs once they carry samples, and is done when all of them have reached the last tick. And it
+//! tells which sample of any external role is missing, and what came instead. Must not judge a role that reports its health.
 
 use crate::bus::iox::{IoxBus, IoxFleetReader, IoxReader};
-use crate::bus::{Bus, BusError, Read, Reader, Topic};
+use crate::bus::{Bus, BusError, Read, Reader, Signal, Topic};
 use crate::config::Scenario;
-use crate::runtime::{RoleId, Visit, visit_writes};
-use crate::sample::{FleetLayout, Health, Message, RoleState, Sample, Stamp};
+use crate::runtime::{RoleId, Visit, ports, visit_writes};
+use crate::sample::{FleetLayout, Health, Message, RoleState, Sample, Stamp, VOID};
+use std::fmt;
 
 /// The signals of an external role, watched.
 pub(super) struct Trace {
-    ends: Vec<Box<dyn End>>,
+    signals: Vec<Traced>,
     last_tick: u64,
+}
+
+/// One signal, and who needs it.
+struct Traced {
+    signal: Signal,
+    end: Box<dyn End>,
+    readers: Vec<RoleId>,
+}
+
+/// What an external role keeps the run waiting for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Lack {
+    /// It stands there, and the run goes on once it has come further.
+    State(RoleState),
+    /// A sample, in lockstep, with what came last.
+    Sample { signal: Signal, tick: u64, came: Option<Stamp> },
+    /// Any sample, in real time, where that of `tick` is due.
+    AnySample { signal: Signal, tick: u64, came: Option<Stamp> },
+}
+
+impl Lack {
+    /// Whether this is what was missing before.
+    pub fn is_still(&self, now: &Self) -> bool {
+        match (self, now) {
+            (Self::Sample { signal, tick, .. }, Self::Sample { signal: other, tick: now, .. }) => {
+                (signal, tick) == (other, now)
+            }
+            (Self::AnySample { signal, came, .. }, Self::AnySample { signal: other, came: now, .. }) => {
+                (signal, came) == (other, now)
+            }
+            _ => self == now,
+        }
+    }
+
+    /// The tick of which a sample is missing.
+    pub fn tick(&self) -> Option<u64> {
+        match self {
+            Self::State(_) => None,
+            Self::Sample { tick, .. } | Self::AnySample { tick, .. } => Some(*tick),
+        }
+    }
+}
+
+impl fmt::Display for Lack {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (signal, tick, came) = match self {
+            Self::State(RoleState::Absent) => return f.write_str("it has not connected"),
+            Self::State(RoleState::Running | RoleState::Done) => return f.write_str("it has not said that it is done"),
+            Self::State(_) => return f.write_str("it has connected and is not ready"),
+            Self::Sample { signal, tick, came } | Self::AnySample { signal, tick, came } => (signal, tick, came),
+        };
+        write!(f, "its {} of tick {tick} is missing; ", signal.name())?;
+        match came {
+            None => f.write_str("none has come"),
+            Some(stamp) if stamp.generation == 0 => {
+                write!(f, "instead came tick {} of generation 0, which marks a warm-up", stamp.tick)
+            }
+            Some(stamp) if stamp.tick < *tick => write!(f, "the last that came is of tick {}", stamp.tick),
+            Some(stamp) => write!(f, "instead came tick {}", stamp.tick),
+        }
+    }
 }
 
 impl Trace {
     /// Watches the signals that a role writes.
     pub fn open(scenario: &Scenario, role: RoleId, bus: &IoxBus) -> Result<Self, BusError> {
-        let ends = visit_writes(scenario, role, &mut Open(bus)).into_iter().collect::<Result<_, _>>()?;
-        Ok(Self { ends, last_tick: scenario.last_tick })
+        let roles = RoleId::all(scenario);
+        let reads = |role: &RoleId, topic: &Topic| ports(scenario, *role).reads.iter().any(|port| port.topic == *topic);
+        let ends = visit_writes(scenario, role, &mut Open(bus)).into_iter();
+        let signals = ends.zip(ports(scenario, role).writes).map(|(end, port)| {
+            let readers = roles.iter().copied().filter(|role| reads(role, &port.topic)).collect();
+            Ok(Traced { signal: port.topic.signal, end: end?, readers })
+        });
+        Ok(Self { signals: signals.collect::<Result<_, BusError>>()?, last_tick: scenario.last_tick })
     }
 
     /// Whether all signals have a writer.
     pub fn written(&self) -> bool {
-        self.ends.iter().all(|end| end.written())
+        self.signals.iter().all(|traced| traced.end.written())
+    }
+
+    /// The first sample that keeps others waiting, as of the last [look](Self::look). `next_tick` tells where a role stands,
+    /// `scored` where the scorer does. In real time nobody waits for a certain sample: what is missing is any new one.
+    pub fn lack(
+        &self,
+        next_tick: impl Fn(RoleId) -> Option<u64> + Copy,
+        scored: Option<u64>,
+        realtime: bool,
+    ) -> Option<Lack> {
+        self.signals.iter().find_map(|traced| {
+            let (signal, seen) = (traced.signal, traced.end.seen());
+            let (tick, came) = (traced.needed(next_tick, scored)?, seen.came);
+            match realtime {
+                true => Some(Lack::AnySample { signal, tick, came }),
+                false => (!seen.has(tick)).then_some(Lack::Sample { signal, tick, came }),
+            }
+        })
     }
 
     /// What the signals tell by now, as the role itself would.
     pub fn look(&mut self) -> Result<Health, BusError> {
         let mut next_tick = u64::MAX;
-        for end in &mut self.ends {
-            next_tick = next_tick.min(end.next_tick()?);
+        for traced in &mut self.signals {
+            next_tick = next_tick.min(traced.end.look()?.next_tick);
         }
         let written = self.written();
         let state = match next_tick {
@@ -45,16 +132,61 @@ impl Trace {
     }
 }
 
+impl Traced {
+    /// The least tick of which somebody still needs a sample. A body needs the command of the tick before its own.
+    fn needed(&self, next_tick: impl Fn(RoleId) -> Option<u64>, scored: Option<u64>) -> Option<u64> {
+        let of = |role: &RoleId| match role {
+            RoleId::Plant(_) => next_tick(*role)?.checked_sub(1),
+            RoleId::Observer | RoleId::Controller => next_tick(*role),
+        };
+        let scored = scored.filter(|_| self.signal != Signal::Measurement);
+        self.readers.iter().filter_map(of).chain(scored).min()
+    }
+}
+
 /// One watched signal.
 trait End {
     fn written(&self) -> bool;
-    /// The tick after the last whose sample has come.
-    fn next_tick(&mut self) -> Result<u64, BusError>;
+    /// Takes what has come.
+    fn look(&mut self) -> Result<&Seen, BusError>;
+    fn seen(&self) -> &Seen;
+}
+
+/// What has come of one signal.
+#[derive(Debug, Default)]
+struct Seen {
+    /// The tick after the newest.
+    next_tick: u64,
+    /// The first and the last tick of the newest samples without a gap between them. It goes back as far as anybody who
+    /// waits can still need: the launcher looks seldom and has as long a queue as they have.
+    run: Option<(u64, u64)>,
+    /// The stamp of what came last, whatever it is worth.
+    came: Option<Stamp>,
+}
+
+impl Seen {
+    fn take(&mut self, stamp: Stamp) {
+        self.came = Some(Stamp { generation: stamp.generation & !VOID, ..stamp });
+        // Readers take generation 0 for a warm-up before the first sample only, and for a fall of the generation after it.
+        if stamp.generation == 0 && self.run.is_none() {
+            return;
+        }
+        self.next_tick = self.next_tick.max(stamp.tick.saturating_add(1));
+        self.run = match self.run {
+            Some((first, last)) if last.checked_add(1) == Some(stamp.tick) => Some((first, stamp.tick)),
+            Some((first, last)) if (first..=last).contains(&stamp.tick) => Some((first, last)),
+            _ => Some((stamp.tick, stamp.tick)),
+        };
+    }
+
+    fn has(&self, tick: u64) -> bool {
+        self.run.is_some_and(|(first, last)| (first..=last).contains(&tick))
+    }
 }
 
 struct Watched<T> {
     reader: T,
-    next_tick: u64,
+    seen: Seen,
 }
 
 impl<S: Sample> End for Watched<IoxReader<S>> {
@@ -62,8 +194,12 @@ impl<S: Sample> End for Watched<IoxReader<S>> {
         self.reader.written()
     }
 
-    fn next_tick(&mut self) -> Result<u64, BusError> {
-        follow(&mut self.reader, &mut self.next_tick)
+    fn look(&mut self) -> Result<&Seen, BusError> {
+        follow(&mut self.reader, &mut self.seen)
+    }
+
+    fn seen(&self) -> &Seen {
+        &self.seen
     }
 }
 
@@ -72,20 +208,23 @@ impl<L: FleetLayout> End for Watched<IoxFleetReader<L>> {
         self.reader.written()
     }
 
-    fn next_tick(&mut self) -> Result<u64, BusError> {
-        follow(&mut self.reader, &mut self.next_tick)
+    fn look(&mut self) -> Result<&Seen, BusError> {
+        follow(&mut self.reader, &mut self.seen)
+    }
+
+    fn seen(&self) -> &Seen {
+        &self.seen
     }
 }
 
-/// Takes what has come and moves the next tick on accordingly.
-fn follow<S: Message + ?Sized>(reader: &mut impl Read<S>, next_tick: &mut u64) -> Result<u64, BusError> {
+/// Takes what has come.
+fn follow<'a, S: Message + ?Sized>(reader: &mut impl Read<S>, seen: &'a mut Seen) -> Result<&'a Seen, BusError> {
     while reader.advance()? {
-        let stamp = reader.current().map(S::stamp);
-        if let Some(stamp) = stamp.filter(|stamp| stamp.generation != 0) {
-            *next_tick = (*next_tick).max(stamp.tick + 1);
+        if let Some(sample) = reader.current() {
+            seen.take(*sample.stamp());
         }
     }
-    Ok(*next_tick)
+    Ok(seen)
 }
 
 /// Opens signals to watch them.
@@ -95,11 +234,11 @@ impl Visit for Open<'_> {
     type Made = Result<Box<dyn End>, BusError>;
 
     fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Ok(Box::new(Watched { reader: self.0.reader::<S>(&topic, Reader::Role)?, next_tick: 0 }))
+        Ok(Box::new(Watched { reader: self.0.reader::<S>(&topic, Reader::Role)?, seen: Seen::default() }))
     }
 
     fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        Ok(Box::new(Watched { reader: self.0.fleet_reader::<L>(&topic, Reader::Role, bodies)?, next_tick: 0 }))
+        Ok(Box::new(Watched { reader: self.0.fleet_reader::<L>(&topic, Reader::Role, bodies)?, seen: Seen::default() }))
     }
 }
 
@@ -111,6 +250,46 @@ mod tests {
     use crate::config::SHIPPED;
     use crate::runtime::{depths, topic};
     use crate::sample::{RateMeasurement, RateTruth};
+
+    fn seen(ticks: &[u64]) -> Seen {
+        let mut seen = Seen::default();
+        ticks.iter().for_each(|&tick| seen.take(Stamp { tick, generation: 1, ..Stamp::default() }));
+        seen
+    }
+
+    /// What keeps a reader waiting is missing, whatever comes after it; what it could still take is there.
+    #[test]
+    fn a_tick_is_missing_if_it_was_not_among_the_last_in_a_row() {
+        let has = |ticks: &[u64], tick| seen(ticks).has(tick);
+        assert!(!has(&[], 0));
+        assert!(has(&[0, 1, 2], 2) && has(&[0, 1, 2], 0) && !has(&[0, 1, 2], 3));
+        assert!(!has(&[0, 1, 3], 2) && !has(&[0, 1, 3, 4, 5], 2), "instead came the next");
+        assert!(has(&[0, 1, 3, 2], 2), "it came late");
+        assert!(has(&[0, 1, 2, 1], 2), "an old one came again");
+        assert!(has(&[7, 8, 9], 8), "the launcher looked too late for the first");
+        assert!(!has(&[u64::MAX, u64::MAX], 0) && has(&[u64::MAX], u64::MAX));
+    }
+
+    /// Before the first sample generation 0 is a warm-up; after it readers take it for a sample, and do not wait.
+    #[test]
+    fn a_warm_up_is_no_sample_and_a_fallen_generation_is_one() {
+        let mut seen = Seen::default();
+        seen.take(Stamp::default());
+        assert!(!seen.has(0) && seen.next_tick == 0);
+        seen.take(Stamp { generation: 1 | VOID, ..Stamp::default() });
+        seen.take(Stamp { tick: 1, ..Stamp::default() });
+        assert!(seen.has(0) && seen.has(1) && seen.came.is_some_and(|came| came.generation == 0));
+    }
+
+    #[test]
+    fn the_words_say_what_is_missing_and_what_came() {
+        let stamp = |tick, generation| Some(Stamp { tick, generation, ..Stamp::default() });
+        let words = |came| Lack::Sample { signal: Signal::Measurement, tick: 41, came }.to_string();
+        assert_eq!(words(None), "its measurement of tick 41 is missing; none has come");
+        assert!(words(stamp(40, 1)).ends_with("; the last that came is of tick 40"));
+        assert!(words(stamp(43, 1)).ends_with("; instead came tick 43"));
+        assert!(words(stamp(41, 0)).ends_with("; instead came tick 41 of generation 0, which marks a warm-up"));
+    }
 
     #[test]
     fn a_silent_role_is_there_runs_and_is_done_by_its_samples() {

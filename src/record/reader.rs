@@ -9,7 +9,7 @@ use super::RecordError;
 use super::layout::{CDR_HEADER, Layout};
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
-use crate::config::{Scenario, ScriptedFault};
+use crate::config::{RunId, Scenario, ScriptedFault};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
@@ -54,6 +54,8 @@ enum Flaw {
 /// What a recording says of its run.
 #[derive(Debug, Clone, Default)]
 pub struct RunInfo {
+    /// The run's identifier, if it has one.
+    pub run: Option<RunId>,
     /// The program's version and source revision.
     pub version: String,
     /// The source revision.
@@ -389,7 +391,9 @@ impl RunInfo {
         if text("schema")? != SCHEMA {
             return Err(format!("it is laid out as {}, and this version reads {SCHEMA}", text("schema")?));
         }
+        let run = run.get("run").map(|id| id.parse()).transpose().map_err(|_| "`run` is no identifier".to_owned())?;
         Ok(Self {
+            run,
             version: text("version")?,
             revision: text("revision")?,
             scenario: text("scenario")?,

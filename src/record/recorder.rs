@@ -232,7 +232,8 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
         ("started_utc", jiff::Timestamp::now().to_string()),
         ("host", json(&host)),
     ];
-    entries.map(|(key, value)| (key.to_owned(), value)).into()
+    let run = scenario.run.map(|run| ("run", run.to_string()));
+    entries.into_iter().chain(run).map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// The layout of every signal of a scenario in this version, by service, in the order of a tick.

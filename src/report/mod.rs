@@ -30,7 +30,7 @@ mod summary;
 mod tables;
 mod traces;
 
-use crate::config::ConfigError;
+use crate::config::{ConfigError, RunId};
 use crate::record::RecordError;
 use source::Source;
 use std::io;
@@ -78,6 +78,15 @@ pub enum ReportError {
         /// What is wrong with it.
         reason: String,
     },
+    /// The directory holds files of two runs.
+    #[error(
+        "{} is of {} and {} of {}: a page shows one run; remove the files of one, or give its run.mcap alone",
+        files[0].0.display(), named(files[0].1), files[1].0.display(), named(files[1].1)
+    )]
+    TwoRuns {
+        /// Two of them, each with its run.
+        files: Box<[(PathBuf, Option<RunId>); 2]>,
+    },
     /// The scenario is refused.
     #[error("the run's scenario is refused by this version: {0}")]
     Scenario(#[from] ConfigError),
@@ -98,6 +107,10 @@ pub enum ReportError {
         /// The system's reason.
         source: io::Error,
     },
+}
+
+fn named(run: Option<RunId>) -> String {
+    run.map_or("a run without an identifier".to_owned(), |run| format!("run {run}"))
 }
 
 /// A page.

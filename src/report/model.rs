@@ -6,12 +6,15 @@ use super::chart::{Marks, Picture, marks};
 use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
+use crate::config::RunId;
 
 /// A page.
 #[derive(Debug)]
 pub struct Model {
     /// What it is of.
     pub title: String,
+    /// The run, if it is known.
+    pub run: Option<RunId>,
     /// When and how that was made.
     pub subtitle: String,
     /// The verdict in a word, and whether it is a good one; none where nobody judged.
@@ -92,7 +95,7 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
         true => ("accepted".to_owned(), Some(true)),
         false => ("not accepted".to_owned(), Some(false)),
     });
-    Ok(Model { title, subtitle, verdict, remarks, marks: marks(&time, &events), sections })
+    Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks: marks(&time, &events), sections })
 }
 
 fn headings(source: &Source) -> (String, String) {

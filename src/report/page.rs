@@ -3,6 +3,7 @@
 use super::chart::Picture;
 use super::html::escape;
 use super::model::{Block, Model, Section};
+use crate::launch::GENERATOR;
 use std::fmt::Write;
 
 const STYLE: &str = include_str!("page.css");
@@ -11,11 +12,12 @@ const STYLE: &str = include_str!("page.css");
 pub fn page(model: &Model) -> String {
     let mut html = String::from("<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n");
     let title = escape(&model.title);
+    let run = model.run.map_or(String::new(), |run| format!(", {}", run.comment()));
     // Writing to a string does not fail.
     let _ = write!(
         html,
         "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
-         <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}: {}</title>\n<style>\n{STYLE}</style>\n\
+         <meta name=\"color-scheme\" content=\"light dark\"/>\n{GENERATOR}{run}\"/>\n<title>{title}: {}</title>\n<style>\n{STYLE}</style>\n\
          </head>\n<body>\n{}\n<main>\n",
         escape(&model.verdict.0),
         model.marks

@@ -2,6 +2,7 @@
 
 use super::axis::Axis;
 use super::chart::{Line, Picture, plain};
+use crate::config::RunId;
 
 /// The stages in the order in which they are shown, and what each is.
 const STAGES: [(&str, &str); 7] = [
@@ -31,6 +32,8 @@ pub struct Curve {
     pub role: String,
     /// The stage.
     pub stage: String,
+    /// The run that it is of.
+    pub run: Option<RunId>,
     /// 1/(1 − p) and the latency in µs, rising. The last is the largest of all, at the number of values.
     pub points: Vec<(f64, f64)>,
 }
@@ -100,7 +103,7 @@ mod tests {
         let mut latency = Latency::default();
         (1..=1000).for_each(|us| latency.record(0, us * 1000));
         let mut text = Vec::new();
-        write_hgrm(&latency, &mut text).unwrap();
+        write_hgrm(&latency, None, &mut text).unwrap();
         let points = read_curve(&String::from_utf8(text).unwrap()).unwrap();
         let (first, last) = (points[0], *points.last().unwrap());
         assert!(first.0 == 1.0 && (first.1 - 1.0).abs() < 0.01, "{first:?}");

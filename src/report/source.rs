@@ -5,11 +5,12 @@
 use super::ReportError;
 use super::percentiles::{Curve, read_curve};
 use super::summary::Summary;
-use crate::config::Scenario;
+use crate::config::{RunId, Scenario};
+use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY};
 use crate::record::Recording;
 use std::fs;
 use std::io::ErrorKind;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Everything that was found.
 #[derive(Debug)]
@@ -47,18 +48,18 @@ impl Source {
 
     fn directory(path: &Path) -> Result<Self, ReportError> {
         let (at, mut missing) = (|name: &str| path.join(name), Vec::new());
-        let summary = text(&at("summary.json"))?;
-        let recording = at("run.mcap").exists().then(|| Recording::open(&at("run.mcap"))).transpose()?;
+        let summary = text(&at(SUMMARY))?;
+        let recording = at(RECORDING).exists().then(|| Recording::open(&at(RECORDING))).transpose()?;
         if summary.is_none() && recording.is_none() {
             return Err(ReportError::NoRun { path: path.to_owned() });
         }
-        let refused = |reason| ReportError::Summary { path: at("summary.json"), reason };
+        let refused = |reason| ReportError::Summary { path: at(SUMMARY), reason };
         let summary = summary.map(|text| Summary::parse(&text)).transpose().map_err(refused)?;
         if summary.is_none() {
             missing.push("there is no summary.json: the run did not come to its end, or not yet".to_owned());
         }
-        let scenario = match (text(&at("scenario.toml"))?, &recording) {
-            (Some(text), _) => Some(Scenario::parse(&text, &at("scenario.toml").display().to_string(), &[])?),
+        let scenario = match (text(&at(SCENARIO))?, &recording) {
+            (Some(text), _) => Some(Scenario::parse(&text, &at(SCENARIO).display().to_string(), &[])?),
             (None, Some(recording)) => Some(recording.scenario()?),
             (None, None) => None,
         };
@@ -69,14 +70,40 @@ impl Source {
                     .to_owned(),
             );
         }
-        let curves = curves(&at("latency"), summary.as_ref())?;
+        let curves = curves(&at(LATENCY), summary.as_ref())?;
         if curves.is_empty() {
             missing.push(
                 "there are no latencies: there is no latency/ in the directory (a run in one thread measures none)"
                     .to_owned(),
             );
         }
-        Ok(Self { summary, scenario, recording, curves, missing })
+        let found = Self { summary, scenario, recording, curves, missing };
+        found.require_one_run(path)?;
+        Ok(found)
+    }
+
+    /// What is joined must be of one run.
+    fn require_one_run(&self, directory: &Path) -> Result<(), ReportError> {
+        let of = |name: &str, run: Option<RunId>| (directory.join(name), run);
+        let mut files: Vec<(PathBuf, Option<RunId>)> = Vec::new();
+        files.extend(self.summary.as_ref().map(|summary| of(SUMMARY, summary.run)));
+        files.extend(self.recording.as_ref().map(|recording| of(RECORDING, recording.info().run)));
+        // Without a file of its own the scenario is the recording's, which has no name in it.
+        let scenario = self.scenario.as_ref().filter(|_| directory.join(SCENARIO).exists());
+        files.extend(scenario.map(|scenario| of(SCENARIO, scenario.run)));
+        let curve = |curve: &Curve| of(&format!("{LATENCY}/{}.{}.hgrm", curve.role, curve.stage), curve.run);
+        files.extend(self.curves.iter().map(curve));
+        let Some((first, others)) = files.split_first() else { return Ok(()) };
+        match others.iter().find(|other| other.1 != first.1) {
+            Some(second) => Err(ReportError::TwoRuns { files: Box::new([first.clone(), second.clone()]) }),
+            None => Ok(()),
+        }
+    }
+
+    /// The run that all of it is of.
+    pub fn run(&self) -> Option<RunId> {
+        let recorded = self.recording.as_ref().and_then(|recording| recording.info().run);
+        self.summary.as_ref().map_or(recorded, |summary| summary.run)
     }
 }
 
@@ -104,7 +131,8 @@ fn curves(directory: &Path, summary: Option<&Summary>) -> Result<Vec<Curve>, Rep
             && let Some(text) = text(&path)?
         {
             let points = read_curve(&text).map_err(|reason| ReportError::Latency { path: path.clone(), reason })?;
-            curves.push(Curve { role: role.to_owned(), stage: stage.to_owned(), points });
+            let (role, stage, run) = (role.to_owned(), stage.to_owned(), RunId::in_comments_of(&text));
+            curves.push(Curve { role, stage, run, points });
         }
     }
     let stages = summary.map_or(&[][..], |summary| &summary.latencies);

@@ -1,5 +1,6 @@
 //! `summary.json` as it is read back. What a key does not say is left out; another layout is refused.
 
+use crate::config::RunId;
 use crate::telemetry::{Grant, Ticks, WatchReport};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -10,6 +11,7 @@ pub const SCHEMA: &str = "corotate/summary/v1";
 /// A run's summary, as far as a report shows it.
 #[derive(Debug, Deserialize)]
 pub struct Summary {
+    pub run: Option<RunId>,
     pub version: String,
     pub revision: String,
     pub scenario: String,
@@ -127,11 +129,11 @@ pub struct Books {
 pub struct Link {
     pub service: String,
     pub reader: String,
-    pub published: u64,
+    pub published: Option<u64>,
     pub received: u64,
     pub gaps: u64,
-    pub unread: u64,
-    pub void: [u64; 2],
+    pub unread: Option<u64>,
+    pub void: (Option<u64>, u64),
     pub stale: u64,
     pub rejected: u64,
 }
@@ -139,6 +141,7 @@ pub struct Link {
 #[derive(Debug, Deserialize)]
 pub struct State {
     pub hash: String,
+    pub elapsed_ticks: u64,
     pub first_disturbed_tick: Option<u64>,
 }
 

@@ -3,6 +3,7 @@
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
+use crate::launch::State;
 use crate::telemetry::Ticks;
 
 /// A scripted fault as it stands in the scenario.
@@ -162,21 +163,22 @@ pub fn books(source: &Source) -> Section {
         )));
         blocks.extend(books.problems.iter().map(|problem| Block::Text(problem.clone())));
         if !books.unbooked.is_empty() {
-            blocks.push(Block::Text(format!("No books of {}.", books.unbooked.join(", "))));
+            let unbooked = books.unbooked.join(", ");
+            blocks.push(Block::Text(format!("No books of {unbooked}: its signals are counted by their readers.")));
         }
         let rows = books.roles.iter().map(ticks_row).collect();
         blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
         let row = |link: &super::summary::Link| {
-            let [sent, received] = link.void;
-            let void = format!("{sent}, {received}");
+            let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
+            let void = format!("{}, {}", told(link.void.0), link.void.1);
             strings(&[
                 &link.service,
                 &link.reader,
-                &link.published,
+                &told(link.published),
                 &link.received,
                 &link.gaps,
                 &void,
-                &link.unread,
+                &told(link.unread),
                 &link.stale,
                 &link.rejected,
             ])
@@ -199,10 +201,13 @@ pub fn books(source: &Source) -> Section {
         blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
     }
     blocks.extend(recorded(source));
-    if let Some(state) = source.summary.as_ref().map(|summary| &summary.state) {
-        let disturbed = state
-            .first_disturbed_tick
-            .map_or("every tick undisturbed".to_owned(), |tick| format!("first disturbed tick {tick}"));
+    if let Some((summary, state)) = source.summary.as_ref().map(|summary| (summary, &summary.state)) {
+        let undisturbed = || {
+            let unbooked = !summary.books.unbooked.is_empty();
+            State::undisturbed_words(state.elapsed_ticks, summary.last_tick + 1, unbooked)
+        };
+        let disturbed =
+            state.first_disturbed_tick.map_or_else(undisturbed, |tick| format!("first disturbed tick {tick}"));
         blocks.push(Block::Text(format!("State hash {}; {disturbed}.", state.hash)));
     }
     Section { id: "books", title: "Books", blocks }
@@ -287,6 +292,9 @@ pub fn machine(source: &Source) -> Section {
     } else {
         let head = vec!["role", "privilege", "asked for", "", "reason"];
         blocks.push(Block::Table { caption: "Privileges".to_owned(), head, rows });
+    }
+    if let Some(run) = source.run() {
+        blocks.push(Block::Text(format!("Run {run}.")));
     }
     if let Some(info) = info {
         let text = format!("Recorded by {}; scenario hash {}, seed {}.", info.version, info.scenario_hash, info.seed);

@@ -310,13 +310,18 @@ fn await_phase<B: Bus>(
     phase: Phase,
 ) -> Result<Option<Schedule>, RoleError> {
     let waited_s = 2.0 * scenario.startup_timeout_s;
-    let end_ns = monotonic_ns() + (waited_s * 1e9) as u64;
+    let limit_ns = (waited_s * 1e9) as u64;
+    let (mut end_ns, mut heard) = (monotonic_ns() + limit_ns, None);
     while monotonic_ns() < end_ns {
         control.announce(state, &**node)?;
         if control.stopped()? {
             return Ok(None);
         }
         let schedule = control.schedule()?;
+        // A launcher that waits for somebody announces again and again: it is alive.
+        if heard.replace(schedule.stamp.tick) != Some(schedule.stamp.tick) {
+            end_ns = monotonic_ns() + limit_ns;
+        }
         if Phase::from_number(schedule.phase) >= phase {
             return Ok(Some(schedule));
         }

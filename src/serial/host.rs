@@ -37,7 +37,7 @@ pub struct LineBook {
     pub dropped_bytes: u64,
     /// How often a good frame followed something dropped.
     pub resyncs: u64,
-    /// Frames that the device sent and that never came whole, by its sequence numbers.
+    /// Frames that the device sent and that did not come whole in their turn, by its sequence numbers.
     pub sequence_gaps: u64,
     /// Answers to a tick that was answered already.
     pub duplicates: u64,
@@ -51,6 +51,8 @@ pub struct LineBook {
     pub unanswered: u64,
     /// Handshakes completed.
     pub handshakes: u64,
+    /// Handshakes with a device that had lost the run: its body was at its initial state again, in the midst of it.
+    pub restarts: u64,
     /// How often the line was opened again.
     pub reopened: u64,
     /// Frames that the line did not take, for the one before was still on its way.
@@ -103,7 +105,7 @@ pub struct Host {
     decoder: Decoder,
     frame: [u8; MAX_FRAME],
     sequence: u32,
-    /// The device's last sequence number.
+    /// The device's highest sequence number.
     heard: Option<u32>,
     greeted: bool,
     greet_due_ns: u64,
@@ -205,8 +207,15 @@ impl Host {
         match message {
             Message::Hello(_) | Message::Tick(_) | Message::Stop => book.echoes += 1,
             Message::Welcome(welcome) if welcome.run == terms.run => {
-                // A greeted device that welcomes again has heard two greetings; one that began anew counts from 0.
-                *heard = Some(sequence);
+                // A greeted device that welcomes again has heard two greetings.
+                let restarted = !self.greeted && self.answered.is_some_and(|answered| welcome.next_tick <= answered);
+                if restarted {
+                    book.restarts += 1;
+                    // It counts from 0: the next frame is the first that is comparable.
+                    *heard = None;
+                } else {
+                    note(heard, book, sequence);
+                }
                 if !self.greeted {
                     book.handshakes += 1;
                     self.greeted = true;
@@ -318,13 +327,14 @@ impl Host {
     }
 }
 
-/// Counts the frames between the last one heard and this one. A device that begins anew counts from 0.
+/// Counts the frames between the newest one heard and this one. One that is not newer came again: it is no gap, and nothing
+/// is counted from it.
 fn note(heard: &mut Option<u32>, book: &mut LineBook, sequence: u32) {
-    let gap = heard.map_or(0, |last| sequence.wrapping_sub(last).wrapping_sub(1));
-    if gap <= u32::MAX / 2 {
-        book.sequence_gaps += u64::from(gap);
+    let ahead = heard.map_or(1, |newest| sequence.wrapping_sub(newest));
+    if (1..=u32::MAX / 2).contains(&ahead) {
+        book.sequence_gaps += u64::from(ahead - 1);
+        *heard = Some(sequence);
     }
-    *heard = Some(sequence);
 }
 
 fn smooth(mean_ns: &mut u64, value_ns: u64) {

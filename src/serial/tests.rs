@@ -333,7 +333,8 @@ fn a_device_that_began_anew_is_greeted_at_once() {
     let Some(Event::Answer(2, CommandEvent::Applied, measurement, _)) = rig.ask(2, Some(1.0), 20 * PERIOD_NS) else {
         panic!()
     };
-    assert_eq!((measurement.omega_rad_s[0], rig.host.book().handshakes), (1.0, 2));
+    let book = rig.host.book();
+    assert_eq!((measurement.omega_rad_s[0], book.handshakes, book.restarts), (1.0, 2, 1));
 }
 
 #[test]
@@ -352,7 +353,8 @@ fn a_silent_device_is_greeted_anew_and_goes_on_where_it_was() {
         panic!()
     };
     assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15, "it was safe meanwhile, not reset: {measurement:?}");
-    assert_eq!((rig.host.book().handshakes, rig.host.silent_ns(rig.now_ns)), (2, 0));
+    let book = rig.host.book();
+    assert_eq!((book.handshakes, book.restarts, rig.host.silent_ns(rig.now_ns)), (2, 0, 0));
 }
 
 #[test]
@@ -413,6 +415,70 @@ fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
     assert!(rig.hear(&answer).is_empty() && rig.hear(&asked).is_empty());
     let book = rig.host.book();
     assert_eq!((book.late, book.duplicates, book.echoes, book.unanswered), (1, 1, 1, 1));
+}
+
+/// A frame of the device with this sequence number, which is no answer to anything that is asked.
+fn frame_of(sequence: u32) -> Vec<u8> {
+    let measurement = [0; content_length::<RateMeasurement>()];
+    let answer = Answer { echo: 0, tick: 1000, event: CommandEvent::Held, measurement: &measurement, truth: &[] };
+    let mut payload = [0; MAX_PAYLOAD];
+    let payload = write(sequence, Message::Answer(answer), &mut payload).unwrap();
+    encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec()
+}
+
+proptest! {
+    /// What is lost is counted once, wherever the numbers wrap, and however often frames that were heard come again.
+    #[test]
+    fn frames_that_come_again_are_no_loss(first: u32, fates in prop::collection::vec((any::<bool>(), any::<prop::sample::Index>(), any::<bool>()), 1..200)) {
+        let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+        let (mut heard, mut lost) = (vec![first], 0);
+        rig.hear(&frame_of(first));
+        let (mut sequence, mut pending) = (first, 0);
+        for (arrives, old, again) in fates {
+            sequence = sequence.wrapping_add(1);
+            if arrives {
+                rig.hear(&frame_of(sequence));
+                heard.push(sequence);
+                lost += std::mem::take(&mut pending);
+            } else {
+                pending += 1;
+            }
+            if again {
+                rig.hear(&frame_of(heard[old.index(heard.len())]));
+            }
+            prop_assert_eq!(rig.host.book().sequence_gaps, lost);
+        }
+    }
+
+    /// Every loss of the device's memory is told once, wherever it happens after an answer, and no other handshake is one.
+    #[test]
+    fn a_device_that_lost_the_run_is_told_from_one_that_was_away(fates in prop::collection::vec(0..4_u8, 1..30)) {
+        let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+        rig.greet();
+        let (mut restarts, mut tick) = (0, 0);
+        for fate in fates {
+            prop_assert!(rig.ask(tick, None, 20 * PERIOD_NS).is_some());
+            tick += 1;
+            match fate {
+                0 => {
+                    rig.device = device();
+                    restarts += 1;
+                }
+                // It was merely unreachable.
+                1 => rig.host.cut(rig.now_ns),
+                // Both at once.
+                2 => {
+                    rig.host.cut(rig.now_ns);
+                    rig.device = device();
+                    restarts += 1;
+                }
+                _ => {}
+            }
+        }
+        prop_assert!(rig.ask(tick, None, 20 * PERIOD_NS).is_some());
+        let book = rig.host.book();
+        prop_assert_eq!((book.restarts, book.sequence_gaps), (restarts, 0));
+    }
 }
 
 /// Samples of another length than agreed are no answer.

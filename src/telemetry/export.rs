@@ -9,11 +9,11 @@ use std::time::Duration;
 /// Ticks per half distance to 100 %: HdrHistogram's own default resolution.
 const TICKS_PER_HALF_DISTANCE: u32 = 5;
 
-/// Writes a percentile distribution, µs, in HdrHistogram's text form (its plotter reads it).
+/// Writes a percentile distribution, µs, in HdrHistogram's text form (its plotter reads it), with a comment at its end.
 ///
 /// # Errors
 /// Those of `out`.
-pub fn write_hgrm(latency: &Latency, out: &mut impl Write) -> io::Result<()> {
+pub fn write_hgrm(latency: &Latency, comment: Option<&str>, out: &mut impl Write) -> io::Result<()> {
     let histogram = latency.histogram();
     writeln!(out, "{:>12} {:>14} {:>10} {:>14}\n", "Value", "Percentile", "TotalCount", "1/(1-Percentile)")?;
     let mut total = 0;
@@ -29,24 +29,29 @@ pub fn write_hgrm(latency: &Latency, out: &mut impl Write) -> io::Result<()> {
     let us = |ns: f64| ns / 1e3;
     writeln!(out, "#[Mean    = {:12.3}, StdDeviation   = {:12.3}]", us(histogram.mean()), us(histogram.stdev()))?;
     writeln!(out, "#[Max     = {:12.3}, Total count    = {:12}]", us(histogram.max() as f64), histogram.len())?;
-    writeln!(out, "#[Buckets = {:12}, SubBuckets     = {:12}]", histogram.buckets(), histogram.distinct_values())
+    writeln!(out, "#[Buckets = {:12}, SubBuckets     = {:12}]", histogram.buckets(), histogram.distinct_values())?;
+    comment.map_or(Ok(()), |comment| writeln!(out, "#[{comment}]"))
 }
 
-/// Writes one interval per named histogram, ns, as an HdrHistogram log: `run_s` is the length of the run.
+/// Writes one interval per named histogram, ns, as an HdrHistogram log, with a comment at its start: `run_s` is the
+/// length of the run.
 ///
 /// # Errors
 /// Those of `out`.
 pub fn write_hlog<'a>(
     stages: impl IntoIterator<Item = (&'a str, &'a Latency)>,
     run_s: f64,
+    comment: Option<&str>,
     out: &mut impl Write,
 ) -> io::Result<()> {
     let other = |error: &dyn std::fmt::Debug| io::Error::other(format!("{error:?}"));
     let mut serializer = V2DeflateSerializer::new();
-    let mut log = IntervalLogWriterBuilder::new()
-        .add_comment("corotate: latencies in nanoseconds, one interval per role and stage")
-        .begin_log_with(out, &mut serializer)
-        .map_err(|error| other(&error))?;
+    let mut builder = IntervalLogWriterBuilder::new();
+    builder.add_comment("corotate: latencies in nanoseconds, one interval per role and stage");
+    if let Some(comment) = comment {
+        builder.add_comment(comment);
+    }
+    let mut log = builder.begin_log_with(out, &mut serializer).map_err(|error| other(&error))?;
     for (name, latency) in stages {
         let tag = Tag::new(name).ok_or_else(|| io::Error::other(format!("`{name}` cannot be a tag")))?;
         log.write_histogram(latency.histogram(), Duration::ZERO, Duration::from_secs_f64(run_s), Some(tag))
@@ -71,7 +76,7 @@ mod tests {
     #[test]
     fn the_percentile_table_ends_at_the_maximum_and_counts_everything() {
         let mut text = Vec::new();
-        write_hgrm(&latency(), &mut text).unwrap();
+        write_hgrm(&latency(), None, &mut text).unwrap();
         let text = String::from_utf8(text).unwrap();
         let rows: Vec<Vec<f64>> = text
             .lines()
@@ -90,7 +95,7 @@ mod tests {
     fn the_log_is_read_back_by_the_library_s_own_reader() {
         let latency = latency();
         let mut log = Vec::new();
-        write_hlog([("leader.step", &latency)], 2.0, &mut log).unwrap();
+        write_hlog([("leader.step", &latency)], 2.0, None, &mut log).unwrap();
         let mut found = 0;
         for entry in IntervalLogIterator::new(&log) {
             if let LogEntry::Interval(interval) = entry.unwrap() {

@@ -151,6 +151,9 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         if event.missed() {
             self.book.starved(tick);
         }
+        if self.link.book().restarts > 0 {
+            self.book.disturbed(tick);
+        }
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
             self.book.safe();
         }

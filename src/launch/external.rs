@@ -1,0 +1,161 @@
+//! External roles that keep a run waiting: who, since when, what is missing, and what came instead.
+//!
+//! Must not end a run; [`super::processes`] does. Must not blame a role whose own inputs are missing.
+
+use super::supervision::Member;
+use super::trace::Lack;
+use crate::config::{ClockKind, Scenario};
+use crate::runtime::RoleId;
+use crate::sample::RoleState;
+
+/// A role is named after it has kept the run waiting for so long, ns; then twice as late each time, up to the second.
+const FIRST_WORD_NS: u64 = 5_000_000_000;
+const WORD_INTERVAL_NS: u64 = 60_000_000_000;
+/// Once the ticks run, an external role may keep the run waiting for so long where the scenario sets no limit, s.
+const TICKS_LIMIT_S: f64 = 30.0;
+/// The least limit in real time, periods.
+const LIMIT_PERIODS: f64 = 10.0;
+/// The most that one look adds to a wait, ns: a launcher that was stopped blames nobody.
+const LOOK_MAX_NS: u64 = 100_000_000;
+
+/// How long each role of a run has been waited for.
+pub(super) struct ExternalWatch {
+    waits: Vec<Wait>,
+}
+
+/// A role that keeps the run waiting.
+#[derive(Debug, PartialEq)]
+pub(super) enum Waiting {
+    /// It is to be named, in these words.
+    Say(String),
+    /// It has used up its time, for this cause.
+    TooLong { member: usize, tick: u64, cause: String },
+}
+
+#[derive(Debug, Default)]
+struct Wait {
+    lack: Option<Lack>,
+    waited_ns: u64,
+    looked_ns: u64,
+    next_word_ns: u64,
+}
+
+impl Wait {
+    /// Goes on waiting for the same, or begins anew; how long it has lasted, ns.
+    fn look(&mut self, lack: Lack, now_ns: u64) -> u64 {
+        if self.lack.as_ref().is_some_and(|before| before.is_still(&lack)) {
+            self.waited_ns += now_ns.saturating_sub(self.looked_ns).min(LOOK_MAX_NS);
+        } else {
+            (self.waited_ns, self.next_word_ns) = (0, FIRST_WORD_NS);
+        }
+        (self.lack, self.looked_ns) = (Some(lack), now_ns);
+        self.waited_ns
+    }
+
+    /// Whether it is time to name the role again.
+    fn word_due(&mut self) -> bool {
+        let due = self.waited_ns >= self.next_word_ns;
+        if due {
+            self.next_word_ns += self.next_word_ns.min(WORD_INTERVAL_NS);
+        }
+        due
+    }
+}
+
+impl ExternalWatch {
+    pub fn new(members: usize) -> Self {
+        Self { waits: (0..members).map(|_| Wait::default()).collect() }
+    }
+
+    /// Looks at external roles that have not reached `state`, before the ticks run.
+    pub fn before_ticks(
+        &mut self,
+        scenario: &Scenario,
+        members: &[Member],
+        state: RoleState,
+        now_ns: u64,
+    ) -> Vec<Waiting> {
+        let lack = |member: &Member| (member.state() < state).then_some(Lack::State(member.state()));
+        self.look(members, scenario.external_timeout_s.unwrap_or(f64::INFINITY), lack, now_ns)
+    }
+
+    /// Looks at external roles whose samples are waited for; `scored_tick` is the scorer's next.
+    pub fn in_ticks(&mut self, scenario: &Scenario, members: &[Member], scored_tick: u64, now_ns: u64) -> Vec<Waiting> {
+        let realtime = scenario.clock == ClockKind::Realtime;
+        let least_s = if realtime { LIMIT_PERIODS * scenario.tick_s() } else { 0.0 };
+        let limit_s = scenario.external_timeout_s.unwrap_or(TICKS_LIMIT_S).max(least_s);
+        // Nothing is known of what other external roles wait for.
+        let next_tick = |role: RoleId| {
+            let own = members.iter().find(|member| member.books().any(|(of, _)| of == role))?;
+            (!own.external && own.state() == RoleState::Running).then_some(own.last.stamp.tick)
+        };
+        let scored = (scored_tick <= scenario.last_tick && !realtime).then_some(scored_tick);
+        let others_done = members.iter().all(|member| member.external || member.state() == RoleState::Done);
+        let lack = |member: &Member| {
+            let unfinished = others_done && member.state() < RoleState::Done;
+            let state = unfinished.then_some(Lack::State(member.state()));
+            member.trace()?.lack(next_tick, scored, realtime).or(state)
+        };
+        self.look(members, limit_s, lack, now_ns)
+    }
+
+    /// Whether some role is waited for at the last look.
+    pub fn waits(&self) -> bool {
+        self.waits.iter().any(|wait| wait.lack.is_some())
+    }
+
+    fn look(
+        &mut self,
+        members: &[Member],
+        limit_s: f64,
+        lack: impl Fn(&Member) -> Option<Lack>,
+        now_ns: u64,
+    ) -> Vec<Waiting> {
+        let mut found = Vec::new();
+        for (index, (member, wait)) in members.iter().zip(&mut self.waits).enumerate() {
+            let Some(lack) = Some(member).filter(|member| member.external).and_then(&lack) else {
+                *wait = Wait::default();
+                continue;
+            };
+            let waited_s = wait.look(lack, now_ns) as f64 / 1e9;
+            if waited_s >= limit_s {
+                let cause = format!("it kept the run waiting for {limit_s} s: {lack}");
+                found.push(Waiting::TooLong {
+                    member: index,
+                    tick: lack.tick().unwrap_or(member.last.stamp.tick),
+                    cause,
+                });
+            } else if wait.word_due() {
+                found.push(Waiting::Say(format!("waiting for {} (external) for {waited_s:.0} s: {lack}", member.name)));
+            }
+        }
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_role_is_named_at_growing_intervals_and_anew_for_another_lack() {
+        let (mut wait, mut words) = (Wait::default(), Vec::new());
+        for look in 0..4000_u64 {
+            let waited_ns = wait.look(Lack::State(RoleState::Absent), look * LOOK_MAX_NS);
+            if wait.word_due() {
+                words.push(waited_ns / 1_000_000_000);
+            }
+        }
+        assert_eq!(words, [5, 10, 20, 40, 80, 140, 200, 260, 320, 380]);
+        assert_eq!(wait.look(Lack::State(RoleState::Open), 0), 0);
+        assert!(!wait.word_due());
+    }
+
+    /// Whoever stopped the launcher did not stop the role.
+    #[test]
+    fn time_in_which_nobody_looked_does_not_count() {
+        let mut wait = Wait::default();
+        wait.look(Lack::State(RoleState::Absent), 0);
+        assert_eq!(wait.look(Lack::State(RoleState::Absent), 3_600_000_000_000), LOOK_MAX_NS);
+    }
+}
