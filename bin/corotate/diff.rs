@@ -3,6 +3,7 @@
 use crate::record::exit_of;
 use crate::{Exit, fail, say};
 use corotate::record::{Comparison, Recording, Tolerances, diff as compare};
+use corotate::system::tell;
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -45,7 +46,7 @@ pub fn diff(arguments: &Arguments) -> Exit {
     };
     for recording in [&a, &b] {
         if let Some(damage) = recording.damage() {
-            eprintln!("corotate: {} is read as far as it goes: {damage}", recording.path().display());
+            tell(format_args!("corotate: {} is read as far as it goes: {damage}", recording.path().display()));
         }
     }
     match compare(&a, &b, tolerances) {

@@ -2,6 +2,7 @@
 
 use crate::{Exit, fail, record, say};
 use corotate::record::{ExportError, Recording, export_csv};
+use corotate::system::tell;
 use std::path::PathBuf;
 
 /// Options of `corotate export`.
@@ -48,7 +49,7 @@ pub fn export(arguments: &Arguments) -> Exit {
 fn write(arguments: &Arguments) -> Result<Vec<PathBuf>, ExportError> {
     let recording = Recording::open(&arguments.file)?;
     if let Some(damage) = recording.damage() {
-        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
+        tell(format_args!("corotate: {} is read as far as it goes: {damage}", arguments.file.display()));
     }
     let mut files = Vec::new();
     if let Some(directory) = &arguments.csv {

@@ -6,6 +6,7 @@ use corotate::config::Scenario;
 use corotate::launch::{LaunchError, replay_as_process};
 use corotate::record::{RecordError, Recording, RoleReplay, replay_in_process};
 use corotate::runtime::RoleId;
+use corotate::system::tell;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -50,7 +51,7 @@ pub fn replay(arguments: &Arguments) -> Exit {
 fn attempt(arguments: &Arguments) -> Result<Vec<RoleReplay>, LaunchError> {
     let recording = Recording::open(&arguments.file)?;
     if let Some(damage) = recording.damage() {
-        eprintln!("corotate: {} is read as far as it goes: {damage}", arguments.file.display());
+        tell(format_args!("corotate: {} is read as far as it goes: {damage}", arguments.file.display()));
     }
     let scenario = recording.scenario_for_replay()?;
     recording.check_layouts(&scenario)?;

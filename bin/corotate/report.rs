@@ -3,6 +3,7 @@
 use crate::record;
 use crate::{Exit, fail, say};
 use corotate::report::{ReportError, report as compose};
+use corotate::system::tell;
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -38,7 +39,7 @@ pub fn report(arguments: &Arguments) -> Exit {
     let composed = compose(source);
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
-        report.remarks().iter().for_each(|remark| eprintln!("corotate: {remark}"));
+        report.remarks().iter().for_each(|remark| tell(format_args!("corotate: {remark}")));
         report.write(&out)
     });
     match written {

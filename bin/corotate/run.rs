@@ -2,8 +2,9 @@
 
 use crate::{Exit, fail, foxglove, print};
 use corotate::config::{ClockKind, SHIPPED, Scenario};
-use corotate::launch::{Action, Launch, LaunchError, Progress, Summary, junit, table, write_run};
+use corotate::launch::{Action, Launch, LaunchError, Outcome, Progress, Summary, junit, table, write_run};
 use corotate::runtime::seat_path;
+use corotate::system::{remedy, tell};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
@@ -124,8 +125,9 @@ pub fn run(arguments: &Arguments) -> Exit {
         return exit;
     }
     let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
-    let written = write_verdict(ended.as_ref().map_err(|failure| failure.reason.as_str()));
-    let exit = match &ended {
+    let told = ended.as_ref().map(|(summary, _)| summary);
+    let written = write_verdict(told.map_err(|failure| failure.reason.as_str()));
+    let exit = match told {
         Ok(summary) => verdict(summary),
         Err(failure) => fail(failure.exit, &failure.reason),
     };
@@ -142,13 +144,15 @@ fn write_junit(path: &Path, name: &str, ended: Result<&Summary, &str>) -> Result
         .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
 }
 
-fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failure> {
+/// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failure> {
     let broken = |reason: String| Failure { exit: Exit::Failure, reason };
     let started = jiff::Timestamp::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
-    let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
+    let program = std::env::current_exe()
+        .map_err(|error| broken(format!("cannot find this program's own file: {error}; {}", remedy(&error))))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.clone()).collect();
     let mut screen = Screen { bar: None, asked: false, fleets };
@@ -169,15 +173,15 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
     let summary = Summary::new(scenario, &outcome, started);
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
-    written.map_err(|error| broken(format!("cannot write the results: {error}")))?;
+    written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
     reported.map_err(broken)?;
-    Ok(summary)
+    Ok((summary, outcome))
 }
 
 fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
     let text = format!("{}results in {}\n", table(summary), directory.display());
     if arguments.json {
-        eprint!("{text}");
+        tell(text.trim_end());
         print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
         print(&text)
@@ -195,7 +199,7 @@ fn verdict(summary: &Summary) -> Exit {
         return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
     }
     if summary.signal != 0 {
-        eprintln!("corotate: ended in order by signal {}", summary.signal);
+        tell(format_args!("corotate: ended in order by signal {}", summary.signal));
         return Exit::Signal(summary.signal);
     }
     for criterion in summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)) {
@@ -220,11 +224,16 @@ pub fn exit_of(error: &LaunchError) -> Exit {
     }
 }
 
+/// A signal cannot be caught: the system's error with what to do.
+pub fn not_caught(error: io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("cannot catch signals: {error}; {}", remedy(&error)))
+}
+
 /// The number of the signal that asked for the end, once one has.
 pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_usize(number, signal.clone(), number as usize)?;
+        signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
     }
     Ok(signal)
 }
@@ -262,8 +271,9 @@ impl Screen {
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
-                    eprintln!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain));
-                    eprintln!("or give a program of your own the seat\n  {}", seat_path(domain, role).display());
+                    tell(format_args!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain)));
+                    let seat = seat_path(domain, role);
+                    tell(format_args!("or give a program of your own the seat\n  {}", seat.display()));
                 }
             }
             Progress::Waiting { .. } => {}

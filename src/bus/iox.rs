@@ -3,6 +3,7 @@
 //! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
 //! by the loop itself (lockstep), not by a writer that waits.
 
+mod cause;
 mod fleet;
 mod latest;
 
@@ -13,6 +14,7 @@ use super::bell::{BELLS_BYTES, Bell, Bells};
 use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
 use crate::sample::{FleetLayout, Sample, VOID};
+use crate::system::remedy;
 use iceoryx2::config::Config;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -164,10 +166,9 @@ impl IoxBus {
         bells: io::Result<Bells>,
         makes: bool,
     ) -> Result<Self, BusError> {
-        // iceoryx2 reports to the console on its own; what matters comes back as an error.
-        set_log_level(LogLevel::Fatal);
+        cause::hear();
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
-        let bells = bells.map_err(|error| failed(error.to_string()))?;
+        let bells = bells.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
         let node = Rc::new(enter(domain, name).map_err(failed)?);
         Ok(Self { node, bells, depths, makes })
     }
@@ -179,6 +180,7 @@ impl IoxBus {
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
+        cause::forget();
         unbroken(|| {
             let builder = self.builder::<Wire<S>>(topic, end, &Qos::of(topic.signal, self.depths))?;
             if self.makes {
@@ -194,6 +196,7 @@ impl IoxBus {
         topic: &Topic,
         end: &'static str,
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
+        cause::forget();
         unbroken(|| {
             let builder = self.builder::<[fleet::Word<L>]>(topic, end, &Qos::of_fleet(topic.signal, self.depths))?;
             if self.makes {
@@ -248,7 +251,8 @@ fn unbroken<T>(mut open: impl FnMut() -> Result<T, BusError>) -> Result<T, BusEr
 }
 
 fn failed_to_open(topic: &Topic, end: &'static str, error: &impl fmt::Debug) -> BusError {
-    BusError::Open { service: topic.to_string(), end, reason: format!("{error:?}") }
+    let otherwise = || format!("{error:?}; is another process of this run its {end}, or of another version?");
+    BusError::Open { service: topic.to_string(), end, reason: cause::reason(otherwise) }
 }
 
 /// Whether a service has a writer. One that was killed is one until its remains are cleared.
@@ -268,12 +272,13 @@ fn config(domain: &Domain) -> Result<Config, String> {
 
 pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
     let config = config(domain)?;
+    cause::forget();
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<Ipc>()
-        .map_err(|error| format!("{error:?}"))
+        .map_err(|error| cause::reason(|| format!("{error:?}; check that /dev/shm and this directory are writable")))
 }
 
 impl Bus for IoxBus {
@@ -292,22 +297,15 @@ impl Bus for IoxBus {
             .max_loaned_samples(1)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
-            .map_err(|error| BusError::Open {
-                service: topic.to_string(),
-                end: "writer",
-                reason: format!("{error:?}"),
-            })?;
+            .map_err(|error| failed_to_open(topic, "writer", &error))?;
         Ok(IoxWriter { publisher, latest, loan: None, shown: None, bell: self.bells.of(topic), topic: topic.clone() })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
         let depth = buffer_size(topic.signal, reader, self.depths);
         let service = self.service::<S>(topic, "reader")?;
-        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
-            service: topic.to_string(),
-            end: "reader",
-            reason: format!("{error:?}"),
-        })?;
+        let subscriber = service.subscriber_builder().buffer_size(depth).create();
+        let subscriber = subscriber.map_err(|error| failed_to_open(topic, "reader", &error))?;
         // Who reads every sample has no use for the latest.
         let lane = match reader {
             Reader::Role if self.has_lane(topic) => Lane::Wanted { generation: 1 },
@@ -361,13 +359,14 @@ impl<S: Sample> IoxWriter<S> {
 
     #[inline]
     fn deliver(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
-        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         self.bell.ring();
         Ok(())
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
-        let chunk = self.publisher.loan_uninit().map_err(|error| self.failed(format!("{error:?}")))?;
+        let chunk =
+            self.publisher.loan_uninit().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         Ok(chunk.write_payload(Wire(S::zeroed())))
     }
 
@@ -406,7 +405,7 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+        self.publisher.update_connections().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))
     }
 }
 
@@ -469,7 +468,7 @@ impl<S: Sample> IoxReader<S> {
         let received = match self.subscriber.receive() {
             Ok(Some(sample)) => sample,
             Ok(None) => return Ok(false),
-            Err(error) => return Err(self.failed(format!("{error:?}"))),
+            Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
         };
         let key = key(&received.payload().0);
         let (generation, _) = key;
@@ -516,7 +515,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
         let news = || match &self.lane {
             Lane::Open(latest) if latest.has_news() => Ok(true),
-            _ => self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}"))),
+            _ => self.subscriber.has_samples().map_err(|error| self.failed(cause::reason(|| format!("{error:?}")))),
         };
         self.bell.sleep(until_ns, news)
     }

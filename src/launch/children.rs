@@ -8,14 +8,15 @@ use super::supervision::Failure;
 use crate::bus::domain::{self, Domain};
 use crate::config::Scenario;
 use crate::runtime::RoleId;
+use crate::system::tell;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -52,11 +53,16 @@ impl RoleProcess {
         command.arg("--parent").arg(std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the launcher alone, and the launcher ends the roles in order.
         command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
-        let mut child = command.spawn().map_err(|source| LaunchError::Spawn { role: name.clone(), source })?;
-        let last_words = Arc::new(Mutex::new(VecDeque::new()));
-        let listener = child.stderr.take().map(|stderr| listen(name, stderr, last_words.clone()));
+        let failed = |source| LaunchError::Spawn { role: name.clone(), source };
+        let mut child = command.spawn().map_err(failed)?;
+        let stderr = child.stderr.take();
         let handle = Pid::from_raw(child.id() as i32).and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
-        Ok(Self { child, status: None, handle, last_words, listener })
+        let last_words = Arc::new(Mutex::new(VecDeque::new()));
+        // Ended again if nobody can listen to it.
+        let mut process = Self { child, status: None, handle, last_words, listener: None };
+        let listen = |stderr| listen(name.clone(), stderr, process.last_words.clone());
+        process.listener = stderr.map(listen).transpose().map_err(failed)?;
+        Ok(process)
     }
 
     /// How the process ended, if it has.
@@ -134,10 +140,14 @@ fn signal_name(signal: i32) -> String {
 }
 
 /// Passes a role's error output on, its name in front, and keeps the end of it.
-fn listen(name: String, stderr: impl Read + Send + 'static, last: Arc<Mutex<VecDeque<String>>>) -> JoinHandle<()> {
-    std::thread::spawn(move || {
+fn listen(
+    name: String,
+    stderr: impl Read + Send + 'static,
+    last: Arc<Mutex<VecDeque<String>>>,
+) -> io::Result<JoinHandle<()>> {
+    std::thread::Builder::new().spawn(move || {
         for line in BufReader::new(stderr).lines().map_while(Result::ok) {
-            eprintln!("[{name}] {line}");
+            tell(format_args!("[{name}] {line}"));
             if let Ok(mut last) = last.lock() {
                 last.push_back(line);
                 while last.len() > LAST_LINES {
@@ -148,17 +158,16 @@ fn listen(name: String, stderr: impl Read + Send + 'static, last: Arc<Mutex<VecD
     })
 }
 
-/// The process that cleans up if the launcher cannot.
+/// The process that cleans up if the launcher cannot. Its input is a pipe that the kernel closes when the launcher dies.
+#[derive(Debug)]
 pub(super) struct Janitor {
     child: Child,
-    /// Held open: the kernel closes it when the launcher dies, and the janitor sees the end of its input.
-    line: Option<ChildStdin>,
 }
 
 impl Janitor {
-    /// Starts the janitor.
+    /// Starts the janitor: before there is anything to remove, so that nothing is left whenever the launcher dies.
     pub fn start(program: &Path) -> Result<Self, LaunchError> {
-        let mut child = Command::new(program)
+        let child = Command::new(program)
             .arg("janitor")
             .process_group(0)
             .stdin(Stdio::piped())
@@ -166,25 +175,22 @@ impl Janitor {
             .stderr(Stdio::null())
             .spawn()
             .map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
-        let line = child.stdin.take();
-        Ok(Self { child, line })
+        Ok(Self { child })
     }
 }
 
+/// Whatever it was there for is done. It is ended, not asked to end: it may have been stopped, and nobody waits for it.
 impl Drop for Janitor {
     fn drop(&mut self) {
-        if let Some(mut line) = self.line.take() {
-            let _ = line.write_all(b"all clean");
-        }
+        let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// The janitor's work: waits for the end of `line`; if the launcher said nothing before, removes what it left behind.
+/// The janitor's work: waits for the end of `line`, and removes what the launcher left behind.
 pub fn janitor(mut line: impl Read) {
-    if io::copy(&mut line, &mut io::sink()).is_ok_and(|said| said > 0) {
-        return;
-    }
+    // However it ends, nobody is left who could close it.
+    let _ = io::copy(&mut line, &mut io::sink());
     // Roles whose launcher was killed are dying at this moment: what they still hold, or were just about to make, goes in a
     // later round.
     let mut gone = Vec::new();

@@ -1,6 +1,6 @@
 //! A run as processes: gather, warm up, run, stop, collect. One thread, which also scores.
 //!
-//! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
+//! Whatever happens, dropping what this file holds ends every role, removes the domain and ends the janitor, in that order.
 
 use super::children::{END_LIMIT, Janitor, RoleProcess};
 use super::foxglove::FoxgloveWatch;
@@ -13,14 +13,17 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
+use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
     shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
+use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use std::fmt;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -44,13 +47,13 @@ const HUNG_PERIODS: u64 = 10;
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     require_descriptors(scenario)?;
+    // Declared first, so that it is dropped last.
+    let janitor = Janitor::start(&launch.program)?;
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_toml().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     describe_seats(scenario, launch, domain)?;
-    // Declared before the roles, so that it is dropped, and cleans up, after them.
-    let _janitor = Janitor::start(&launch.program)?;
     let (_low_latency, grants) = match scenario.clock {
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
@@ -58,14 +61,29 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?;
     domain.seal()?;
     let mut crew = Crew::start(scenario, launch, domain, &bus)?;
-    let mut scorer = score::open(scenario, &bus)?;
-    let signal = crew.conduct(&mut *scorer, launch, &grants)?;
+    let mut scorer = score::open(scenario, &bus).map_err(|error| crew.blame(error.into()))?;
+    let signal = crew.conduct(&mut *scorer, launch, &grants).map_err(|error| crew.blame(error))?;
     let Dismissal { reports, unbooked, problems } = crew.dismiss();
     let score = scorer.finish()?;
     let (incidents, recorder) = crew.incidents(&score.recoveries_s);
     let recording = recorder.finish(domain, &reports);
     let domain = Some(domain.root().to_owned());
-    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal })
+    let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
+    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal, remains })
+}
+
+/// What is still there of a run whose roles have ended. It is removed when this is dropped, in this order: after the
+/// results have been written and told.
+pub(super) struct Remains {
+    _bus: IoxBus,
+    _domain: OwnedDomain,
+    _janitor: Janitor,
+}
+
+impl fmt::Debug for Remains {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Remains").field(&self._domain).finish()
+    }
 }
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
@@ -141,7 +159,7 @@ impl<'a> Crew<'a> {
         bus: &'a IoxBus,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
-        let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
+        let mut recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
         let foxglove = FoxgloveWatch::start(&launch.program, launch.foxglove, domain)?;
         // All of them first: they come up while their links are opened here.
         let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
@@ -149,11 +167,23 @@ impl<'a> Crew<'a> {
             false => RoleProcess::start(&launch.program, scenario, role, domain).map(|process| (role, Some(process))),
         };
         let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
-        let started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
-        let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
-        let members = started.into_iter().map(member).collect::<Result<_, _>>()?;
+        let mut started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
+        let open = |(role, process): &(RoleId, Option<RoleProcess>)| {
+            Member::new(scenario, *role, process.is_none(), domain, bus)
+        };
+        let mut members = started.iter().map(open).collect::<Result<Vec<_>, _>>().map_err(|error| {
+            let roles = started.iter_mut().map(|(role, process)| (role.name(scenario), process.as_mut()));
+            blame(error, roles.chain([(RECORDER, recorder.process())]))
+        })?;
+        members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
         Ok(Self { scenario, domain, bus, program, members, schedule, word, incidents, recorder, foxglove })
+    }
+
+    /// See [`blame`].
+    fn blame(&mut self, error: LaunchError) -> LaunchError {
+        let members = self.members.iter_mut().map(|member| (&*member.name, member.process.as_mut()));
+        blame(error, members.chain([(RECORDER, self.recorder.process())]))
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -269,12 +299,16 @@ impl<'a> Crew<'a> {
         self.recorder.supervise(self.bus);
         self.foxglove.supervise(self.bus);
         for member in &mut self.members {
+            let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.failure(self.scenario, self.bus) {
-                let incident = member.fail(failure, self.scenario, now_ns);
-                eprintln!("corotate: {incident}");
+                let incident = match complete {
+                    true => member.note(failure, self.scenario),
+                    false => member.fail(failure, self.scenario, now_ns),
+                };
+                tell(format_args!("corotate: {incident}"));
                 self.bus.clear_dead();
                 scorer.incident(incident.tick);
-                go_on &= incident.action == Action::Restarted;
+                go_on &= incident.action != Action::Stopped;
                 self.incidents.push(incident);
             }
             member.restart(&self.program, self.scenario, self.domain, now_ns)?;
@@ -341,10 +375,14 @@ impl<'a> Crew<'a> {
         let mut dismissal = Dismissal::default();
         for member in &mut self.members {
             let reported = report_path(self.domain.root(), &member.name).exists();
+            let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.bad_end(reported) {
-                let stopped = Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) };
-                eprintln!("corotate: {stopped}");
-                self.incidents.push(stopped);
+                let incident = match complete {
+                    true => member.note(failure, self.scenario),
+                    false => Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) },
+                };
+                tell(format_args!("corotate: {incident}"));
+                self.incidents.push(incident);
             }
             for (role, ledger) in member.books() {
                 dismissal.gather(self.scenario, self.domain, role, ledger);
@@ -359,6 +397,22 @@ impl<'a> Crew<'a> {
         let recovered = self.incidents.into_iter().zip(recoveries);
         (recovered.map(|(incident, recovery_s)| Incident { recovery_s, ..incident }).collect(), self.recorder)
     }
+}
+
+/// Why a link failed, if a process died: one that dies while it opens its links leaves some half made.
+fn blame<'a>(
+    error: LaunchError,
+    processes: impl Iterator<Item = (&'a str, Option<&'a mut RoleProcess>)>,
+) -> LaunchError {
+    if !matches!(error, LaunchError::Bus(_) | LaunchError::Ledger(_)) {
+        return error;
+    }
+    let death = |(name, process): (&str, Option<&mut RoleProcess>)| {
+        let process = process?;
+        process.ended().filter(|status| !status.success())?;
+        process.require_alive(name).err()
+    };
+    processes.filter_map(death).next().unwrap_or(error)
 }
 
 /// Notices that nothing moves any more.

@@ -33,12 +33,13 @@ pub fn replay_as_process(
 ) -> Result<RoleReplay, LaunchError> {
     let mut script = Script::read(recording, scenario, role)?;
     cut(&mut script);
+    // Declared first, so that it is dropped last.
+    let _janitor = Janitor::start(program)?;
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, without_interruptions(scenario).as_bytes())
         .map_err(|source| LaunchError::Write { path, source })?;
-    let _janitor = Janitor::start(program)?;
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
     domain.seal()?;
     let mut prompter = Prompter {

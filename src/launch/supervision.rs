@@ -10,7 +10,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
-use crate::runtime::{RoleId, open_ledger, topic};
+use crate::runtime::{RoleId, open_ledger, report_path, topic};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
 use serde::Serialize;
@@ -57,6 +57,8 @@ pub enum Action {
     Restarted,
     /// The run was ended in order.
     Stopped,
+    /// Nothing: it died after its last tick, and its results are complete.
+    Noted,
 }
 
 impl fmt::Display for Incident {
@@ -69,6 +71,7 @@ impl fmt::Display for Incident {
         f.write_str(match self.action {
             Action::Restarted => "; it is started anew",
             Action::Stopped => "; the run ends",
+            Action::Noted => " after its last tick; its results are complete",
         })
     }
 }
@@ -121,15 +124,15 @@ pub(super) struct Member {
 }
 
 impl Member {
-    /// A role with its process, or one that somebody else starts.
+    /// A role whose process, unless somebody else starts it, is still to be given.
     pub fn new(
         scenario: &Scenario,
         role: RoleId,
-        process: Option<RoleProcess>,
+        external: bool,
         domain: &Domain,
         bus: &IoxBus,
     ) -> Result<Self, LaunchError> {
-        let (external, now_ns) = (process.is_none(), monotonic_ns());
+        let now_ns = monotonic_ns();
         let name = role.name(scenario).to_owned();
         let hosted = role.hosted(scenario).into_iter().filter(|other| *other != role);
         let hosted = hosted.map(|other| Ok((other, open_ledger(domain, scenario, other)?)));
@@ -140,7 +143,7 @@ impl Member {
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
             name,
             role,
-            process,
+            process: None,
             external,
             last: Health::default(),
             generation: 1,
@@ -263,22 +266,44 @@ impl Member {
         }
     }
 
-    /// Decides what is done about a failure, and prepares it.
-    pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
-        let supervision = &scenario.supervision;
-        let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
-        let again = !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max;
-        let incident = Incident {
+    /// Whether its process has ended and nothing is missing: every tick is done, and every report is there.
+    pub fn ended_complete(&mut self, scenario: &Scenario, domain: &Domain) -> bool {
+        let ended = self.process.as_mut().is_some_and(|process| process.ended().is_some());
+        ended
+            && self.books().all(|(role, ledger)| {
+                crate::runtime::next_tick(ledger) > scenario.last_tick
+                    && report_path(domain.root(), role.name(scenario)).exists()
+            })
+    }
+
+    /// Takes note of a failure by which nothing is lost.
+    pub fn note(&mut self, failure: Failure, scenario: &Scenario) -> Incident {
+        self.process = None;
+        self.last.state = RoleState::Done as u64;
+        self.incident(failure, scenario, Action::Noted)
+    }
+
+    fn incident(&self, failure: Failure, scenario: &Scenario, action: Action) -> Incident {
+        Incident {
             role: self.name.clone(),
             with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
             generation: self.generation,
             tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
             cause: failure.cause,
             last_words: failure.last_words,
-            action: if again { Action::Restarted } else { Action::Stopped },
+            action,
             outage_s: None,
             recovery_s: None,
-        };
+        }
+    }
+
+    /// Decides what is done about a failure, and prepares it.
+    pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
+        let supervision = &scenario.supervision;
+        let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
+        let again = !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max;
+        let action = if again { Action::Restarted } else { Action::Stopped };
+        let incident = self.incident(failure, scenario, action);
         // Reaped here, before anybody takes the seat.
         self.process = None;
         if again {

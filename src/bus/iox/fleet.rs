@@ -1,6 +1,6 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
-use super::{IoxBus, Ipc, buffer_size};
+use super::{IoxBus, Ipc, buffer_size, cause, failed_to_open};
 use crate::bus::bell::Bell;
 use crate::bus::{BusError, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample};
@@ -52,16 +52,15 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
             .max_loaned_samples(1)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
-            .map_err(|error| BusError::Open {
-                service: topic.to_string(),
-                end: "writer",
-                reason: format!("{error:?}"),
-            })?;
+            .map_err(|error| failed_to_open(topic, "writer", &error))?;
         Ok(Self { publisher, loan: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, [Word<L>], ()>, BusError> {
-        let chunk = self.publisher.loan_slice_uninit(self.length).map_err(|error| self.failed(format!("{error:?}")))?;
+        let chunk = self
+            .publisher
+            .loan_slice_uninit(self.length)
+            .map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         Ok(chunk.write_from_fn(|_| Word::wrap(0)))
     }
 
@@ -79,7 +78,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
             None => self.loan()?,
         };
         fill(FleetSample::over_mut(Word::peel_slice_mut(sample.payload_mut())));
-        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         self.bell.ring();
         Ok(())
     }
@@ -94,7 +93,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+        self.publisher.update_connections().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))
     }
 }
 
@@ -117,11 +116,8 @@ impl<L: FleetLayout> IoxFleetReader<L> {
         bodies: usize,
     ) -> Result<Self, BusError> {
         let depth = buffer_size(topic.signal, reader, bus.depths);
-        let subscriber = service.subscriber_builder().buffer_size(depth).create().map_err(|error| BusError::Open {
-            service: topic.to_string(),
-            end: "reader",
-            reason: format!("{error:?}"),
-        })?;
+        let subscriber = service.subscriber_builder().buffer_size(depth).create();
+        let subscriber = subscriber.map_err(|error| failed_to_open(topic, "reader", &error))?;
         let length = FleetSample::<L>::length(bodies);
         Ok(Self { service, subscriber, current: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
@@ -148,7 +144,7 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
                 }
                 Ok(Some(_)) => {}
                 Ok(None) => return Ok(false),
-                Err(error) => return Err(self.failed(format!("{error:?}"))),
+                Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
             }
         }
     }
@@ -159,7 +155,8 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
+        let news =
+            || self.subscriber.has_samples().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))));
         self.bell.sleep(until_ns, news)
     }
 

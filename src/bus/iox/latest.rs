@@ -5,12 +5,13 @@
 //! blackboard that its writer died on cannot be written again while anybody reads it, so each generation of a writer has
 //! one of its own.
 
-use super::{Ipc, MAX_NODES, MAX_READERS, Topic, Wire};
+use super::{Ipc, MAX_NODES, MAX_READERS, Topic, Wire, cause};
 use crate::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::reader::{BlackboardValue, EntryHandle};
 use iceoryx2::port::writer::EntryHandleMut;
 use iceoryx2::prelude::*;
+use std::fmt;
 
 /// A blackboard of ours has one entry.
 const KEY: u64 = 0;
@@ -28,9 +29,9 @@ impl<S: Sample> LatestWriter<S> {
             .max_nodes(MAX_NODES)
             .add::<Wire<S>>(KEY, Wire(S::zeroed()))
             .create()
-            .map_err(|error| format!("{error:?}"))?;
-        let writer = service.writer_builder().create().map_err(|error| format!("{error:?}"))?;
-        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(|error| format!("{error:?}"))
+            .map_err(wrong)?;
+        let writer = service.writer_builder().create().map_err(wrong)?;
+        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(wrong)
     }
 
     /// Puts a sample there.
@@ -85,6 +86,10 @@ impl<S: Sample> LatestReader<S> {
     pub fn sample(&self) -> &S {
         &self.value.0
     }
+}
+
+fn wrong(error: impl fmt::Debug) -> String {
+    cause::reason(|| format!("{error:?}; is another process of this run its writer?"))
 }
 
 fn name(topic: &Topic, generation: u64) -> Result<ServiceName, String> {
