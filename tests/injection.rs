@@ -1,8 +1,8 @@
 //! Injected system-call failures: each system call that a command makes in its own code fails once with each plausible
 //! error. Whatever fails, the command names cause and remedy, exits with the right code in time, and leaves nothing behind.
 //!
-//! By default a sample of the cells. `COROTATE_INJECT=all` runs all of them; `COROTATE_INJECT=run:openat:EMFILE:120` runs
-//! one and prints what it said.
+//! By default one cell of each system call. `COROTATE_INJECT=N` runs all targets with all errors, at N places in each
+//! system call's sequence; `COROTATE_INJECT=run:openat:EMFILE:120,...` runs these cells and prints what was said.
 
 mod common;
 
@@ -21,7 +21,7 @@ const ERRORS: [(&str, &[&str]); 29] = [
     ("fallocate", &["ENOSPC", "EOPNOTSUPP", "EINTR"]),
     ("mmap", &["ENOMEM", "EAGAIN"]),
     ("flock", &["ENOLCK", "EINTR"]),
-    ("fcntl", &["EAGAIN", "ENOLCK", "EINTR"]),
+    ("fcntl", &["ENOLCK", "EAGAIN", "EINTR"]),
     ("clone3", &["EAGAIN", "ENOMEM"]),
     ("rename", &["EIO", "ENOSPC", "EACCES"]),
     ("write", &["ENOSPC", "EIO", "EINTR"]),
@@ -213,6 +213,8 @@ fn sites(target: Target) -> Vec<(&'static str, Vec<usize>)> {
 fn may_fail(call: &str, text: &str) -> bool {
     match call {
         "mmap" => text.contains("MAP_SHARED") || text.contains("MAP_STACK"),
+        // A process may always ask for its own limits.
+        "prlimit64" => !text.contains(", NULL, "),
         "write" => !text.starts_with("write(1,") && !text.starts_with("write(2,"),
         _ => true,
     }
@@ -366,6 +368,16 @@ fn cells(target: Target, most_errors: usize, most_sites: usize) -> Vec<Cell> {
     cells
 }
 
+/// One cell of each system call, the targets taken in turn.
+fn one_of_each_call() -> Vec<Cell> {
+    let all: Vec<Cell> = TARGETS.into_iter().flat_map(|target| cells(target, 1, 1)).collect();
+    let of = |(index, (call, _)): (usize, &(&str, &[&str]))| {
+        let those: Vec<&Cell> = all.iter().filter(|cell| cell.call == *call).collect();
+        those.get(index % those.len().max(1)).map(|cell| (*cell).clone())
+    };
+    ERRORS.iter().enumerate().filter_map(of).collect()
+}
+
 fn parse(text: &str) -> Cell {
     let mut words = text.split(':');
     let mut word = || words.next().expect("TARGET:CALL:ERROR:N").to_owned();
@@ -378,10 +390,95 @@ fn parse(text: &str) -> Cell {
 fn every_failed_system_call_is_told_and_leaves_nothing() {
     let asked = std::env::var("COROTATE_INJECT").unwrap_or_default();
     let (cells, limit, verbose) = match asked.as_str() {
-        "" => (TARGETS.into_iter().flat_map(|target| cells(target, 1, 1)).collect(), WATCHDOG, false),
-        "all" => (TARGETS.into_iter().flat_map(|target| cells(target, 9, 12)).collect(), LIMIT, false),
-        one => (one.split(',').map(parse).collect::<Vec<_>>(), LIMIT, true),
+        "" => (one_of_each_call(), WATCHDOG, false),
+        asked => match asked.parse() {
+            Ok(places) => {
+                (TARGETS.into_iter().flat_map(|target| cells(target, usize::MAX, places)).collect(), LIMIT, false)
+            }
+            Err(_) => (asked.split(',').map(parse).collect::<Vec<_>>(), LIMIT, true),
+        },
     };
     let failures = judge_all(&cells, limit, verbose);
     assert!(failures.is_empty(), "{} of {} cells:\n{}", failures.len(), cells.len(), failures.join("\n"));
+}
+
+/// A file system without locks: whoever cannot lock says so, once, and leaves no lock file.
+#[test]
+fn a_domain_that_cannot_be_locked_is_an_error() {
+    let bench = Bench::new();
+    let scenario = Target::Run.scenario(&bench);
+    let scenario: Vec<&str> = scenario.iter().map(String::as_str).collect();
+    let options = ["-o", "/dev/null", "-e", "inject=flock:error=ENOLCK", PROGRAM];
+    let done = bench.start_program(Path::new("strace"), &[&options, &scenario[..]].concat()).wait();
+    told_clearly(&done, &[1]).unwrap();
+    assert!(done.stderr.contains("cannot lock"), "{done:?}");
+    bench.assert_clean(&[]);
+}
+
+/// A janitor that hangs keeps nobody waiting.
+#[test]
+fn a_stopped_janitor_holds_no_run_up() {
+    let bench = Bench::new();
+    let scenario = Target::Watch.scenario(&bench);
+    let run = bench.start(&scenario.iter().map(String::as_str).collect::<Vec<_>>());
+    bench.await_role("controller");
+    let domains = bench.domains();
+    send_signal(bench.await_role("janitor"), libc::SIGSTOP);
+    run.signal(libc::SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    assert!(bench.path("out/summary.json").exists());
+    bench.assert_clean(&domains);
+}
+
+/// Where a user may start only so many processes and threads, a run that needs more is refused in words.
+#[test]
+fn too_few_threads_are_an_error() {
+    let bench = Bench::unprivileged();
+    let scenario = Target::Run.scenario(&bench);
+    let scenario: Vec<&str> = scenario.iter().map(String::as_str).collect();
+    let program = bench.command().get_program().to_owned();
+    for limit in ["--nproc=1", "--nproc=2", "--nproc=3", "--nproc=4", "--nproc=5", "--nproc=6"] {
+        let limited = [&[limit, program.to_str().unwrap()], &scenario[..]].concat();
+        let done = bench.start_program(Path::new("prlimit"), &limited).wait();
+        told_clearly(&done, &[1, 4]).unwrap();
+        bench.assert_clean(&[]);
+    }
+}
+
+/// A run whose stderr takes nothing goes on: words to the user are not what it is for.
+#[test]
+fn a_full_stderr_ends_no_run() {
+    let bench = Bench::new();
+    let scenario = Target::Role.scenario(&bench).join(" ");
+    let run = bench.start_program(Path::new("/bin/sh"), &["-c", &format!("exec {PROGRAM} {scenario} 2>/dev/full")]);
+    bench.await_role("controller");
+    let domains = bench.domains();
+    run.signal(libc::SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    bench.assert_clean(&domains);
+}
+
+/// Whoever dies after its last tick, with its report written, has done all that it was there for.
+#[test]
+fn a_death_after_the_last_tick_is_noted_and_costs_nothing() {
+    let bench = Bench::new();
+    let scenario = Target::Realtime.scenario(&bench);
+    let scenario = scenario.iter().map(|word| if word == "0.2" { "2" } else { word }).chain(["--record"]);
+    let run = bench.start(&scenario.collect::<Vec<_>>());
+    let controller = bench.await_role("controller");
+    let domains = bench.domains();
+    // The recording is begun when the ticks are. While the launcher stands still, nobody lets the roles go.
+    await_some(|| std::fs::metadata(bench.path("out/run.mcap")).ok().filter(|file| file.len() > 0));
+    run.signal(libc::SIGSTOP);
+    let report = domains[0].join("controller.report.json");
+    await_some(|| report.exists().then_some(()));
+    send_signal(controller, libc::SIGKILL);
+    run.signal(libc::SIGCONT);
+    let done = run.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary = std::fs::read_to_string(bench.path("out/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+    assert_eq!(summary["incidents"][0]["action"], "noted", "{}", summary["incidents"]);
+    assert_eq!(summary["incidents"][0]["role"], "controller");
+    bench.assert_clean(&domains);
 }

@@ -238,6 +238,9 @@ pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     Ok(signal)
 }
 
+/// The most runs of one scenario that begin in one second.
+const DIRECTORIES: u32 = 10_000;
+
 /// The directory for the results: as given, or a new one under `runs/`.
 pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
@@ -247,14 +250,14 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
     let runs = Path::new("runs");
     std::fs::create_dir_all(runs).map_err(|error| named(runs, error))?;
     let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
-    for attempt in 1.. {
+    for attempt in 1..=DIRECTORIES {
         let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
         match std::fs::create_dir(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
         }
     }
-    unreachable!("the loop over all numbers does not end")
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
 }
 
 /// Progress on a terminal; silence elsewhere, but for what a person must do.

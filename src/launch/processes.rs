@@ -445,3 +445,31 @@ impl Stall {
         Err(LaunchError::Hung { limit_s: self.limit_ns as f64 / 1e9, roles: roles.join(", ") })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::Command;
+
+    /// What a link says that a dead process left half made is no cause.
+    #[test]
+    fn a_link_that_failed_is_blamed_on_the_process_that_died() {
+        let error = || BusError::Open { service: "s".to_owned(), end: "reader", reason: "HangsInCreation".to_owned() };
+        let start = |script: &str| {
+            let mut command = Command::new("/bin/sh");
+            command.args(["-c", script]);
+            let mut process = RoleProcess::spawn(command, "role".to_owned()).unwrap();
+            while process.ended().is_none() {
+                std::thread::yield_now();
+            }
+            process
+        };
+        let (mut well, mut killed) = (start("exit 0"), start("kill -9 $$"));
+        let blamed = blame(error().into(), [("well", Some(&mut well)), ("killed", Some(&mut killed))].into_iter());
+        assert!(
+            matches!(&blamed, LaunchError::Died { role, cause, .. } if role == "killed" && cause.contains("SIGKILL"))
+        );
+        let blamed = blame(error().into(), [("well", Some(&mut well)), ("external", None)].into_iter());
+        assert!(matches!(blamed, LaunchError::Bus(_)));
+    }
+}

@@ -224,8 +224,12 @@ impl Member {
             return None;
         }
         process.kill();
-        let said = if heard { "said nothing" } else { "was not ready" };
-        Some(Failure { cause: format!("it {said} for {limit_s} s and was killed"), last_words: process.last_words() })
+        let (said, limit) = match heard {
+            true => ("said nothing", "supervision.heartbeat_timeout_s"),
+            false => ("was not ready", "launch.startup_timeout_s"),
+        };
+        let cause = format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}");
+        Some(Failure { cause, last_words: process.last_words() })
     }
 
     /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next

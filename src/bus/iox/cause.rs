@@ -26,6 +26,8 @@ const SERIOUS: [i32; 11] = [
 
 thread_local! {
     static LAST: Cell<Option<i32>> = const { Cell::new(None) };
+    /// The last error of any kind, by which a word that tells nothing is made clearer.
+    static ANY: Cell<Option<i32>> = const { Cell::new(None) };
 }
 
 struct Ear;
@@ -33,6 +35,7 @@ struct Ear;
 impl Log for Ear {
     fn log(&self, _: LogLevel, _: Arguments<'_>, _: Arguments<'_>) {
         let code = io::Error::last_os_error().raw_os_error();
+        ANY.set(code);
         if code.is_some_and(|code| SERIOUS.contains(&code)) {
             LAST.set(code);
         }
@@ -50,11 +53,19 @@ pub fn forget() {
     // The error at hand is forgotten too, by one that is no cause: a name that cannot be there.
     let _ = std::fs::metadata("");
     LAST.set(None);
+    ANY.set(None);
 }
 
 /// Why the transport failed: the error of the system behind it and what to do about it, else `otherwise`.
 pub fn reason(otherwise: impl FnOnce() -> String) -> String {
-    let Some(code) = LAST.take() else { return otherwise() };
-    let error = io::Error::from_raw_os_error(code);
-    format!("{error}; {}", remedy(&error))
+    let told = |code| {
+        let error = io::Error::from_raw_os_error(code);
+        format!("{error}; {}", remedy(&error))
+    };
+    let (serious, any) = (LAST.take(), ANY.take());
+    serious.map(told).unwrap_or_else(|| {
+        let words = otherwise();
+        let vague = ["Internal", "UnableTo"].iter().any(|word| words.contains(word));
+        any.filter(|_| vague).map_or(words, told)
+    })
 }
