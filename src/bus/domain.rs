@@ -197,7 +197,7 @@ impl Domain {
         self.in_shared_memory().for_each(|path| drop(fs::remove_file(path)));
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
-        if !self.root.exists() {
+        if !self.root.exists() && self.in_shared_memory().next().is_none() {
             let _ = fs::remove_file(lock_path(&self.root));
         }
         // The directory of all domains goes with the last; it is not empty while another run lives.
@@ -333,6 +333,20 @@ mod tests {
         drop(owned);
         assert!(!shared.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
         assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
+    }
+
+    #[test]
+    fn what_could_not_be_removed_stays_marked() {
+        let owned = OwnedDomain::create(0).unwrap();
+        let domain = owned.domain().clone();
+        // What `remove_file` refuses.
+        let stubborn = domain.shared("x");
+        fs::create_dir(&stubborn).unwrap();
+        drop(owned);
+        assert!(domain.exists() && !domain.root().exists());
+        fs::remove_dir(&stubborn).unwrap();
+        remove_dead_domains();
+        assert!(!domain.exists());
     }
 
     #[test]

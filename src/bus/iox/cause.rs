@@ -65,7 +65,7 @@ pub fn reason(otherwise: impl FnOnce() -> String) -> String {
     let (serious, any) = (LAST.take(), ANY.take());
     serious.map(told).unwrap_or_else(|| {
         let words = otherwise();
-        let vague = ["Internal", "UnableTo"].iter().any(|word| words.contains(word));
+        let vague = ["Internal", "UnableTo", "Insufficient"].iter().any(|word| words.contains(word));
         any.filter(|_| vague).map_or(words, told)
     })
 }
