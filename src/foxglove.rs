@@ -137,7 +137,7 @@ fn show(
         Some(path) => {
             write_whole(path, url.as_bytes()).map_err(|source| FoxgloveError::Tell { path: path.clone(), source })?
         }
-        None => eprintln!("foxglove: {url}"),
+        None => crate::system::tell(format_args!("foxglove: {url}")),
     }
     let ended = follow(links, domain, &mut channels, terminated);
     // Not waited for: a client that does not read would never let it end.

@@ -69,6 +69,8 @@ pub mod runtime;
 #[cfg(feature = "runtime")]
 pub mod shared;
 #[cfg(feature = "runtime")]
+pub mod system;
+#[cfg(feature = "runtime")]
 pub mod telemetry;
 #[cfg(feature = "runtime")]
 pub mod watch;

@@ -529,12 +529,12 @@ fn run_at_random(scenario: &Scenario, file: &Path, random: &mut Random, deaths: 
     let mut run = Scheduled::new(scenario, &bus, file);
     let mut held_until = vec![0; run.roles.len()];
     for tick in 0..=scenario.last_tick {
-        for index in 0..run.roles.len() {
-            if run.nodes[index].is_none() && held_until[index] <= tick {
+        for (index, held) in held_until.iter_mut().enumerate() {
+            if run.nodes[index].is_none() && *held <= tick {
                 run.begin(index, tick);
             }
             if random.one_in(60) {
-                held_until[index] = tick + random.pause(4);
+                *held = tick + random.pause(4);
             }
         }
         for _ in 0..3 * run.roles.len() {

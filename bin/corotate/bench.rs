@@ -96,7 +96,7 @@ fn attempt(arguments: &Arguments) -> Result<Results, (Exit, String)> {
     write_results(&directory, &results).map_err(|error| broken(format!("cannot write the results: {error}")))?;
     let text = format!("{}results in {}\n", table(&results), directory.display());
     let printed = if arguments.json {
-        eprint!("{text}");
+        corotate::system::tell(text.trim_end());
         print(&format!("{}\n", serde_json::to_string(&results).expect("results of plain values are JSON")))
     } else {
         print(&text)

@@ -4,6 +4,7 @@ use crate::role::{die_with, terminated_by_signals};
 use crate::{Exit, fail};
 use corotate::launch::line_words;
 use corotate::runtime::{DeviceError, DeviceSeat, RoleError, run_bridge};
+use corotate::system::tell;
 use std::path::PathBuf;
 
 /// Options of `corotate bridge`.
@@ -56,10 +57,10 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
         baud: arguments.baud,
         patience_s: arguments.patience,
     };
-    let welcomed = |device: &str| eprintln!("{} on {}: {device}", seat.body, seat.path.display());
+    let welcomed = |device: &str| tell(format_args!("{} on {}: {device}", seat.body, seat.path.display()));
     let book = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
     if let Some(book) = book {
-        eprintln!("{}", line_words(&seat.body, &book));
+        tell(line_words(&seat.body, &book));
     }
     Ok(Exit::Ok)
 }

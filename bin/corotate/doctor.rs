@@ -4,6 +4,7 @@ use crate::{Exit, fail, say};
 use corotate::bus::domain::{domains, remove_dead_domains};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::doctor::{Demand, Diagnosis, Lateness, Machine, leftovers, measure};
+use corotate::system::remedy;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
@@ -47,7 +48,10 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     }
     let mut checks = Machine::at(Path::new("/")).examine(&Demand::of(&scenario));
     checks.push(leftovers(&domains()));
-    let lateness = (arguments.seconds > 0).then(|| sleep(&scenario, arguments.seconds));
+    let lateness = match (arguments.seconds > 0).then(|| sleep(&scenario, arguments.seconds)).transpose() {
+        Ok(lateness) => lateness,
+        Err(exit) => return exit,
+    };
     let diagnosis = Diagnosis::new(&scenario.name, checks, lateness);
     let text = if arguments.json { diagnosis.to_json() } else { diagnosis.to_string() };
     match say(&text) {
@@ -58,10 +62,10 @@ pub fn doctor(arguments: &Arguments) -> Exit {
 }
 
 /// Measures, with its progress on a terminal.
-fn sleep(scenario: &Scenario, seconds: u32) -> Lateness {
+fn sleep(scenario: &Scenario, seconds: u32) -> Result<Lateness, Exit> {
     let style = ProgressStyle::with_template("{bar:40} measuring lateness, {eta} left");
     let bar = ProgressBar::new(1000).with_style(style.expect("the template is a constant that parses"));
     let lateness = measure(scenario, f64::from(seconds), &mut |done| bar.set_position((1e3 * done) as u64));
     bar.finish_and_clear();
-    lateness
+    lateness.map_err(|error| fail(Exit::Failure, &format!("cannot start a thread: {error}; {}", remedy(&error))))
 }

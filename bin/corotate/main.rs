@@ -182,7 +182,19 @@ fn say(text: &str) -> Result<(), Exit> {
 fn main() -> ExitCode {
     // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
     let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
-    let exit = match Arguments::parse().command {
+    let command = Arguments::parse().command;
+    // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
+    let exit = std::panic::catch_unwind(|| obey(command)).unwrap_or_else(|_| {
+        let reason =
+            "a defect of this program or of iceoryx2, where the lines above say; run it again, and report them";
+        fail(Exit::Failure, &reason)
+    });
+    exit.into()
+}
+
+/// Does what the command line asks for.
+fn obey(command: Option<Command>) -> Exit {
+    match command {
         None => run::run(&run::Arguments::default()),
         Some(Command::Run(arguments)) => run::run(&arguments),
         Some(Command::Check(arguments)) => check::check(&arguments),
@@ -203,8 +215,7 @@ fn main() -> ExitCode {
         Some(Command::Bench(arguments)) => bench::bench(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),
-    };
-    exit.into()
+    }
 }
 
 fn janitor(arguments: &JanitorArguments) -> Exit {

@@ -3,9 +3,10 @@
 use crate::{Exit, fail, foxglove, print};
 use corotate::config::{ClockKind, RunId, SHIPPED, Scenario};
 use corotate::launch::{
-    Action, Launch, LaunchError, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
+    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
 };
 use corotate::runtime::seat_path;
+use corotate::system::{remedy, tell};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
@@ -130,8 +131,9 @@ pub fn run(arguments: &Arguments) -> Exit {
         return exit;
     }
     let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
-    let written = write_verdict(ended.as_ref().map_err(|failure| failure.reason.as_str()));
-    let exit = match &ended {
+    let told = ended.as_ref().map(|(summary, _)| summary);
+    let written = write_verdict(told.map_err(|failure| failure.reason.as_str()));
+    let exit = match told {
         Ok(summary) => verdict(summary),
         Err(failure) => fail(failure.exit, &failure.reason),
     };
@@ -148,7 +150,8 @@ fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str
         .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
 }
 
-fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failure> {
+/// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failure> {
     let broken = |reason: String| Failure { exit: Exit::Failure, reason };
     let started = jiff::Timestamp::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
@@ -160,7 +163,8 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
         })?;
     }
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
-    let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
+    let program = std::env::current_exe()
+        .map_err(|error| broken(format!("cannot find this program's own file: {error}; {}", remedy(&error))))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.clone()).collect();
     let mut screen = Screen { bar: None, asked: false, fleets };
@@ -181,15 +185,15 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<Summary, Failur
     let summary = Summary::new(scenario, &outcome, started);
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
-    written.map_err(|error| broken(format!("cannot write the results: {error}")))?;
+    written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
     reported.map_err(broken)?;
-    Ok(summary)
+    Ok((summary, outcome))
 }
 
 fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
     let text = format!("{}results in {}\n", table(summary), directory.display());
     if arguments.json {
-        eprint!("{text}");
+        tell(text.trim_end());
         print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
         print(&text)
@@ -207,7 +211,7 @@ fn verdict(summary: &Summary) -> Exit {
         return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
     }
     if summary.signal != 0 {
-        eprintln!("corotate: ended in order by signal {}", summary.signal);
+        tell(format_args!("corotate: ended in order by signal {}", summary.signal));
         return Exit::Signal(summary.signal);
     }
     for criterion in summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)) {
@@ -232,14 +236,22 @@ pub fn exit_of(error: &LaunchError) -> Exit {
     }
 }
 
+/// A signal cannot be caught: the system's error with what to do.
+pub fn not_caught(error: io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("cannot catch signals: {error}; {}", remedy(&error)))
+}
+
 /// The number of the signal that asked for the end, once one has.
 pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_usize(number, signal.clone(), number as usize)?;
+        signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
     }
     Ok(signal)
 }
+
+/// The most runs of one scenario that begin in one second.
+const DIRECTORIES: u32 = 10_000;
 
 /// The directory for the results: as given, or a new one under `runs/`.
 pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
@@ -250,14 +262,14 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
     let runs = Path::new("runs");
     std::fs::create_dir_all(runs).map_err(|error| named(runs, error))?;
     let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
-    for attempt in 1.. {
+    for attempt in 1..=DIRECTORIES {
         let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
         match std::fs::create_dir(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
         }
     }
-    unreachable!("the loop over all numbers does not end")
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
 }
 
 /// Progress on a terminal; silence elsewhere, but for what a person must do.
@@ -274,14 +286,15 @@ impl Screen {
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
-                    eprintln!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain));
-                    eprintln!("or give a program of your own the seat\n  {}", seat_path(domain, role).display());
+                    tell(format_args!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain)));
+                    let seat = seat_path(domain, role);
+                    tell(format_args!("or give a program of your own the seat\n  {}", seat.display()));
                 }
             }
             Progress::Waiting { .. } => {}
             Progress::External(words) => match &self.bar {
-                Some(bar) => bar.suspend(|| eprintln!("{words}")),
-                None => eprintln!("{words}"),
+                Some(bar) => bar.suspend(|| tell(words)),
+                None => tell(words),
             },
             Progress::Running { tick, last_tick, metric } => {
                 let bar = self.bar.get_or_insert_with(|| bar(*last_tick));

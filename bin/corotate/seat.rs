@@ -3,6 +3,7 @@
 use crate::{Exit, fail, say};
 use corotate::config::{ClockKind, Scenario};
 use corotate::runtime::{RoleError, RoleId, describe_seat, join_run};
+use corotate::system::tell;
 use std::path::PathBuf;
 
 /// Options of `corotate seat`.
@@ -49,9 +50,9 @@ fn describe(arguments: &Arguments) -> Result<(), Exit> {
     let domain = domain.map_err(|error| fail(Exit::Usage, &error))?;
     if domain.is_none() {
         let name = &arguments.role;
-        eprintln!(
+        tell(format_args!(
             "corotate: a domain exists while a run does; `run --external {name}` writes this with its domain, or give --domain"
-        );
+        ));
     }
     say(&describe_seat(&scenario, role, domain.as_ref()).to_json())
 }

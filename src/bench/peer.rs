@@ -208,14 +208,15 @@ impl Peer {
         let (orders, stdout) = (child.stdin.take(), child.stdout.take());
         let (lines, answers) = channel();
         // Ends with the peer's output.
-        std::thread::spawn(move || {
+        let listen = move || {
             for line in stdout.into_iter().flat_map(|stdout| BufReader::new(stdout).lines()).map_while(Result::ok) {
                 if lines.send(line).is_err() {
                     break;
                 }
             }
-        });
+        };
         let mut peer = Self { child, orders, answers, grants: Vec::new() };
+        std::thread::Builder::new().spawn(listen).map_err(BenchError::system("start a thread"))?;
         match peer.answer()? {
             Answer::Here(grants) => peer.grants = grants,
             other => return Err(unexpected(&other)),

@@ -3,7 +3,9 @@
 //! Knows files and locks, not the transport. The lock says whether the run is alive; the kernel lets go of it when the
 //! launcher dies, however it dies. Must not touch a domain whose lock is held.
 
+use crate::system::remedy;
 use rustix::fs::{FlockOperation, flock, fstat, statvfs};
+use rustix::io::Errno;
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
@@ -16,6 +18,8 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 const PREFIX: &str = "corotate_";
 /// What the transport's socket paths may not exceed, less what it appends: see sockaddr_un.
 const MAX_ROOT_LENGTH: usize = 48;
+/// How often something is tried again that another process, or a signal, has come in the way of.
+const ATTEMPTS: u32 = 100;
 
 /// A domain that this process uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,6 +44,20 @@ pub enum DomainError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
+    },
+    /// A domain cannot be locked, so nobody could tell whether its run is alive.
+    #[error("cannot lock {}: {source}; {}, or set XDG_RUNTIME_DIR to a directory of a local file system", path.display(), remedy(source))]
+    Lock {
+        /// The lock file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// Every name that was tried was taken, or taken away.
+    #[error("cannot make a domain in {} in {ATTEMPTS} attempts; end whatever removes files there", path.display())]
+    Contended {
+        /// The directory of all domains.
+        path: PathBuf,
     },
     /// There is too little shared memory. Found out later it would kill whoever touches the missing page.
     #[error("/dev/shm has {} KiB free and the run may take {}; free some, or mount it larger", free >> 10, needed >> 10)]
@@ -92,7 +110,7 @@ impl OwnedDomain {
         let create = |path: &Path, source| DomainError::Create { path: path.to_owned(), source };
         remove_dead(&base);
         require_room(bytes as u64)?;
-        loop {
+        for _ in 0..ATTEMPTS {
             // Within the loop: another run that ends may remove the directory as long as it is empty.
             DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
             let root = base.join(random_id());
@@ -100,11 +118,14 @@ impl OwnedDomain {
                 return Err(DomainError::TooLong { path: root });
             }
             // The lock comes first: a domain without a lock that is held counts as dead.
-            let path = lock_path(&root);
-            let Some(lock) = lock(&path, Lock::New).map_err(|error| create(&path, error))? else { continue };
-            DirBuilder::new().mode(0o700).create(&root).map_err(|error| create(&root, error))?;
-            return Ok(Self { domain: Domain { root }, _lock: lock });
+            let Some(lock) = lock(&lock_path(&root), Lock::New)? else { continue };
+            // Removed again if it cannot be completed.
+            let owned = Self { domain: Domain { root }, _lock: lock };
+            let root = owned.domain.root();
+            DirBuilder::new().mode(0o700).create(root).map_err(|error| create(root, error))?;
+            return Ok(owned);
         }
+        Err(DomainError::Contended { path: base })
     }
 
     /// The domain, to be used.
@@ -186,7 +207,7 @@ impl Domain {
         self.in_shared_memory().for_each(|path| drop(fs::remove_file(path)));
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
-        if !self.root.exists() {
+        if !self.root.exists() && self.in_shared_memory().next().is_none() {
             let _ = fs::remove_file(lock_path(&self.root));
         }
         // The directory of all domains goes with the last; it is not empty while another run lives.
@@ -284,19 +305,38 @@ enum Lock {
 }
 
 /// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
-fn lock(path: &Path, lock: Lock) -> io::Result<Option<File>> {
+fn lock(path: &Path, lock: Lock) -> Result<Option<File>, DomainError> {
     let file = match OpenOptions::new().write(true).create_new(lock == Lock::New).mode(0o600).open(path) {
         Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
             return Ok(None);
         }
-        other => other?,
+        other => other.map_err(|source| DomainError::Create { path: path.to_owned(), source })?,
     };
-    if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
-        return Ok(None);
+    match flock_now(&file) {
+        Ok(()) => {}
+        Err(Errno::WOULDBLOCK) => return Ok(None),
+        Err(error) => {
+            if lock == Lock::New {
+                let _ = fs::remove_file(path);
+            }
+            return Err(DomainError::Lock { path: path.to_owned(), source: error.into() });
+        }
     }
     // Whoever cleans up takes the lock, removes the file, lets go: a lock on a removed file protects nothing.
     let same = fs::metadata(path).is_ok_and(|at_path| fstat(&file).is_ok_and(|held| held.st_ino == at_path.ino()));
     Ok(same.then_some(file))
+}
+
+/// Locks a file, or tells at once that another process has. A signal is no reason.
+fn flock_now(file: &File) -> Result<(), Errno> {
+    let mut locked = Err(Errno::INTR);
+    for _ in 0..ATTEMPTS {
+        locked = flock(file, FlockOperation::NonBlockingLockExclusive);
+        if locked != Err(Errno::INTR) {
+            break;
+        }
+    }
+    locked
 }
 
 fn random_id() -> String {
@@ -321,6 +361,20 @@ mod tests {
         drop(owned);
         assert!(!shared.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
         assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
+    }
+
+    #[test]
+    fn what_could_not_be_removed_stays_marked() {
+        let owned = OwnedDomain::create(0).unwrap();
+        let domain = owned.domain().clone();
+        // What `remove_file` refuses.
+        let stubborn = domain.shared("x");
+        fs::create_dir(&stubborn).unwrap();
+        drop(owned);
+        assert!(domain.exists() && !domain.root().exists());
+        fs::remove_dir(&stubborn).unwrap();
+        remove_dead_domains();
+        assert!(!domain.exists());
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
 //! by the loop itself (lockstep), not by a writer that waits.
 
+mod cause;
 mod fleet;
 mod latest;
 
@@ -14,6 +15,7 @@ use super::domain::Domain;
 use super::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::{FleetLayout, Sample, VOID};
+use crate::system::remedy;
 use iceoryx2::config::Config;
 use iceoryx2::node::NodeState;
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
@@ -186,10 +188,9 @@ impl IoxBus {
         bells: io::Result<Bells>,
         makes: bool,
     ) -> Result<Self, BusError> {
-        // iceoryx2 reports to the console on its own; what matters comes back as an error.
-        set_log_level(LogLevel::Fatal);
+        cause::hear();
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
-        let bells = bells.map_err(|error| failed(error.to_string()))?;
+        let bells = bells.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
         let node = Rc::new(enter(domain, name).map_err(failed)?);
         Ok(Self { node, bells, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
     }
@@ -233,6 +234,7 @@ impl IoxBus {
     ) -> Result<T, BusError> {
         let begun_ns = monotonic_ns();
         loop {
+            cause::forget();
             let refusal = match attempt() {
                 Ok(opened) => return Ok(opened),
                 Err(refusal) => refusal,
@@ -257,6 +259,9 @@ impl IoxBus {
                 self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
             let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
             reason = format!("{reason} for {limit_s} s: whoever makes it stands still{files}");
+        } else {
+            let remedy = format!("is another process of this run its {end}, or of another version?");
+            reason = cause::reason(|| format!("{reason}; {remedy}"));
         }
         BusError::Open { service: topic.to_string(), end, reason }
     }
@@ -428,12 +433,13 @@ fn config(domain: &Domain) -> Result<Config, String> {
 
 pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
     let config = config(domain)?;
+    cause::forget();
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<Ipc>()
-        .map_err(|error| format!("{error:?}"))
+        .map_err(|error| cause::reason(|| format!("{error:?}; check that /dev/shm and this directory are writable")))
 }
 
 impl Bus for IoxBus {
@@ -514,13 +520,14 @@ impl<S: Sample> IoxWriter<S> {
 
     #[inline]
     fn queue(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
-        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         self.bell.ring();
         Ok(())
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
-        let chunk = self.publisher.loan_uninit().map_err(|error| self.failed(format!("{error:?}")))?;
+        let chunk =
+            self.publisher.loan_uninit().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         Ok(chunk.write_payload(Wire(S::zeroed())))
     }
 
@@ -570,7 +577,7 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+        self.publisher.update_connections().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))
     }
 }
 
@@ -637,7 +644,7 @@ impl<S: Sample> IoxReader<S> {
             None => match self.subscriber.receive() {
                 Ok(Some(sample)) => sample,
                 Ok(None) => return Ok(false),
-                Err(error) => return Err(self.failed(format!("{error:?}"))),
+                Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
             },
         };
         let key = key(&received.payload().0);
@@ -686,7 +693,9 @@ impl<S: Sample> Read<S> for IoxReader<S> {
         let Self { subscriber, lane, idle, pending, bell, topic, .. } = self;
         let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
         let Lane::Open(latest) = lane else {
-            return bell.sleep(until_ns, || subscriber.has_samples().map_err(|error| failed(format!("{error:?}"))));
+            return bell.sleep(until_ns, || {
+                subscriber.has_samples().map_err(|error| failed(cause::reason(|| format!("{error:?}"))))
+            });
         };
         bell.sleep(until_ns, || {
             // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
@@ -696,7 +705,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
                         *pending = Some(sample).filter(|sample| key(&sample.payload().0) > key(latest.sample()))
                     }
                     Ok(None) => return Ok(false),
-                    Err(error) => return Err(failed(format!("{error:?}"))),
+                    Err(error) => return Err(failed(cause::reason(|| format!("{error:?}")))),
                 }
             }
             // The next look goes to the queue, if nothing is in the lane.

@@ -20,19 +20,15 @@ use crate::sample::{FleetLayout, FleetSample, Sample};
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
     /// The shared-memory domain could not be entered.
-    #[error(
-        "cannot enter the shared-memory domain {domain}: {reason}; check that /dev/shm and the domain's directory are writable"
-    )]
+    #[error("cannot enter the shared-memory domain {domain}: {reason}")]
     Domain {
         /// Where.
         domain: String,
-        /// The transport's reason.
+        /// Why, and what to do.
         reason: String,
     },
     /// A signal could not be opened.
-    #[error(
-        "cannot open {service} as {end}: {reason}; is another process of this run its {end}, or of another version?"
-    )]
+    #[error("cannot open {service} as {end}: {reason}")]
     Open {
         /// The service's name.
         service: String,

@@ -8,6 +8,7 @@ use crate::config::Scenario;
 use crate::runtime::{RoleId, hold_low_latency_idle, release_priority, take_privileges};
 use crate::telemetry::{Grant, Latency, Percentiles};
 use serde::Serialize;
+use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
@@ -28,17 +29,20 @@ pub struct Lateness {
 }
 
 /// Sleeps for so many seconds as the first plant of a scenario would. `progress` hears how far it is, 0 to 1.
-pub fn measure(scenario: &Scenario, seconds: f64, progress: &mut dyn FnMut(f64)) -> Lateness {
+///
+/// # Errors
+/// The system's reason why there is no thread.
+pub fn measure(scenario: &Scenario, seconds: f64, progress: &mut dyn FnMut(f64)) -> io::Result<Lateness> {
     let wakes = ((seconds * 1e9 / scenario.period_ns as f64) as u64).max(1);
     let done = AtomicU64::new(0);
     // A thread of its own takes the privileges, so that whoever shows the progress has none.
     std::thread::scope(|scope| {
-        let probe = scope.spawn(|| probe(scenario, wakes, &done));
+        let probe = std::thread::Builder::new().spawn_scoped(scope, || probe(scenario, wakes, &done))?;
         while !probe.is_finished() {
             progress(done.load(Ordering::Relaxed) as f64 / wakes as f64);
             std::thread::park_timeout(WORD);
         }
-        probe.join().expect("the probe only sleeps and counts")
+        Ok(probe.join().expect("the probe only sleeps and counts"))
     })
 }
 
@@ -123,7 +127,7 @@ mod tests {
         let overrides = ["tick_hz=1000", "realtime.cores=[1023]", "realtime.priority=0"].map(str::to_owned);
         let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
         let mut last = 0.0;
-        let lateness = measure(&scenario, 0.05, &mut |done| last = done);
+        let lateness = measure(&scenario, 0.05, &mut |done| last = done).unwrap();
         assert_eq!(lateness.percentiles.count, 50);
         assert!((0.0..=1.0).contains(&last));
         assert!(lateness.check().found.contains("no core"), "{:?}", lateness.check());

@@ -7,10 +7,11 @@ use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::runtime::RoleId;
+use crate::system::tell;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{self, BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
@@ -51,11 +52,16 @@ impl RoleProcess {
         command.arg("--parent").arg(std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the launcher alone, and the launcher ends the roles in order.
         command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
-        let mut child = command.spawn().map_err(|source| LaunchError::Spawn { role: name.clone(), source })?;
-        let last_words = Arc::new(Mutex::new(VecDeque::new()));
-        let listener = child.stderr.take().map(|stderr| listen(name, stderr, last_words.clone()));
+        let failed = |source| LaunchError::Spawn { role: name.clone(), source };
+        let mut child = command.spawn().map_err(failed)?;
+        let stderr = child.stderr.take();
         let handle = Pid::from_raw(child.id() as i32).and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
-        Ok(Self { child, status: None, handle, last_words, listener })
+        let last_words = Arc::new(Mutex::new(VecDeque::new()));
+        // Ended again if nobody can listen to it.
+        let mut process = Self { child, status: None, handle, last_words, listener: None };
+        let listen = |stderr| listen(name.clone(), stderr, process.last_words.clone());
+        process.listener = stderr.map(listen).transpose().map_err(failed)?;
+        Ok(process)
     }
 
     /// How the process ended, if it has.
@@ -133,10 +139,14 @@ fn signal_name(signal: i32) -> String {
 }
 
 /// Passes a role's error output on, its name in front, and keeps the end of it.
-fn listen(name: String, stderr: impl Read + Send + 'static, last: Arc<Mutex<VecDeque<String>>>) -> JoinHandle<()> {
-    std::thread::spawn(move || {
+fn listen(
+    name: String,
+    stderr: impl Read + Send + 'static,
+    last: Arc<Mutex<VecDeque<String>>>,
+) -> io::Result<JoinHandle<()>> {
+    std::thread::Builder::new().spawn(move || {
         for line in BufReader::new(stderr).lines().map_while(Result::ok) {
-            eprintln!("[{name}] {line}");
+            tell(format_args!("[{name}] {line}"));
             if let Ok(mut last) = last.lock() {
                 last.push_back(line);
                 while last.len() > LAST_LINES {

@@ -6,6 +6,7 @@ use super::LaunchError;
 use super::children::RoleProcess;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
+use crate::system::tell;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -44,7 +45,7 @@ impl FoxgloveWatch {
         let Some(process) = self.process.as_mut().filter(|_| !self.listens) else { return Ok(true) };
         process.require_alive(FOXGLOVE)?;
         if let Ok(address) = std::fs::read_to_string(&self.tells) {
-            eprintln!("foxglove: {address}");
+            tell(format_args!("foxglove: {address}"));
             self.listens = true;
         }
         Ok(self.listens)
@@ -55,7 +56,7 @@ impl FoxgloveWatch {
         let Some(process) = &mut self.process else { return };
         if let Some(status) = process.ended() {
             let cause = process.failure(status).cause;
-            eprintln!("corotate: foxglove failed: {cause}; the run goes on without");
+            tell(format_args!("corotate: foxglove failed: {cause}; the run goes on without"));
             self.process = None;
             janitor.clear_dead();
         }

@@ -7,6 +7,7 @@ use crate::clock::Grid;
 use crate::config::{OnFailure, Scenario};
 use crate::record::Recorder;
 use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
+use crate::system::tell;
 use crate::telemetry::{Ledger, RoleReport};
 use crate::with_rig;
 use std::cell::RefCell;
@@ -49,7 +50,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         let mut scorer = scorer.borrow_mut();
         if let (Some(recorder), None) = (&mut recorder, &unrecorded) {
             unrecorded = recorder.poll().err();
-            unrecorded.iter().for_each(|error| eprintln!("corotate: {error}; the run goes on"));
+            unrecorded.iter().for_each(|error| tell(format_args!("corotate: {error}; the run goes on")));
         }
         match scorer.poll(1) {
             Ok(_) => proceed(&**scorer, scenario, launch, tick),
@@ -82,6 +83,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         incidents,
         grants: Vec::new(),
         domain: None,
+        remains: None,
         signal: if ended == Ended::Stopped { launch.signal.load(Ordering::Relaxed) } else { 0 },
     })
 }

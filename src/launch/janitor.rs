@@ -9,6 +9,7 @@ use super::LaunchError;
 use crate::bus::domain::{self, Domain};
 use crate::bus::iox;
 use crate::clock::monotonic_ns;
+use crate::system::tell;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use std::fs::{self, Metadata};
@@ -21,14 +22,10 @@ use std::time::{Duration, SystemTime};
 
 /// The launcher asks for what the dead left to be put away; so is answered when it is done.
 const CLEAR: u8 = b'c';
-/// The launcher is done, and removes the domain itself.
-const DONE: u8 = b'd';
 /// A janitor that has not answered for so long is replaced, ns. A clean-up takes some 5 ms per dead process.
 const ANSWER_NS: u64 = 2_000_000_000;
 /// So many janitors in a row are tried for one request.
 const ATTEMPTS: u32 = 3;
-/// A janitor may take so long to end.
-const END_LIMIT: Duration = Duration::from_secs(1);
 /// Between two looks for unfinished files and for processes that came.
 const LOOK: Duration = Duration::from_millis(50);
 /// A directory's time of change is so coarse at the most: what changed just before a look is looked at again.
@@ -113,7 +110,7 @@ impl Janitor {
                 self.attempts = attempts;
             }
             Some(Err(_)) | None => {
-                eprintln!("corotate: the janitor {how}; what a dead process left may keep its successor out");
+                tell(format_args!("corotate: the janitor {how}; what a dead process left may keep its successor out"));
                 self.pending = 0;
             }
         }
@@ -140,15 +137,9 @@ impl Process {
     }
 }
 
+/// The domain is gone. It is ended, not asked to end: it may stand still, and nobody waits for it.
 impl Drop for Janitor {
     fn drop(&mut self) {
-        let _ = self.process.line.write_all(&[DONE]);
-        let end_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
-        while matches!(self.process.child.try_wait(), Ok(None)) && monotonic_ns() < end_ns {
-            // It closes its answers when it ends.
-            let mut ended = [PollFd::new(&self.process.answers, PollFlags::empty())];
-            let _ = poll(&mut ended, Some(&timespec(Duration::from_millis(10))));
-        }
         self.process.kill();
     }
 }
@@ -158,8 +149,8 @@ fn timespec(duration: Duration) -> Timespec {
 }
 
 /// The janitor's work in a domain: removes unfinished files, puts away what the dead left when `line` asks for it or
-/// somebody comes, and answers. At the end of `line`, unless the launcher said that it was done, removes what is left of
-/// this domain and of every other whose launcher is dead.
+/// somebody comes, and answers. At the end of `line` the launcher is dead: removes what is left of this domain and of every other
+/// whose launcher is dead.
 ///
 /// # Errors
 /// The system's reason for not starting a thread.
@@ -188,9 +179,6 @@ pub fn janitor(
             Ok(0) | Err(_) => break,
             Ok(count) => &requests[..count],
         };
-        if requests.contains(&DONE) {
-            return Ok(());
-        }
         clear();
         // Nobody is left to be told if this fails.
         let _ = answers.write_all(requests).and_then(|()| answers.flush());

@@ -35,6 +35,7 @@ use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
 use crate::record::RecordError;
+use crate::system::remedy;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;
 use std::net::SocketAddr;
@@ -105,7 +106,7 @@ pub enum LaunchError {
         needed: u64,
     },
     /// A file of the domain could not be written.
-    #[error("cannot write {}: {source}", path.display())]
+    #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
     Write {
         /// The file.
         path: PathBuf,
@@ -113,7 +114,7 @@ pub enum LaunchError {
         source: io::Error,
     },
     /// A process could not be started.
-    #[error("cannot start {role}: {source}")]
+    #[error("cannot start {role}: {source}; {}", remedy(source))]
     Spawn {
         /// The role.
         role: String,

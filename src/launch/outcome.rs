@@ -2,6 +2,7 @@
 //!
 //! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
 
+use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
 use crate::config::{RunId, Scenario};
@@ -43,6 +44,9 @@ pub struct Outcome {
     pub domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
     pub signal: usize,
+    /// What is still to be removed of the run, if it had processes: that goes when this is dropped.
+    #[expect(dead_code, reason = "held for what its end does")]
+    pub(super) remains: Option<Remains>,
 }
 
 /// A run's summary, as it is written to `summary.json`.

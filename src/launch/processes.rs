@@ -1,6 +1,6 @@
 //! A run as processes: gather, warm up, run, stop, collect. One thread, which also scores.
 //!
-//! Whatever happens, dropping what this file holds ends every role and removes the domain, in that order.
+//! Whatever happens, dropping what this file holds ends every role, removes the domain and ends the janitor, in that order.
 
 use super::children::{END_LIMIT, RoleProcess};
 use super::external::{ExternalWatch, Waiting};
@@ -21,9 +21,11 @@ use crate::runtime::{
     shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
+use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use std::fmt;
 use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -58,7 +60,6 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     describe_seats(scenario, launch, domain)?;
-    // Declared before the roles, so that it is dropped, and cleans up, after them.
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = Janitor::start(&launch.program, domain, startup_limit)?;
     let (_low_latency, grants) = match scenario.clock {
@@ -68,14 +69,29 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
     domain.seal()?;
     let mut crew = Crew::start(scenario, launch, domain, &bus, &mut janitor)?;
-    let mut scorer = score::open(scenario, &bus)?;
-    let signal = crew.conduct(&mut *scorer, launch, &grants)?;
+    let mut scorer = score::open(scenario, &bus).map_err(|error| crew.blame(error.into()))?;
+    let signal = crew.conduct(&mut *scorer, launch, &grants).map_err(|error| crew.blame(error))?;
     let Dismissal { reports, unbooked, problems } = crew.dismiss();
     let score = scorer.finish()?;
     let (incidents, recorder) = crew.incidents(&score.recoveries_s);
     let recording = recorder.finish(domain, &reports);
     let domain = Some(domain.root().to_owned());
-    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal })
+    let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
+    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal, remains })
+}
+
+/// What is still there of a run whose roles have ended. It is removed when this is dropped, in this order: after the
+/// results have been written and told.
+pub(super) struct Remains {
+    _bus: IoxBus,
+    _domain: OwnedDomain,
+    _janitor: Janitor,
+}
+
+impl fmt::Debug for Remains {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Remains").field(&self._domain).finish()
+    }
 }
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
@@ -153,7 +169,7 @@ impl<'a> Crew<'a> {
         janitor: &'a mut Janitor,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
-        let recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
+        let mut recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
         let foxglove = FoxgloveWatch::start(&launch.program, launch.foxglove, domain)?;
         // All of them first: they come up while their links are opened here.
         let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
@@ -161,9 +177,15 @@ impl<'a> Crew<'a> {
             false => RoleProcess::start(&launch.program, scenario, role, domain).map(|process| (role, Some(process))),
         };
         let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
-        let started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
-        let member = |(role, process)| Member::new(scenario, role, process, domain, bus);
-        let members = started.into_iter().map(member).collect::<Result<Vec<_>, _>>()?;
+        let mut started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
+        let open = |(role, process): &(RoleId, Option<RoleProcess>)| {
+            Member::new(scenario, *role, process.is_none(), domain, bus)
+        };
+        let mut members = started.iter().map(open).collect::<Result<Vec<_>, _>>().map_err(|error| {
+            let roles = started.iter_mut().map(|(role, process)| (role.name(scenario), process.as_mut()));
+            blame(error, roles.chain([(RECORDER, recorder.process())]))
+        })?;
+        members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
         let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
         Ok(Self {
@@ -179,6 +201,12 @@ impl<'a> Crew<'a> {
             recorder,
             foxglove,
         })
+    }
+
+    /// See [`blame`].
+    fn blame(&mut self, error: LaunchError) -> LaunchError {
+        let members = self.members.iter_mut().map(|member| (&*member.name, member.process.as_mut()));
+        blame(error, members.chain([(RECORDER, self.recorder.process())]))
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -305,12 +333,16 @@ impl<'a> Crew<'a> {
         self.recorder.supervise(self.janitor);
         self.foxglove.supervise(self.janitor);
         for member in &mut self.members {
+            let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.failure(self.scenario, self.janitor) {
-                let incident = member.fail(failure, self.scenario, now_ns);
-                eprintln!("corotate: {incident}");
+                let incident = match complete {
+                    true => member.note(failure, self.scenario),
+                    false => member.fail(failure, self.scenario, now_ns),
+                };
+                tell(format_args!("corotate: {incident}"));
                 self.janitor.clear_dead();
                 scorer.incident(incident.tick);
-                go_on &= incident.action == Action::Restarted;
+                go_on &= incident.action != Action::Stopped;
                 self.incidents.push(incident);
             }
             // A successor finds its links free once the remains of its predecessor are put away.
@@ -335,7 +367,7 @@ impl<'a> Crew<'a> {
                     let failure = Failure { cause, last_words: String::new() };
                     let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
                     let incident = Incident { tick, ..incident };
-                    eprintln!("corotate: {incident}");
+                    tell(format_args!("corotate: {incident}"));
                     scorer.incident(incident.tick);
                     self.incidents.push(incident);
                     go_on = false;
@@ -406,10 +438,14 @@ impl<'a> Crew<'a> {
         let mut dismissal = Dismissal::default();
         for member in &mut self.members {
             let reported = report_path(self.domain.root(), &member.name).exists();
+            let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.bad_end(reported) {
-                let stopped = Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) };
-                eprintln!("corotate: {stopped}");
-                self.incidents.push(stopped);
+                let incident = match complete {
+                    true => member.note(failure, self.scenario),
+                    false => Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) },
+                };
+                tell(format_args!("corotate: {incident}"));
+                self.incidents.push(incident);
             }
             for (role, ledger) in member.books() {
                 dismissal.gather(self.scenario, self.domain, role, ledger);
@@ -424,6 +460,22 @@ impl<'a> Crew<'a> {
         let recovered = self.incidents.into_iter().zip(recoveries);
         (recovered.map(|(incident, recovery_s)| Incident { recovery_s, ..incident }).collect(), self.recorder)
     }
+}
+
+/// Why a link failed, if a process died: one that dies while it opens its links leaves some half made.
+fn blame<'a>(
+    error: LaunchError,
+    processes: impl Iterator<Item = (&'a str, Option<&'a mut RoleProcess>)>,
+) -> LaunchError {
+    if !matches!(error, LaunchError::Bus(_) | LaunchError::Ledger(_)) {
+        return error;
+    }
+    let death = |(name, process): (&str, Option<&mut RoleProcess>)| {
+        let process = process?;
+        process.ended().filter(|status| !status.success())?;
+        process.require_alive(name).err()
+    };
+    processes.filter_map(death).next().unwrap_or(error)
 }
 
 /// Notices that nothing moves any more.
@@ -455,5 +507,33 @@ impl Stall {
         let roles: Vec<&str> =
             waiting.filter(|member| Some(member.last.stamp.tick) == behind).map(|member| &*member.name).collect();
         Err(LaunchError::Hung { limit_s: self.limit_ns as f64 / 1e9, roles: roles.join(", ") })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::Command;
+
+    /// What a link says that a dead process left half made is no cause.
+    #[test]
+    fn a_link_that_failed_is_blamed_on_the_process_that_died() {
+        let error = || BusError::Open { service: "s".to_owned(), end: "reader", reason: "HangsInCreation".to_owned() };
+        let start = |script: &str| {
+            let mut command = Command::new("/bin/sh");
+            command.args(["-c", script]);
+            let mut process = RoleProcess::spawn(command, "role".to_owned()).unwrap();
+            while process.ended().is_none() {
+                std::thread::yield_now();
+            }
+            process
+        };
+        let (mut well, mut killed) = (start("exit 0"), start("kill -9 $$"));
+        let blamed = blame(error().into(), [("well", Some(&mut well)), ("killed", Some(&mut killed))].into_iter());
+        assert!(
+            matches!(&blamed, LaunchError::Died { role, cause, .. } if role == "killed" && cause.contains("SIGKILL"))
+        );
+        let blamed = blame(error().into(), [("well", Some(&mut well)), ("external", None)].into_iter());
+        assert!(matches!(blamed, LaunchError::Bus(_)));
     }
 }

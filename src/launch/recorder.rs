@@ -14,6 +14,7 @@ use crate::config::Scenario;
 use crate::record::{RECORDER, RecordingReport};
 use crate::runtime::{report_path, topic};
 use crate::sample::{Health, RoleState};
+use crate::system::tell;
 use crate::telemetry::RoleReport;
 use std::path::Path;
 use std::process::Command;
@@ -60,6 +61,11 @@ impl RecorderWatch {
         })
     }
 
+    /// Its process, if it is ours.
+    pub fn process(&mut self) -> Option<&mut RoleProcess> {
+        self.process.as_mut()
+    }
+
     /// Hears how it is.
     pub fn listen(&mut self) -> Result<(), BusError> {
         let now_ns = monotonic_ns();
@@ -101,7 +107,7 @@ impl RecorderWatch {
             }
             None => return,
         };
-        eprintln!("corotate: the recorder failed: {problem}; the run goes on without");
+        tell(format_args!("corotate: the recorder failed: {problem}; the run goes on without"));
         self.problem = Some(problem);
         janitor.clear_dead();
     }

@@ -11,7 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
-use crate::runtime::{RoleId, open_ledger, topic};
+use crate::runtime::{RoleId, open_ledger, report_path, topic};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
 use serde::Serialize;
@@ -66,6 +66,8 @@ pub enum Action {
     Restarted,
     /// The run was ended in order.
     Stopped,
+    /// Nothing: it died after its last tick, and its results are complete.
+    Noted,
 }
 
 impl fmt::Display for Incident {
@@ -80,6 +82,7 @@ impl fmt::Display for Incident {
             Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
             Action::Restarted => "; it is started anew",
             Action::Stopped => "; the run ends",
+            Action::Noted => " after its last tick; its results are complete",
         })
     }
 }
@@ -134,15 +137,15 @@ pub(super) struct Member {
 }
 
 impl Member {
-    /// A role with its process, or one that somebody else starts.
+    /// A role whose process, unless somebody else starts it, is still to be given.
     pub fn new(
         scenario: &Scenario,
         role: RoleId,
-        process: Option<RoleProcess>,
+        external: bool,
         domain: &Domain,
         bus: &IoxBus,
     ) -> Result<Self, LaunchError> {
-        let (external, now_ns) = (process.is_none(), monotonic_ns());
+        let now_ns = monotonic_ns();
         let name = role.name(scenario).to_owned();
         let hosted = role.hosted(scenario).into_iter().filter(|other| *other != role);
         let hosted = hosted.map(|other| Ok((other, open_ledger(domain, scenario, other)?)));
@@ -153,7 +156,7 @@ impl Member {
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
             name,
             role,
-            process,
+            process: None,
             external,
             last: Health::default(),
             generation: 1,
@@ -239,8 +242,12 @@ impl Member {
             return None;
         }
         process.kill();
-        let said = if heard { "said nothing" } else { "was not ready" };
-        Some(Failure { cause: format!("it {said} for {limit_s} s and was killed"), last_words: process.last_words() })
+        let (said, limit) = match heard {
+            true => ("said nothing", "supervision.heartbeat_timeout_s"),
+            false => ("was not ready", "launch.startup_timeout_s"),
+        };
+        let cause = format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}");
+        Some(Failure { cause, last_words: process.last_words() })
     }
 
     /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next
@@ -284,6 +291,39 @@ impl Member {
         }
     }
 
+    /// Whether its process has ended and nothing is missing: every tick is done, and every report is there.
+    pub fn ended_complete(&mut self, scenario: &Scenario, domain: &Domain) -> bool {
+        let ended = self.process.as_mut().is_some_and(|process| process.ended().is_some());
+        ended
+            && self.books().all(|(role, ledger)| {
+                crate::runtime::next_tick(ledger) > scenario.last_tick
+                    && report_path(domain.root(), role.name(scenario)).exists()
+            })
+    }
+
+    /// Takes note of a failure by which nothing is lost.
+    pub fn note(&mut self, failure: Failure, scenario: &Scenario) -> Incident {
+        self.process = None;
+        self.last.state = RoleState::Done as u64;
+        self.incident(failure, scenario, Action::Noted)
+    }
+
+    fn incident(&self, failure: Failure, scenario: &Scenario, action: Action) -> Incident {
+        Incident {
+            role: self.name.clone(),
+            external: self.external,
+            with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
+            generation: self.generation,
+            tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
+            cause: failure.cause,
+            last_words: failure.last_words,
+            begins_anew: false,
+            action,
+            outage_s: None,
+            recovery_s: None,
+        }
+    }
+
     /// Decides what is done about a failure, and prepares it.
     pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
@@ -294,19 +334,8 @@ impl Member {
         if begins_anew {
             self.books().for_each(|(_, ledger)| ledger.distrust());
         }
-        let incident = Incident {
-            role: self.name.clone(),
-            external: self.external,
-            with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
-            generation: self.generation,
-            tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
-            cause: failure.cause,
-            last_words: failure.last_words,
-            begins_anew,
-            action: if again { Action::Restarted } else { Action::Stopped },
-            outage_s: None,
-            recovery_s: None,
-        };
+        let action = if again { Action::Restarted } else { Action::Stopped };
+        let incident = Incident { begins_anew, ..self.incident(failure, scenario, action) };
         // Reaped here, before anybody takes the seat.
         self.process = None;
         if again {

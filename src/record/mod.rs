@@ -46,6 +46,7 @@ use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::ConfigError;
 use crate::runtime::RoleError;
+use crate::system::remedy;
 use std::io;
 use std::path::PathBuf;
 
@@ -78,7 +79,7 @@ pub enum RecordError {
         source: io::Error,
     },
     /// The file cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {source}; {}", path.display(), remedy(source))]
     Read {
         /// The recording.
         path: PathBuf,

@@ -14,6 +14,7 @@ use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
 use crate::sample::{Phase, RoleState, Schedule};
+use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use crate::with_rig;
 use std::io;
@@ -98,7 +99,7 @@ pub enum RoleError {
         waited_s: f64,
     },
     /// The report could not be written.
-    #[error("cannot write the report {}: {source}", path.display())]
+    #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
     Report {
         /// The file.
         path: PathBuf,

@@ -110,35 +110,35 @@ impl Bench {
 
     /// Asserts that no process, file or shared memory of any run in this bench is left; waits for the dying.
     pub fn assert_clean(&self, domains: &[PathBuf]) {
-        let left = || {
-            let ids: Vec<String> =
-                domains.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect();
-            let files = |directory: &Path| -> Vec<PathBuf> {
-                std::fs::read_dir(directory).into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
-            };
-            let mut left = files(&self.runtime.path().join("corotate"));
-            let named = |path: &PathBuf| ids.iter().any(|id| path.to_string_lossy().contains(id));
-            left.extend(files(Path::new("/dev/shm")).into_iter().filter(named));
-            left.extend(self.processes().into_iter().map(|pid| PathBuf::from(format!("/proc/{pid}"))));
-            left
-        };
         let end = Instant::now() + WATCHDOG;
-        while !left().is_empty() {
-            assert!(Instant::now() < end, "left behind: {:?}", left());
+        while !self.left(domains).is_empty() {
+            assert!(Instant::now() < end, "left behind: {:?}", self.left(domains));
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
+    /// The processes, files and shared memory of runs in this bench and of these domains.
+    pub fn left(&self, domains: &[PathBuf]) -> Vec<PathBuf> {
+        let ids: Vec<String> =
+            domains.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect();
+        let files = |directory: &Path| -> Vec<PathBuf> {
+            std::fs::read_dir(directory).into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+        };
+        let mut left = files(&self.runtime.path().join("corotate"));
+        let named = |path: &PathBuf| ids.iter().any(|id| path.to_string_lossy().contains(id));
+        left.extend(files(Path::new("/dev/shm")).into_iter().filter(named));
+        left.extend(self.processes().into_iter().map(|pid| PathBuf::from(format!("/proc/{pid}"))));
+        left
+    }
+
+    /// The entry in the environment by which every process of this bench is known.
+    pub fn mark(&self) -> String {
+        format!("XDG_RUNTIME_DIR={}", self.runtime.path().display())
+    }
+
     /// Every process of the program that runs in this bench, zombies apart.
     pub fn processes(&self) -> Vec<u32> {
-        let mark = format!("XDG_RUNTIME_DIR={}", self.runtime.path().display());
-        let pids =
-            std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
-        pids.filter(|pid: &u32| {
-            let of = |file: &str| std::fs::read(format!("/proc/{pid}/{file}")).unwrap_or_default();
-            String::from_utf8_lossy(&of("environ")).split('\0').any(|entry| entry == mark)
-        })
-        .collect()
+        processes_marked(&self.mark())
     }
 
     /// The process of a role, once it runs.
@@ -183,6 +183,10 @@ impl Running {
         self.child.id()
     }
 
+    pub fn ended(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     pub fn signal(&self, signal: i32) {
         send_signal(self.pid(), signal);
     }
@@ -224,6 +228,16 @@ fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
         pipe.read_to_end(&mut bytes).unwrap();
         String::from_utf8_lossy(&bytes).into_owned()
     })
+}
+
+/// Every process with this entry in its environment, zombies apart.
+pub fn processes_marked(mark: &str) -> Vec<u32> {
+    let pids = std::fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+    pids.filter(|pid: &u32| {
+        let environment = std::fs::read(format!("/proc/{pid}/environ")).unwrap_or_default();
+        String::from_utf8_lossy(&environment).split('\0').any(|entry| entry == mark)
+    })
+    .collect()
 }
 
 pub fn send_signal(pid: u32, signal: i32) {

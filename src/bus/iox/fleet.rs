@@ -1,6 +1,6 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
-use super::{Connections, IoxBus, Ipc, buffer_size};
+use super::{Connections, IoxBus, Ipc, buffer_size, cause};
 use crate::bus::bell::Bell;
 use crate::bus::{BusError, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample};
@@ -56,7 +56,10 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, [Word<L>], ()>, BusError> {
-        let chunk = self.publisher.loan_slice_uninit(self.length).map_err(|error| self.failed(format!("{error:?}")))?;
+        let chunk = self
+            .publisher
+            .loan_slice_uninit(self.length)
+            .map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         Ok(chunk.write_from_fn(|_| Word::wrap(0)))
     }
 
@@ -81,7 +84,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     #[inline]
     fn deliver(&mut self) -> Result<(), BusError> {
         let Some(sample) = self.loan.take() else { return Ok(()) };
-        sample.send().map_err(|error| self.failed(format!("{error:?}")))?;
+        sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
         self.bell.ring();
         Ok(())
     }
@@ -96,7 +99,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     }
 
     fn refresh(&mut self) -> Result<(), BusError> {
-        self.publisher.update_connections().map_err(|error| self.failed(format!("{error:?}")))
+        self.publisher.update_connections().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))
     }
 }
 
@@ -150,7 +153,7 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
                 }
                 Ok(Some(_)) => {}
                 Ok(None) => return Ok(false),
-                Err(error) => return Err(self.failed(format!("{error:?}"))),
+                Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
             }
         }
     }
@@ -161,7 +164,8 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let news = || self.subscriber.has_samples().map_err(|error| self.failed(format!("{error:?}")));
+        let news =
+            || self.subscriber.has_samples().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))));
         self.bell.sleep(until_ns, news)
     }
 

@@ -1,0 +1,26 @@
+//! Errors of the system in words: what a user can do about them. Must not decide what becomes of the program.
+
+use std::fmt::Display;
+use std::io::{self, Write};
+
+/// What to do about an error of the system.
+pub fn remedy(error: &io::Error) -> &'static str {
+    match error.raw_os_error() {
+        Some(libc::ENOSPC | libc::EDQUOT) => "free some room there",
+        Some(libc::EMFILE) => "raise the limit on open files with `ulimit -n`",
+        Some(libc::ENFILE) => "the machine has too many open files: end some programs",
+        Some(libc::EAGAIN) => "raise the limit on processes and threads with `ulimit -u`, or end some",
+        Some(libc::ENOMEM) => "free some memory, or raise the limits on it (`ulimit -v`, `ulimit -l`)",
+        Some(libc::EACCES | libc::EPERM) => "check owner and permissions",
+        Some(libc::EROFS) => "it is mounted read-only: choose another place",
+        Some(libc::ENOENT) => "check that it is still there",
+        Some(libc::EIO) => "check the device: `dmesg` tells more",
+        Some(libc::ENOLCK | libc::EOPNOTSUPP | libc::ENOSYS) => "the file system cannot do that: choose another place",
+        _ => "try again; `corotate doctor` examines the machine",
+    }
+}
+
+/// Writes a line to stderr. Without a stderr the exit code is all there is to say, where `eprintln!` would panic.
+pub fn tell(line: impl Display) {
+    let _ = writeln!(io::stderr(), "{line}");
+}
