@@ -114,10 +114,12 @@ fn a_limit_on_descriptors_is_an_error_and_not_the_end_of_the_world() {
 fn results_that_cannot_be_written_are_told_and_still_shown() {
     for file in ["summary.json", "scenario.toml", "hashes.txt"] {
         let bench = Bench::new();
-        std::fs::create_dir(bench.path("out")).unwrap();
-        symlink("/dev/full", bench.path("out").join(file)).unwrap();
         let run = shipped("rigid-pair");
-        let done = bench.run(&["run", run.to_str().unwrap(), "--clock=lockstep", "--out=out"]);
+        let running = bench.start(&["run", run.to_str().unwrap(), "--duration=2", "--set=accept={}", "--out=out"]);
+        // Before that, the directory would be refused: it would hold a file that is not ours.
+        bench.await_role("follower");
+        symlink("/dev/full", bench.path("out").join(file)).unwrap();
+        let done = running.wait();
         assert_eq!(done.code, Some(1), "{file}: {done:?}");
         assert!(done.stderr.contains(file) && done.stderr.contains("No space left"), "{file}: {done:?}");
         assert!(done.stdout.contains("books balance"), "{file}: {done:?}");

@@ -220,8 +220,8 @@ fn one_bit_is_found_wherever_it_is_and_another_layout_is_refused() {
     flip(4 + 32, "/corotate/rigid_pair/leader/measurement", 500);
     let done = replay(&bench, &changed, &["--role", "observer"]);
     assert!(done.code == Some(3) && done.stdout.contains("at tick 500, "), "{done:?}");
-    // The generation of the last sample is part of the output, too.
-    flip(4 + 8, "/corotate/rigid_pair/follower/command", 1000);
+    // The last sample is compared, too.
+    flip(4 + 32, "/corotate/rigid_pair/follower/command", 1000);
     let done = replay(&bench, &changed, &["--role", "controller"]);
     assert!(done.code == Some(3) && done.stdout.contains("tick 1000, "), "{done:?}");
     rewrite(

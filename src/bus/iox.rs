@@ -49,9 +49,9 @@ const MAX_FLEET_READERS: usize = 4;
 /// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
 const MAX_BORROWED: usize = 2;
 
-/// How long one look at what somebody else has begun to make waits for it. It is finished within microseconds unless its
-/// maker stands still; then the opening looks again.
-const CREATION_TIMEOUT: Duration = Duration::from_millis(500);
+/// How long the transport waits for what somebody else has begun to make: longer than any machine keeps a maker from going
+/// on, because a connection that was given up is not tried again. The wait for a maker that is dead is ended by the janitor.
+const CREATION_TIMEOUT: Duration = Duration::from_secs(10);
 /// For so long an opening tries again where no other limit is given, ns.
 const OPENING_NS: u64 = 10_000_000_000;
 /// A dead process holds its place until the janitor has put away what it left: for so long a successor asks again, ns.

@@ -71,7 +71,9 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let mut crew = Crew::start(scenario, launch, domain, &bus, &mut janitor)?;
     let mut scorer = score::open(scenario, &bus).map_err(|error| crew.blame(error.into()))?;
     let signal = crew.conduct(&mut *scorer, launch, &grants).map_err(|error| crew.blame(error))?;
-    let Dismissal { reports, unbooked, problems } = crew.dismiss();
+    let mut dismissal = crew.dismiss();
+    dismissal.leave_out_partial(|role| is_external(scenario, launch, role));
+    let Dismissal { reports, unbooked, problems } = dismissal;
     let score = scorer.finish()?;
     let (incidents, recorder) = crew.incidents(&score.recoveries_s);
     let recording = recorder.finish(domain, &reports);
@@ -120,6 +122,20 @@ struct Dismissal {
 }
 
 impl Dismissal {
+    /// Leaves out the account of an external role that covers less than others have read of it: that of a program which took
+    /// the seat after another, and knows nothing of that one.
+    fn leave_out_partial(&mut self, is_external: impl Fn(&str) -> bool) {
+        let last_read = |service: &str| {
+            let links = self.reports.iter().flat_map(|report| &report.read);
+            links.filter(|link| link.service == service).filter_map(|link| link.last_tick).max()
+        };
+        let covers = |report: &RoleReport| report.written.iter().all(|link| link.last_tick >= last_read(&link.service));
+        let partial = |report: &&RoleReport| is_external(&report.role) && !covers(report);
+        let names: Vec<String> = self.reports.iter().filter(partial).map(|report| report.role.clone()).collect();
+        self.reports.retain(|report| !names.contains(&report.role));
+        self.unbooked.extend(names);
+    }
+
     /// Takes in what a role has left.
     fn gather(&mut self, scenario: &Scenario, domain: &Domain, role: RoleId, ledger: &Ledger) {
         let name = role.name(scenario).to_owned();
@@ -438,9 +454,8 @@ impl<'a> Crew<'a> {
         let mut dismissal = Dismissal::default();
         for member in &mut self.members {
             let reported = report_path(self.domain.root(), &member.name).exists();
-            let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.bad_end(reported) {
-                let incident = match complete {
+                let incident = match member.ended_complete(self.scenario, self.domain) {
                     true => member.note(failure, self.scenario),
                     false => Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) },
                 };

@@ -369,14 +369,12 @@ impl Stage<'_> {
             }
             let (script, scenario) = (self.script, self.scenario);
             let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, script.role, self.bus, self.ledger))?;
-            if self.ledger.generation() >= step.generation {
+            // Memory of one's own is always open. A life without a tick hands on what it was given.
+            if node.restore().is_ok() && self.ledger.generation() >= step.generation {
                 // Others than a body pass over what the outage took tick by tick: of a long one the links would not hold all.
                 let body = matches!(script.role, RoleId::Plant(_));
-                // Memory of one's own is always open.
-                if node.restore().is_ok() {
-                    let first_tick = if body && step.generation > 1 { step.tick } else { node.next_tick() };
-                    node.start(script.grid, first_tick)?;
-                }
+                let first_tick = if body && step.generation > 1 { step.tick } else { node.next_tick() };
+                node.start(script.grid, first_tick)?;
             }
             self.node = Some(node);
         }

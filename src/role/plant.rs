@@ -174,7 +174,7 @@ impl<B: Body> Plant<B> {
         }
     }
 
-    /// Moves the body on by `ticks` ticks in which no command came, with the actuators' own protection.
+    /// Moves the body on by `ticks` ticks that nobody served: no command came, and the actuators protect themselves.
     pub fn advance_alone(&mut self, ticks: u64) {
         if !self.actuation.driven {
             return self.advance(ticks);

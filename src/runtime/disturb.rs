@@ -17,6 +17,7 @@ pub struct Disturbance<S: Carried + ?Sized> {
     /// Samples that are held back, each with the tick at which it is sent, in the order in which they are sent. As much room
     /// as can ever be needed is taken at the start.
     late: Vec<(u64, S::Owned)>,
+    room: usize,
     /// How many bodies the signal tells of.
     bodies: usize,
 }
@@ -33,8 +34,9 @@ impl<S: Carried + ?Sized> Disturbance<S> {
             Action::Transport(Transport::Delay { ticks }) => ticks.min(fault.ticks) as usize,
             _ => 0,
         };
-        let late = Vec::with_capacity(faults.iter().map(kept).sum());
-        (!faults.is_empty()).then(|| Box::new(Self { faults, late, bodies }))
+        // One is added before those that are due are let go.
+        let room = faults.iter().map(kept).sum::<usize>() + 1;
+        (!faults.is_empty()).then(|| Box::new(Self { faults, late: Vec::with_capacity(room), room, bodies }))
     }
 
     /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
@@ -82,9 +84,9 @@ impl<S: Carried + ?Sized> Disturbance<S> {
 
 impl<S: Carried + ?Sized> Persist for Disturbance<S> {
     fn persist<W: Words>(&mut self, words: &mut W) {
-        let (mut count, room) = (self.late.len() as u64, self.late.capacity());
+        let mut count = self.late.len() as u64;
         count.persist(words);
-        self.late.resize_with(room, || (0, S::blank(self.bodies)));
+        self.late.resize_with(self.room, || (0, S::blank(self.bodies)));
         for (due, sample) in &mut self.late {
             due.persist(words);
             sample.borrow_mut().words_mut().persist(words);
@@ -197,7 +199,7 @@ mod tests {
         let delay = Action::Transport(Transport::Delay { ticks: 3 });
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)], 1).unwrap();
         let room = disturbance.late.capacity();
-        assert_eq!(room, 3);
+        assert_eq!(room, 3 + 1);
         for tick in 5..105_u64 {
             let due = disturbance.due(tick);
             let sent = (0..due).map(|index| disturbance.late(index).unwrap().stamp.tick).collect::<Vec<_>>();

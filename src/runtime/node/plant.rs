@@ -31,8 +31,6 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
     unsettled: Option<u64>,
-    /// The first tick that no predecessor served, until this one executes its first: until then the body was alone.
-    alone_since: Option<u64>,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -57,7 +55,6 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             ledger: seat.ledger.reopened(),
             inherited: Inherited::Nothing,
             unsettled: None,
-            alone_since: None,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -89,7 +86,6 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             self.truth.finish()?;
             self.plant.advance(1);
         }
-        self.alone_since = Some(self.book.next());
         Ok(())
     }
 
@@ -165,12 +161,10 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         if self.inherited != Inherited::Nothing {
             self.take_over()?;
         }
-        if self.clock == Clock::Monotonic && self.alone_since.is_some() {
-            // Whether that tick will be missed too is not known yet.
-            self.book.skip_to(first_tick);
-        } else {
+        if self.clock == Clock::None {
             self.skip_to(first_tick);
         }
+        // Else the first look at the grid skips what was missed, with whatever more is missed until then.
         Ok(())
     }
 
@@ -229,10 +223,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
 
     fn skip_to(&mut self, tick: u64) {
         let missed = self.book.skip_to(tick);
-        match self.alone_since.take() {
-            Some(from) => self.plant.advance_alone(tick.saturating_sub(from)),
-            None => self.plant.advance(missed),
-        }
+        self.plant.advance_alone(missed);
     }
 
     fn warm_up(&mut self) -> Result<(), BusError> {
