@@ -28,6 +28,8 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     voids: bool,
     /// Whether samples are shown first, and published when there is time.
     shows: bool,
+    /// Whether one is shown and not published.
+    shown: bool,
     disturbance: Option<Box<Disturbance<S>>>,
     book: WriteBook,
     /// How much of a tick has been sent, for a successor: the tick + 1, and 16 bits for the number of samples.
@@ -99,6 +101,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             filled: false,
             voids: false,
             shows: false,
+            shown: false,
             disturbance: None,
             book: WriteBook::open(ledger, last_tick),
             progress,
@@ -199,6 +202,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         }
         if self.shows {
             self.port.show()?;
+            self.shown = true;
         } else {
             self.port.deliver()?;
             hooks::at(Place::Sent);
@@ -296,7 +300,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     #[inline]
     pub fn publish(&mut self) -> Result<(), BusError> {
         self.port.publish()?;
-        if self.shows {
+        if std::mem::take(&mut self.shown) {
             self.sent(1);
         }
         Ok(())
