@@ -33,7 +33,7 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
     let role = |role: RoleId| -> ReadyNode {
         let ledger = private_ledger(scenario, role);
         let mut node = corotate::with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &ledger)).unwrap();
-        node.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, 0);
+        node.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, 0).unwrap();
         node
     };
     let mut nodes = [role(RoleId::Observer), role(RoleId::Controller), role(RoleId::Plant(1))];
