@@ -90,7 +90,10 @@ pub enum FoxgloveError {
 /// # Errors
 /// [`FoxgloveError`].
 pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
-    let root = seat.domain.clone().or_else(newest_run).ok_or(FoxgloveError::NoRun)?;
+    let root = match &seat.domain {
+        Some(root) => root.clone(),
+        None => newest_run().map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?,
+    };
     let (domain, scenario) = join(&root)?;
     let mut links = join_beside(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;

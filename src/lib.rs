@@ -16,6 +16,7 @@
 //! | `config` | scenario files: as typed, then as resolved | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
 //! | `clock` | the time grid and how to wait on it | no |
+//! | `files` | files beside other users: what is this user's alone, and where what is written goes | no |
 //! | `shared` | words of memory that processes share | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
@@ -54,6 +55,8 @@ pub mod clock;
 pub mod config;
 #[cfg(feature = "runtime")]
 pub mod doctor;
+#[cfg(feature = "runtime")]
+pub mod files;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
 #[cfg(feature = "runtime")]

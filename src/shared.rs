@@ -6,8 +6,9 @@
 //!
 //! Must not know what the atomics mean.
 
+use crate::files::require_own;
 use memmap2::MmapRaw;
-use rustix::fs::{FallocateFlags, fallocate};
+use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::marker::PhantomData;
@@ -57,6 +58,13 @@ impl Atomic for AtomicU32 {
     }
 }
 
+/// Opens a file of ours, through no link: somebody else could shorten his, and whoever touches what is gone is killed.
+fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    let file = options.read(true).write(true).custom_flags(OFlags::NOFOLLOW.bits() as i32).open(path)?;
+    require_own(&file)?;
+    Ok(file)
+}
+
 impl<A: Atomic> Shared<A> {
     /// The atomics in a file as they were left, or so many new ones, all zero. How many there are is for the caller to check.
     ///
@@ -64,7 +72,7 @@ impl<A: Atomic> Shared<A> {
     /// The system's reason.
     pub fn open(path: &Path, count: usize) -> io::Result<Self> {
         let bytes = (count * size_of::<A>()) as u64;
-        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
+        let file = open(path, OpenOptions::new().create(true).truncate(false).mode(0o600))?;
         if file.metadata()?.len() == 0 {
             // Really allocated, not merely promised: a page that is missing later would kill the process.
             fallocate(&file, FallocateFlags::empty(), 0, bytes)?;
@@ -85,7 +93,7 @@ impl<A: Atomic> Shared<A> {
     /// # Errors
     /// The system's reason.
     pub fn existing(path: &Path) -> io::Result<Self> {
-        let file = OpenOptions::new().read(true).write(true).open(path)?;
+        let file = open(path, &mut OpenOptions::new())?;
         // An empty mapping is refused by the system itself.
         Ok(Self { map: MmapRaw::map_raw(&file)?, file, width: PhantomData })
     }

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 /// System calls with the errors that a system gives for them in practice.
-const ERRORS: [(&str, &[&str]); 29] = [
+const ERRORS: [(&str, &[&str]); 38] = [
     ("openat", &["EMFILE", "ENFILE", "ENOSPC", "EACCES", "EIO", "ENOMEM", "EINTR"]),
     ("ftruncate", &["ENOSPC", "EIO", "EINTR"]),
     ("fallocate", &["ENOSPC", "EOPNOTSUPP", "EINTR"]),
@@ -27,7 +27,16 @@ const ERRORS: [(&str, &[&str]); 29] = [
     ("write", &["ENOSPC", "EIO", "EINTR"]),
     ("read", &["EIO", "EINTR"]),
     ("mkdir", &["ENOSPC", "EACCES", "EIO"]),
+    ("mkdirat", &["ENOSPC", "EACCES", "EIO"]),
+    ("symlink", &["ENOSPC", "EIO"]),
+    ("readlink", &["EIO", "ENOMEM"]),
+    ("fstat", &["EIO"]),
+    ("fstatfs", &["EIO"]),
+    ("getrandom", &["ENOSYS", "EINTR"]),
+    ("execve", &["ENOMEM", "EACCES"]),
+    ("poll", &["EINTR", "ENOMEM"]),
     ("unlink", &["EIO", "EPERM"]),
+    ("unlinkat", &["EIO", "EPERM"]),
     ("rmdir", &["EIO", "EBUSY"]),
     ("ppoll", &["EINTR", "ENOMEM"]),
     ("pidfd_open", &["EMFILE", "ENOSYS"]),
@@ -184,7 +193,7 @@ fn calls() -> String {
 /// The numbers of the calls that a target makes in its own code and that may fail, by call.
 fn sites(target: Target) -> Vec<(&'static str, Vec<usize>)> {
     let bench = Bench::new();
-    let trace = format!("trace={},sigaltstack,execve", calls());
+    let trace = format!("trace={},sigaltstack", calls());
     let ended = target.trace(&bench, &["-e", &trace, "-s", "200"]);
     assert!(ended.done.signal.is_none() && ended.done.code.is_some_and(|code| code < 2), "{target}: {:?}", ended.done);
     let log = std::fs::read_to_string(bench.path("strace.log")).unwrap();
@@ -254,7 +263,8 @@ fn judge(cell: &Cell, limit: Duration, verbose: bool) -> Result<Duration, String
         let codes: &[i32] = if cell.target == Target::Role { &[1, 4, 143] } else { &[143] };
         told_clearly(&beside, codes).map_err(|reason| format!("the run beside it: {reason}"))?;
     }
-    if matches!(cell.call.as_str(), "unlink" | "rmdir" | "getdents64" | "openat" | "newfstatat" | "statx") {
+    if matches!(cell.call.as_str(), "unlink" | "unlinkat" | "rmdir" | "getdents64" | "openat" | "newfstatat" | "statx")
+    {
         // What could not be removed is so by the next run of the same user.
         bench.run(&["doctor", "--clean"]);
     }
@@ -291,7 +301,7 @@ fn told_clearly(done: &Done, codes: &[i32]) -> Result<(), String> {
 
 /// The domains that a traced process has opened something of.
 fn domains(log: &str) -> Vec<std::path::PathBuf> {
-    let named = log.split("corotate_").skip(1).filter_map(|rest| rest.get(..8));
+    let named = log.split("corotate_").skip(1).filter_map(|rest| rest.get(..32));
     let ids: BTreeSet<&str> = named.filter(|id| id.bytes().all(|byte| byte.is_ascii_hexdigit())).collect();
     ids.into_iter().map(Into::into).collect()
 }

@@ -111,6 +111,24 @@ fn checkpoints(bench: &Bench, directory: &str) -> Vec<(u64, String)> {
     text.lines().skip(1).map(entry).collect()
 }
 
+/// Of a long run not every tick has a hash, but the last one has, and `clean_ticks` are all of an undisturbed run's.
+#[test]
+fn a_long_run_has_the_hash_of_its_last_tick() {
+    let bench = Bench::new();
+    for (ticks, stride) in [(16_384, 1), (16_385, 2), (40_000, 3)] {
+        let duration = format!("{}", (ticks - 1) as f64 / 1000.0);
+        let options = ["--clock=in-process", "--set", "accept={}", "--duration", &duration, "--out", "out"];
+        let summary = bench.summary("rigid-pair", &options);
+        let (state, hashes) = (&summary["state"], checkpoints(&bench, "out"));
+        assert_eq!((state["elapsed_ticks"].as_u64(), state["clean_ticks"].as_u64()), (Some(ticks), Some(ticks)));
+        assert_eq!(state["clean_hash"], state["hash"]);
+        let (last, hash) = hashes.last().unwrap();
+        assert_eq!((*last, hash.as_str()), (ticks, state["hash"].as_str().unwrap()));
+        let strides = hashes[..hashes.len() - 1].iter().enumerate();
+        assert!(strides.clone().all(|(index, (at, _))| *at == (index as u64 + 1) * stride), "{ticks}");
+    }
+}
+
 /// Real time gives the bits of the in-process run for every tick before the first disturbed one, which the summary names.
 #[test]
 fn realtime_gives_the_same_bits_up_to_the_first_missed_tick() {

@@ -1,7 +1,7 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
 use crate::{Exit, fail, say};
-use corotate::bus::domain::{domains, remove_dead_domains};
+use corotate::bus::domain::{DomainError, domains, remove_dead_domains};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::doctor::{Demand, Diagnosis, Lateness, Machine, leftovers, measure};
 use corotate::system::remedy;
@@ -43,11 +43,10 @@ pub fn doctor(arguments: &Arguments) -> Exit {
         Ok(scenario) => scenario,
         Err(error) => return fail(Exit::Usage, &error),
     };
-    if arguments.clean {
-        remove_dead_domains();
-    }
+    // If it cannot be done, the line on what is left says why.
+    let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
     let mut checks = Machine::at(Path::new("/")).examine(&Demand::of(&scenario));
-    checks.push(leftovers(&domains()));
+    checks.push(leftovers(cleared.and_then(|_| domains())));
     let lateness = match (arguments.seconds > 0).then(|| sleep(&scenario, arguments.seconds)).transpose() {
         Ok(lateness) => lateness,
         Err(exit) => return exit,

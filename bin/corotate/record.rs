@@ -23,7 +23,7 @@ pub struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   corotate run --record                             record a run from its first tick to its last
-  corotate record --domain $XDG_RUNTIME_DIR/corotate/1a2b3c4d --out part.mcap
+  corotate record --domain $XDG_RUNTIME_DIR/corotate/<id> --out part.mcap
                                                     record a run that is under way, from now on; Ctrl-C ends it in order";
 
 /// Records to the end of the run.

@@ -2,6 +2,7 @@
 
 use crate::{Exit, fail, foxglove, print};
 use corotate::config::{ClockKind, RunId, SHIPPED, Scenario};
+use corotate::files;
 use corotate::launch::{
     Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
 };
@@ -145,8 +146,8 @@ pub fn run(arguments: &Arguments) -> Exit {
 
 fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str>) -> Result<(), Exit> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
-    let made = directory.map_or(Ok(()), std::fs::create_dir_all);
-    made.and_then(|()| std::fs::write(path, junit(name, run, ended)))
+    let made = directory.map_or(Ok(()), files::create_directories);
+    made.and_then(|()| files::write(path, junit(name, run, ended).as_bytes()))
         .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
 }
 
@@ -257,14 +258,14 @@ const DIRECTORIES: u32 = 10_000;
 pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     if let Some(path) = given {
-        return std::fs::create_dir_all(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
+        return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
     }
     let runs = Path::new("runs");
-    std::fs::create_dir_all(runs).map_err(|error| named(runs, error))?;
+    files::create_directories(runs).map_err(|error| named(runs, error))?;
     let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
     for attempt in 1..=DIRECTORIES {
         let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
-        match std::fs::create_dir(&path) {
+        match files::create_directory(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
         }

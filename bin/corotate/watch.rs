@@ -25,7 +25,7 @@ from when the sample that it waits for was sent; median/99 % of the last 4096.
 
 Examples:
   corotate run & corotate watch          the newest run of this user
-  corotate watch $XDG_RUNTIME_DIR/corotate/1a2b3c4d
+  corotate watch $XDG_RUNTIME_DIR/corotate/<id>
                                          the run in that domain
   corotate watch --once 5 > screen.txt   one screen as text, after five seconds";
 

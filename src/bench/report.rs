@@ -3,12 +3,12 @@
 //! Must not compute a figure: what is not on the board is not told.
 
 use super::{Bench, Board, Figure, Row, TARGETS, Verdict};
+use crate::files;
 use crate::launch::plain;
 use crate::telemetry::Host;
 use crate::telemetry::{Grant, write_hgrm};
 use serde::Serialize;
 use std::fmt::Write as _;
-use std::fs;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
@@ -149,16 +149,16 @@ fn number(value: f64) -> String {
 /// # Errors
 /// Those of the file system.
 pub fn write_results(directory: &Path, results: &Results) -> io::Result<()> {
-    fs::write(directory.join("bench.txt"), table(results))?;
-    let mut json = BufWriter::new(fs::File::create(directory.join("bench.json"))?);
+    files::write(&directory.join("bench.txt"), table(results).as_bytes())?;
+    let mut json = BufWriter::new(files::create(&directory.join("bench.json"))?);
     serde_json::to_writer_pretty(&mut json, results)?;
     json.flush()?;
     let latency = directory.join("latency");
-    fs::create_dir_all(&latency)?;
+    files::create_directories(&latency)?;
     for figure in &results.figures {
         if let Some(pooled) = &figure.pooled {
             let name = figure.name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
-            let mut out = BufWriter::new(fs::File::create(latency.join(format!("{}.{name}.hgrm", figure.row.name())))?);
+            let mut out = BufWriter::new(files::create(&latency.join(format!("{}.{name}.hgrm", figure.row.name())))?);
             write_hgrm(pooled, None, &mut out)?;
             out.flush()?;
         }

@@ -18,7 +18,7 @@ use std::ffi::OsString;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
@@ -240,8 +240,8 @@ pub(super) fn status_word(pid: i32, key: &str) -> Option<u64> {
 
 /// What a domain's files take of shared memory, bytes.
 fn shared_bytes(domain: &Domain) -> u64 {
-    let prefix = domain.prefix();
-    let entries = fs::read_dir(Path::new("/dev/shm")).into_iter().flatten().flatten();
-    let own = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
-    own.filter_map(|entry| entry.metadata().ok()).map(|data| data.blocks() * 512).sum()
+    let own = domain
+        .in_shared_memory()
+        .chain(fs::read_dir(domain.shared("")).into_iter().flatten().flatten().map(|entry| entry.path()));
+    own.filter_map(|path| fs::metadata(path).ok()).map(|data| data.blocks() * 512).sum()
 }

@@ -1,14 +1,21 @@
-//! A run's domain: the directory and the name prefix under which everything it shares lives, so that two runs never meet.
+//! A run's domain: the directories and the name prefix under which everything it shares lives, so that two runs never meet
+//! and no other user gets in.
 //!
-//! Knows files and locks, not the transport. The lock says whether the run is alive; the kernel lets go of it when the
-//! launcher dies, however it dies. Must not touch a domain whose lock is held.
+//! The domain's directory is private, and all that is believed is in it. What is mapped lies in shared memory: our own files
+//! in a directory there that is private too, and `shared` in the domain's directory leads to it; the transport's beside it,
+//! under a prefix that nobody knows before the first of them is made.
+//!
+//! Knows files and locks, and of the transport only which of its files it would leave open to everybody. The lock says whether the run is alive; the kernel lets go of it when the
+//! launcher dies, however it dies. Must not touch a domain whose lock is held, nor what another user has put beside it.
 
+use crate::files::{PrivacyError, require_private, user, user_name};
 use crate::system::remedy;
-use rustix::fs::{FlockOperation, flock, fstat, statvfs};
+use rustix::fs::{FlockOperation, OFlags, flock, fstat, statvfs};
 use rustix::io::Errno;
+use rustix::rand::{GetRandomFlags, getrandom};
 use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -16,8 +23,19 @@ use std::time::SystemTime;
 pub const SHARED_MEMORY: &str = "/dev/shm";
 /// What the names of a domain's files in [`SHARED_MEMORY`] begin with, before its id.
 const PREFIX: &str = "corotate_";
-/// What the transport's socket paths may not exceed, less what it appends: see sockaddr_un.
-const MAX_ROOT_LENGTH: usize = 48;
+/// What the transport's paths may not exceed, less what it appends: the directory of a node, and a file's name with the prefix.
+const MAX_ROOT_LENGTH: usize = 112;
+/// Letters of an identifier: 128 random bits, so that nobody guesses one.
+const ID_LENGTH: usize = 32;
+/// The file of iceoryx2 0.10 that it makes writable for everybody, its count of nodes, by the end of its name: the SHA-1 of
+/// the count's type is in it. Made here, closed, it is taken as it is.
+const NODE_COUNT: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
+/// What is in it at first: the version 0.10.0 as 64 bits in the machine's order, then the count.
+const NO_NODES: [u64; 2] = [10 << 16, 0];
+/// So often a domain is given up in which another user has put something before us.
+const DOMAINS_MAX: u32 = 3;
+/// The link in a domain's directory to that of its own files in shared memory.
+const OWN_SHARED: &str = "shared";
 /// How often something is tried again that another process, or a signal, has come in the way of.
 const ATTEMPTS: u32 = 100;
 
@@ -37,6 +55,15 @@ pub struct OwnedDomain {
 /// Why a domain could not be made or joined.
 #[derive(Debug, thiserror::Error)]
 pub enum DomainError {
+    /// A directory is not this user's alone.
+    #[error(transparent)]
+    Privacy(#[from] PrivacyError),
+    /// Another user made what is the domain's to make, again and again.
+    #[error("{} was there before this run could make it, in {DOMAINS_MAX} domains one after the other; remove it, or have its owner stopped", path.display())]
+    Taken {
+        /// What he made.
+        path: PathBuf,
+    },
     /// A directory or file could not be made.
     #[error("cannot make {}: {source}; set XDG_RUNTIME_DIR to a directory that you may write", path.display())]
     Create {
@@ -78,7 +105,7 @@ pub enum DomainError {
         needed: u64,
     },
     /// The directory's path is too long for the transport's sockets.
-    #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for socket names; set XDG_RUNTIME_DIR to a shorter one", path.display())]
+    #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for the transport's files; set XDG_RUNTIME_DIR to a shorter one", path.display())]
     TooLong {
         /// The path.
         path: PathBuf,
@@ -91,11 +118,22 @@ pub enum DomainError {
     },
 }
 
-/// The directory that holds this user's domains.
+/// The directory that is to hold this user's domains.
 fn base() -> PathBuf {
     match std::env::var_os("XDG_RUNTIME_DIR").filter(|directory| !directory.is_empty()) {
         Some(directory) => PathBuf::from(directory).join("corotate"),
-        None => PathBuf::from(format!("/tmp/corotate-{}", rustix::process::getuid().as_raw())),
+        None => PathBuf::from(format!("/tmp/corotate-{}", user())),
+    }
+}
+
+/// The same, if it is there, without links.
+///
+/// # Errors
+/// [`PrivacyError`]: there may be anything in it.
+pub fn private_base() -> Result<Option<PathBuf>, PrivacyError> {
+    match require_private(&base()) {
+        Err(PrivacyError::System { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+        base => base.map(Some),
     }
 }
 
@@ -106,14 +144,16 @@ impl OwnedDomain {
     /// # Errors
     /// [`DomainError`].
     pub fn create(bytes: usize) -> Result<Self, DomainError> {
-        let base = base();
         let create = |path: &Path, source| DomainError::Create { path: path.to_owned(), source };
-        remove_dead(&base);
+        remove_dead_domains()?;
         require_room(bytes as u64)?;
+        let mut taken = 1;
         for _ in 0..ATTEMPTS {
             // Within the loop: another run that ends may remove the directory as long as it is empty.
+            let base = base();
             DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
-            let root = base.join(random_id());
+            let Some(base) = private_base()? else { continue };
+            let root = base.join(random_id()?);
             if root.as_os_str().len() > MAX_ROOT_LENGTH {
                 return Err(DomainError::TooLong { path: root });
             }
@@ -123,9 +163,12 @@ impl OwnedDomain {
             let owned = Self { domain: Domain { root }, _lock: lock };
             let root = owned.domain.root();
             DirBuilder::new().mode(0o700).create(root).map_err(|error| create(root, error))?;
-            return Ok(owned);
+            match owned.domain.make_shared() {
+                Err(DomainError::Taken { .. }) if taken < DOMAINS_MAX => taken += 1,
+                made => return made.map(|()| owned),
+            }
         }
-        Err(DomainError::Contended { path: base })
+        Err(DomainError::Contended { path: base() })
     }
 
     /// The domain, to be used.
@@ -141,17 +184,34 @@ impl Drop for OwnedDomain {
 }
 
 impl Domain {
-    /// The domain at a directory that a launcher made.
+    /// The domain at a directory that a launcher of this user made.
     ///
     /// # Errors
-    /// [`DomainError::NotADomain`].
+    /// [`DomainError::NotADomain`], [`DomainError::Privacy`].
     pub fn join(root: &Path) -> Result<Self, DomainError> {
-        let named = root.file_name().is_some_and(|name| name.len() == 8);
+        let named = root.file_name().is_some_and(|name| name.len() == ID_LENGTH);
         if named && root.is_dir() && lock_path(root).is_file() {
-            Ok(Self { root: root.to_owned() })
+            Ok(Self { root: require_private(root)? })
         } else {
             Err(DomainError::NotADomain { path: root.to_owned() })
         }
+    }
+
+    /// Makes what is the domain's in shared memory before anybody else does. The first file there tells the transport's prefix,
+    /// so it is the only one of its files that has a name which can be known beforehand.
+    fn make_shared(&self) -> Result<(), DomainError> {
+        let failed = |path: &Path, source: io::Error| match source.kind() {
+            io::ErrorKind::AlreadyExists => DomainError::Taken { path: path.to_owned() },
+            _ => DomainError::Create { path: path.to_owned(), source },
+        };
+        let count = Path::new(SHARED_MEMORY).join(self.prefix() + NODE_COUNT);
+        let made = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&count);
+        made.and_then(|mut file| file.write_all(bytemuck::bytes_of(&NO_NODES)))
+            .map_err(|error| failed(&count, error))?;
+        let shared = Path::new(SHARED_MEMORY).join(format!("{}-{}", self.mark(), random_id()?));
+        let link = self.root.join(OWN_SHARED);
+        symlink(&shared, &link).map_err(|error| failed(&link, error))?;
+        DirBuilder::new().mode(0o700).create(&shared).map_err(|error| failed(&shared, error))
     }
 
     /// Its directory, open to this user alone.
@@ -171,40 +231,55 @@ impl Domain {
         }
     }
 
-    /// What the names of its files in shared memory begin with.
+    /// What the names of all its files in shared memory begin with.
+    fn mark(&self) -> String {
+        format!("{PREFIX}{}", self.root.file_name().unwrap_or_default().to_string_lossy())
+    }
+
+    /// What the names of the transport's files in shared memory begin with.
     pub fn prefix(&self) -> String {
-        format!("{PREFIX}{}_", self.root.file_name().unwrap_or_default().to_string_lossy())
+        self.mark() + "_"
     }
 
-    /// Where a file lies in shared memory that goes with the domain.
+    /// Where a file of ours lies in shared memory that goes with the domain.
     pub fn shared(&self, name: &str) -> PathBuf {
-        Path::new(SHARED_MEMORY).join(self.prefix() + name)
+        self.root.join(OWN_SHARED).join(name)
     }
 
-    /// Takes from other users what the transport has left open to them in shared memory so far.
-    ///
-    /// iceoryx2 0.10 makes one file, its count of nodes, writable for everybody. It is there once somebody has entered.
+    /// What is the domain's in shared memory: the transport's files, and the directory of our own. What another user has put
+    /// there under such a name is not.
+    pub fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
+        let (mark, user) = (self.mark(), user());
+        let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+        entries
+            .filter(move |entry| entry.file_name().to_string_lossy().starts_with(&mark))
+            .filter(move |entry| entry.metadata().is_ok_and(|file| file.uid() == user))
+            .map(|entry| entry.path())
+    }
+
+    /// Checks that whatever this process has mapped of the domain is its user's, so that no other can shorten it.
     ///
     /// # Errors
-    /// [`DomainError::Create`].
-    pub fn seal(&self) -> Result<(), DomainError> {
-        for path in self.in_shared_memory() {
-            let private = fs::Permissions::from_mode(0o600);
-            fs::set_permissions(&path, private).map_err(|source| DomainError::Create { path, source })?;
+    /// [`PrivacyError::Foreign`].
+    pub fn require_own_mappings(&self) -> Result<(), DomainError> {
+        let begins = format!("{SHARED_MEMORY}/{}", self.prefix());
+        let maps = fs::read_to_string("/proc/self/maps").unwrap_or_default();
+        for path in maps.lines().filter_map(|line| line.find(&begins).map(|at| Path::new(&line[at..]))) {
+            // What is gone cannot be looked at by its name, and went while it was ours: nobody else can remove it.
+            if let Ok(file) = fs::symlink_metadata(path)
+                && file.uid() != user()
+            {
+                return Err(PrivacyError::Foreign { path: path.to_owned(), owner: user_name(file.uid()) }.into());
+            }
         }
         Ok(())
     }
 
-    /// The domain's files in shared memory.
-    pub(super) fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
-        let prefix = self.prefix();
-        let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-        entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(&prefix)).map(|entry| entry.path())
-    }
-
     /// Removes every trace of the domain. What is gone already is no error.
     fn remove(&self) {
-        self.in_shared_memory().for_each(|path| drop(fs::remove_file(path)));
+        self.in_shared_memory().for_each(|path| {
+            let _ = fs::remove_file(&path).or_else(|_| fs::remove_dir_all(path));
+        });
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
         if !self.root.exists() && self.in_shared_memory().next().is_none() {
@@ -216,8 +291,11 @@ impl Domain {
 }
 
 /// Removes the domains of this user whose launcher is dead, and tells which.
-pub fn remove_dead_domains() -> Vec<Domain> {
-    remove_dead(&base())
+///
+/// # Errors
+/// [`PrivacyError`].
+pub fn remove_dead_domains() -> Result<Vec<Domain>, PrivacyError> {
+    Ok(private_base()?.map_or(Vec::new(), |base| remove_dead(&base)))
 }
 
 /// A domain that was found, of a run or of what is left of one.
@@ -232,13 +310,19 @@ pub struct Found {
 }
 
 /// The domains of this user, the newest first.
-pub fn domains() -> Vec<Found> {
-    found(&base())
+///
+/// # Errors
+/// [`DomainError::Privacy`].
+pub fn domains() -> Result<Vec<Found>, DomainError> {
+    Ok(private_base()?.map_or(Vec::new(), |base| found(&base)))
 }
 
 /// The domain of the newest run of this user that is under way.
-pub fn newest_run() -> Option<PathBuf> {
-    domains().into_iter().find(|found| found.alive).map(|found| found.root)
+///
+/// # Errors
+/// [`DomainError::Privacy`].
+pub fn newest_run() -> Result<Option<PathBuf>, DomainError> {
+    Ok(domains()?.into_iter().find(|found| found.alive).map(|found| found.root))
 }
 
 fn found(base: &Path) -> Vec<Found> {
@@ -306,7 +390,9 @@ enum Lock {
 
 /// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
 fn lock(path: &Path, lock: Lock) -> Result<Option<File>, DomainError> {
-    let file = match OpenOptions::new().write(true).create_new(lock == Lock::New).mode(0o600).open(path) {
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(lock == Lock::New).mode(0o600).custom_flags(OFlags::NOFOLLOW.bits() as i32);
+    let file = match options.open(path) {
         Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
             return Ok(None);
         }
@@ -339,11 +425,17 @@ fn flock_now(file: &File) -> Result<(), Errno> {
     locked
 }
 
-fn random_id() -> String {
-    use std::hash::{BuildHasher, Hasher};
-    // The standard library seeds every RandomState from the system's randomness.
-    let random = std::collections::hash_map::RandomState::new().build_hasher().finish();
-    format!("{:08x}", random as u32)
+/// The system's randomness, or an error: an identifier that can be guessed is none.
+fn random_id() -> Result<String, DomainError> {
+    let mut bytes = [0; ID_LENGTH / 2];
+    match getrandom(&mut bytes, GetRandomFlags::empty()) {
+        // As many as these are given at once.
+        Ok(count) if count == bytes.len() => Ok(format!("{:0ID_LENGTH$x}", u128::from_ne_bytes(bytes))),
+        other => {
+            let source = other.err().map_or(io::ErrorKind::UnexpectedEof.into(), io::Error::from);
+            Err(DomainError::Create { path: "an identifier".into(), source })
+        }
+    }
 }
 
 #[cfg(test)]
@@ -356,25 +448,15 @@ mod tests {
         let domain = owned.domain().clone();
         assert_eq!(fs::metadata(domain.root()).unwrap().mode() & 0o777, 0o700);
         assert_eq!(Domain::join(domain.root()).unwrap(), domain);
-        let shared = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
-        fs::write(&shared, b"x").unwrap();
+        let transports = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
+        fs::write(&transports, b"x").unwrap();
+        let own = fs::canonicalize(domain.shared("")).unwrap();
+        assert!(own.starts_with(SHARED_MEMORY));
+        assert_eq!(fs::metadata(&own).unwrap().mode() & 0o777, 0o700);
+        fs::write(domain.shared("y"), b"y").unwrap();
         drop(owned);
-        assert!(!shared.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
+        assert!(!transports.exists() && !own.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
         assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
-    }
-
-    #[test]
-    fn what_could_not_be_removed_stays_marked() {
-        let owned = OwnedDomain::create(0).unwrap();
-        let domain = owned.domain().clone();
-        // What `remove_file` refuses.
-        let stubborn = domain.shared("x");
-        fs::create_dir(&stubborn).unwrap();
-        drop(owned);
-        assert!(domain.exists() && !domain.root().exists());
-        fs::remove_dir(&stubborn).unwrap();
-        remove_dead_domains();
-        assert!(!domain.exists());
     }
 
     #[test]

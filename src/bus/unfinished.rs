@@ -41,7 +41,8 @@ impl Domain {
     }
 
     fn begun(&self) -> Vec<(PathBuf, Metadata)> {
-        let in_shared_memory = |file: &Metadata| file.len() == 0 || file.permissions().mode() & READABLE == 0;
+        let in_shared_memory =
+            |file: &Metadata| file.is_file() && (file.len() == 0 || file.permissions().mode() & READABLE == 0);
         let of_services = |file: &Metadata| file.permissions().mode() & WRITABLE != 0;
         let services = fs::read_dir(self.root().join("services")).into_iter().flatten().flatten();
         let files = self.in_shared_memory().map(|path| (path, true)).chain(services.map(|entry| (entry.path(), false)));
@@ -84,12 +85,16 @@ fn is_open(path: &Path, file: &Metadata) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::domain::OwnedDomain;
+    use super::super::domain::{OwnedDomain, SHARED_MEMORY};
     use super::*;
     use std::fs::{File, OpenOptions};
     use std::os::unix::fs::OpenOptionsExt;
 
     const LIMIT: Duration = Duration::from_secs(3600);
+
+    fn shared(domain: &Domain, name: &str) -> PathBuf {
+        Path::new(SHARED_MEMORY).join(domain.prefix() + name)
+    }
 
     fn begin(path: &Path) -> File {
         OpenOptions::new().write(true).create_new(true).mode(WRITABLE).open(path).unwrap()
@@ -109,7 +114,7 @@ mod tests {
         let domain = owned.domain();
         let services = domain.root().join("services");
         fs::create_dir(&services).unwrap();
-        let [empty, unreadable, whole] = ["empty", "unreadable", "whole"].map(|name| domain.shared(name));
+        let [empty, unreadable, whole] = ["empty", "unreadable", "whole"].map(|name| shared(domain, name));
         let (described, locked) = (services.join("described"), services.join("locked"));
         drop(begin(&empty));
         begin(&unreadable).set_len(1).unwrap();
@@ -128,7 +133,7 @@ mod tests {
     #[test]
     fn what_somebody_has_open_is_left_until_the_limit() {
         let owned = OwnedDomain::create(0).unwrap();
-        let path = owned.domain().shared("held");
+        let path = shared(owned.domain(), "held");
         let held = begin(&path);
         settle(owned.domain());
         assert!(path.exists());

@@ -13,7 +13,7 @@ mod machine;
 pub use lateness::{Lateness, measure};
 pub use machine::{Demand, Machine};
 
-use crate::bus::domain::Found;
+use crate::bus::domain::{DomainError, Found};
 use crate::telemetry::Host;
 use serde::Serialize;
 use std::fmt;
@@ -121,9 +121,17 @@ impl fmt::Display for Diagnosis {
     }
 }
 
-/// What is left of runs whose launcher was killed.
-pub fn leftovers(domains: &[Found]) -> Check {
+/// What is left of runs whose launcher was killed. Where others can write, nobody knows whose it is.
+pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
     let name = "leftover domains";
+    let domains = match domains {
+        Ok(domains) => domains,
+        Err(error) => {
+            let text = error.to_string();
+            let (problem, remedy) = text.split_once("; ").unwrap_or((&text, "remove it"));
+            return Check::bad("run directory", problem, remedy);
+        }
+    };
     let dead: Vec<&Found> = domains.iter().filter(|found| !found.alive).collect();
     let running = domains.len() - dead.len();
     match dead.first() {
@@ -156,8 +164,8 @@ mod tests {
     #[test]
     fn the_dead_are_told_and_the_living_are_not_blamed() {
         let found = |alive| Found { root: "/run/corotate/00000000".into(), alive, made: None };
-        assert_eq!(leftovers(&[found(true)]).verdict, Verdict::Ok);
-        let check = leftovers(&[found(true), found(false)]);
+        assert_eq!(leftovers(Ok(vec![found(true)])).verdict, Verdict::Ok);
+        let check = leftovers(Ok(vec![found(true), found(false)]));
         assert!(check.verdict == Verdict::Warn && check.found.starts_with("1 of dead runs"), "{check:?}");
     }
 }

@@ -189,7 +189,7 @@ pub fn janitor(
     for pause_ms in [0, 50, 500] {
         std::thread::sleep(Duration::from_millis(pause_ms));
         gone.iter().for_each(Domain::forget);
-        gone.extend(domain::remove_dead_domains());
+        gone.extend(domain::remove_dead_domains().unwrap_or_default());
     }
     Ok(())
 }

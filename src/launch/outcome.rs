@@ -6,6 +6,7 @@ use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
 use crate::config::{RunId, Scenario};
+use crate::files;
 use crate::record::RecordingReport;
 use crate::rig::{CertificateReport, Figure};
 use crate::runtime::RoleId;
@@ -16,7 +17,7 @@ use crate::telemetry::{
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -175,7 +176,8 @@ pub struct State {
     pub elapsed_ticks: u64,
     /// The first tick whose samples may differ from an undisturbed run's, if any.
     pub first_disturbed_tick: Option<u64>,
-    /// How many ticks from the first on are covered by `clean_hash`.
+    /// How many ticks from the first on are covered by `clean_hash`: all that are undisturbed, or up to the last checkpoint
+    /// among them. Runs of more than 16 384 ticks have one every 2nd, 3rd, … tick.
     pub clean_ticks: u64,
     /// The hash over those ticks.
     pub clean_hash: String,
@@ -355,17 +357,24 @@ impl State {
         links.sort_by_key(|(service, _)| *service);
         let stride = links.iter().map(|(_, hash)| hash.stride).max().unwrap_or(1);
         let count = links.iter().map(|(_, hash)| hash.hashes.len()).min().unwrap_or(0);
-        let checkpoints: Vec<(u64, u64)> = (0..count)
+        let mut checkpoints: Vec<(u64, u64)> = (0..count)
             .map(|index| ((index as u64 + 1) * stride, combine(links.iter().map(|(_, hash)| hash.hashes[index]))))
             .collect();
         let first_disturbed_tick = books.roles.values().filter_map(|ticks| ticks.first_disturbed).min();
+        let hash = combine(links.iter().map(|(_, hash)| hash.last));
+        let mut elapsed = books.roles.values().map(|ticks| ticks.elapsed);
+        let elapsed_ticks = elapsed.clone().min().unwrap_or(0);
+        // The end is seldom a multiple of the stride. It is one moment only if all came as far.
+        let covered = checkpoints.last().map_or(0, |(ticks, _)| *ticks);
+        if first_disturbed_tick.is_none() && covered < elapsed_ticks && elapsed.all(|ticks| ticks == elapsed_ticks) {
+            checkpoints.push((elapsed_ticks, hash));
+        }
         let clean =
             checkpoints.iter().rev().find(|(ticks, _)| first_disturbed_tick.is_none_or(|first| *ticks <= first));
         let (clean_ticks, clean_hash) = clean.copied().unwrap_or((0, 0));
-        let hash = combine(links.iter().map(|(_, hash)| hash.last));
         Self {
             hash: format!("{hash:016x}"),
-            elapsed_ticks: books.roles.values().map(|ticks| ticks.elapsed).min().unwrap_or(0),
+            elapsed_ticks,
             first_disturbed_tick,
             clean_ticks,
             clean_hash: format!("{clean_hash:016x}"),
@@ -464,14 +473,14 @@ pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io
     })?;
     write(&directory.join(HASHES), |out| {
         let run = run.as_ref().map_or(String::new(), |run| format!("{run}: "));
-        writeln!(out, "# {run}ticks covered, hash over everything published in them")?;
+        writeln!(out, "# {run}ticks from the first on, hash over everything published in them")?;
         summary.state.checkpoints.iter().try_for_each(|(ticks, hash)| writeln!(out, "{ticks} {hash:016x}"))
     })?;
     if summary.latencies.is_empty() {
         return Ok(());
     }
     let latency = directory.join(LATENCY);
-    fs::create_dir_all(&latency).map_err(|error| named(&latency, &error))?;
+    files::create_directories(&latency).map_err(|error| named(&latency, &error))?;
     for stage in &summary.latencies {
         let path = latency.join(format!("{}.{}.hgrm", stage.role, stage.stage));
         write(&path, |out| write_hgrm(&stage.latency, run.as_deref(), out))?;
@@ -488,9 +497,9 @@ pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io
     })
 }
 
-fn write(path: &Path, content: impl FnOnce(&mut BufWriter<fs::File>) -> io::Result<()>) -> io::Result<()> {
+fn write(path: &Path, content: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
     let attempt = || {
-        let mut out = BufWriter::new(fs::File::create(path)?);
+        let mut out = BufWriter::new(files::create(path)?);
         content(&mut out)?;
         out.flush()
     };

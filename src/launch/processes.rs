@@ -67,7 +67,6 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         _ => (None, Vec::new()),
     };
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
-    domain.seal()?;
     let mut crew = Crew::start(scenario, launch, domain, &bus, &mut janitor)?;
     let mut scorer = score::open(scenario, &bus).map_err(|error| crew.blame(error.into()))?;
     let signal = crew.conduct(&mut *scorer, launch, &grants).map_err(|error| crew.blame(error))?;

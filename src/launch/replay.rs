@@ -42,7 +42,6 @@ pub fn replay_as_process(
         .map_err(|source| LaunchError::Write { path, source })?;
     let _janitor = Janitor::start(program, domain, Duration::from_secs_f64(scenario.startup_timeout_s))?;
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
-    domain.seal()?;
     let mut prompter = Prompter {
         schedule: bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?,
         health: bus.reader(&topic(scenario, &script.name, Signal::Health), Reader::Role)?,

@@ -4,6 +4,7 @@
 //! certainly one of ours.
 
 use crate::config::RunId;
+use crate::files;
 use serde::Deserialize;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
@@ -65,7 +66,7 @@ pub fn new_run() -> io::Result<RunId> {
 /// # Errors
 /// [`ResultsError`]; nothing has been removed if a file is [`Foreign`](ResultsError::Foreign).
 pub fn claim(directory: &Path) -> Result<(), ResultsError> {
-    fs::create_dir_all(directory).map_err(failed(directory))?;
+    files::create_directories(directory).map_err(failed(directory))?;
     let older = older(directory)?;
     older.iter().try_for_each(|path| fs::remove_file(path).map_err(failed(path)))?;
     // It stays if somebody else has put something there.

@@ -182,7 +182,7 @@ fn books(summary: &Summary, text: &mut String) {
         }
         Some(tick) => writeln!(
             text,
-            "state hash {}; first disturbed tick {tick}, hash of the {} ticks before {}",
+            "state hash {}; first disturbed tick {tick}, hash of the first {} ticks {}",
             state.hash, state.clean_ticks, state.clean_hash
         ),
     };

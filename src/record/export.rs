@@ -10,6 +10,7 @@ mod parquet;
 use super::RecordError;
 use super::layout::Layout;
 use super::reader::{Recording, SignalInfo};
+use crate::files;
 use crate::sample::{FieldKind, Stamp};
 use std::fs::{File, Permissions};
 use std::io;
@@ -86,8 +87,10 @@ pub fn export_parquet(recording: &Recording, directory: &Path) -> Result<Vec<Pat
 }
 
 fn export<T: Table>(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
-    std::fs::create_dir_all(directory).map_err(|source| ExportError::Write { path: directory.to_owned(), source })?;
-    let begin = |signal: &SignalInfo| Part::<T>::begin(recording, signal, directory);
+    let failed = |source| ExportError::Write { path: directory.to_owned(), source };
+    files::create_directories(directory).map_err(failed)?;
+    let place = files::Directory::open(directory).map_err(failed)?;
+    let begin = |signal: &SignalInfo| Part::<T>::begin(recording, signal, &place, directory);
     let mut parts = recording.signals().iter().map(begin).collect::<Result<Vec<_>, _>>()?;
     let (mut bits, mut written) = (Vec::new(), Ok(()));
     recording.visit(|signal, received_ns, sample| {
@@ -98,7 +101,7 @@ fn export<T: Table>(recording: &Recording, directory: &Path) -> Result<Vec<PathB
         }
     })?;
     written?;
-    parts.into_iter().map(Part::end).collect()
+    parts.into_iter().map(|part| part.end(&place)).collect()
 }
 
 /// A table that does not have its name yet.
@@ -109,13 +112,18 @@ struct Part<T> {
 }
 
 impl<T: Table> Part<T> {
-    fn begin(recording: &Recording, signal: &SignalInfo, directory: &Path) -> Result<Self, ExportError> {
+    fn begin(
+        recording: &Recording,
+        signal: &SignalInfo,
+        place: &files::Directory,
+        directory: &Path,
+    ) -> Result<Self, ExportError> {
         let name = format!("{}.{}.{}", file_name(&signal.body), file_name(&signal.signal), T::EXTENSION);
         let path = directory.join(&name);
         // Like any file that is made, for whom the user's mask allows.
         let permissions = Permissions::from_mode(0o666);
         let made =
-            tempfile::Builder::new().prefix(&name).suffix(".part").permissions(permissions).tempfile_in(directory);
+            tempfile::Builder::new().prefix(&name).suffix(".part").permissions(permissions).tempfile_in(place.path());
         let begun = made.and_then(|made| {
             let (file, part) = made.into_parts();
             Ok((part, T::begin(file, recording, signal)?))
@@ -130,9 +138,10 @@ impl<T: Table> Part<T> {
         self.table.row(bits).map_err(|source| ExportError::Write { path: self.path.clone(), source })
     }
 
-    fn end(self) -> Result<PathBuf, ExportError> {
+    fn end(self, place: &files::Directory) -> Result<PathBuf, ExportError> {
         let Self { path, file, table } = self;
-        match table.end().and_then(|()| file.persist(&path).map_err(io::Error::from)) {
+        let named = place.path().join(path.file_name().unwrap_or_default());
+        match table.end().and_then(|()| file.persist(named).map_err(io::Error::from)) {
             Ok(()) => Ok(path),
             Err(source) => Err(ExportError::Write { path, source }),
         }

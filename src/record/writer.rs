@@ -8,12 +8,13 @@
 use super::RecordError;
 use super::layout::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 use super::taps::{Channel, MessageSink};
+use crate::files;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions};
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
@@ -68,7 +69,7 @@ impl Writer {
     /// [`RecordError::Write`].
     pub fn create(path: &Path) -> Result<Self, RecordError> {
         let failed = |source| RecordError::Write { path: path.to_owned(), source };
-        let file = OpenOptions::new().write(true).create(true).truncate(true).open(path).map_err(failed)?;
+        let file = files::create(path).map_err(failed)?;
         let sink = Sink { file: file.try_clone().map_err(failed)?, broken: false };
         let options = WriteOptions::new()
             .profile("ros2")

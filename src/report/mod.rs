@@ -142,7 +142,8 @@ impl Report {
     /// # Errors
     /// [`ReportError::Write`].
     pub fn write(&self, path: &Path) -> Result<(), ReportError> {
-        std::fs::write(path, &self.html).map_err(|source| ReportError::Write { path: path.to_owned(), source })
+        crate::files::write(path, self.html.as_bytes())
+            .map_err(|source| ReportError::Write { path: path.to_owned(), source })
     }
 }
 

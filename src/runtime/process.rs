@@ -13,6 +13,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
+use crate::files;
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
@@ -202,7 +203,7 @@ fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
 /// Writes a file so that nobody ever sees a part of it.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let part = path.with_extension("part");
-    std::fs::write(&part, bytes)?;
+    files::write(&part, bytes)?;
     std::fs::rename(&part, path)
 }
 

@@ -198,6 +198,17 @@ impl Ledger {
         Ok(())
     }
 
+    /// The record that is there, for whoever only reads: whatever its length is said to be, nothing is made.
+    fn open_record(&self) -> Option<&Record> {
+        let words = self.word(Self::LENGTH).load(Ordering::Relaxed) as usize;
+        if self.memory.record.get().is_none() && words > 0 {
+            let storage = Storage::Shared(SharedWords::existing(&self.record_path()?).ok()?);
+            let whole = words.checked_mul(2) == Some(storage.words().len());
+            whole.then(|| self.memory.record.set(Record { storage, words }));
+        }
+        self.memory.record.get()
+    }
+
     fn record_path(&self) -> Option<PathBuf> {
         self.memory.path.as_ref().map(|path| path.with_extension("state"))
     }
@@ -220,11 +231,7 @@ impl Ledger {
 
     /// The last record that was committed; none before the first, or where none can be read.
     pub fn record(&self) -> Option<Vec<u64>> {
-        let words = self.word(Self::LENGTH).load(Ordering::Relaxed) as usize;
-        if words == 0 || self.reserve(words).is_err() {
-            return None;
-        }
-        let record = self.memory.record.get()?;
+        let record = self.open_record()?;
         for _ in 0..Self::TRIES {
             let commits = self.word(Self::COMMITS).load(Ordering::Acquire);
             if commits == 0 {
@@ -336,6 +343,22 @@ mod tests {
         assert!(matches!(Ledger::shared(&path, 6), Err(LedgerError::Size { found: 72, expected: 80, .. })));
         assert!(matches!(Ledger::shared(&path, 5).unwrap().reserve(4), Err(LedgerError::Size { .. })));
         assert!(matches!(Ledger::shared(directory.path(), 6), Err(LedgerError::Open { .. })));
+    }
+
+    #[test]
+    fn whoever_only_reads_makes_nothing_whatever_is_in_the_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("x.books");
+        let writer = Ledger::shared(&path, 0).unwrap();
+        for length in [1, 1 << 40, u64::MAX / 2 + 2, u64::MAX] {
+            writer.word(Ledger::LENGTH).store(length, Ordering::Relaxed);
+            assert_eq!(Ledger::shared(&path, 0).unwrap().record(), None);
+            assert!(!path.with_extension("state").exists(), "{length}");
+        }
+        writer.reserve(3).unwrap();
+        commit(&writer, &[1, 2, 3]);
+        writer.word(Ledger::LENGTH).store(u64::MAX / 2 + 4, Ordering::Relaxed);
+        assert_eq!(Ledger::shared(&path, 0).unwrap().record(), None, "twice that is 6, and there are 6 words");
     }
 
     #[test]

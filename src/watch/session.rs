@@ -50,7 +50,10 @@ impl Session {
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
-        let root = directory.map(Path::to_owned).or_else(newest_run).ok_or(WatchError::NoRun)?;
+        let root = match directory {
+            Some(root) => root.to_owned(),
+            None => newest_run()?.ok_or(WatchError::NoRun)?,
+        };
         let end_ns = monotonic_ns() + JOIN_NS;
         let (domain, scenario) = insist(end_ns, || join(&root))?;
         let mut model = Model {

@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// Nothing here takes so long, however loaded the machine is; what does, hangs.
-pub const WATCHDOG: Duration = Duration::from_secs(120);
+pub const WATCHDOG: Duration = Duration::from_secs(300);
 
 /// A place to run in, with nothing of any other run in it.
 pub struct Bench {
@@ -62,6 +62,11 @@ impl Bench {
 
     pub fn path(&self, name: &str) -> PathBuf {
         self.directory.path().join(name)
+    }
+
+    /// Where the domains of its programs lie, in a directory of the program's name.
+    pub fn runtime(&self) -> PathBuf {
+        self.runtime.path().to_owned()
     }
 
     pub fn command(&self) -> Command {

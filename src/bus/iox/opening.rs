@@ -1,0 +1,222 @@
+//! What keeps an end from being opened, and whether it may pass.
+//!
+//! Must not wait longer than it is told to, nor clean up after anybody.
+
+use super::{IoxBus, cause};
+use crate::bus::{BusError, Topic};
+use crate::clock::{monotonic_ns, sleep_until};
+use iceoryx2::port::publisher::PublisherCreateError;
+use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
+use iceoryx2::service::builder::blackboard::BlackboardCreateError;
+use iceoryx2::service::builder::publish_subscribe::{
+    PublishSubscribeCreateError, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
+};
+use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A dead process holds its place until the janitor has put away what it left: for so long a successor asks again, ns.
+const VACATE_NS: u64 = 2_000_000_000;
+/// Between two attempts at an opening, ns.
+const RETRY_NS: u64 = 20_000_000;
+
+impl IoxBus {
+    /// Opens something, again and again while what is in the way may pass. A signal to this process only breaks off an
+    /// attempt: what it asks for is done in order, by whoever looks for it.
+    pub(super) fn open<T>(
+        &self,
+        topic: &Topic,
+        end: &'static str,
+        mut attempt: impl FnMut() -> Result<T, Refusal>,
+    ) -> Result<T, BusError> {
+        let begun_ns = monotonic_ns();
+        loop {
+            cause::forget();
+            let refusal = match attempt() {
+                Ok(opened) => {
+                    let mapped = self.domain.require_own_mappings();
+                    return mapped
+                        .map(|()| opened)
+                        .map_err(|error| self.failed_to_open(topic, end, Refusal::never(error)));
+                }
+                Err(refusal) => refusal,
+            };
+            let limit_ns = match refusal.passes {
+                Passes::Never => 0,
+                Passes::WhenFinished => self.opening_ns,
+                Passes::WhenVacated => VACATE_NS.min(self.opening_ns),
+            };
+            if monotonic_ns() - begun_ns >= limit_ns {
+                return Err(self.failed_to_open(topic, end, refusal));
+            }
+            sleep_until(monotonic_ns() + RETRY_NS);
+        }
+    }
+
+    fn failed_to_open(&self, topic: &Topic, end: &'static str, refusal: Refusal) -> BusError {
+        let Refusal { mut reason, passes } = refusal;
+        if passes == Passes::WhenFinished {
+            let limit_s = self.opening_ns as f64 / 1e9;
+            let unfinished =
+                self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
+            let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
+            reason = format!("{reason} for {limit_s} s: whoever makes it stands still{files}");
+        } else {
+            let remedy = format!("is another process of this run its {end}, or of another version?");
+            reason = cause::reason(|| format!("{reason}; {remedy}"));
+        }
+        BusError::Open { service: topic.to_string(), end, reason }
+    }
+}
+
+/// Whether what keeps something from being opened may pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Passes {
+    Never,
+    /// Once somebody else has finished what he makes, or this process the handling of a signal.
+    WhenFinished,
+    /// Once the remains of a dead process are put away.
+    WhenVacated,
+}
+
+/// Why something could not be opened.
+#[derive(Debug)]
+pub(super) struct Refusal {
+    reason: String,
+    passes: Passes,
+}
+
+impl Refusal {
+    pub(super) fn new(error: impl fmt::Debug, passes: Passes) -> Self {
+        Self { reason: format!("{error:?}"), passes }
+    }
+
+    pub(super) fn never(error: impl fmt::Debug) -> Self {
+        Self::new(error, Passes::Never)
+    }
+}
+
+impl From<PublishSubscribeOpenError> for Refusal {
+    fn from(error: PublishSubscribeOpenError) -> Self {
+        use PublishSubscribeOpenError as Error;
+        Self::new(
+            error,
+            match error {
+                Error::Interrupt | Error::HangsInCreation | Error::IsMarkedForDestruction => Passes::WhenFinished,
+                Error::ExceedsMaxNumberOfNodes => Passes::WhenVacated,
+                _ => Passes::Never,
+            },
+        )
+    }
+}
+
+impl From<PublishSubscribeOpenOrCreateError> for Refusal {
+    fn from(error: PublishSubscribeOpenOrCreateError) -> Self {
+        use PublishSubscribeCreateError as Create;
+        use PublishSubscribeOpenOrCreateError as Error;
+        match error {
+            Error::PublishSubscribeOpenError(error) => error.into(),
+            Error::PublishSubscribeCreateError(
+                Create::Interrupt
+                | Create::AlreadyExists
+                | Create::HangsInCreation
+                | Create::IsBeingCreatedByAnotherInstance,
+            )
+            | Error::SystemInFlux => Self::new(error, Passes::WhenFinished),
+            Error::PublishSubscribeCreateError(_) => Self::never(error),
+        }
+    }
+}
+
+impl From<BlackboardCreateError> for Refusal {
+    fn from(error: BlackboardCreateError) -> Self {
+        use BlackboardCreateError as Error;
+        let begun = matches!(error, Error::Interrupt | Error::HangsInCreation | Error::IsBeingCreatedByAnotherInstance);
+        Self::new(error, if begun { Passes::WhenFinished } else { Passes::Never })
+    }
+}
+
+impl From<PublisherCreateError> for Refusal {
+    fn from(error: PublisherCreateError) -> Self {
+        let taken = error == PublisherCreateError::ExceedsMaxSupportedPublishers;
+        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+    }
+}
+
+impl From<SubscriberCreateError> for Refusal {
+    fn from(error: SubscriberCreateError) -> Self {
+        let taken = error == SubscriberCreateError::ExceedsMaxSupportedSubscribers;
+        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+    }
+}
+
+/// Whether an end that is being opened could be connected to every other end there is. The transport itself only logs it,
+/// and never tries again.
+#[derive(Clone, Default)]
+pub(super) struct Connections {
+    failed: Arc<AtomicBool>,
+}
+
+impl Connections {
+    /// What the transport is to call if it cannot connect.
+    pub(super) fn watch(&self) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
+        let failed = self.failed.clone();
+        move |_, _| {
+            failed.store(true, Ordering::Relaxed);
+            DegradationAction::Warn
+        }
+    }
+
+    /// The end, if it is connected.
+    pub(super) fn whole<T>(&self, end: T) -> Result<T, Refusal> {
+        if self.failed.load(Ordering::Relaxed) {
+            return Err(Refusal {
+                reason: "not connected to every process that has it open (is /dev/shm full?)".to_owned(),
+                passes: Passes::Never,
+            });
+        }
+        Ok(end)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{bus, topic};
+    use super::*;
+    use crate::bus::domain::{OwnedDomain, SHARED_MEMORY};
+    use std::path::Path;
+    use std::time::Duration;
+
+    /// Opens by attempts that are refused until so many have been made; returns how many were.
+    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> Refusal) -> (u32, Result<(), BusError>) {
+        let mut made = 0;
+        let attempt = || {
+            made += 1;
+            if made > until { Ok(()) } else { Err(refusal()) }
+        };
+        let opened = bus.open(&topic(), "reader", attempt);
+        (made, opened)
+    }
+
+    #[test]
+    fn what_may_pass_is_tried_again_and_nothing_else() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let interrupted = || PublishSubscribeOpenOrCreateError::from(PublishSubscribeOpenError::Interrupt).into();
+        assert!(matches!(attempts(&bus, 2, interrupted), (3, Ok(()))));
+        let (made, refused) = attempts(&bus, 2, || Refusal::never("a signal called Interrupt"));
+        assert!(made == 1 && refused.is_err());
+    }
+
+    #[test]
+    fn an_opening_has_a_limit_and_names_the_file_that_it_waits_for() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain).within(Duration::from_millis(50));
+        let path = Path::new(SHARED_MEMORY).join(domain.domain().prefix() + "begun");
+        std::fs::write(&path, "").unwrap();
+        let (_, refused) = attempts(&bus, u32::MAX, || PublishSubscribeOpenError::HangsInCreation.into());
+        let reason = refused.unwrap_err().to_string();
+        assert!(reason.contains("0.05 s") && reason.contains(path.to_str().unwrap()), "{reason}");
+    }
+}

@@ -1,0 +1,316 @@
+//! The links of single bodies over shared memory: samples of one size, by a queue, and the newest by its lane too.
+
+use super::latest::{LatestReader, LatestWriter};
+use super::{Ipc, Wire, cause, is_written};
+use crate::bus::bell::Bell;
+use crate::bus::{BusError, Read, Topic, Write};
+use crate::sample::{Sample, VOID};
+use iceoryx2::node::Node;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::sample::Sample as Received;
+use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use std::rc::Rc;
+
+/// The writing end.
+pub struct IoxWriter<S: Sample> {
+    pub(super) publisher: Publisher<Ipc, Wire<S>, ()>,
+    pub(super) latest: Option<LatestWriter<S>>,
+    pub(super) loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    /// What was shown in the lane and is not sent.
+    pub(super) shown: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    pub(super) bell: Bell,
+    pub(super) topic: Topic,
+}
+
+impl<S: Sample> IoxWriter<S> {
+    /// The sample that was filled, and is in the lane if there is one.
+    #[inline]
+    fn filled(&mut self) -> Option<SampleMut<Ipc, Wire<S>, ()>> {
+        let sample = self.loan.take()?;
+        if let Some(latest) = &self.latest {
+            latest.put(&sample.payload().0);
+            // Whoever looks at the lane need not sleep until the queues are served.
+            self.bell.ring();
+        }
+        Some(sample)
+    }
+
+    #[inline]
+    fn queue(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
+        sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
+        self.bell.ring();
+        Ok(())
+    }
+
+    fn loan(&self) -> Result<SampleMut<Ipc, Wire<S>, ()>, BusError> {
+        let chunk =
+            self.publisher.loan_uninit().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
+        Ok(chunk.write_payload(Wire(S::zeroed())))
+    }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Send { service: self.topic.to_string(), reason }
+    }
+}
+
+impl<S: Sample> Write<S> for IoxWriter<S> {
+    #[inline]
+    fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError> {
+        let mut sample = match self.loan.take() {
+            Some(sample) => sample,
+            None => self.loan()?,
+        };
+        fill(&mut sample.payload_mut().0);
+        self.loan = Some(sample);
+        Ok(())
+    }
+
+    #[inline]
+    fn deliver(&mut self) -> Result<(), BusError> {
+        let sample = self.filled();
+        sample.map_or(Ok(()), |sample| self.queue(sample))
+    }
+
+    #[inline]
+    fn show(&mut self) -> Result<(), BusError> {
+        self.publish()?;
+        self.shown = self.filled();
+        if self.latest.is_none() { self.publish() } else { Ok(()) }
+    }
+
+    #[inline]
+    fn publish(&mut self) -> Result<(), BusError> {
+        self.shown.take().map_or(Ok(()), |sample| self.queue(sample))
+    }
+
+    /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
+    #[inline]
+    fn prepare(&mut self) -> Result<(), BusError> {
+        if self.loan.is_none() {
+            self.loan = Some(self.loan()?);
+        }
+        Ok(())
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.publisher.update_connections().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))
+    }
+}
+
+/// Looks at the fast lane between two at the queue, where nothing new is as a rule.
+const LOOKS: u32 = 256;
+
+/// The reading end.
+pub struct IoxReader<S: Sample> {
+    pub(super) node: Rc<Node<Ipc>>,
+    pub(super) service: PortFactory<Ipc, Wire<S>, ()>,
+    pub(super) subscriber: Subscriber<Ipc, Wire<S>, ()>,
+    pub(super) lane: Lane<S>,
+    /// Looks at the lane that found nothing.
+    pub(super) idle: u32,
+    pub(super) current: Current<S>,
+    /// Taken from the queue before a sleep, and not told of yet.
+    pub(super) pending: Option<Received<Ipc, Wire<S>, ()>>,
+    /// Generation and tick of the last sample told of.
+    pub(super) newest: (u64, u64),
+    pub(super) bell: Bell,
+    pub(super) topic: Topic,
+}
+
+/// A reader's fast lane.
+#[allow(clippy::large_enum_variant, reason = "there is one per reader, and it is looked at at every tick")]
+pub(super) enum Lane<S: Sample> {
+    /// There is none.
+    None,
+    /// It is to be looked for: that of a writer of this generation.
+    Wanted { generation: u64 },
+    /// It is there.
+    Open(LatestReader<S>),
+}
+
+/// What tells the samples of a signal apart, and orders them: generation and tick.
+#[inline]
+fn key(sample: &impl Sample) -> (u64, u64) {
+    let stamp = sample.stamp();
+    (stamp.generation & !VOID, stamp.tick)
+}
+
+/// Where the sample at hand is.
+pub(super) enum Current<S: Sample> {
+    None,
+    InLane,
+    Queued(Received<Ipc, Wire<S>, ()>),
+}
+
+impl<S: Sample> IoxReader<S> {
+    /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
+    pub fn written(&self) -> bool {
+        is_written(&self.service)
+    }
+
+    #[cold]
+    fn failed(&self, reason: String) -> BusError {
+        BusError::Receive { service: self.topic.to_string(), reason }
+    }
+
+    /// Takes the next sample from the queue, unless the lane has had it.
+    fn receive(&mut self) -> Result<bool, BusError> {
+        let received = match self.pending.take() {
+            Some(sample) => sample,
+            None => match self.subscriber.receive() {
+                Ok(Some(sample)) => sample,
+                Ok(None) => return Ok(false),
+                Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
+            },
+        };
+        let key = key(&received.payload().0);
+        let (generation, _) = key;
+        match &mut self.lane {
+            Lane::Open(latest) if key <= self::key(latest.sample()) => return Ok(false),
+            Lane::Open(latest) if generation > latest.generation() => self.lane = Lane::Wanted { generation },
+            // Warm-up tells nothing of its writer.
+            Lane::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
+            _ => {}
+        }
+        self.newest = key;
+        self.current = Current::Queued(received);
+        Ok(true)
+    }
+}
+
+impl<S: Sample> Read<S> for IoxReader<S> {
+    #[inline]
+    fn advance(&mut self) -> Result<bool, BusError> {
+        if let Lane::Open(latest) = &mut self.lane {
+            if latest.advance() {
+                let before = std::mem::replace(&mut self.newest, key(latest.sample()));
+                self.current = Current::InLane;
+                // The queue may have been faster, and the lane may take one sample for two.
+                return Ok(self.newest != before);
+            }
+            self.idle = self.idle.wrapping_add(1);
+            if !self.idle.is_multiple_of(LOOKS) {
+                return Ok(false);
+            }
+        }
+        self.receive()
+    }
+
+    #[inline]
+    fn current(&self) -> Option<&S> {
+        match (&self.current, &self.lane) {
+            (Current::Queued(sample), _) => Some(&sample.payload().0),
+            (Current::InLane, Lane::Open(latest)) => Some(latest.sample()),
+            _ => None,
+        }
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        let Self { subscriber, lane, idle, pending, bell, topic, .. } = self;
+        let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
+        let Lane::Open(latest) = lane else {
+            return bell.sleep(until_ns, || {
+                subscriber.has_samples().map_err(|error| failed(cause::reason(|| format!("{error:?}"))))
+            });
+        };
+        bell.sleep(until_ns, || {
+            // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
+            while !latest.has_news() && pending.is_none() {
+                match subscriber.receive() {
+                    Ok(Some(sample)) => {
+                        *pending = Some(sample).filter(|sample| key(&sample.payload().0) > key(latest.sample()))
+                    }
+                    Ok(None) => return Ok(false),
+                    Err(error) => return Err(failed(cause::reason(|| format!("{error:?}")))),
+                }
+            }
+            // The next look goes to the queue, if nothing is in the lane.
+            *idle = u32::MAX;
+            Ok(true)
+        })
+    }
+
+    fn refresh(&mut self) {
+        // Or the first look at the queue, once the lane is open, would connect to its writer in the midst of the loop. What
+        // is wrong with it is told by that look.
+        let _ = self.subscriber.update_connections();
+        if let Lane::Wanted { generation } = self.lane {
+            match LatestReader::open(&self.node, &self.topic, generation) {
+                Some(latest) => self.lane = Lane::Open(latest),
+                // Where there is none there will be none: a lane is made before its signal. But before the first sample it
+                // is not known whose to look for.
+                None if self.newest != (0, 0) => self.lane = Lane::None,
+                None => {}
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{bus, topic};
+    use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::bus::{Bus, Reader, Signal};
+    use crate::clock::monotonic_ns;
+    use crate::sample::RateCommand;
+
+    /// A signal with a fast lane, whose bus has links of the newest sample.
+    fn fast() -> Topic {
+        Topic { signal: Signal::Command, ..topic() }
+    }
+
+    fn send(writer: &mut IoxWriter<RateCommand>, tick: u64, generation: u64) {
+        writer.send(|sample| (sample.stamp.tick, sample.stamp.generation) = (tick, generation)).unwrap();
+    }
+
+    /// The queue still holds what the lane has given: that must not keep the reader awake.
+    #[test]
+    fn a_reader_of_the_lane_sleeps_at_once_when_there_is_nothing_new() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut writer = bus.writer::<RateCommand>(&fast(), 1).unwrap();
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        send(&mut writer, 0, 1);
+        assert!(reader.advance().unwrap());
+        reader.refresh();
+        assert!(matches!(reader.lane, Lane::Open(_)));
+        for tick in 1..20 {
+            send(&mut writer, tick, 1);
+            assert!(reader.advance().unwrap());
+            assert!(matches!(reader.current, Current::InLane));
+            let (until_ns, mut sleeps) = (monotonic_ns() + 2_000_000, 0);
+            while monotonic_ns() < until_ns {
+                reader.sleep(until_ns).unwrap();
+                assert!(!reader.advance().unwrap());
+                sleeps += 1;
+            }
+            assert!(sleeps <= 2, "tick {tick}: {sleeps} sleeps in 2 ms");
+        }
+    }
+
+    /// A successor of the writer has a lane of its own, which is looked for only later.
+    #[test]
+    fn what_only_the_queue_has_ends_the_sleep_and_is_found_at_the_next_look() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        for generation in 1..4 {
+            let mut writer = bus.writer::<RateCommand>(&fast(), generation).unwrap();
+            for tick in 0..3 {
+                let tick = 10 * generation + tick;
+                send(&mut writer, tick, generation);
+                reader.sleep(monotonic_ns() + 1_000_000).unwrap();
+                assert!(reader.advance().unwrap(), "generation {generation}, tick {tick}");
+                assert_eq!(key(reader.current().unwrap()), (generation, tick));
+                assert!(!reader.advance().unwrap(), "once");
+            }
+            reader.refresh();
+            assert!(!reader.advance().unwrap(), "what is in the lane now was in the queue");
+        }
+    }
+}
