@@ -10,10 +10,12 @@ Exit codes: 0 the run ended in order, 1 it did not, 2 the seat is not one for th
 import argparse
 import ctypes
 import gc
+import glob
 import importlib.metadata
 import json
 import math
 import os
+import shutil
 import signal
 import sys
 import time
@@ -246,13 +248,14 @@ class Actuator:
 class Follower:
     """The role: its links, its ticks, its books."""
 
-    def __init__(self, seat, terminated, silent):
-        self.seat, self.terminated, self.silent = seat, terminated, silent
+    def __init__(self, path, terminated, silent):
+        with open(path, encoding="utf-8") as file:
+            self.seat = seat = json.load(file)
+        self.path, self.terminated, self.silent = path, terminated, silent
         if seat["schema"] != "corotate/seat/v1" or seat["kind"] != "plant" or not seat["reads"]:
             raise SeatError(f"{seat['role']} is no driven body described by corotate/seat/v1")
         if seat["scenario"]["rig"] != "rigid-body":
             raise SeatError(f"this program is a rigid body, and the rig is {seat['scenario']['rig']}")
-        self.domain = seat["transport"]["domain"]
         self.transport = Transport(seat["transport"], seat["role"])
         try:
             self.open_links()
@@ -412,12 +415,13 @@ class Follower:
 
     def stopped(self):
         """Whether the run is over for this role. The launcher says so before it removes the domain."""
-        gone = not os.path.isdir(self.domain)
+        # Not the domain's directory: the transport makes that anew for whoever comes too late.
+        gone = not os.path.exists(self.path)
         word = self.schedule.newest()
         if self.terminated or (word is not None and word.phase >= self.seat["phases"]["stop"]):
             return True
         if gone:
-            raise RunLost(f"{self.domain} is gone: the run was killed")
+            raise RunLost(f"{self.path} is gone: the run is over")
         return False
 
     def ask_for_priority(self):
@@ -463,6 +467,20 @@ class Follower:
                 file.write(end.record)
 
 
+def forget(transport):
+    """Removes what the transport made anew in a domain that was gone when this program came."""
+    domain = transport["domain"]
+    if os.path.exists(domain + ".lock"):
+        return
+    shutil.rmtree(domain, ignore_errors=True)
+    for path in glob.glob(f"/dev/shm/{transport['prefix']}*"):
+        os.remove(path)
+    try:
+        os.rmdir(os.path.dirname(domain))
+    except OSError:
+        pass  # Other runs live there.
+
+
 def main():
     parser = argparse.ArgumentParser(description="A follower in a seat of a corotate run.")
     parser.add_argument("seat", help="the seat's description, as the waiting run prints its path")
@@ -473,8 +491,7 @@ def main():
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _frame: terminated.append(number))
     try:
-        with open(arguments.seat, encoding="utf-8") as file:
-            follower = Follower(json.load(file), terminated, arguments.silent)
+        follower = Follower(arguments.seat, terminated, arguments.silent)
         if arguments.record:
             follower.record()
         # What is made from now on is freed by reference counts; a collection would cost ticks.
@@ -491,6 +508,9 @@ def main():
         return 2
     except RunLost as error:
         print(f"follower: {error}", file=sys.stderr)
+        transport = follower.seat["transport"]
+        del follower
+        forget(transport)
         return 1
     return 128 + terminated[0] if terminated else 0
 
