@@ -1,5 +1,8 @@
-//! Errors of the system in words: what a user can do about them. Must not decide what becomes of the program.
+//! The system: its errors in words, with what a user can do about them, its stderr, and its randomness. Must not decide what
+//! becomes of the program.
 
+use rustix::io::retry_on_intr;
+use rustix::rand::{GetRandomFlags, getrandom};
 use std::fmt::Display;
 use std::io::{self, Write};
 
@@ -17,6 +20,19 @@ pub fn remedy(error: &io::Error) -> &'static str {
         Some(libc::EIO) => "check the device: `dmesg` tells more",
         Some(libc::ENOLCK | libc::EOPNOTSUPP | libc::ENOSYS) => "the file system cannot do that: choose another place",
         _ => "try again; `corotate doctor` examines the machine",
+    }
+}
+
+/// 128 bits that nobody can guess.
+///
+/// # Errors
+/// The system's reason.
+pub fn random_bits() -> io::Result<u128> {
+    let mut bytes = [0; size_of::<u128>()];
+    // As few as these are given at once.
+    match retry_on_intr(|| getrandom(&mut bytes, GetRandomFlags::empty()))? {
+        16 => Ok(u128::from_ne_bytes(bytes)),
+        _ => Err(io::ErrorKind::UnexpectedEof.into()),
     }
 }
 

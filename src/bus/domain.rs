@@ -9,10 +9,9 @@
 //! launcher dies, however it dies. Must not touch a domain whose lock is held, nor what another user has put beside it.
 
 use crate::files::{PrivacyError, require_private, user, user_name};
-use crate::system::remedy;
+use crate::system::{random_bits, remedy};
 use rustix::fs::{FlockOperation, OFlags, flock, fstat, statvfs};
 use rustix::io::Errno;
-use rustix::rand::{GetRandomFlags, getrandom};
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, symlink};
@@ -63,6 +62,12 @@ pub enum DomainError {
     Taken {
         /// What he made.
         path: PathBuf,
+    },
+    /// An identifier that can be guessed is none.
+    #[error("the system has no random numbers: {source}; {}", remedy(source))]
+    Random {
+        /// The system's reason.
+        source: io::Error,
     },
     /// A directory or file could not be made.
     #[error("cannot make {}: {source}; set XDG_RUNTIME_DIR to a directory that you may write", path.display())]
@@ -425,17 +430,9 @@ fn flock_now(file: &File) -> Result<(), Errno> {
     locked
 }
 
-/// The system's randomness, or an error: an identifier that can be guessed is none.
 fn random_id() -> Result<String, DomainError> {
-    let mut bytes = [0; ID_LENGTH / 2];
-    match getrandom(&mut bytes, GetRandomFlags::empty()) {
-        // As many as these are given at once.
-        Ok(count) if count == bytes.len() => Ok(format!("{:0ID_LENGTH$x}", u128::from_ne_bytes(bytes))),
-        other => {
-            let source = other.err().map_or(io::ErrorKind::UnexpectedEof.into(), io::Error::from);
-            Err(DomainError::Create { path: "an identifier".into(), source })
-        }
-    }
+    let bits = random_bits().map_err(|source| DomainError::Random { source })?;
+    Ok(format!("{bits:0ID_LENGTH$x}"))
 }
 
 #[cfg(test)]

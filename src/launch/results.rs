@@ -5,6 +5,7 @@
 
 use crate::config::RunId;
 use crate::files;
+use crate::system::random_bits;
 use serde::Deserialize;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
@@ -56,9 +57,7 @@ pub enum ResultsError {
 /// # Errors
 /// Those of the system's source of random numbers.
 pub fn new_run() -> io::Result<RunId> {
-    let mut bits = [0; 16];
-    File::open("/dev/urandom")?.read_exact(&mut bits)?;
-    Ok(RunId::from_bits(bits))
+    Ok(RunId::from_bits(random_bits()?.to_ne_bytes()))
 }
 
 /// Makes a directory for a run's results. If it exists, the files of an older run of ours in it are removed.
