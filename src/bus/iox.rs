@@ -180,7 +180,7 @@ impl IoxBus {
         cause::hear();
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
         let bells = bells.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
-        let node = Rc::new(enter(domain, name).map_err(failed)?);
+        let node = Rc::new(enter(domain.root(), domain, name).map_err(failed)?);
         Ok(Self { node, bells, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
     }
 
@@ -245,7 +245,8 @@ pub fn clear_dead(domain: &Domain) -> Result<(), BusError> {
         }
         CallbackProgression::Continue
     };
-    Node::<Ipc>::list(&config(domain).map_err(failed)?, clear).map_err(|error| failed(format!("{error:?}")))
+    Node::<Ipc>::list(&config(domain.root(), domain).map_err(failed)?, clear)
+        .map_err(|error| failed(format!("{error:?}")))
 }
 
 /// Whether a service has a writer. One that was killed is one until its remains are cleared.
@@ -253,10 +254,10 @@ fn is_written<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P
     service.dynamic_config().number_of_publishers() > 0
 }
 
-/// The transport's configuration by which a process enters a domain.
-fn config(domain: &Domain) -> Result<Config, String> {
+/// The transport's configuration by which a process enters a domain, whose directory is at `root`.
+fn config(root: &std::path::Path, domain: &Domain) -> Result<Config, String> {
     let mut config = Config::default();
-    let root = domain.root().to_string_lossy();
+    let root = root.to_string_lossy();
     let root = Path::new(root.as_bytes()).map_err(|error| format!("{error:?}"))?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|error| format!("{error:?}"))?;
@@ -268,8 +269,8 @@ fn config(domain: &Domain) -> Result<Config, String> {
     Ok(config)
 }
 
-pub(super) fn enter(domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
-    let config = config(domain)?;
+pub(super) fn enter(root: &std::path::Path, domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
+    let config = config(root, domain)?;
     cause::forget();
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
@@ -353,11 +354,11 @@ mod tests {
         let domain = OwnedDomain::create(0).unwrap();
         let shared = || domain.domain().in_shared_memory().map(|path| (path.metadata().unwrap(), path));
         let before: Vec<_> = shared().map(|(_, path)| path).collect();
-        let first = enter(domain.domain(), "first").unwrap();
+        let first = enter(domain.domain().root(), domain.domain(), "first").unwrap();
         assert_eq!(shared().map(|(_, path)| path).collect::<Vec<_>>(), before, "a node alone makes no file");
         let count = before.iter().find(|path| path.to_string_lossy().contains("_node.")).unwrap();
         let count = || std::fs::read(count).unwrap()[8];
-        let (counted, _second) = (count(), enter(domain.domain(), "second").unwrap());
+        let (counted, _second) = (count(), enter(domain.domain().root(), domain.domain(), "second").unwrap());
         assert_eq!((counted, count()), (1, 2), "it counts in the file that was there");
         let bus = bus(&domain);
         let _ends =
@@ -371,7 +372,7 @@ mod tests {
     #[test]
     fn what_the_dead_left_is_not_put_away_by_whoever_comes() {
         let domain = OwnedDomain::create(0).unwrap();
-        let config = config(domain.domain()).unwrap();
+        let config = config(domain.domain().root(), domain.domain()).unwrap();
         assert!(!config.global.node.cleanup_dead_nodes_on_creation);
         assert!(!config.global.node.cleanup_dead_nodes_on_destruction);
         assert!(!config.global.service.cleanup_dead_nodes_on_open);
@@ -417,7 +418,7 @@ mod tests {
         let domain = OwnedDomain::create(0).unwrap();
         let _reader = bus(&domain).reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut versions = Vec::new();
-        Ipc::list(&config(domain.domain()).unwrap(), |service| {
+        Ipc::list(&config(domain.domain().root(), domain.domain()).unwrap(), |service| {
             versions.push(service.static_details.iceoryx2_version().to_string());
             CallbackProgression::Continue
         })

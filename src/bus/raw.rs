@@ -5,6 +5,7 @@
 use super::domain::Domain;
 use super::iox::enter;
 use super::{BusError, iox::Ipc};
+use crate::files::Directory;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
@@ -15,8 +16,8 @@ use iceoryx2::prelude::*;
 use std::fmt::Debug;
 use std::time::Duration;
 
-/// A bare node.
-pub(crate) struct RawNode(Node<Ipc>);
+/// A bare node, and the domain's directory, by which its paths are short enough for the sockets of bare events.
+pub(crate) struct RawNode(Node<Ipc>, #[expect(dead_code, reason = "held open")] Directory);
 
 /// The bare publisher of samples of `WORDS` words.
 pub(crate) struct RawPublisher<const WORDS: usize>(Publisher<Ipc, [u64; WORDS], ()>);
@@ -52,8 +53,10 @@ impl RawNode {
     /// Enters a domain.
     pub fn enter(domain: &Domain, name: &str) -> Result<Self, BusError> {
         set_log_level(LogLevel::Fatal);
-        let node = enter(domain, name);
-        node.map(Self).map_err(|reason| BusError::Domain { domain: domain.root().display().to_string(), reason })
+        let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
+        let root = Directory::open(domain.root()).map_err(|error| failed(error.to_string()))?;
+        let node = enter(&root.path(), domain, name).map_err(failed)?;
+        Ok(Self(node, root))
     }
 
     /// One publisher, and the newest sample only.
