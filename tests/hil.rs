@@ -645,7 +645,7 @@ fn the_foreign_follower_does_not_outlive_its_run() {
         running.wait();
         let follower = follower.wait();
         assert_eq!(follower.code, Some(1), "{follower:?}");
-        assert!(follower.stderr.contains("the run was killed"), "{follower:?}");
+        assert!(follower.stderr.contains("follower.seat.json is gone: the run is over"), "{follower:?}");
         bench.assert_clean(&domains);
     }
 }

@@ -370,12 +370,16 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
         let fixed = ["run", scenario.to_str().unwrap(), "--out", clock, "--set", "accept={}", "--clock", clock];
         let running = bench.start(&[&fixed[..], &["--duration", seconds]].concat());
         let domain = await_some(|| bench.domains().pop());
-        // The watcher sees a tick; it is gone again before the recorder comes.
-        await_some(|| {
-            let mut session = Session::open(Some(&domain)).ok()?;
-            session.follow(200_000_000, || false).ok()?;
-            (session.model.tick > 0).then_some(())
-        });
+        // The watcher sees a tick; it is gone again before the recorder comes. In a thread of its own: it gives way to
+        // everybody, and what is started from its thread would too.
+        let watch = || {
+            await_some(|| {
+                let mut session = Session::open(Some(&domain)).ok()?;
+                session.follow(200_000_000, || false).ok()?;
+                (session.model.tick > 0).then_some(())
+            })
+        };
+        std::thread::scope(|scope| scope.spawn(watch).join().unwrap());
         let file = format!("{clock}.mcap");
         let recorder = bench.start(&["record", "--domain", domain.to_str().unwrap(), "--out", &file]);
         await_some(|| std::fs::metadata(bench.path(&file)).ok().filter(|file| file.len() > 0));

@@ -14,10 +14,12 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::writer::EntryHandleMut;
 use iceoryx2::prelude::*;
 use std::fmt::Debug;
+use std::rc::Rc;
 use std::time::Duration;
 
-/// A bare node, and the domain's directory, by which its paths are short enough for the sockets of bare events.
-pub(crate) struct RawNode(Node<Ipc>, #[expect(dead_code, reason = "held open")] Directory);
+/// A bare node, and the domain's directory, by which its paths are short enough for the sockets of bare events. It stays open
+/// until the last socket is removed.
+pub(crate) struct RawNode(Node<Ipc>, Rc<Directory>);
 
 /// The bare publisher of samples of `WORDS` words.
 pub(crate) struct RawPublisher<const WORDS: usize>(Publisher<Ipc, [u64; WORDS], ()>);
@@ -28,9 +30,9 @@ pub(crate) struct RawBoardWriter<const WORDS: usize>(EntryHandleMut<Ipc, u64, [u
 /// Its reading end.
 pub(crate) struct RawBoardReader<const WORDS: usize>(EntryHandle<Ipc, u64, [u64; WORDS]>);
 /// The end of a bare event that rings.
-pub(crate) struct RawNotifier(Notifier<Ipc>);
+pub(crate) struct RawNotifier(Notifier<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
 /// The end that waits.
-pub(crate) struct RawListener(Listener<Ipc>);
+pub(crate) struct RawListener(Listener<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
 
 /// What a service's builder says of an error.
 fn refused(service: &str, end: &'static str, reason: impl Debug) -> BusError {
@@ -56,7 +58,7 @@ impl RawNode {
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
         let root = Directory::open(domain.root()).map_err(|error| failed(error.to_string()))?;
         let node = enter(&root.path(), domain, name).map_err(failed)?;
-        Ok(Self(node, root))
+        Ok(Self(node, Rc::new(root)))
     }
 
     /// One publisher, and the newest sample only.
@@ -122,13 +124,13 @@ impl RawNode {
     /// The end of an event that rings.
     pub fn notifier(&self, name: &str) -> Result<RawNotifier, BusError> {
         let notifier = self.event(name, "notifier")?.notifier_builder().create();
-        notifier.map(RawNotifier).map_err(|error| refused(name, "notifier", error))
+        notifier.map(|end| RawNotifier(end, self.1.clone())).map_err(|error| refused(name, "notifier", error))
     }
 
     /// The end of an event that waits.
     pub fn listener(&self, name: &str) -> Result<RawListener, BusError> {
         let listener = self.event(name, "listener")?.listener_builder().create();
-        listener.map(RawListener).map_err(|error| refused(name, "listener", error))
+        listener.map(|end| RawListener(end, self.1.clone())).map_err(|error| refused(name, "listener", error))
     }
 }
 
