@@ -14,6 +14,7 @@
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
 //! | `config` | scenario files: as typed, then as resolved | no |
+//! | `analysis` | what may be claimed of the loop that runs: its rate, its floor | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
 //! | `clock` | the time grid and how to wait on it | no |
 //! | `files` | files beside other users: what is this user's alone, and where what is written goes | no |
@@ -45,6 +46,8 @@ pub mod state;
 #[cfg(feature = "serial")]
 pub mod serial;
 
+#[cfg(feature = "runtime")]
+pub mod analysis;
 #[cfg(feature = "runtime")]
 pub mod bench;
 #[cfg(feature = "runtime")]

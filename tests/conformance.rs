@@ -166,3 +166,26 @@ fn an_identifier_that_cannot_work_is_refused() {
         assert!(done.stderr.contains(said), "{set}: {}", done.stderr);
     }
 }
+
+/// What is claimed of every shipped scenario, for programs: the theorem's rate and the loop's, each under its name.
+#[test]
+fn every_shipped_scenario_is_told_what_may_be_claimed_of_it() {
+    let bench = Bench::new();
+    for (name, _) in SHIPPED {
+        let done = bench.run(&["check", "--json", shipped(name).to_str().unwrap()]);
+        assert_eq!(done.code, Some(0), "{name}: {done:?}");
+        let told: Value = serde_json::from_str(&done.stdout).unwrap();
+        assert_eq!((told["schema"].as_str(), told["scenario"].as_str()), (Some("corotate/check/v1"), Some(name)));
+        for follower in told["followers"].as_array().unwrap() {
+            let rate = &follower["loop_rate_per_s"];
+            assert_eq!(rate.is_null(), follower["reason"].is_string(), "{name}: {follower:#}");
+            assert!(rate.is_null() || rate.as_f64().unwrap() > 0.0, "{name}: {follower:#}");
+            assert_eq!(rate.is_number(), follower["floor"].is_number(), "{name}: {follower:#}");
+            assert!(follower["warnings"].is_array(), "{name}: {follower:#}");
+            let close = ["rigid-pair", "rigid-pair-hyperbolic", "rigid-trio", "rigid-fleet", "faults"].contains(&name);
+            let continuous = follower["continuous_rate_per_s"].as_f64();
+            let near = || (rate.as_f64().unwrap() / continuous.unwrap() - 1.0).abs() < 0.02;
+            assert!(!close || near(), "{name}: at 1 kHz sampling costs little: {follower:#}");
+        }
+    }
+}

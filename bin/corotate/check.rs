@@ -1,8 +1,8 @@
 //! `corotate check`: validate scenarios and tell what is proven of them.
 
 use crate::{Exit, fail, say};
+use corotate::analysis::{Claim, claims, digits};
 use corotate::config::Scenario;
-use corotate::rig::CertificateReport;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -16,11 +16,15 @@ pub struct Arguments {
     /// Override any key of the scenarios
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Print what is claimed of each scenario as one line of JSON (corotate/check/v1)
+    #[arg(long)]
+    json: bool,
 }
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate check pair.toml                  the scenario with every default, and its certificate
+  corotate check pair.toml                  the scenario with every default, and what may be claimed of its loop
+  corotate check --json pair.toml           those claims for programs
   corotate check config/*.toml > /dev/null  are they all valid? exit code 2 if one is not";
 
 /// Checks scenarios; all of them, even if one fails.
@@ -29,7 +33,8 @@ pub fn check(arguments: &Arguments) -> Exit {
     for path in &arguments.files {
         match Scenario::load(path, &arguments.set) {
             Ok(scenario) => {
-                if let Err(gone) = say(&tell(path, &scenario)) {
+                let text = if arguments.json { json(path, &scenario) } else { tell(path, &scenario) };
+                if let Err(gone) = say(&text) {
                     return gone;
                 }
             }
@@ -39,35 +44,65 @@ pub fn check(arguments: &Arguments) -> Exit {
     exit
 }
 
-/// The scenario as resolved, and what is proven of it as comments, so that the whole is a scenario file.
+/// What is claimed of a scenario, for programs.
+fn json(path: &Path, scenario: &Scenario) -> String {
+    let value = serde_json::json!({
+        "schema": "corotate/check/v1",
+        "file": path.display().to_string(),
+        "scenario": scenario.name,
+        "clock": scenario.clock.name(),
+        "tick_hz": 1.0 / scenario.tick_s(),
+        "notes": scenario.rig.notes(),
+        "limits": scenario.rig.limits(),
+        "followers": claims(scenario),
+    });
+    format!("{value}\n")
+}
+
+/// The scenario as resolved, and what is claimed of it as comments, so that the whole is a scenario file.
 fn tell(path: &Path, scenario: &Scenario) -> String {
     let mut text = format!("# {}: valid\n{}\n", path.display(), scenario.to_toml());
-    tell_proof(scenario, &mut text).expect("a string takes every text");
+    tell_claims(scenario, &mut text).expect("a string takes every text");
     text
 }
 
-fn tell_proof(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
+fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
     for limit in scenario.rig.limits() {
-        writeln!(text, "# limit: {}: {:.4}", limit.name, limit.value)?;
+        writeln!(text, "# limit: {}: {}", limit.name, digits(limit.value))?;
     }
-    scenario.rig.certificates().iter().try_for_each(|certificate| tell_certificate(certificate, text))
+    claims(scenario).iter().try_for_each(|claim| tell_claim(claim, text))
 }
 
-fn tell_certificate(certificate: &CertificateReport, text: &mut String) -> std::fmt::Result {
-    writeln!(text, "# certificate of {}", certificate.body)?;
-    for bound in &certificate.bounds {
-        writeln!(text, "#   {}: {:.4}", bound.name, bound.value)?;
+fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "# {}, the law in continuous time", claim.body)?;
+    for bound in &claim.bounds {
+        writeln!(text, "#   {}: {}", bound.name, digits(bound.value))?;
     }
-    for condition in &certificate.conditions {
+    for condition in &claim.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
-        let margin = condition.value - condition.required;
-        writeln!(
-            text,
-            "#   {}: {:.4} > {:.4} {verdict}, margin {margin:.4}",
-            condition.name, condition.value, condition.required
-        )?;
+        let [value, required] = [condition.value, condition.required].map(digits);
+        let margin = digits(condition.value - condition.required);
+        writeln!(text, "#   {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
     }
-    writeln!(text, "#   the error falls at least as exp(-{} t)", certificate.rate_per_s)?;
-    certificate.warnings.iter().try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
+    match claim.continuous_rate_per_s {
+        Some(rate) => writeln!(text, "#   its error falls at least as exp(-{} t)", digits(rate))?,
+        None => writeln!(text, "#   no constant rate: the observer's gain varies")?,
+    }
+    writeln!(text, "# {}, the loop that runs: sampled, held, one tick late", claim.body)?;
+    match (claim.loop_rate_per_s, &claim.reason) {
+        (Some(rate), _) => writeln!(text, "#   once it is small, the error falls as exp(-{} t)", digits(rate))?,
+        (None, reason) => writeln!(text, "#   no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
+    }
+    for floor in &claim.floors {
+        writeln!(text, "#   floor to expect: {} {}", floor.name, digits(floor.value))?;
+    }
+    for reach in &claim.reaches {
+        let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
+        match reach.after_s {
+            Some(after_s) => writeln!(text, "#   {metric} from {from} to {limit}: {} s at that rate", digits(after_s))?,
+            None => writeln!(text, "#   {metric} from {from} to {limit}: never, it is below the floor")?,
+        }
+    }
+    claim.warnings.iter().try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
 }

@@ -219,7 +219,7 @@ fn verdict(summary: &Summary) -> Exit {
         let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
         fail(Exit::NotAccepted, &format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
     }
-    if summary.accepted { Exit::Ok } else { Exit::NotAccepted }
+    if summary.accepted == Some(false) { Exit::NotAccepted } else { Exit::Ok }
 }
 
 /// The exit code of a run, or a replay, that failed.

@@ -6,7 +6,7 @@ use super::nearest;
 use super::scenario::Checks;
 use std::collections::BTreeMap;
 
-/// Acceptance criteria. Without any, every run that ends is accepted.
+/// Acceptance criteria. Without any, nothing is judged.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Accept {
     /// From this time on the limits apply, s.

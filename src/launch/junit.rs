@@ -63,6 +63,7 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
     let mut properties = vec![("run".to_owned(), run.to_string())];
     if let Some(summary) = summary {
         let told = [
+            ("verdict", summary.verdict.clone()),
             ("clock", summary.clock.to_owned()),
             ("tick_hz", summary.tick_hz.to_string()),
             ("state_hash", summary.state.hash.clone()),
@@ -72,6 +73,10 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
             ("revision", summary.revision.to_owned()),
         ];
         properties.extend(told.map(|(name, value)| (name.to_owned(), value)));
+        for (signal, told) in &summary.score.statuses {
+            let ticks = |(name, ticks): (&&str, &u64)| (format!("ticks {name} of {signal}"), ticks.to_string());
+            properties.extend(told.iter().map(ticks));
+        }
         let rejected = summary.books.links.iter().filter(|link| link.rejected > 0);
         properties.extend(rejected.map(|link| {
             (format!("rejected_samples of {} at {}", link.service, link.reader), link.rejected.to_string())
@@ -108,7 +113,9 @@ fn judge(criterion: &Criterion) -> Verdict {
         (Some(true), _) => Verdict::Passed,
         (Some(false), Some(value)) => Verdict::Failed(format!("{value:e} is above the limit {limit:e}")),
         (Some(false), None) => Verdict::Failed(format!("nothing was measured; the limit is {limit:e}")),
-        (None, _) => Verdict::Skipped("cannot be judged with this clock".to_owned()),
+        (None, _) => Verdict::Skipped(
+            "not judged: this clock does not measure it, or the run ended before it applies".to_owned(),
+        ),
     }
 }
 

@@ -5,10 +5,11 @@
 use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
+use crate::analysis::{Claim, claims};
 use crate::config::{RunId, Scenario};
 use crate::files;
 use crate::record::RecordingReport;
-use crate::rig::{CertificateReport, Figure};
+use crate::rig::Figure;
 use crate::runtime::RoleId;
 use crate::serial::LineBook;
 use crate::telemetry::{
@@ -74,8 +75,10 @@ pub struct Summary {
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
     pub signal: usize,
-    /// Whether every criterion that could be judged holds.
-    pub accepted: bool,
+    /// Whether every criterion that could be judged holds; none if none could be.
+    pub accepted: Option<bool>,
+    /// The same in words, with the reason where nothing was judged.
+    pub verdict: String,
     /// One entry per criterion.
     pub criteria: Vec<Criterion>,
     /// The score.
@@ -88,8 +91,8 @@ pub struct Summary {
     pub limits: Vec<Figure>,
     /// What the watchdog saw, if anything is watched.
     pub watchdog: Option<WatchReport>,
-    /// What is proven of the loop.
-    pub certificates: Vec<CertificateReport>,
+    /// What may be claimed of the loop, per driven body.
+    pub certificates: Vec<Claim>,
     /// The books.
     pub books: Books,
     /// The state hash.
@@ -230,7 +233,8 @@ impl Summary {
             lost.flat_map(|incident| incident.with.iter().chain([&incident.role])).map(String::as_str).collect();
         let interrupted = outcome.signal != 0 || !lost.is_empty();
         let books = Books::new(scenario, outcome, interrupted, &lost);
-        let criteria = judge(scenario, outcome, &books, &latencies);
+        let criteria = judge(scenario, outcome, &books, &latencies, interrupted);
+        let accepted = accepted(&criteria, interrupted);
         Self {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
@@ -245,14 +249,15 @@ impl Summary {
             hosted: hosted(scenario),
             domain: outcome.domain.clone(),
             signal: outcome.signal,
-            accepted: criteria.iter().all(|criterion| criterion.holds != Some(false)),
+            accepted,
+            verdict: verdict(accepted, criteria.is_empty(), interrupted),
             criteria,
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
             notes: scenario.rig.notes(),
             limits: scenario.rig.limits(),
             watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),
-            certificates: scenario.rig.certificates(),
+            certificates: claims(scenario),
             state: State::new(&outcome.reports, &books),
             books,
             latencies,
@@ -428,7 +433,31 @@ fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {
     own.chain(roles).collect()
 }
 
-fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[StageFigures]) -> Vec<Criterion> {
+/// Whether what was judged holds; none if nothing was, or if the run was `interrupted` before anything failed.
+fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool> {
+    let judged = criteria.iter().filter_map(|criterion| criterion.holds);
+    judged.reduce(|all, one| all && one).filter(|all| !(*all && interrupted))
+}
+
+fn verdict(accepted: Option<bool>, no_criteria: bool, interrupted: bool) -> String {
+    match accepted {
+        Some(true) => "accepted",
+        Some(false) => "not accepted",
+        None if no_criteria => "not judged: the scenario has no criteria",
+        None if interrupted => "not judged: the run was stopped before its end",
+        None => "not judged: this clock measures none of the criteria",
+    }
+    .to_owned()
+}
+
+/// Holds the results against the criteria. What a run that was `interrupted` did not get to is not judged.
+fn judge(
+    scenario: &Scenario,
+    outcome: &Outcome,
+    books: &Books,
+    latencies: &[StageFigures],
+    interrupted: bool,
+) -> Vec<Criterion> {
     let accept = &scenario.accept;
     let mut criteria = Vec::new();
     let mut add = |name: String, limit: f64, value: Option<f64>, judged: bool| {
@@ -437,11 +466,13 @@ fn judge(scenario: &Scenario, outcome: &Outcome, books: &Books, latencies: &[Sta
     };
     for (metric, limit) in &accept.metric_max {
         let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
-        add(format!("{metric}_max"), *limit, score.and_then(|score| score.settled_max), true);
+        let value = score.and_then(|score| score.settled_max);
+        add(format!("{metric}_max"), *limit, value, value.is_some() || !interrupted);
     }
     for (metric, limit) in &accept.metric_peak {
         let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
-        add(format!("{metric}_peak"), *limit, score.and_then(|score| score.peak), true);
+        let value = score.and_then(|score| score.peak);
+        add(format!("{metric}_peak"), *limit, value, value.is_some() || !interrupted);
     }
     // Asked for or not: a run that lost a body is not accepted.
     if outcome.score.faulted_ticks > 0 {

@@ -5,12 +5,13 @@
 use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
-use crate::rig::{BodyInfo, Command, Estimate, FleetTruth, Rig, Truth};
+use crate::rig::{Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{Horizon, Input, Seek, topic};
-use crate::sample::{Message, Stamp};
+use crate::sample::{Message, Sample, Stamp, status};
 use crate::with_rig;
 use serde::Serialize;
+use std::collections::BTreeMap;
 
 /// The score of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -25,21 +26,27 @@ pub struct Score {
     pub metrics: Vec<MetricScore>,
     /// How the live certificate fared, if the rig has one.
     pub certificate: Option<CertificateScore>,
+    /// Per signal, at how many ticks its status said what; only what was said.
+    pub statuses: BTreeMap<String, BTreeMap<&'static str, u64>>,
     /// Per incident: from its tick until every metric with a limit was within it for good, or until the next incident, s.
     #[serde(skip)]
     pub recoveries_s: Vec<Option<f64>>,
 }
 
-/// For how many steps of all driven bodies the published bound on V̇ held: V(k+1) ≤ V(k) + h·bound(k).
+/// For how many steps of all driven bodies the bound on V̇ held, of the true errors: V(k+1) ≤ V(k) + h·bound(k). Together
+/// these are all steps: a tick of a body is one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct CertificateScore {
     /// It held, or V was at the floor of rounding.
     pub held: u64,
     /// It did not.
     pub broken: u64,
-    /// Nothing can be said: before the first command acts, and around missed ticks.
+    /// Nothing can be said: before the first command acts, around missed ticks, and where nothing was observable.
     pub unjudged: u64,
 }
+
+/// Status bits of an estimate that saw nothing of what it tells.
+const BLIND: u64 = status::UNOBSERVABLE | status::UNUSABLE | status::INITIAL;
 
 /// V from which on its change over one tick is more than rounding, for rates of the order of 1 rad/s.
 ///
@@ -105,12 +112,47 @@ pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B) -> Result<Box<dyn Sc
     with_rig!(&scenario.rig, rig => typed(rig, scenario, bus))
 }
 
-/// A driven body's commands, for the live certificate.
-struct DrivenBody<R: Rig, B: Bus> {
+/// A driven body, for the live certificate.
+struct DrivenBody {
     body: usize,
-    command: Input<B, Command<R>>,
-    /// Tick, V, and the bound on V̇, of the command before.
+    /// Tick, V, and the bound on V̇, of the tick before.
     before: Option<(u64, f64, f64)>,
+}
+
+/// How often the status of a signal's samples said what.
+struct Statuses {
+    signal: String,
+    /// Where the status is in a sample, words.
+    at: Option<usize>,
+    counts: [u64; status::NAMES.len()],
+}
+
+impl Statuses {
+    fn new<S: Sample>(body: &str, signal: Signal) -> Self {
+        let at = S::FIELDS.iter().find(|field| field.name == "status").map(|field| field.offset / size_of::<u64>());
+        Self { signal: format!("{body}/{}", signal.name()), at, counts: [0; status::NAMES.len()] }
+    }
+
+    fn of(&self, words: &[u64]) -> u64 {
+        self.at.map_or(0, |at| words[at])
+    }
+
+    /// Counts what a sample says. Most say nothing.
+    #[inline]
+    fn take(&mut self, words: &[u64]) {
+        let told = self.of(words);
+        if told != 0 {
+            let counts = self.counts.iter_mut().zip(status::NAMES);
+            counts.for_each(|(count, (_, bit))| *count += u64::from(told & bit != 0));
+        }
+    }
+
+    /// What was said, by name; that an estimate begins with its guess is nothing to tell.
+    fn told(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        let counts = status::NAMES.into_iter().zip(self.counts);
+        let told = counts.filter(|((_, bit), count)| *count > 0 && *bit != status::INITIAL);
+        told.map(|((name, _), count)| (name, count))
+    }
 }
 
 /// The truth of a body, or of a fleet.
@@ -173,8 +215,9 @@ struct RigScorer<R: Rig, B: Bus> {
     tick_s: f64,
     truths: Vec<TruthInput<R, B>>,
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
-    /// Commands of the driven bodies.
-    commands: Vec<DrivenBody<R, B>>,
+    driven: Vec<DrivenBody>,
+    /// Of the estimate, and of every body's truth.
+    statuses: Vec<Statuses>,
     next_tick: u64,
     last_tick: u64,
     /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
@@ -187,13 +230,10 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
         let bodies = rig.bodies().iter();
         let horizon = crate::runtime::horizon(scenario, None);
-        // A fleet's commands say nothing that a scorer could judge.
+        // The certificate is about single bodies.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
-        let command = |(body, info): (usize, &BodyInfo)| {
-            let mut command = Input::watch(bus, &topic(scenario, &info.name, Signal::Command), Reader::Scorer)?;
-            command.expect(horizon);
-            Ok(DrivenBody { body, command, before: None })
-        };
+        let estimates = Statuses::new::<Estimate<R>>(&rig.bodies()[0].name, Signal::Estimate);
+        let truths = bodies.clone().map(|body| Statuses::new::<Truth<R>>(&body.name, Signal::Truth));
         // What no role uses is not scored either.
         let mut estimate =
             Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
@@ -217,7 +257,8 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 .map(|body| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet))
                 .collect::<Result<_, _>>()?,
             estimate,
-            commands: driven.map(command).collect::<Result<_, BusError>>()?,
+            driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
+            statuses: core::iter::once(estimates).chain(truths).collect(),
             next_tick: 0,
             last_tick: scenario.last_tick,
             incidents: Vec::new(),
@@ -228,6 +269,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 faulted_ticks: 0,
                 metrics: rig.metrics().iter().map(metric).collect(),
                 certificate: None,
+                statuses: BTreeMap::new(),
                 recoveries_s: Vec::new(),
             },
         })
@@ -238,9 +280,6 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let mut settled = self.estimate.seek(self.next_tick)? != Seek::NotYet;
         for truth in &mut self.truths {
             settled &= truth.seek(self.next_tick)? != Seek::NotYet;
-        }
-        for driven in &mut self.commands {
-            settled &= driven.command.seek(self.next_tick)? != Seek::NotYet;
         }
         Ok(settled)
     }
@@ -263,10 +302,21 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         {
             *last = tick;
         }
-        for driven in &mut self.commands {
+        let (estimates, truths) = self.statuses.split_at_mut(1);
+        estimate.iter().for_each(|estimate| estimates[0].take(estimate.words()));
+        let told = truths.iter_mut().zip(&self.truths);
+        told.for_each(|(statuses, truth)| truth.one(tick).iter().for_each(|truth| statuses.take(truth.words())));
+        // What the observer was not told of cannot be judged.
+        let seen = estimate.filter(|estimate| estimates[0].of(estimate.words()) & BLIND == 0);
+        for driven in &mut self.driven {
+            let (observed, own) = (self.truths[0].one(tick), self.truths[driven.body].one(tick));
+            let now = match (observed, own, seen) {
+                (Some(observed), Some(own), Some(estimate)) => self.rig.true_lyapunov(observed, own, estimate),
+                _ => None,
+            };
             // A follower that held or was safe did not apply what the certificate is about.
-            let undisturbed = self.truths[driven.body].one(tick).is_some_and(|truth| R::undisturbed(truth));
-            driven.judge(tick, self.tick_s, undisturbed, &mut self.score.certificate);
+            let undisturbed = own.is_some_and(|truth| R::undisturbed(truth));
+            driven.judge(tick, self.tick_s, now, undisturbed, &mut self.score.certificate);
         }
         self.next_tick += 1;
     }
@@ -289,23 +339,30 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     }
 }
 
-impl<R: Rig, B: Bus> DrivenBody<R, B> {
-    fn judge(&mut self, tick: u64, tick_s: f64, undisturbed: bool, score: &mut Option<CertificateScore>) {
-        let told =
-            at(&self.command, tick).and_then(R::lyapunov).filter(|(v, bound)| v.is_finite() && bound.is_finite());
-        let now = told.map(|(v, bound)| (tick, v, bound));
-        if let Some((tick, v, _)) = now {
+impl DrivenBody {
+    /// Judges one step by what is known of V now.
+    fn judge(
+        &mut self,
+        tick: u64,
+        tick_s: f64,
+        now: Option<(f64, f64)>,
+        undisturbed: bool,
+        score: &mut Option<CertificateScore>,
+    ) {
+        let now = now.filter(|(v, bound)| v.is_finite() && bound.is_finite());
+        if let Some((v, _)) = now {
             let score = score.get_or_insert_default();
-            match self.before {
-                // The first command acts from tick 1 on: V is under control from there.
-                Some((before, v_before, bound)) if before + 1 == tick && before > 0 && undisturbed => {
-                    let holds = v <= (v_before + tick_s * bound).max(lyapunov_floor(tick_s));
-                    *(if holds { &mut score.held } else { &mut score.broken }) += 1;
-                }
-                _ => score.unjudged += 1,
+            // The first command acts from tick 1 on: V is under control from there.
+            if let Some((before, v_before, bound)) = self.before
+                && before + 1 == tick
+                && before > 0
+                && undisturbed
+            {
+                let holds = v <= (v_before + tick_s * bound).max(lyapunov_floor(tick_s));
+                *(if holds { &mut score.held } else { &mut score.broken }) += 1;
             }
         }
-        self.before = now.filter(|_| undisturbed);
+        self.before = now.filter(|_| undisturbed).map(|(v, bound)| (tick, v, bound));
     }
 }
 
@@ -353,7 +410,6 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         let horizon = Horizon::Due(grid);
         self.truths.iter_mut().for_each(|truth| truth.expect(horizon));
         self.estimate.expect(horizon);
-        self.commands.iter_mut().for_each(|driven| driven.command.expect(horizon));
     }
 
     fn incident(&mut self, tick: u64) {
@@ -365,15 +421,19 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         loop {
             self.poll(u64::MAX)?;
             let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.next_tick);
-            let more = newest(self.estimate.last_tick())
-                || self.truths.iter().any(|truth| newest(truth.last_tick()))
-                || self.commands.iter().any(|driven| newest(driven.command.last_tick()));
+            let more = newest(self.estimate.last_tick()) || self.truths.iter().any(|truth| newest(truth.last_tick()));
             if !more || self.next_tick > self.last_tick {
                 break;
             }
             self.score_tick();
         }
         self.score.recoveries_s = self.recoveries_s();
+        if let Some(certificate) = &mut self.score.certificate {
+            let steps = self.next_tick * self.driven.len() as u64;
+            certificate.unjudged = steps - certificate.held - certificate.broken;
+        }
+        let told = |statuses: &Statuses| (statuses.signal.clone(), statuses.told().collect::<BTreeMap<_, _>>());
+        self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
         let (tick_s, ticks) = (self.tick_s, self.next_tick);
         for metric in &mut self.score.metrics {
             let first_within = metric.last_above.map_or(0, |tick| tick + 1);

@@ -95,11 +95,15 @@ fn results(summary: &Summary, text: &mut String) {
         let limit = number(criterion.limit);
         rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
     }
-    let _ = writeln!(text, "\n{rows}");
+    let _ = writeln!(text, "\n{rows}\n\n{}", summary.verdict);
     if let Some(score) = summary.score.certificate {
         let judged = score.held + score.broken;
         let _ =
             writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
+    }
+    for (signal, told) in &summary.score.statuses {
+        let told: Vec<String> = told.iter().map(|(name, ticks)| format!("{name} at {ticks}")).collect();
+        let _ = writeln!(text, "{signal}: {} of {} ticks", told.join(", "), summary.last_tick + 1);
     }
 }
 

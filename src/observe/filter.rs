@@ -129,6 +129,11 @@ impl<const N: usize> InvariantFilter<N> {
         }
     }
 
+    /// The same filter, begun at another guess.
+    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+        Self { estimate: guess, ..self }
+    }
+
     /// The estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {

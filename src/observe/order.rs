@@ -38,6 +38,15 @@ impl<const N: usize> Filter<N> {
         }
     }
 
+    /// The same filter, begun at another guess.
+    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+        match self {
+            Self::First(filter) => Self::First(filter.begun_at(guess)),
+            Self::Second(filter) => Self::Second(filter.begun_at(guess)),
+            Self::Kalman(filter) => Self::Kalman(filter.begun_at(guess)),
+        }
+    }
+
     /// The estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {

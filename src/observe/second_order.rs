@@ -37,6 +37,11 @@ impl<const N: usize> SecondOrderFilter<N> {
         Self { bandwidth, damping, estimate: guess, residual: SVector::zeros(), gains: none }
     }
 
+    /// The same filter, begun at another guess.
+    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+        Self { estimate: guess, ..self }
+    }
+
     /// The estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {
@@ -140,6 +145,11 @@ impl<const N: usize> KalmanFilter<N> {
             rest: deviation[index] * deviation[index],
         });
         Self { density, estimate: guess, residual: SVector::zeros(), covariance, based: false }
+    }
+
+    /// The same filter, begun at another guess.
+    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+        Self { estimate: guess, ..self }
     }
 
     /// The estimate ŵ at the end of the last step.

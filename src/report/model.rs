@@ -91,10 +91,8 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
     sections.push(tables::machine(source));
     sections.retain(|section| !section.blocks.is_empty());
     let (title, subtitle) = headings(source);
-    let verdict = source.summary.as_ref().map_or(("not judged".to_owned(), None), |summary| match summary.accepted {
-        true => ("accepted".to_owned(), Some(true)),
-        false => ("not accepted".to_owned(), Some(false)),
-    });
+    let unjudged = ("not judged: there is no summary".to_owned(), None);
+    let verdict = source.summary.as_ref().map_or(unjudged, |summary| (summary.verdict.clone(), summary.accepted));
     Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks: marks(&time, &events), sections })
 }
 

@@ -8,6 +8,7 @@ use super::counterpart::counterpart;
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::{BODIES_SHOWN, MetricTrace, Traces};
+use crate::analysis::{claims, digits};
 use crate::config::Scenario;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
@@ -220,27 +221,28 @@ fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) ->
     lines.extend(falling(scenario, &shown, y.foot(), end_s));
     lines.extend(limits(scenario, &shown, end_s));
     let caption = "Errors on a logarithmic axis, every tick scored as the launcher scores it. The straight lines fall at the \
-                   certified rate and at the observer's, from the first error on: what is proven is the rate of fall, \
-                   not the constant before it. Zeros are drawn at the foot.";
+                   rate of the sampled loop, where one is claimed, and at the observer's, from the first error on: what is \
+                   claimed is the rate of fall once the error is small, not the constant before it. Zeros are drawn at the foot.";
     let picture = over_time("errors over time, logarithmic", time, &y, &lines);
     let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), rescored(source, traces)];
     Section { id: "errors", title: "Synchronisation and estimation error", blocks }
 }
 
-/// Lines from the first errors on, that fall at the certified rate and at the observer's.
+/// Lines from the first errors on, that fall at the loop's rate and at the observer's.
 fn falling(scenario: &Scenario, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Vec<Line> {
-    let certified = scenario.rig.certificates().iter().map(|certificate| certificate.rate_per_s).reduce(f64::min);
+    let rates: Vec<Option<f64>> = claims(scenario).iter().map(|claim| claim.loop_rate_per_s).collect();
+    // The plot shows the worst body: no line unless there is one for every body.
+    let claimed =
+        rates.iter().copied().collect::<Option<Vec<f64>>>().and_then(|rates| rates.into_iter().reduce(f64::min));
     let estimate = shown.iter().find(|metric| metric.name.starts_with("estimate_error"));
-    let both = [
-        ("grey d2", "certified", certified, shown.first()),
-        ("grey d4", "observer", observer_rate(scenario), estimate),
-    ];
+    let both =
+        [("grey d2", "loop", claimed, shown.first()), ("grey d4", "observer", observer_rate(scenario), estimate)];
     let line = |(class, name, rate, metric): (&'static str, &str, Option<f64>, Option<&&MetricTrace>)| {
         let (rate, metric) = (rate.filter(|rate| rate.is_finite() && *rate > 0.0)?, metric?);
         let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
         let to_s = ((from / foot).ln() / rate).min(end_s);
         let end = (to_s, from * (-rate * to_s).exp());
-        (to_s > 0.0).then(|| Line::through(class, &format!("{name}: exp(−{rate} t)"), vec![(0.0, from), end]))
+        (to_s > 0.0).then(|| Line::through(class, &format!("{name}: exp(−{} t)", digits(rate)), vec![(0.0, from), end]))
     };
     both.into_iter().filter_map(line).collect()
 }
@@ -314,7 +316,8 @@ fn lyapunov(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let (low, high) = range(columns, true);
     if high > 0.0 {
         let y = Axis::decades("V, rad²/s²", (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
-        let caption = "V = ½(|e|² + ε²) of [D](15) as the controller published it.".to_owned();
+        let caption =
+            "V = ½(|e|² + ε²) of [D](15) as the controller sees it: of its own estimate, not of the truth.".to_owned();
         figures.push((over_time("V over time, logarithmic", time, &y, &lines), caption));
     }
     for (body, [fell, bound]) in &traces.falls {

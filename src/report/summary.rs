@@ -21,7 +21,8 @@ pub struct Summary {
     pub started_utc: String,
     pub host: Host,
     pub signal: usize,
-    pub accepted: bool,
+    pub accepted: Option<bool>,
+    pub verdict: String,
     pub criteria: Vec<Criterion>,
     pub score: Score,
     pub incidents: Vec<Incident>,
@@ -100,9 +101,20 @@ pub struct Figure {
 #[derive(Debug, Deserialize)]
 pub struct Certificate {
     pub body: String,
+    pub continuous_rate_per_s: Option<f64>,
+    pub loop_rate_per_s: Option<f64>,
+    pub reason: Option<String>,
+    pub floors: Vec<Figure>,
+    pub reaches: Vec<Reach>,
     pub conditions: Vec<Condition>,
-    pub rate_per_s: Option<f64>,
     pub warnings: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+pub struct Reach {
+    pub metric: String,
+    pub limit: f64,
+    pub after_s: Option<f64>,
 }
 
 #[derive(Debug, Deserialize)]

@@ -3,6 +3,7 @@
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
+use crate::analysis::digits;
 use crate::launch::State;
 use crate::telemetry::Ticks;
 
@@ -66,7 +67,7 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
         };
         let rows: Vec<_> = summary.criteria.iter().map(row).collect();
         if rows.is_empty() {
-            blocks.push(Block::Text("The scenario has no criteria: every run that ends is accepted.".to_owned()));
+            blocks.push(Block::Text("The scenario has no criteria: nothing is judged.".to_owned()));
         } else {
             let head = vec!["criterion of [accept]", "value", "limit", "verdict"];
             blocks.push(Block::Table { caption: String::new(), head, rows });
@@ -249,10 +250,13 @@ pub fn certificate(source: &Source) -> Section {
             let verdict = if condition.holds { "✓ holds" } else { "✗ does not hold" };
             strings(&[&condition.name, &value, &required, &verdict])
         };
-        let rate = number(certificate.rate_per_s);
-        let caption = format!("{}: the error falls at least as exp(−{rate} t)", certificate.body);
+        let continuous = certificate.continuous_rate_per_s.map_or(String::new(), |rate| {
+            format!("; the error of the continuous law falls at least as exp(−{} t)", digits(rate))
+        });
+        let caption = format!("{}{continuous}", certificate.body);
         let rows = certificate.conditions.iter().map(row).collect();
         blocks.push(Block::Table { caption, head: vec!["condition", "value", "required", ""], rows });
+        blocks.push(Block::Text(told_of_loop(certificate)));
         blocks.extend(certificate.warnings.iter().map(|warning| Block::Text(format!("Warning: {warning}."))));
     }
     if let Some(score) = &summary.score.certificate {
@@ -267,6 +271,22 @@ pub fn certificate(source: &Source) -> Section {
     let caption = "What samples are held against".to_owned();
     blocks.extend((!rows.is_empty()).then(|| Block::Table { caption, head: vec!["limit", "value"], rows }));
     Section { id: "certificate", title: "Certificate", blocks }
+}
+
+/// What is claimed of the loop that ran.
+fn told_of_loop(certificate: &super::summary::Certificate) -> String {
+    let rate = match (certificate.loop_rate_per_s, &certificate.reason) {
+        (Some(rate), _) => format!("once it is small, the error falls as exp(−{} t)", digits(rate)),
+        (None, reason) => format!("no rate is claimed: {}", reason.as_deref().unwrap_or("none was computed")),
+    };
+    let floor = |floor: &super::summary::Figure| format!("{} {}", floor.name, number(floor.value));
+    let floors: Vec<String> = certificate.floors.iter().map(floor).collect();
+    let reach = |reach: &super::summary::Reach| match reach.after_s {
+        Some(after_s) => format!("{} ≤ {} after {} s at that rate", reach.metric, digits(reach.limit), digits(after_s)),
+        None => format!("{} ≤ {} is below the floor", reach.metric, digits(reach.limit)),
+    };
+    let reaches: String = certificate.reaches.iter().map(|one| format!(" From the start, {}.", reach(one))).collect();
+    format!("The sampled loop of {}: {rate}. Floors to expect: {}.{reaches}", certificate.body, floors.join(", "))
 }
 
 /// Where it ran, with which privileges, and the scenario.

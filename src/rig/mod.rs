@@ -54,6 +54,19 @@ impl BodyInfo {
     }
 }
 
+/// Where a loop begins that is analysed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Start {
+    /// As the scenario has it.
+    Given,
+    /// Where it is to get: the driven body at what it follows, the observer at the truth.
+    Settled,
+    /// Off that by so much in every component that the loop controls, in their units.
+    Off(f64),
+    /// Off that by so much in the one that it does not control ([`Rig::FREE`]).
+    Shifted(f64),
+}
+
 /// A plant, an observer and a control law that belong together.
 pub trait Rig: Clone + Send + Sync + 'static {
     /// The kind of body.
@@ -72,6 +85,9 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type Fleet: Fleet<Estimate<Self>>;
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
     const AXES: usize;
+    /// The field of truths and estimates that the loop does not control, if there is one: a motion that is shifted in it is
+    /// as good.
+    const FREE: Option<&'static str> = None;
 
     /// The bodies; the first is the observed one.
     fn bodies(&self) -> &[BodyInfo];
@@ -112,13 +128,28 @@ pub trait Rig: Clone + Send + Sync + 'static {
         estimate: Option<&Estimate<Self>>,
         out: &mut [f64],
     );
+    /// This rig with no other driven body than the one with this index, and that a single one, begun there, with or without
+    /// noise: for the analysis of its loop. None if the rig cannot tell where that is settled.
+    fn alone(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
+        None
+    }
     /// What is proven of the closed loop, one entry per driven body.
     fn certificates(&self) -> Vec<CertificateReport>;
     /// Whether a body applied what it was told to at this tick.
     fn undisturbed(_truth: &Truth<Self>) -> bool {
         true
     }
-    /// V and the bound on V̇ that a controller published with a command, if the rig has such a function.
+    /// V and the bound on V̇ of a driven body, of the true errors, if the rig has such a function: from the truths of the
+    /// observed body and of the driven one, and from the estimate.
+    fn true_lyapunov(
+        &self,
+        _observed: &Truth<Self>,
+        _driven: &Truth<Self>,
+        _estimate: &Estimate<Self>,
+    ) -> Option<(f64, f64)> {
+        None
+    }
+    /// V and the bound on V̇ that a controller published with a command, if the rig has such a function: as it sees them.
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None
     }
@@ -128,15 +159,21 @@ pub trait Rig: Clone + Send + Sync + 'static {
     }
 }
 
-/// A certificate as told to people and written to the summary.
+/// The observed body's entry of a list, and another one's unless that is the same.
+fn pair<T: Clone>(of: &[T], other: usize) -> Vec<T> {
+    let others = (other > 0).then(|| of[other].clone());
+    core::iter::once(of[0].clone()).chain(others).collect()
+}
+
+/// What is proven of one driven body's law in continuous time, and the conditions of stability when it is sampled.
 #[derive(Debug, Clone, Serialize)]
 pub struct CertificateReport {
     /// The driven body.
     pub body: String,
     /// One entry per condition.
     pub conditions: Vec<ConditionReport>,
-    /// The slowest exponent of the error, 1/s.
-    pub rate_per_s: f64,
+    /// The slowest exponent of the continuous law's error, 1/s; none where the observer's is not constant.
+    pub continuous_rate_per_s: Option<f64>,
     /// What the conditions rest on.
     pub bounds: Vec<Figure>,
     /// What a careful engineer would change.

@@ -12,7 +12,9 @@ pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub(super) use resolve::{hold, rendezvous};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, FleetTruth, NoFleet, Rig};
+use super::{
+    BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, FleetTruth, NoFleet, Rig, Start, pair,
+};
 use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold, Watched};
 use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
@@ -93,27 +95,19 @@ impl OrbitRig {
                 condition("sampled: 1 > |z| of the slowest mode", certificate.sampled),
                 condition("thrust limit > thrust asked for at the start, du/s^2", margin),
             ],
-            rate_per_s: certificate.rate_per_s,
-            bounds: vec![
-                figure("radius of the circular orbit it is linearised about, du", self.certified_radius()),
-                figure("rate that sampling and delay leave, 1/s", certificate.sampled_rate_per_s),
-            ],
-            warnings: self.warnings(certificate, &margin),
+            continuous_rate_per_s: self.constant_rate().then_some(certificate.rate_per_s),
+            bounds: vec![figure("radius of the circular orbit it is linearised about, du", self.certified_radius())],
+            warnings: self.warnings(&margin),
         }
     }
 
-    fn warnings(&self, certificate: &OrbitCertificate, margin: &Condition) -> Vec<String> {
+    /// Whether the loop does not wait for an observer whose gain varies.
+    fn constant_rate(&self) -> bool {
+        self.filter.decay_rates().is_some() || matches!(self.aim, Aim::Circle { full_state: true, .. })
+    }
+
+    fn warnings(&self, margin: &Condition) -> Vec<String> {
         let mut warnings = Vec::new();
-        if certificate.sampled_rate_per_s < 0.75 * certificate.rate_per_s {
-            warnings.push(format!(
-                "sampling and delay leave {:.3} of the designed {:.3} 1/s; raise tick_hz, or set controller.predict",
-                certificate.sampled_rate_per_s, certificate.rate_per_s
-            ));
-        }
-        if self.filter.decay_rates().is_none() {
-            warnings
-                .push("the observer's gain varies with the noise: its rate is not part of this certificate".to_owned());
-        }
         if !margin.holds() {
             warnings.push(
                 "the thrust limit acts at first: the rate holds from when the law asks for less; watch the radius until then"
@@ -147,6 +141,7 @@ impl Rig for OrbitRig {
     type CommandGuard = CommandGuard;
     type Fleet = NoFleet;
     const AXES: usize = 4;
+    const FREE: Option<&'static str> = Some("angle_rad");
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies
@@ -250,6 +245,31 @@ impl Rig for OrbitRig {
         // A scenario whose loop could not be certified was refused.
         self.certificate()
             .map_or(Vec::new(), |certificate| self.driven().map(|index| self.report(index, &certificate)).collect())
+    }
+
+    fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
+        let mut rig = Self {
+            bodies: pair(&self.bodies, index),
+            initial: pair(&self.initial, index),
+            sensors: pair(&self.sensors, index),
+            ..self.clone()
+        };
+        if !noisy {
+            rig.sensors.iter_mut().for_each(|sensors| sensors.noise = Noise::new(0, 0, [0.0; 4], [0.0; 4]));
+        }
+        if start != Start::Given {
+            let settled = OrbitState { theta: self.initial[0].theta, ..self.reference(self.initial[0]) };
+            let (off, shift) = match start {
+                Start::Off(off) => (off, 0.0),
+                Start::Shifted(shift) => (0.0, shift),
+                Start::Given | Start::Settled => (0.0, 0.0),
+            };
+            let OrbitState { r, vr, theta, vtheta } = settled;
+            let driven = OrbitState { r: r + off, vr: vr + off, theta: theta + shift, vtheta: vtheta + off };
+            rig.initial = if index == 0 { vec![driven] } else { vec![self.initial[0], driven] };
+            rig.initial_guess = Vector2::new(vr + off, vtheta + off);
+        }
+        Some(rig)
     }
 
     fn notes(&self) -> Vec<String> {

@@ -3,7 +3,7 @@
 use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
 use crate::state::{Persist, Words};
-use nalgebra::{SVector, Vector3};
+use nalgebra::{SVector, Vector1, Vector3};
 
 /// An identifier with its estimate.
 #[derive(Debug, Clone)]
@@ -30,6 +30,17 @@ impl Identifier {
     /// For a body with the symmetry axis `axis`, 1 to 3; `filter` is at the initial guess of a.
     pub fn axisymmetric(relation: Axisymmetric, axis: usize, filter: Filter<1>, slowest_decay: f64) -> Self {
         Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay, excitation: 0.0 }
+    }
+
+    /// The same identifier, begun at other coefficients.
+    pub fn begun_at(self, a: &Vector3<f64>) -> Self {
+        let kind = match self.kind {
+            Kind::Asymmetric { relation, filter } => Kind::Asymmetric { relation, filter: filter.begun_at(*a) },
+            Kind::Axisymmetric { relation, filter, axis } => {
+                Kind::Axisymmetric { relation, filter: filter.begun_at(Vector1::new(a[axis % 3])), axis }
+            }
+        };
+        Self { kind, ..self }
     }
 
     /// Learns from one step; returns the status bits of what stood against it.

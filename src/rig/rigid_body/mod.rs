@@ -21,7 +21,7 @@ pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 pub(super) use resolve::resolve;
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig, UNKNOWN_DEVIATION};
+use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig, Start, UNKNOWN_DEVIATION, pair};
 use crate::config::Checks;
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
 use crate::model::{Inertia, Noise, RigidBody};
@@ -61,6 +61,8 @@ pub struct RigidBodyRig {
     limits: Limits,
     notes: Vec<String>,
     tick_s: f64,
+    /// What is proven of any follower: they differ in nothing that it knows of.
+    certificate: Option<Certificate>,
 }
 
 /// The observer's parameters.
@@ -163,8 +165,7 @@ impl RigidBodyRig {
         (Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s), controller)
     }
 
-    /// The certificate of any follower: they differ in nothing that it knows of.
-    fn certificate(&self) -> Option<Certificate> {
+    fn certify(&self) -> Option<Certificate> {
         let controller = self.controller?;
         // The papers' conditions are about the papers' filter.
         let decay_rate_per_s = match &self.observer {
@@ -242,7 +243,7 @@ impl Rig for RigidBodyRig {
         RateLaw {
             law,
             adaptation: InertiaAdaptation::new(controller.adaptation_gain),
-            certificate: self.certificate(),
+            certificate: self.certificate,
             supplied: Vector3::ith(self.supplied(), 1.0),
             learned: controller.learned,
             acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
@@ -292,7 +293,7 @@ impl Rig for RigidBodyRig {
             Some("is watched by the controller, and this scenario has none")
         } else if silent {
             Some("is not published by the Kalman filter")
-        } else if watched == Watched::Lyapunov && self.certificate().is_none() {
+        } else if watched == Watched::Lyapunov && self.certificate.is_none() {
             Some("is published with the first-order filter only")
         } else if watched == Watched::Lyapunov && self.bodies[1..].iter().all(|body| body.fleet.is_some()) {
             Some("is not published for a fleet")
@@ -342,6 +343,35 @@ impl Rig for RigidBodyRig {
         }
     }
 
+    fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
+        let mut rig = Self {
+            bodies: pair(&self.bodies, index),
+            initial_rates: pair(&self.initial_rates, index),
+            spreads: pair(&self.spreads, index),
+            inertia_factors: pair(&self.inertia_factors, index),
+            noise: pair(&self.noise, index),
+            deviations_rad_s: pair(&self.deviations_rad_s, index),
+            biases_rad_s: pair(&self.biases_rad_s, index),
+            ..self.clone()
+        };
+        rig.bodies.iter_mut().for_each(|body| body.fleet = None);
+        if !noisy {
+            rig.noise.fill(Noise::new(self.seed, 0, [0.0; 3], [0.0; 3]));
+        }
+        if start != Start::Given {
+            let off = if let Start::Off(off) = start { off } else { 0.0 };
+            let leader = self.initial_rates[0];
+            rig.initial_rates[1..].fill(leader.add_scalar(off));
+            match &mut rig.observer {
+                ObserverDesign::Hidden { guess_rad_s, .. } => *guess_rad_s = leader[self.supplied()] + off,
+                ObserverDesign::Learner(parts) => {
+                    parts.identifier = parts.identifier.clone().begun_at(&self.inertia.coefficients());
+                }
+            }
+        }
+        Some(rig)
+    }
+
     fn notes(&self) -> Vec<String> {
         self.notes.clone()
     }
@@ -350,13 +380,20 @@ impl Rig for RigidBodyRig {
         truth.status & (status::HOLDING | status::SAFE) == 0
     }
 
+    fn true_lyapunov(&self, leader: &RateTruth, follower: &RateTruth, estimate: &RateEstimate) -> Option<(f64, f64)> {
+        let [rate, own, estimated] =
+            [leader.omega_rad_s, follower.omega_rad_s, estimate.omega_rad_s].map(Vector3::from);
+        let hidden_error = rate[self.supplied()] - estimated[self.supplied()];
+        Some(self.certificate?.lyapunov(&(own - rate), hidden_error))
+    }
+
     fn lyapunov(command: &RateCommand) -> Option<(f64, f64)> {
         let (v, bound) = (command.lyapunov_rad2_s2, command.lyapunov_rate_bound_rad2_s3);
         (v > 0.0).then_some((v, bound))
     }
 
     fn certificates(&self) -> Vec<CertificateReport> {
-        let Some(certificate) = self.certificate() else { return Vec::new() };
+        let Some(certificate) = self.certificate else { return Vec::new() };
         let axis = self.supplied() + 1;
         let condition = |name: &str, condition: crate::control::Condition| ConditionReport {
             name: name.to_owned(),
@@ -381,15 +418,14 @@ impl Rig for RigidBodyRig {
         }
         if !certificate.exact.holds() {
             warnings.push(
-                "V is not proven to fall everywhere (the error still converges, at the rate below); raise \
-                 observer.decay_rate_per_s or the gains"
+                "V of the continuous law is not proven to fall everywhere; raise observer.decay_rate_per_s or the gains"
                     .to_owned(),
             );
         }
         let report = |body: &BodyInfo| CertificateReport {
             body: body.name.clone(),
             conditions: conditions.clone(),
-            rate_per_s: certificate.rate_per_s,
+            continuous_rate_per_s: Some(certificate.rate_per_s),
             bounds: vec![Figure { name: "M >= |omega|, rad/s".to_owned(), value: certificate.rate_bound_rad_s }],
             warnings: warnings.clone(),
         };

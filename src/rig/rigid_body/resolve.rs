@@ -47,7 +47,9 @@ pub(in crate::rig) fn resolve(
         limits: design_limits(&raw, &inertia, checks),
         notes,
         tick_s: frame.tick_s,
+        certificate: None,
     };
+    rig.certificate = rig.certify();
     for (index, follower) in raw.follower.into_iter().enumerate() {
         let factor = Vector3::from(follower.inertia_factor);
         let own = inertia.moments_kg_m2().component_mul(&factor);

@@ -1,0 +1,169 @@
+//! One driven body's loop in one place: the roles' own state machines, tick by tick, without links, guards and clocks.
+//!
+//! It gives the bits of an undisturbed run. Must not compute anything that a role computes.
+
+use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
+use crate::role::{Actuation, Controller, Observer, Plant, Rearm};
+use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
+use crate::state::{Persist, Words};
+
+/// The loop of a rig's observed body and one driven one, which may be the same.
+pub(super) struct Chain<R: Rig> {
+    rig: R,
+    observed: Plant<R::Body>,
+    /// None if the observed body is the driven one.
+    driven: Option<Plant<R::Body>>,
+    observer: Observer<R::Estimator>,
+    controller: Controller<R::Law>,
+    measurement: Measurement<R>,
+    own: Measurement<R>,
+    command: Command<R>,
+    truths: [Truth<R>; 2],
+    estimate: Estimate<R>,
+    tick: u64,
+}
+
+impl<R: Rig> Chain<R> {
+    /// The loop of a rig whose last body is the driven one, at its start.
+    pub fn new(rig: &R, tick_s: f64) -> Self {
+        let last = rig.bodies().len() - 1;
+        let plant = |index: usize| {
+            let driven = rig.bodies()[index].driven;
+            // No command is ever missing here.
+            let actuation = Actuation { driven, timeout_ticks: u64::MAX, rearm: Rearm::Auto };
+            Plant::new(rig.body(index), actuation, tick_s)
+        };
+        Self {
+            rig: rig.clone(),
+            observed: plant(0),
+            driven: (last > 0).then(|| plant(last)),
+            observer: Observer::new(rig.estimator(), tick_s),
+            controller: Controller::new(rig.law(last)),
+            measurement: Default::default(),
+            own: Default::default(),
+            command: Default::default(),
+            truths: Default::default(),
+            estimate: Default::default(),
+            tick: 0,
+        }
+    }
+
+    /// One tick: measure, estimate, command, move on, and hand the command over. What is in flight between two ticks is then
+    /// with the plant.
+    pub fn advance(&mut self) {
+        let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
+        self.observed.measure(&stamp, &mut self.measurement);
+        self.observer.step(&self.measurement, &mut self.estimate);
+        self.observed.truth(&stamp, &mut self.truths[0]);
+        self.tick += 1;
+        match &mut self.driven {
+            Some(driven) => {
+                driven.measure(&stamp, &mut self.own);
+                driven.truth(&stamp, &mut self.truths[1]);
+                self.controller.step(&self.estimate, &self.own, &mut self.command);
+                driven.advance(1);
+                driven.command(self.tick, Some(&self.command));
+                self.observed.advance(1);
+            }
+            None => {
+                self.controller.step(&self.estimate, &self.measurement, &mut self.command);
+                self.observed.advance(1);
+                self.observed.command(self.tick, Some(&self.command));
+            }
+        }
+    }
+
+    /// The rig's metrics at the last tick, in its order.
+    pub fn score(&self, out: &mut [f64]) {
+        self.rig.score(|index| self.truths.get(index), |_| None, Some(&self.estimate), out);
+    }
+
+    /// Every number of the driven body's motion and of the estimate at the last tick that the loop is to control.
+    pub fn output(&self, out: &mut Vec<f64>) {
+        out.clear();
+        for field in numbers::<Truth<R>>().filter(|field| R::FREE != Some(field.name)) {
+            out.extend(values(self.truth(), field));
+        }
+        for field in numbers::<Estimate<R>>().filter(|field| R::FREE != Some(field.name)) {
+            out.extend(values(&self.estimate, field));
+        }
+    }
+
+    /// The driven body's coordinate that the loop does not control.
+    pub fn free(&self) -> f64 {
+        let field = numbers::<Truth<R>>().find(|field| R::FREE == Some(field.name));
+        field.and_then(|field| values(self.truth(), field).next()).unwrap_or(0.0)
+    }
+
+    /// The driven body's.
+    fn truth(&self) -> &Truth<R> {
+        &self.truths[usize::from(self.driven.is_some())]
+    }
+
+    /// The bits of the estimate's `status` at the last tick.
+    pub fn status(&self) -> u64 {
+        let field = Estimate::<R>::FIELDS.iter().find(|field| field.name == "status");
+        field.map_or(0, |field| self.estimate.words()[field.offset / 8])
+    }
+
+    /// Passes what the loop remembers, but for the motion that it is to follow.
+    fn state<W: Words>(&mut self, words: &mut W) {
+        match &mut self.driven {
+            Some(driven) => driven.persist(words),
+            None => self.observed.persist(words),
+        }
+        self.observer.persist(words);
+        self.controller.persist(words);
+    }
+
+    /// The numbers of the state.
+    pub fn numbers(&mut self) -> Vec<f64> {
+        let mut numbers = Numbers(Vec::new());
+        self.state(&mut numbers);
+        numbers.0
+    }
+
+    /// Takes from every number of the state what `away` has, and then makes its distance from `from` so many times as large.
+    pub fn stretch(&mut self, from: &[f64], away: &[f64], factor: f64) {
+        self.state(&mut Stretch { from, away, factor });
+    }
+}
+
+/// The fields of a sample that are numbers.
+fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
+    S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64)
+}
+
+fn values<'a, S: Sample>(sample: &'a S, field: &Field) -> impl Iterator<Item = f64> + use<'a, S> {
+    sample.words()[field.offset / 8..][..field.count].iter().map(|bits| f64::from_bits(*bits))
+}
+
+/// Reads the numbers of a state.
+struct Numbers(Vec<f64>);
+
+impl Words for Numbers {
+    fn word(&mut self, _: &mut u64) {}
+
+    fn number(&mut self, value: &mut f64) {
+        self.0.push(*value);
+    }
+}
+
+/// Moves the numbers of a state; counters and flags stay.
+struct Stretch<'a> {
+    from: &'a [f64],
+    away: &'a [f64],
+    factor: f64,
+}
+
+impl Words for Stretch<'_> {
+    fn word(&mut self, _: &mut u64) {}
+
+    fn number(&mut self, value: &mut f64) {
+        let Some((from, rest)) = self.from.split_first() else { return };
+        let (away, further) = self.away.split_first().unwrap_or((&0.0, &[]));
+        let moved = from + self.factor * (*value - from - away);
+        (self.from, self.away) = (rest, further);
+        *value = if moved.is_finite() { moved } else { *from };
+    }
+}

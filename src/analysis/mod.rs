@@ -1,0 +1,445 @@
+//! What may be claimed of the loop that runs: the rate at which its error falls, the floor that it falls to, and whether it
+//! gets there from the scenario's own start.
+//!
+//! The loop is sampled, held and one tick late, so the theorems about continuous time say nothing of its rate. Here the roles'
+//! own code is run in one thread (`chain.rs`): beside a loop that is synchronised from the start runs one that is off by a
+//! little, and the logarithm of their distance gives the largest exponent, which is a Floquet exponent where the leader's
+//! motion is periodic. The numbers of the state are those by which a killed role is continued, so none is forgotten, whatever
+//! the filter, the law and the delay are. Must not derive by hand what the code does.
+
+mod chain;
+
+use crate::config::Scenario;
+use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
+use crate::sample::status;
+use crate::with_rig;
+use chain::Chain;
+use serde::Serialize;
+
+/// The distance of the two loops, over the size of what they say.
+const DISTANCE: f64 = 1e-5;
+/// It is set back once it has fallen to, or grown by, so much.
+const FALLEN: f64 = 1e-3;
+const GROWN: f64 = 10.0;
+/// Below this, over the size of what they say, it is rounding.
+const ROUNDING: f64 = 1e-11;
+/// Ticks that are looked at, at the least and at the most.
+const TICKS_MIN: u64 = 2_000;
+const TICKS_MAX: u64 = 64_000;
+/// The two halves of the ticks looked at must give one rate, to within this part of it.
+const AGREEMENT: f64 = 0.02;
+/// A start is small, and the linearisation speaks of it, below this part of the largest error.
+const SMALL: f64 = 1e-2;
+/// A loop whose floor is above this part of what it says synchronises nothing.
+const USELESS: f64 = 0.05;
+const USELESS_REASON: &str = "even from where it is settled the error comes to a floor that is no synchronisation: rounding, \
+                              quadrature or noise outweigh what the motion tells; raise tick_hz, or choose another axis";
+/// A loop that says so many times what it said at first has diverged.
+const BLOWN: f64 = 20.0;
+/// A loop that keeps less of the continuous rate than this is told of.
+const COMFORTABLE: f64 = 0.75;
+
+/// What may be claimed of one driven body: of the law in continuous time, and of the loop that runs.
+#[derive(Debug, Clone, Serialize)]
+pub struct Claim {
+    /// The driven body.
+    pub body: String,
+    /// The slowest exponent of the continuous law's error, 1/s; none if the rig has no theorem for this scenario.
+    pub continuous_rate_per_s: Option<f64>,
+    /// The exponent at which the error of the sampled, held and delayed loop falls once it is small, 1/s; none if no such
+    /// claim holds.
+    pub loop_rate_per_s: Option<f64>,
+    /// Why none is claimed.
+    pub reason: Option<String>,
+    /// The first of `floors`.
+    pub floor: Option<f64>,
+    /// Per metric: below this its error does not stay, for the quadrature at this tick, rounding, the sensors' noise and bias,
+    /// and the bodies' differences.
+    pub floors: Vec<Figure>,
+    /// When the limits in `[accept]` are reached at that rate.
+    pub reaches: Vec<Reach>,
+    /// The conditions on the continuous law, and those of stability.
+    pub conditions: Vec<ConditionReport>,
+    /// What the conditions rest on.
+    pub bounds: Vec<Figure>,
+    /// What a careful engineer would change.
+    pub warnings: Vec<String>,
+}
+
+/// When a metric reaches its limit.
+#[derive(Debug, Clone, Serialize)]
+pub struct Reach {
+    /// The metric.
+    pub metric: String,
+    /// Its limit in `[accept]`.
+    pub limit: f64,
+    /// What it is at the start.
+    pub from: f64,
+    /// How long a fall from there takes at the loop's rate, s; none if the limit is below the floor.
+    pub after_s: Option<f64>,
+}
+
+/// What may be claimed of every driven body's loop.
+pub fn claims(scenario: &Scenario) -> Vec<Claim> {
+    fn of_rig<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<Claim> {
+        let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+        let certificates = rig.certificates();
+        let certificate = |name: &str| certificates.iter().find(|certificate| certificate.body == name);
+        driven
+            .map(|(index, body)| Analysis::new(rig, index, scenario).claim(&body.name, certificate(&body.name)))
+            .collect()
+    }
+    with_rig!(&scenario.rig, rig => of_rig(rig, scenario))
+}
+
+/// The analysis of one driven body's loop.
+struct Analysis<'a, R> {
+    rig: &'a R,
+    index: usize,
+    scenario: &'a Scenario,
+    tick_s: f64,
+}
+
+/// An exponent, and how much of the motion it speaks of.
+struct Exponent {
+    /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over the halves of those.
+    rate_per_s: f64,
+    halves_per_s: [f64; 2],
+    /// Part of the ticks at which the observer was told nothing.
+    unobserved: f64,
+    /// The size of what the loop says where it is settled.
+    size: f64,
+}
+
+impl<'a, R: Rig> Analysis<'a, R> {
+    fn new(rig: &'a R, index: usize, scenario: &'a Scenario) -> Self {
+        Self { rig, index, scenario, tick_s: scenario.tick_s() }
+    }
+
+    fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
+        let (rate, floors) = match self.rig.alone(self.index, Start::Settled, false) {
+            None => (Err("this rig does not tell where its loop is settled".to_owned()), Vec::new()),
+            Some(settled) => {
+                let exponent = self.exponent(&settled);
+                match self.judge(&exponent) {
+                    Err(reason) => (Err(reason), Vec::new()),
+                    Ok(rate) => {
+                        let floors = self.floors(self.ticks_to_settle(rate));
+                        let useful = floors.iter().all(|floor| *floor <= USELESS * exponent.size);
+                        let arrives = || self.arrives(rate, &floors).map(|()| rate);
+                        let rate = if useful { arrives() } else { Err(USELESS_REASON.to_owned()) };
+                        (rate, floors)
+                    }
+                }
+            }
+        };
+        let loop_rate_per_s = rate.as_ref().ok().copied();
+        let mut claim = Claim {
+            body: body.to_owned(),
+            continuous_rate_per_s: certificate.and_then(|certificate| certificate.continuous_rate_per_s),
+            loop_rate_per_s,
+            floor: floors.first().copied(),
+            reaches: loop_rate_per_s.map_or(Vec::new(), |rate| self.reaches(rate, &floors)),
+            floors: self.named(&floors),
+            conditions: certificate.map_or(Vec::new(), |certificate| certificate.conditions.clone()),
+            bounds: certificate.map_or(Vec::new(), |certificate| certificate.bounds.clone()),
+            warnings: certificate.map_or(Vec::new(), |certificate| certificate.warnings.clone()),
+            reason: rate.err(),
+        };
+        claim.warn();
+        claim
+    }
+
+    fn named(&self, values: &[f64]) -> Vec<Figure> {
+        let named = self.rig.metrics().iter().zip(values);
+        named.map(|(name, value)| Figure { name: (*name).to_owned(), value: *value }).collect()
+    }
+
+    /// When each limit of the scenario is reached, from its error at the start.
+    fn reaches(&self, rate_per_s: f64, floors: &[f64]) -> Vec<Reach> {
+        let Some(rig) = self.rig.alone(self.index, Start::Given, false) else {
+            return Vec::new();
+        };
+        let mut start = vec![0.0; floors.len()];
+        let mut chain = Chain::new(&rig, self.tick_s);
+        chain.advance();
+        chain.score(&mut start);
+        let limits = &self.scenario.accept.metric_max;
+        let limited = self.rig.metrics().iter().zip(start.iter().zip(floors));
+        let reach = |(metric, (from, floor)): (&&str, (&f64, &f64))| {
+            let limit = *limits.get(*metric)?;
+            let after_s = (limit > *floor).then(|| ((from / limit).ln() / rate_per_s).max(0.0));
+            Some(Reach { metric: (*metric).to_owned(), limit, from: *from, after_s })
+        };
+        limited.filter_map(reach).collect()
+    }
+
+    /// The largest exponent of the loop about the motion that it is to follow.
+    fn exponent(&self, ideal: &R) -> Exponent {
+        let begun = |start| self.rig.alone(self.index, start, false).map(|rig| Chain::new(&rig, self.tick_s));
+        let (mut here, mut there) = (Vec::new(), Vec::new());
+        let mut reference = Chain::new(ideal, self.tick_s);
+        reference.advance();
+        reference.output(&mut here);
+        let size = norm(&here).max(f64::MIN_POSITIVE);
+        let Some(mut near) = begun(Start::Off(DISTANCE * size)) else { unreachable!("as the settled one was") };
+        // What the loop does not control does not decay, and is taken out again and again.
+        let mut shifted = R::FREE.and_then(|_| begun(Start::Shifted(DISTANCE)));
+        near.advance();
+        shifted.iter_mut().for_each(Chain::advance);
+        let (mut fallen, mut since, mut unobserved) = (0.0, None, 0_u64);
+        // The logarithm by which the distance has fallen, after every tick.
+        let mut falls = Vec::new();
+        let mut end = TICKS_MIN.max(self.scenario.last_tick.min(TICKS_MAX / 8));
+        loop {
+            while (falls.len() as u64) < end {
+                reference.advance();
+                near.advance();
+                shifted.iter_mut().for_each(Chain::advance);
+                reference.output(&mut here);
+                if blown(norm(&here), size) {
+                    return Exponent::GROWS;
+                }
+                near.output(&mut there);
+                here.iter_mut().zip(&there).for_each(|(here, there)| *here -= there);
+                let distance = norm(&here);
+                let from = *since.get_or_insert(distance);
+                falls.push(fallen + (from / distance.max(ROUNDING * size)).ln());
+                unobserved += u64::from(reference.status() & (status::UNOBSERVABLE | status::UNUSABLE) != 0);
+                if !(FALLEN * DISTANCE * size..GROWN * DISTANCE * size).contains(&distance) {
+                    fallen = falls[falls.len() - 1];
+                    let from = reference.numbers();
+                    let away = shifted.as_mut().map_or(Vec::new(), |shifted| {
+                        let part = (near.free() - reference.free()) / (shifted.free() - reference.free());
+                        shifted.numbers().iter().zip(&from).map(|(shifted, from)| part * (shifted - from)).collect()
+                    });
+                    near.stretch(&from, &away, DISTANCE * size / distance.max(ROUNDING * size));
+                    since = Some(DISTANCE * size);
+                }
+            }
+            let slope = |from: usize, to: usize| (falls[to - 1] - falls[from - 1]) / ((to - from) as f64 * self.tick_s);
+            let (begin, end_at) = (falls.len() / 4, falls.len());
+            let middle = (begin + end_at) / 2;
+            let exponent = Exponent {
+                rate_per_s: slope(begin, end_at),
+                halves_per_s: [slope(begin, middle), slope(middle, end_at)],
+                unobserved: unobserved as f64 / end as f64,
+                size,
+            };
+            if exponent.agrees() || end >= TICKS_MAX {
+                return exponent;
+            }
+            end *= 2;
+        }
+    }
+
+    /// Whether the exponent is a rate.
+    fn judge(&self, exponent: &Exponent) -> Result<f64, String> {
+        let Exponent { rate_per_s, halves_per_s: [first, second], unobserved, .. } = exponent;
+        if *unobserved > 0.5 {
+            return Err(format!(
+                "not observable: at {:.0} % of the ticks the measured components tell nothing of the hidden one",
+                1e2 * unobserved
+            ));
+        }
+        if *rate_per_s == f64::NEG_INFINITY {
+            return Err(
+                "this sampled loop diverges even from where it is settled; lower the gains or raise tick_hz".to_owned()
+            );
+        }
+        if rate_per_s.is_nan() || *rate_per_s <= 0.0 {
+            return Err(format!(
+                "the error of this sampled loop grows, by {} 1/s; lower the gains or raise tick_hz",
+                digits(-rate_per_s)
+            ));
+        }
+        if !exponent.agrees() {
+            return Err(format!(
+                "no one rate along this motion: {} 1/s in one half of what was looked at, {} 1/s in the other",
+                digits(*first),
+                digits(*second)
+            ));
+        }
+        Ok(*rate_per_s)
+    }
+
+    /// Ticks after which an error that falls at this rate has settled.
+    fn ticks_to_settle(&self, rate_per_s: f64) -> u64 {
+        let ticks = 40.0 / (rate_per_s.max(0.0) * self.tick_s);
+        (ticks.min(TICKS_MAX as f64) as u64).clamp(TICKS_MIN, TICKS_MAX)
+    }
+
+    /// The largest error per metric of a loop that was synchronised from the start, with all that disturbs it.
+    fn floors(&self, ticks: u64) -> Vec<f64> {
+        let mut floors = vec![0.0; self.rig.metrics().len()];
+        let mut values = floors.clone();
+        if let Some(rig) = self.rig.alone(self.index, Start::Settled, true) {
+            let mut chain = Chain::new(&rig, self.tick_s);
+            let (mut output, mut size) = (Vec::new(), None);
+            for tick in 0..ticks {
+                chain.advance();
+                chain.output(&mut output);
+                if blown(norm(&output), *size.get_or_insert(norm(&output))) {
+                    return vec![f64::INFINITY; floors.len()];
+                }
+                chain.score(&mut values);
+                if tick >= ticks / 2 {
+                    floors.iter_mut().zip(&values).for_each(|(floor, value)| *floor = value.max(*floor));
+                }
+            }
+        }
+        floors
+    }
+
+    /// Whether the scenario's own start leads where the rate speaks of.
+    fn arrives(&self, rate_per_s: f64, floors: &[f64]) -> Result<(), String> {
+        let Some(rig) = self.rig.alone(self.index, Start::Given, false) else {
+            return Ok(());
+        };
+        let mut chain = Chain::new(&rig, self.tick_s);
+        let mut values = vec![0.0; floors.len()];
+        let mut largest = values.clone();
+        let ticks = self.ticks_to_settle(rate_per_s);
+        let (mut output, mut size) = (Vec::new(), None);
+        for _ in 0..ticks {
+            chain.advance();
+            chain.output(&mut output);
+            if blown(norm(&output), *size.get_or_insert(norm(&output))) {
+                return Err("from this start the loop diverges".to_owned());
+            }
+            chain.score(&mut values);
+            largest.iter_mut().zip(&values).for_each(|(largest, value)| *largest = value.max(*largest));
+            let small = |((value, largest), floor): ((&f64, &f64), &f64)| *value <= (SMALL * largest).max(2.0 * floor);
+            if values.iter().zip(&largest).zip(floors).all(small) {
+                return Ok(());
+            }
+        }
+        let (name, value) = self.rig.metrics().iter().zip(&values).next().unwrap_or((&"error", &f64::NAN));
+        Err(format!(
+            "from this start the loop does not synchronise: {name} is still {value:.1e} after {:.3} s",
+            ticks as f64 * self.tick_s
+        ))
+    }
+}
+
+impl Claim {
+    /// Adds what stands against it.
+    fn warn(&mut self) {
+        match (self.loop_rate_per_s, self.continuous_rate_per_s) {
+            (None, _) => self.warnings.extend(self.reason.clone()),
+            (Some(rate), Some(continuous)) if rate < COMFORTABLE * continuous => self.warnings.push(format!(
+                "sampling, hold and delay leave {} of the continuous law's {} 1/s; raise tick_hz, lower the gains, or set \
+                 controller.predict",
+                digits(rate),
+                digits(continuous)
+            )),
+            _ => {}
+        }
+        for reach in self.reaches.iter().filter(|reach| reach.after_s.is_none()) {
+            self.warnings.push(format!(
+                "accept.{}_max = {} is below the floor; raise it, or raise tick_hz or lower the noise",
+                reach.metric,
+                digits(reach.limit)
+            ));
+        }
+    }
+}
+
+/// A number with enough digits to be told from another, however small it is.
+pub fn digits(value: f64) -> String {
+    if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
+        let text = format!("{value:.4}");
+        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+    } else {
+        format!("{value:.3e}")
+    }
+}
+
+impl Exponent {
+    /// That of a loop which does not even stay where it is settled.
+    const GROWS: Self =
+        Self { rate_per_s: f64::NEG_INFINITY, halves_per_s: [f64::NEG_INFINITY; 2], unobserved: 0.0, size: 0.0 };
+
+    fn agrees(&self) -> bool {
+        let [first, second] = self.halves_per_s;
+        (first - second).abs() <= AGREEMENT * self.rate_per_s.abs()
+    }
+}
+
+/// Whether what a loop says is so far from what it said at first that it will not come back.
+fn blown(now: f64, first: f64) -> bool {
+    now.is_nan() || now > BLOWN * first.max(f64::MIN_POSITIVE)
+}
+
+fn norm(values: &[f64]) -> f64 {
+    values.iter().map(|value| value * value).sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+
+    fn claim(overrides: &[&str]) -> Claim {
+        let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
+        let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap().1;
+        claims(&Scenario::parse(text, "test", &overrides).unwrap()).remove(0)
+    }
+
+    /// Rates from an independent program: the product of the one-tick transitions of (e, command on its way, ε), linearised
+    /// about the leader's motion by its variational equation.
+    #[test]
+    fn the_rate_is_that_of_the_linearised_product_of_ticks() {
+        for (scale, gain, decay, tick_hz, predict, expected) in [
+            (1.0, 50.0, 200.0, 100.0, false, 34.5407),
+            (1.0, 70.0, 200.0, 100.0, false, 17.8008),
+            (1.0, 90.0, 200.0, 100.0, false, 5.1908),
+            (1.0, 190.0, 200.0, 100.0, true, 10.495),
+            (8.0, 4.0, 6.0, 100.0, false, 4.2754),
+            (20.0, 4.0, 6.0, 20.0, false, 2.7616),
+            (1.0, 4.0, 0.5, 1000.0, false, 0.4939),
+            (1.0, 4.0, 6.0, 5.0, false, 0.5108),
+            (1.0, 4.0, 6.0, 5.0, true, 6.0),
+        ] {
+            let rate = [0.6, -0.4, 0.8].map(|value| value * scale);
+            let claim = claim(&[
+                &format!("leader.initial_rate_rad_s={rate:?}"),
+                &format!("controller.gain_per_s={:?}", [gain; 3]),
+                &format!("controller.predict={predict}"),
+                &format!("observer.decay_rate_per_s={decay:?}"),
+                &format!("tick_hz={tick_hz:?}"),
+            ]);
+            let found = claim.loop_rate_per_s.unwrap_or(f64::NAN);
+            println!("{scale} {gain} {decay} {tick_hz} {predict}: {found:.4}, expected {expected}; {:?}", claim.reason);
+            assert!((found / expected - 1.0).abs() < 0.03, "{found} is not {expected}");
+        }
+    }
+
+    /// Nothing is claimed of loops that do not converge, or whose observer is told nothing.
+    #[test]
+    fn no_rate_is_claimed_where_none_holds() {
+        for (overrides, reason) in [
+            (
+                // Fast, and sampled at 20 Hz: every continuous condition holds.
+                &[
+                    "leader.inertia_kg_m2=[1.0, 1.1, 2.05]",
+                    "leader.initial_rate_rad_s=[16.0, -11.0, 22.0]",
+                    "tick_hz=20.0",
+                ][..],
+                "raise tick_hz",
+            ),
+            (&["leader.initial_rate_rad_s=[0.0, 0.0, 0.8]"], "not observable"),
+            (&["leader.inertia_kg_m2=[1.0, 1.00000000000001, 1.00000000000002]"], ""),
+        ] {
+            let claim = claim(overrides);
+            println!("{overrides:?}: {claim:?}");
+            assert!(claim.loop_rate_per_s.is_none() && claim.reason.unwrap().contains(reason));
+            assert!(!claim.warnings.is_empty());
+        }
+    }
+
+    #[test]
+    fn small_numbers_have_digits() {
+        assert_eq!([0.0, 4.0, 0.25, 1.5e-7, -2e-4].map(digits), ["0", "4", "0.25", "1.500e-7", "-2.000e-4"]);
+    }
+}
