@@ -34,8 +34,11 @@ const SMALL: f64 = 1e-2;
 const USELESS: f64 = 0.05;
 const USELESS_REASON: &str = "even from where it is settled the error comes to a floor that is no synchronisation: rounding, \
                               quadrature or noise outweigh what the motion tells; raise tick_hz, or choose another axis";
-/// A loop that says so many times what it said at first has diverged.
-const BLOWN: f64 = 20.0;
+/// A loop that was settled, and says so many times what it said then, does not stay settled.
+const LOST: f64 = 20.0;
+/// A loop that says so many times what it said at its start has diverged. A transient may be large: a wrong first guess at a
+/// high gain.
+const DIVERGED: f64 = 1e6;
 /// A loop that keeps less of the continuous rate than this is told of.
 const COMFORTABLE: f64 = 0.75;
 
@@ -197,7 +200,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
                 near.advance();
                 shifted.iter_mut().for_each(Chain::advance);
                 reference.output(&mut here);
-                if blown(norm(&here), size) {
+                if exceeds(norm(&here), LOST * size) {
                     return Exponent::GROWS;
                 }
                 near.output(&mut there);
@@ -279,7 +282,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
             for tick in 0..ticks {
                 chain.advance();
                 chain.output(&mut output);
-                if blown(norm(&output), *size.get_or_insert(norm(&output))) {
+                if exceeds(norm(&output), LOST * *size.get_or_insert(norm(&output))) {
                     return vec![f64::INFINITY; floors.len()];
                 }
                 chain.score(&mut values);
@@ -304,7 +307,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
         for _ in 0..ticks {
             chain.advance();
             chain.output(&mut output);
-            if blown(norm(&output), *size.get_or_insert(norm(&output))) {
+            if exceeds(norm(&output), DIVERGED * *size.get_or_insert(norm(&output))) {
                 return Err("from this start the loop diverges".to_owned());
             }
             chain.score(&mut values);
@@ -366,9 +369,9 @@ impl Exponent {
     }
 }
 
-/// Whether what a loop says is so far from what it said at first that it will not come back.
-fn blown(now: f64, first: f64) -> bool {
-    now.is_nan() || now > BLOWN * first.max(f64::MIN_POSITIVE)
+/// Whether a size is beyond a limit, or no number.
+fn exceeds(size: f64, limit: f64) -> bool {
+    size.is_nan() || size > limit.max(f64::MIN_POSITIVE)
 }
 
 fn norm(values: &[f64]) -> f64 {
