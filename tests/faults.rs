@@ -6,6 +6,7 @@ mod common;
 use common::{Bench, shipped};
 use corotate::config::Scenario;
 use corotate::launch::{Launch, Summary, run};
+use corotate::role::DOUBTS;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -514,4 +515,27 @@ fn a_tick_from_the_future_does_not_blind_the_scorer() {
     let unscored = summary["score"]["unscored_ticks"].as_u64().unwrap();
     assert!((1..=missed + 2).contains(&unscored), "{unscored} unscored, {missed} missed: {:#}", summary["books"]);
     bench.assert_clean(&[]);
+}
+
+/// Without faults every sample is right, and a guard doubts it for a bounded time only: also that of a follower which a wrong
+/// first guess has driven beyond what it may turn at.
+#[test]
+fn a_guard_is_no_trap() {
+    let smallsat = ["leader.inertia_kg_m2=[0.082, 0.091, 0.034]", "leader.initial_rate_rad_s=[0.012, -0.01, 0.012]"];
+    let at_rest = ["observer.initial_guess_rad_s=0.2", "follower.0.initial_rate_rad_s=[0.0, 0.0, 0.0]"];
+    let fleet = ["follower.0.count=5", "follower.0.initial_rate_spread_rad_s=[0.1, 0.1, 0.1]"];
+    let (wrong, narrow) = (["observer.initial_guess_rad_s=15.0"], ["limits.rate_rad_s=1.6"]);
+    for (overrides, doubts) in [
+        (wrong.to_vec(), false),
+        ([smallsat, at_rest].concat(), false),
+        ([wrong, narrow].concat(), true),
+        ([&wrong[..], &narrow, &fleet].concat(), true),
+    ] {
+        let overrides = ["clock=in-process"].into_iter().chain(overrides).map(str::to_owned).collect::<Vec<_>>();
+        let text = std::fs::read_to_string(shipped("rigid-pair")).unwrap();
+        let run = Disturbed::run(&Scenario::parse(&text, "trap", &overrides).unwrap());
+        assert!(run.last < SETTLED_RAD_S, "{overrides:?}: {}", run.last);
+        // The guards of the controller and of nobody else doubt; the follower leaves its range once, and comes back.
+        assert_eq!(run.count("rejected_samples"), if doubts { DOUBTS } else { 0 }, "{overrides:?}");
+    }
 }

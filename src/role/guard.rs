@@ -1,7 +1,8 @@
 //! What the receiving end checks of a sample before anything is made of it: numbers, range, and how fast they change.
 //!
 //! Must not repair anything: a sample is believed whole or not at all. Must not refuse for ever what was right: the change
-//! that is allowed grows with the time since the last sample that was believed.
+//! that is allowed grows with the time since the last sample that was believed, and a body that moves beyond its range as its
+//! equations of motion say is believed after [`DOUBTS`] samples.
 
 use crate::sample::Stamp;
 use crate::state::{Persist, Words, persist_fields};
@@ -101,12 +102,30 @@ impl<const N: usize> Plausible<N> {
                     && self.reached(i, value, stamp.tick, &change));
         }
         if believed {
-            for i in (0..N).filter(|i| valid >> i & 1 == 1) {
-                (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
-            }
+            self.believe(stamp, values, valid);
         }
         (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
         believed
+    }
+
+    /// Remembers a sample that was found to be right in another way.
+    #[inline]
+    pub fn believe(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) {
+        for i in (0..N).filter(|i| valid >> i & 1 == 1) {
+            (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
+        }
+        self.trusted = true;
+    }
+
+    /// The bounds that it judges by.
+    pub fn bounds(&self) -> &Bounds<N> {
+        &self.bounds
+    }
+
+    /// Whether all components lie in their range. What is not a number does not.
+    #[inline]
+    pub fn contains(&self, values: &[f64; N]) -> bool {
+        (0..N).all(|i| self.in_range(i, values[i]))
     }
 
     /// What is not a number is in no range.
@@ -138,6 +157,77 @@ impl<const N: usize> Persist for Plausible<N> {
         self.before_tick.persist(words);
         self.repeated.persist(words);
         self.trusted.persist(words);
+    }
+}
+
+/// So many samples in a row of a body beyond its range are not believed, however right they are.
+pub const DOUBTS: u64 = 8;
+/// Of the way that a body moves, so much may be other than its equations say: its inertia is not known exactly.
+const MISMATCH: f64 = 0.25;
+
+/// Tells a body that moves beyond its range from a sensor that lies: the body moves as its equations and what is applied to
+/// it say.
+///
+/// It is followed from a sample on, for [`DOUBTS`] samples, and then from the last of them: small differences do not add up,
+/// and a lie that hides in noise at first does not stay hidden. What stops following is doubted anew.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pursuit<const N: usize> {
+    /// Where the body is at `next_tick` if it follows.
+    next: [f64; N],
+    next_tick: u64,
+    /// How far it has moved since the sample that it is followed from.
+    path: f64,
+    /// How many samples have followed; 0 if none is followed.
+    samples: u64,
+}
+
+impl<const N: usize> Default for Pursuit<N> {
+    fn default() -> Self {
+        Self { next: [0.0; N], next_tick: 0, path: 0.0, samples: 0 }
+    }
+}
+
+impl<const N: usize> Pursuit<N> {
+    /// Whether a body is being followed.
+    #[inline]
+    pub fn active(&self) -> bool {
+        self.samples > 0
+    }
+
+    /// Follows no body any more.
+    #[inline]
+    pub fn stop(&mut self) {
+        self.samples = 0;
+    }
+
+    /// Whether a body that was sampled at this tick has been found to move as it must. `allowance` is the noise of two
+    /// samples; `flow` tells where it is one tick later. Call it with every sample as long as it is [active](Self::active).
+    pub fn follows(
+        &mut self,
+        tick: u64,
+        values: &[f64; N],
+        allowance: &[f64; N],
+        flow: impl FnOnce(&[f64; N]) -> [f64; N],
+    ) -> bool {
+        let near = |i: usize| (values[i] - self.next[i]).abs() <= allowance[i] + MISMATCH * self.path;
+        let follows = self.active() && tick == self.next_tick && (0..N).all(near);
+        self.samples = if follows { self.samples + 1 } else { 1 };
+        let anew = self.samples % DOUBTS == 1;
+        let from = if anew { *values } else { self.next };
+        self.next = flow(&from);
+        self.next_tick = tick + 1;
+        let moved = from.iter().zip(&self.next).map(|(from, next)| (next - from) * (next - from)).sum::<f64>();
+        self.path = if anew { 0.0 } else { self.path } + libm::sqrt(moved);
+        self.samples > DOUBTS
+    }
+}
+
+impl<const N: usize> Persist for Pursuit<N> {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.next.persist(words);
+        self.next_tick.persist(words);
+        self.path.persist(words);
+        self.samples.persist(words);
     }
 }
 

@@ -9,6 +9,6 @@ mod observer;
 mod plant;
 
 pub use controller::{Controller, Law};
-pub use guard::{Bounds, Guard, Plausible, Unguarded};
+pub use guard::{Bounds, DOUBTS, Guard, Plausible, Pursuit, Unguarded};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};

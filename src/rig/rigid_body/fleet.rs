@@ -4,10 +4,11 @@
 //! for one is so for all.
 
 use super::RigidBodyRig;
+use super::limits::Motion;
 use crate::control::FleetLaw;
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rig::Fleet;
-use crate::role::{Body, Bounds, Guard, Law};
+use crate::role::{Body, Bounds, Guard, Law, Pursuit};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
 };
@@ -58,6 +59,7 @@ pub struct RateFleet {
     law: FleetLaw,
     learned: bool,
     bounds: Bounds<3>,
+    motion: Option<Motion>,
     acceleration_max_rad_s2: f64,
 }
 
@@ -80,6 +82,7 @@ impl RateFleet {
             law: FleetLaw::new(law, acceleration_max_rad_s2),
             learned: controller.learned,
             bounds: rig.limits.bounds(&rig.sensed(index), rig.tick_s),
+            motion: rig.sensed(index).motion(rig.tick_s),
             acceleration_max_rad_s2,
         }
     }
@@ -110,6 +113,9 @@ impl Fleet<RateEstimate> for RateFleet {
     fn measurement_guard(&self) -> FleetMeasurementGuard {
         FleetMeasurementGuard {
             bounds: self.bounds,
+            motion: self.motion,
+            pursuits: vec![Pursuit::default(); self.count()],
+            pursuing: false,
             acceleration_max_rad_s2: self.acceleration_max_rad_s2,
             believed: zeros(self.count()),
             believed_tick: None,
@@ -211,11 +217,15 @@ impl Law for FleetRateLaw {
     }
 }
 
-/// Guards measurements of a fleet as [`Plausible`](crate::role::Plausible) does those of a body: a sample is believed for all
-/// bodies or for none.
+/// Guards measurements of a fleet as [`MeasurementGuard`](super::MeasurementGuard) does those of a body: a sample is believed
+/// for all bodies or for none.
 #[derive(Debug)]
 pub struct FleetMeasurementGuard {
     bounds: Bounds<3>,
+    motion: Option<Motion>,
+    /// One per body; all of them are active if `pursuing`, else none.
+    pursuits: Vec<Pursuit<3>>,
+    pursuing: bool,
     acceleration_max_rad_s2: f64,
     /// The last rates that were believed, and their tick.
     believed: Arrays,
@@ -235,8 +245,37 @@ impl FleetMeasurementGuard {
         })
     }
 
+    fn in_range(&self, rates: [&[f64]; 3]) -> bool {
+        rates.into_iter().zip(self.bounds.magnitude).all(|(rates, limit)| within(rates, limit))
+    }
+
+    /// Judges a sample that is out of range, or comes after one: every body is to move as it must.
+    #[cold]
+    fn follows(&mut self, sample: &FleetMeasurement) -> bool {
+        let (Some(motion), [r1, r2, r3], [a1, a2, a3]) = (self.motion, sample.vector(OMEGA), sample.vector(APPLIED))
+        else {
+            return false;
+        };
+        let tick = sample.stamp().tick;
+        let (mut all, mut active) = (true, true);
+        for (i, pursuit) in self.pursuits.iter_mut().enumerate() {
+            all &= motion.follows(pursuit, tick, &[r1[i], r2[i], r3[i]], &[a1[i], a2[i], a3[i]], &self.bounds);
+            active &= pursuit.active();
+        }
+        self.pursuing = true;
+        if !active {
+            self.stop();
+        }
+        all
+    }
+
+    fn stop(&mut self) {
+        self.pursuits.iter_mut().for_each(Pursuit::stop);
+        self.pursuing = false;
+    }
+
     fn possible(&self, rates: [&[f64]; 3], tick: u64) -> bool {
-        let in_range = rates.into_iter().zip(self.bounds.magnitude).all(|(rates, limit)| within(rates, limit));
+        let in_range = self.in_range(rates);
         let Some(since) = self.believed_tick.filter(|_| in_range) else { return in_range };
         let smooth = match self.doubted_tick {
             Some(doubted) if tick.saturating_sub(since) > SHORT_GAP_TICKS => {
@@ -254,6 +293,8 @@ impl Persist for FleetMeasurementGuard {
         self.believed_tick.persist(words);
         persist_arrays(&mut self.doubted, words);
         self.doubted_tick.persist(words);
+        self.pursuits.persist(words);
+        self.pursuing.persist(words);
     }
 }
 
@@ -266,7 +307,11 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
         }
         let stamp = sample.stamp();
         let rates = sample.vector(OMEGA);
-        let believed = self.possible(rates, stamp.tick);
+        let usual = self.possible(rates, stamp.tick);
+        if usual && self.pursuing {
+            self.stop();
+        }
+        let believed = usual || ((self.pursuing || !self.in_range(rates)) && self.follows(sample));
         if believed {
             assign(all_mut(&mut self.believed), rates);
             (self.believed_tick, self.doubted_tick) = (Some(stamp.tick), None);

@@ -2,10 +2,12 @@
 //!
 //! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
 
+use super::MAX_TURN_RAD;
 use super::observer::ALL;
 use crate::config::{Checks, finite_positive};
+use crate::model::RigidBody;
 use crate::rig::{Figure, SURE_DEVIATIONS};
-use crate::role::{Bounds, Guard, Plausible};
+use crate::role::{Bounds, Guard, Plausible, Pursuit};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
@@ -39,6 +41,8 @@ pub(super) struct Circumstances {
     pub leader_rad_s: f64,
     /// The fastest initial rate of a follower, rad/s.
     pub follower_rad_s: f64,
+    /// How far the first guess is from the hidden rate, rad/s: so far the law drives a follower off at first.
+    pub guess_error_rad_s: f64,
     /// How far an estimate may err before it settles, rad/s.
     pub transient_rad_s: f64,
     /// How fast the observer moves an estimate that errs, 1/s; +inf where nothing bounds that.
@@ -74,7 +78,7 @@ impl Limits {
                 format!("{rate_rad_s} is not above the {fastest_rad_s:.3} rad/s that a body may turn at; raise it")
             });
         }
-        let default_rad_s = RATE_MARGIN * (about.leader_rad_s + about.follower_rad_s);
+        let default_rad_s = RATE_MARGIN * (about.leader_rad_s + about.follower_rad_s + about.guess_error_rad_s);
         let rate_rad_s = raw.rate_rad_s.unwrap_or(default_rad_s.max(f64::MIN_POSITIVE));
         let estimate_rad_s = rate_rad_s + about.transient_rad_s;
         let demand = about.gain_per_s * (estimate_rad_s + rate_rad_s)
@@ -101,15 +105,23 @@ impl Limits {
 
     /// A guard for a body's measurements; without the components in `needed` a measurement is of no use to the reader.
     pub fn measurement(&self, body: &Sensed, tick_s: f64, needed: u64) -> MeasurementGuard {
-        let rate = Plausible::new(self.bounds(body, tick_s));
-        MeasurementGuard { rate, acceleration_rad_s2: self.acceleration_rad_s2, needed }
+        MeasurementGuard {
+            rate: Plausible::new(self.bounds(body, tick_s)),
+            pursuit: Pursuit::default(),
+            motion: body.motion(tick_s),
+            acceleration_rad_s2: self.acceleration_rad_s2,
+            needed,
+        }
     }
 
     /// What a body's measured rates can be.
     pub fn bounds(&self, body: &Sensed, tick_s: f64) -> Bounds<3> {
         let free = body.coefficients * (self.rate_rad_s * self.rate_rad_s);
-        let driven =
-            if body.driven { body.factor.map(|factor| self.acceleration_rad_s2 / factor) } else { Vector3::zeros() };
+        let driven = if body.driven.is_some() {
+            body.factor.map(|factor| self.acceleration_rad_s2 / factor)
+        } else {
+            Vector3::zeros()
+        };
         let spread = body.deviation * SURE_DEVIATIONS;
         let rounding = Vector3::repeat(8.0 * f64::EPSILON * self.rate_rad_s);
         Bounds {
@@ -146,28 +158,88 @@ pub(super) struct Sensed {
     pub coefficients: Vector3<f64>,
     /// Inertia over the nominal one.
     pub factor: Vector3<f64>,
-    pub driven: bool,
+    /// As it moves; none if it is free, for then its energy bounds its rate.
+    pub driven: Option<RigidBody>,
     /// Of the sensors, rad/s.
     pub deviation: Vector3<f64>,
     pub bias: Vector3<f64>,
 }
 
-/// Guards measurements: their range, and how fast Euler's equations and the actuators let them change.
+impl Sensed {
+    pub fn motion(&self, tick_s: f64) -> Option<Motion> {
+        self.driven.map(|body| Motion { body, factor: self.factor, tick_s })
+    }
+}
+
+/// How a driven body moves in one tick.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Motion {
+    body: RigidBody,
+    factor: Vector3<f64>,
+    tick_s: f64,
+}
+
+impl Motion {
+    /// Whether a sample of the body is believed although it lies beyond the range, or follows one that does: it moves as
+    /// Euler's equations and what is applied say. Nothing is followed that turns too far in a tick to be told from its mirror
+    /// image.
+    pub fn follows(
+        &self,
+        pursuit: &mut Pursuit<3>,
+        tick: u64,
+        rate: &[f64; 3],
+        applied: &[f64; 3],
+        bounds: &Bounds<3>,
+    ) -> bool {
+        if !within(rate, MAX_TURN_RAD / self.tick_s) {
+            pursuit.stop();
+            return false;
+        }
+        let applied = Vector3::from(*applied).component_div(&self.factor);
+        pursuit.follows(tick, rate, &bounds.allowance, |from| {
+            self.body.flow(&Vector3::from(*from), &applied, self.tick_s).into()
+        })
+    }
+}
+
+/// Guards measurements: their range, and how fast Euler's equations and the actuators let them change. A driven body beyond
+/// its range is believed once it was seen to move as it must.
 #[derive(Debug)]
 pub struct MeasurementGuard {
     rate: Plausible<3>,
+    pursuit: Pursuit<3>,
+    motion: Option<Motion>,
     acceleration_rad_s2: f64,
     needed: u64,
 }
 
-persist_fields!(MeasurementGuard, rate);
+persist_fields!(MeasurementGuard, rate, pursuit);
+
+impl MeasurementGuard {
+    /// Judges a sample that is out of range, or comes after one.
+    #[cold]
+    fn follows(&mut self, sample: &RateMeasurement) -> bool {
+        let (Some(motion), ALL) = (self.motion, sample.valid) else { return false };
+        let (rate, tick) = (&sample.omega_rad_s, sample.stamp.tick);
+        let follows = motion.follows(&mut self.pursuit, tick, rate, &sample.applied_rad_s2, self.rate.bounds());
+        if follows {
+            self.rate.believe(&sample.stamp, rate, ALL);
+        }
+        follows
+    }
+}
 
 impl Guard<RateMeasurement> for MeasurementGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateMeasurement) -> bool {
         sample.valid & self.needed == self.needed
             && within(&sample.applied_rad_s2, self.acceleration_rad_s2)
-            && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid)
+            && if self.rate.accepts(&sample.stamp, &sample.omega_rad_s, sample.valid) {
+                self.pursuit.stop();
+                true
+            } else {
+                (self.pursuit.active() || !self.rate.contains(&sample.omega_rad_s)) && self.follows(sample)
+            }
     }
 }
 
@@ -214,6 +286,7 @@ fn within(values: &[f64; 3], limit: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::role::DOUBTS;
     use crate::sample::Stamp;
 
     const LIMITS: Limits = Limits {
@@ -226,6 +299,7 @@ mod tests {
 
     fn sensed(driven: bool) -> Sensed {
         let zero = Vector3::zeros();
+        let driven = driven.then(|| RigidBody::with_coefficients(Vector3::new(-0.5, 0.5, 0.2)));
         Sensed { coefficients: Vector3::repeat(0.5), factor: Vector3::repeat(2.0), driven, deviation: zero, bias: zero }
     }
 
@@ -242,6 +316,39 @@ mod tests {
             assert!(!guard.accepts(&measurement(1, 1.0 + 1.01e-3 * slew)));
             assert!(guard.accepts(&measurement(1, 1.0 + 0.99e-3 * slew)));
         }
+    }
+
+    /// A body under a constant command that was driven beyond its range, as its sensor shows it: through `seen`.
+    fn believed(seen: impl Fn(u64, Vector3<f64>) -> Vector3<f64>) -> Vec<u64> {
+        let (sensed, applied) = (sensed(true), Vector3::new(4.0, -2.0, 1.0));
+        let (body, mut rate) = (sensed.driven.unwrap(), Vector3::new(2.5, -1.0, 1.5));
+        let mut guard = LIMITS.measurement(&sensed, 1e-3, ALL);
+        assert!(guard.accepts(&measurement(0, 1.0)));
+        let accepts = |tick: &u64| {
+            let mut sample = measurement(*tick, 0.0);
+            (sample.omega_rad_s, sample.applied_rad_s2) = (seen(*tick, rate).into(), applied.into());
+            rate = body.flow(&rate, &applied.component_div(&sensed.factor), 1e-3);
+            guard.accepts(&sample)
+        };
+        (1..100).filter(accepts).collect()
+    }
+
+    #[test]
+    fn a_body_beyond_its_range_that_moves_as_it_must_is_believed_after_a_few_doubts() {
+        assert_eq!(believed(|_, rate| rate), (1 + DOUBTS..100).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_sensor_beyond_the_range_that_lies_is_not_believed() {
+        const NEVER: [u64; 0] = [];
+        let stuck = Vector3::new(2.5, -1.0, 1.5);
+        assert_eq!(believed(|_, _| stuck), NEVER);
+        assert_eq!(believed(|_, rate| 1.5 * rate), NEVER);
+        assert_eq!(believed(|_, rate| rate + Vector3::new(50.0, 0.0, 0.0)), NEVER);
+        assert_eq!(believed(|tick, rate| if tick % 5 == 0 { 3.0 * rate } else { rate }), NEVER);
+        assert_eq!(believed(|_, _| Vector3::repeat(f64::MAX)), NEVER);
+        let then_stuck = believed(|tick, rate| if tick < 30 { rate } else { stuck });
+        assert_eq!(then_stuck, (1 + DOUBTS..30).collect::<Vec<_>>());
     }
 
     #[test]

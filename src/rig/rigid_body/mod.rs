@@ -144,13 +144,19 @@ impl RigidBodyRig {
         }
     }
 
+    /// A body as it moves, with its own inertia.
+    fn moved(&self, index: usize) -> RigidBody {
+        let own = self.inertia.moments_kg_m2().component_mul(&self.inertia_factors[index]);
+        Inertia::new(own.into()).map_or(RigidBody::new(&self.inertia), |own| RigidBody::new(&own))
+    }
+
     /// A body as its measurements show it.
     fn sensed(&self, index: usize) -> Sensed {
         Sensed {
             // A follower may have another inertia.
             coefficients: if index == 0 { self.leader_coefficients() } else { Vector3::repeat(1.0) },
             factor: self.inertia_factors[index],
-            driven: self.bodies[index].driven,
+            driven: self.bodies[index].driven.then(|| self.moved(index)),
             deviation: self.deviations_rad_s[index],
             bias: self.biases_rad_s[index],
         }
@@ -200,13 +206,11 @@ impl Rig for RigidBodyRig {
     }
 
     fn body(&self, index: usize) -> RatePlant {
-        let factor = self.inertia_factors[index];
-        let own = self.inertia.moments_kg_m2().component_mul(&factor);
         RatePlant {
-            body: Inertia::new(own.into()).map_or(RigidBody::new(&self.inertia), |own| RigidBody::new(&own)),
+            body: self.moved(index),
             rate: self.initial_rates[index],
             asked: Vector3::zeros(),
-            inertia_factor: factor,
+            inertia_factor: self.inertia_factors[index],
             measured: if index == 0 { self.measured } else { ALL },
             noise: self.noise[index].clone(),
             outages: if index == 0 { self.outages.clone() } else { Vec::new() },

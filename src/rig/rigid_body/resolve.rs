@@ -44,7 +44,7 @@ pub(in crate::rig) fn resolve(
         noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
         deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
         biases_rad_s: vec![raw.leader.bias_rad_s.into()],
-        limits: design_limits(&raw, &inertia, checks),
+        limits: design_limits(&raw, &inertia, supplied_axis, checks),
         notes,
         tick_s: frame.tick_s,
         certificate: None,
@@ -106,7 +106,7 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
     outages
 }
 
-fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limits {
+fn design_limits(raw: &Raw, inertia: &Inertia, hidden: Option<usize>, checks: &mut Checks<'_>) -> Limits {
     let fastest =
         |rates: &mut dyn Iterator<Item = [f64; 3]>| rates.map(|rate| Vector3::from(rate).norm()).fold(0.0, f64::max);
     let noisy = raw.leader.noise_rad_s != [0.0; 3] || raw.observer.decay_rate_per_s.is_none();
@@ -114,6 +114,8 @@ fn design_limits(raw: &Raw, inertia: &Inertia, checks: &mut Checks<'_>) -> Limit
     let about = Circumstances {
         leader_rad_s: inertia.rate_bound_rad_s(&raw.leader.initial_rate_rad_s.into()),
         follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.fastest().into())),
+        guess_error_rad_s: hidden
+            .map_or(0.0, |axis| (raw.observer.initial_guess_rad_s - raw.leader.initial_rate_rad_s[axis - 1]).abs()),
         transient_rad_s: raw.observer.initial_guess_rad_s.abs()
             + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
         // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.
