@@ -1,0 +1,227 @@
+//! Files, overrides, options and command lines that make no sense, and what `corotate check` prints beside them.
+
+use super::common::{Bench, shipped};
+use super::{FILE, PAIR, assert_says, place, refused, refused_in, with};
+use corotate::config::{SHIPPED, Scenario};
+
+#[test]
+fn what_is_no_file_is_refused() {
+    let bench = Bench::new();
+    std::fs::create_dir(bench.path("directory")).unwrap();
+    std::fs::write(bench.path("file"), PAIR).unwrap();
+    for command in ["run", "check"] {
+        for (path, reason) in [
+            ("nowhere.toml", "No such file"),
+            ("directory", "Is a directory"),
+            ("directory/nowhere.toml", "No such file"),
+            ("file/below.toml", "Not a directory"),
+            ("/dev/zero", "longer than"),
+            ("/dev/null", "name: is missing"),
+        ] {
+            let done = refused_in(&bench, &[command, path]);
+            assert!(
+                done.stderr.starts_with(&format!("corotate: {path}: ")) && done.stderr.contains(reason),
+                "{done:?}"
+            );
+            assert!(done.stderr.contains("give the path of a scenario file") || path == "/dev/null", "{done:?}");
+            assert!(done.stdout.is_empty() && done.stderr.lines().count() == 1, "{done:?}");
+        }
+    }
+}
+
+#[test]
+fn an_override_that_cannot_be_read_is_refused() {
+    let deep = format!("{}=1", vec!["a"; 60_000].join("."));
+    let nested = format!("tick_hz={}", "[".repeat(100_000));
+    for (argument, reason) in [
+        ("tick_hz", "no `=`"),
+        ("", "no `=`"),
+        ("=", "neither TOML nor a bare word"),
+        ("=1", "key is empty"),
+        (".=1", "key is empty"),
+        ("tick_hz.=1", "key is empty"),
+        ("leader..x=1", "key is empty"),
+        ("follower.7.name=x", "no 7"),
+        ("follower.1.name=x", "no 1"),
+        ("follower[1].name=x", "no 1"),
+        ("follower.one.name=x", "not a position"),
+        ("follower.-1.name=x", "not a position"),
+        ("follower.99999999999999999999.name=x", "not a position"),
+        ("name.x=1", "plain value"),
+        ("leader.inertia_kg_m2.0.x=1", "plain value"),
+        ("tick_hz=", "neither TOML nor a bare word"),
+        ("tick_hz=[1,", "neither TOML nor a bare word"),
+        ("tick_hz='x", "neither TOML nor a bare word"),
+        ("tick_hz=a b", "neither TOML nor a bare word"),
+        ("tick_hz==5", "neither TOML nor a bare word"),
+        ("tick_hz=1\nname=\"x\"", "neither TOML nor a bare word"),
+        ("name=\u{1b}[31m", "neither TOML nor a bare word"),
+        (&deep, "no key lies so deep"),
+        (&nested, "neither TOML nor a bare word"),
+    ] {
+        let shown: String = argument.chars().take_while(|c| !c.is_control()).take(100).collect();
+        let lines = refused(PAIR, &["--set", argument]);
+        assert_eq!(lines.len(), 1, "{lines:?}");
+        assert_says(&lines, &format!("corotate: --set {shown}"), &[reason, "write --set key=value"]);
+    }
+}
+
+#[test]
+fn an_override_is_checked_as_a_file_is_and_named_as_the_place() {
+    for (argument, key, parts) in [
+        ("tick_herz=1000", "tick_herz", ["unknown key", "did you mean `tick_hz`?"]),
+        ("zzz=1", "zzz", ["unknown key", "known here"]),
+        ("a.b.c=1", "a", ["unknown key", "known here"]),
+        ("leader.inertia=[1,2,2.5]", "leader.inertia", ["unknown key", "did you mean `inertia_kg_m2`?"]),
+        ("observer.x.y.z=1", "observer.x", ["unknown key", "known here"]),
+        ("accept.foo=1", "accept.foo", ["unknown criterion", "known here"]),
+        ("tick_hz=0", "tick_hz", ["outside", "give a rate"]),
+        ("tick_hz=1e", "tick_hz", ["got string", "give a number"]),
+        ("duration_s=nan", "duration_s", ["not a finite number", "give"]),
+        ("leader.inertia_kg_m2.1=inf", "leader.inertia_kg_m2[1]", ["not a finite number", "give"]),
+        ("leader.inertia_kg_m2[1]=inf", "leader.inertia_kg_m2[1]", ["not a finite number", "give"]),
+        ("leader.inertia_kg_m2=[1,1,1]", "leader.inertia_kg_m2", ["sphere", "differ"]),
+        ("leader.measured_axes=[1,1]", "leader.measured_axes", ["exactly one", "name two"]),
+        ("leader=1", "leader", ["got integer", "give a table"]),
+        ("leader={}", "leader.inertia_kg_m2", ["is missing", "add it"]),
+        ("follower.0=3", "follower[0]", ["got integer", "give a table"]),
+        ("follower.0.name=observer", "follower[0].name", ["taken", "choose another"]),
+        ("follower[0].name=observer", "follower[0].name", ["taken", "choose another"]),
+        ("realtime.cores=fast", "realtime.cores", ["no such choice", "give"]),
+        ("rig=rigidbody", "rig", ["there is no rig", "did you mean `rigid-body`?"]),
+        ("clock=fast", "clock", ["no choice `fast`", "known here"]),
+    ] {
+        assert_says(&refused(PAIR, &["--set", argument]), &format!("corotate: --set {argument}: {key}: "), &parts);
+    }
+    let last = refused(PAIR, &["--set", "tick_hz=0", "--set", "tick_hz=-1", "--json"]);
+    assert_says(&last, "corotate: --set tick_hz=-1: tick_hz: ", &["outside"]);
+    assert_eq!(last.len(), 1, "the first is overridden: {last:?}");
+}
+
+#[test]
+fn options_are_checked_as_their_keys_are() {
+    for (option, value, key, parts) in [
+        ("--clock", "nonsense", "clock", ["no choice `nonsense`", "known here"]),
+        ("--clock", "1", "clock", ["got", "give"]),
+        ("--clock", "", "clock", ["neither TOML", "write"]),
+        ("--duration", "nan", "duration_s", ["not a finite number", "give"]),
+        ("--duration", "inf", "duration_s", ["not a finite number", "give"]),
+        ("--duration", "0", "duration_s", ["ticks", "give a length"]),
+        ("--duration", "-1", "duration_s", ["ticks", "give a length"]),
+        ("--duration", "10s", "duration_s", ["got string \"10s\"", "give a number"]),
+        ("--tick-hz", "0", "tick_hz", ["outside", "give a rate"]),
+        ("--tick-hz", "-5", "tick_hz", ["outside", "give a rate"]),
+        ("--tick-hz", "fast", "tick_hz", ["got string", "give a number"]),
+        ("--external", "nosuch", "--external nosuch", ["no such role", "has: leader, follower, observer, controller"]),
+        ("--external", "", "--external", ["no such role", "has: leader"]),
+    ] {
+        assert_says(&refused(PAIR, &[option, value]), "corotate: ", &[key, parts[0], parts[1]]);
+    }
+    let alone = refused(PAIR, &["--external", "follower", "--clock", "in-process"]);
+    assert_says(&alone, "corotate: --external follower: ", &["one process", "give --clock realtime or lockstep"]);
+}
+
+#[cfg(not(feature = "foxglove"))]
+#[test]
+fn foxglove_that_was_left_out_of_the_build_is_refused() {
+    for arguments in [&["run", "--foxglove"][..], &["run", "--foxglove", "0.0.0.0:9000"], &["foxglove"]] {
+        let done = refused_in(&Bench::new(), arguments);
+        assert!(done.stderr.contains("build it with `cargo build --release --features foxglove`"), "{done:?}");
+    }
+}
+
+#[cfg(not(feature = "parquet"))]
+#[test]
+fn parquet_that_was_left_out_of_the_build_is_refused() {
+    let bench = Bench::new();
+    for options in [&["--parquet", "tables"][..], &["--csv", "tables", "--parquet", "tables"]] {
+        let done = refused_in(&bench, &[&["export", "nosuch.mcap"], options].concat());
+        assert!(done.stderr.contains("--parquet: this program was built without Parquet; build it with"), "{done:?}");
+        assert!(done.stderr.contains("`cargo build --release --features parquet`"), "{done:?}");
+        assert!(!bench.path("tables").exists());
+    }
+}
+
+#[test]
+fn a_command_line_that_makes_no_sense_is_refused() {
+    let bench = Bench::new();
+    let path = bench.path("");
+    let pair = shipped("rigid-pair").display().to_string();
+    let cases: [(&[&str], &str, &str); 26] = [
+        (&["nosuch"], "unrecognized subcommand 'nosuch'", "--help"),
+        (&["--nosuch"], "unexpected argument '--nosuch'", "--help"),
+        (&[""], "unrecognized subcommand", "--help"),
+        (&["run", "--nosuch"], "unexpected argument '--nosuch'", "--help"),
+        (&["run", "a.toml", "b.toml"], "unexpected argument 'b.toml'", "--help"),
+        (&["run", "--set"], "a value is required for '--set <KEY=VALUE>'", "--help"),
+        (&["run", "--external", "x"], "no such role", "has: leader"),
+        (&["run", "--set", "tick_herz=1"], "--set tick_herz=1", "did you mean"),
+        (&["check"], "<FILES>", "--help"),
+        (&["seat"], "<FILE>", "--help"),
+        (&["seat", "nosuch.toml"], "<ROLE>", "--help"),
+        (&["seat", "nosuch.toml", "leader"], "nosuch.toml: cannot be read", "give the path of a scenario file"),
+        (&["seat", &pair, "nosuch"], "no role `nosuch`", "it has: leader, follower, observer, controller"),
+        (&["seat", &pair, "leader", "--clock", "in-process"], "no seats", "give --clock realtime or lockstep"),
+        (&["seat", &pair, "leader", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
+        (&["init"], "<NAME>", "--help"),
+        (&["init", "nosuch"], "no scenario `nosuch`", "there are: rigid-pair"),
+        (&["init", ""], "no scenario ``", "there are: rigid-pair"),
+        (&["plant"], "--domain <DIR>", "--help"),
+        (&["plant", "--domain", "/nonexistent"], "--body <NAME>", "--help"),
+        (
+            &["plant", "--domain", "/nonexistent", "--body", "leader"],
+            "not the domain of a run",
+            "`corotate run` prints it",
+        ),
+        (&["observer", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
+        (&["observer", "--domain", path.to_str().unwrap()], "not the domain of a run", "`corotate run` prints it"),
+        (&["export", "nosuch.mcap"], "<--csv <DIR>|--parquet <DIR>>", "--help"),
+        (&["controller", "--domain", "."], "not the domain of a run", "`corotate run` prints it"),
+        (&["controller", "--domain", ""], "a value is required for '--domain <DIR>'", "--help"),
+    ];
+    for (arguments, reason, remedy) in cases {
+        let done = refused_in(&bench, arguments);
+        assert!(done.stdout.is_empty() && done.stderr.contains(reason) && done.stderr.contains(remedy), "{done:?}");
+    }
+}
+
+#[test]
+fn check_prints_the_good_among_the_bad() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("good.toml"), PAIR).unwrap();
+    let bad = with(PAIR, "tick_hz", "0");
+    std::fs::write(bench.path(FILE), &bad).unwrap();
+    let alone = bench.run(&["check", "good.toml"]);
+    assert_eq!((alone.code, alone.stderr.as_str()), (Some(0), ""));
+    for files in [["good.toml", FILE], [FILE, "good.toml"]] {
+        let done = refused_in(&bench, &["check", files[0], files[1]]);
+        assert_eq!(done.stdout, alone.stdout);
+        assert!(done.stderr.starts_with(&format!("corotate: {}: tick_hz: ", place(&bad, "tick_hz"))), "{done:?}");
+    }
+}
+
+#[test]
+fn what_check_prints_is_the_scenario_it_checked() {
+    let bench = Bench::new();
+    for (name, text) in SHIPPED {
+        let path = shipped(name);
+        let done = bench.run(&["check", path.to_str().unwrap()]);
+        assert_eq!((done.code, done.stderr.as_str()), (Some(0), ""), "{name}");
+        let resolved = Scenario::load(&path, &[]).unwrap().to_toml();
+        assert_eq!(Scenario::parse(&done.stdout, name, &[]).unwrap().to_toml(), resolved);
+        assert_eq!(Scenario::parse(&resolved, name, &[]).unwrap().to_toml(), resolved);
+        assert_eq!(Scenario::parse(text, name, &[]).unwrap().to_toml(), resolved, "as built in");
+    }
+}
+
+#[test]
+fn a_stdout_that_takes_nothing_is_a_failure_and_no_panic() {
+    let pair = shipped("rigid-pair");
+    for arguments in [["init", "rigid-pair"], ["check", pair.to_str().unwrap()]] {
+        let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+        let output = Bench::new().command().args(arguments).stdout(full).output().unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        assert!(stderr.starts_with("corotate: cannot write to stdout: "), "{stderr}");
+    }
+}

@@ -1,0 +1,150 @@
+//! Holds the program to its word on bad input: exit code 2, one clear message with place, key, reason and remedy; nothing
+//! started, nothing left. Whatever the text, the parser answers and never panics.
+//!
+//! Most cases change one line of the shipped scenario rigid-pair; the line that must be named is found in the changed text.
+
+mod commands;
+#[path = "../common/mod.rs"]
+mod common;
+mod random;
+mod text;
+mod values;
+
+use common::{Bench, Done};
+use std::path::PathBuf;
+
+/// The text that is spoilt.
+const PAIR: &str = include_str!("../../config/rigid-pair.toml");
+/// The name that it is given, as messages must name it.
+const FILE: &str = "bad.toml";
+
+/// What one key is set to, and what must be said of it: a part of the reason, a part of the remedy.
+type Row = (&'static str, &'static str, &'static str, &'static str);
+
+/// The line numbers, from 1, and paths of all keys and tables of a text that is laid out as the shipped ones.
+fn paths(text: &str) -> Vec<(usize, String)> {
+    let mut found: Vec<(usize, String)> = Vec::new();
+    let mut table = String::new();
+    for (number, line) in (1..).zip(text.lines()) {
+        if let Some((name, _)) = line.strip_prefix("[[").and_then(|rest| rest.split_once("]]")) {
+            let of_list = |path: &&(usize, String)| path.1.starts_with(&format!("{name}[")) && path.1.ends_with(']');
+            table = format!("{name}[{}]", found.iter().filter(of_list).count());
+            found.push((number, table.clone()));
+        } else if let Some((name, _)) = line.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+            table = name.to_owned();
+            found.push((number, table.clone()));
+        } else if let Some((key, _)) = line.split_once(" = ").filter(|_| !line.starts_with('#')) {
+            found.push((number, if table.is_empty() { key.to_owned() } else { format!("{table}.{key}") }));
+        }
+    }
+    found
+}
+
+/// The keys of the spoilt text, without its tables.
+fn keys() -> Vec<String> {
+    let is_key = |number: usize| !line(number).starts_with('[');
+    paths(PAIR).into_iter().filter(|(number, _)| is_key(*number)).map(|(_, path)| path).collect()
+}
+
+/// A line of the spoilt text.
+fn line(number: usize) -> &'static str {
+    PAIR.lines().nth(number - 1).unwrap()
+}
+
+fn line_of(text: &str, key: &str) -> Option<usize> {
+    paths(text).into_iter().find(|(_, path)| path == key).map(|(number, _)| number)
+}
+
+/// The table that a key belongs to, and its name there.
+fn split(key: &str) -> (Option<&str>, &str) {
+    key.rsplit_once('.').map_or((None, key), |(table, name)| (Some(table), name))
+}
+
+/// The text with another line in the place of one, or more lines, or none.
+fn replace(text: &str, number: usize, by: &[&str]) -> String {
+    let mut lines: Vec<&str> = text.lines().collect();
+    lines.splice(number - 1..number, by.iter().copied());
+    lines.join("\n") + "\n"
+}
+
+/// The text with one key set to a value, in its place or as the first of its table.
+fn with(text: &str, key: &str, value: &str) -> String {
+    let (table, name) = split(key);
+    let line = format!("{name} = {value}");
+    match (line_of(text, key), table) {
+        (Some(number), _) => replace(text, number, &[&line]),
+        (None, Some(table)) => {
+            let head = line_of(text, table).unwrap();
+            replace(text, head, &[text.lines().nth(head - 1).unwrap(), &line])
+        }
+        (None, None) => format!("{line}\n{text}"),
+    }
+}
+
+/// The text without a table and its keys, every other line where it was.
+fn without_table(table: &str) -> String {
+    let of_table = |path: &str| path == table || path.starts_with(&format!("{table}."));
+    let gone: Vec<usize> =
+        paths(PAIR).into_iter().filter(|(_, path)| of_table(path)).map(|(number, _)| number).collect();
+    let keep = |(number, line)| if gone.contains(&number) { "" } else { line };
+    (1..).zip(PAIR.lines()).map(keep).collect::<Vec<_>>().join("\n")
+}
+
+/// Where a message must say that a key is: its line, its table's line, or the file.
+fn place(text: &str, key: &str) -> String {
+    let around = std::iter::successors(Some(key), |key| key.rfind(['.', '[']).map(|end| &key[..end]));
+    match around.into_iter().find_map(|key| line_of(text, key)) {
+        Some(number) => format!("{FILE}:{number}"),
+        None => FILE.to_owned(),
+    }
+}
+
+/// Everything that a bench's directory and runtime directory hold.
+fn contents(bench: &Bench) -> Vec<PathBuf> {
+    let command = bench.command();
+    let runtime = command.get_envs().find(|(name, _)| *name == "XDG_RUNTIME_DIR").and_then(|(_, value)| value).unwrap();
+    let directories = [bench.path(""), PathBuf::from(runtime)];
+    directories.iter().flat_map(|path| std::fs::read_dir(path).unwrap()).map(|entry| entry.unwrap().path()).collect()
+}
+
+/// Runs what must be refused before anything is started, and returns what it says.
+fn refused_in(bench: &Bench, arguments: &[&str]) -> Done {
+    let before = contents(bench);
+    let done = bench.run(arguments);
+    assert_eq!(done.code, Some(2), "{done:?}");
+    assert!(!done.stderr.is_empty() && !done.stderr.contains("panicked"), "{done:?}");
+    // A message that fills the screen, or paints on it, is not clear.
+    assert!(done.stderr.lines().all(|line| line.len() < 2000 && !line.contains(char::is_control)), "{done:?}");
+    assert_eq!(contents(bench), before, "something was left");
+    assert!(bench.processes().is_empty(), "something was started and still runs");
+    done
+}
+
+/// Runs a text that must be refused, and returns the lines that say why.
+fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
+    let bench = Bench::new();
+    std::fs::write(bench.path(FILE), text).unwrap();
+    let done = refused_in(&bench, &[&["run", FILE], arguments].concat());
+    assert_eq!(done.stdout, "", "{done:?}");
+    let lines: Vec<String> = done.stderr.lines().map(str::to_owned).collect();
+    assert!(lines.iter().all(|line| line.starts_with("corotate: ")), "{lines:?}");
+    assert!(lines.len() <= 3, "one fault, {} findings: {lines:?}", lines.len());
+    lines
+}
+
+/// Asserts that one of the lines says all of this.
+fn assert_says(lines: &[String], start: &str, parts: &[&str]) {
+    let says = |line: &String| line.starts_with(start) && parts.iter().all(|part| line.contains(part));
+    assert!(lines.iter().any(says), "expected {start:?} and {parts:?}, got {lines:#?}");
+}
+
+/// Asserts that a text is refused for one key, in the right place.
+fn assert_refused(text: &str, key: &str, parts: &[&str]) {
+    assert_says(&refused(text, &[]), &format!("corotate: {}: {key}", place(text, key)), parts);
+}
+
+fn assert_all_refused(rows: &[Row]) {
+    for (key, value, reason, remedy) in rows {
+        assert_refused(&with(PAIR, key, value), key, &[reason, remedy]);
+    }
+}
