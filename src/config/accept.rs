@@ -82,7 +82,7 @@ fn check_instant(path: &str, value: f64, duration_s: f64, checks: &mut Checks<'_
     checks.require(value < duration_s, path, || {
         format!(
             "{value} s is not before the end of the run at {duration_s} s, so nothing would be judged; lower it or raise \
-             duration_s"
+             duration_s, or judge nothing with --set accept={{}}"
         )
     });
 }

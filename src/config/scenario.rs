@@ -111,16 +111,17 @@ impl Scenario {
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
-        let accept = accept::resolve(&raw.accept, raw.duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        // Nothing is concluded from a length or a tick that is refused.
+        let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
+        let accept = accept::resolve(&raw.accept, duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
         check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
-            // Of a tick that is refused nothing is concluded.
-            let last_tick = if tick_possible(raw.tick_hz) { last_tick } else { u64::MAX };
+            let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
             let setting = fault::Setting { rig, last_tick, seed: raw.seed };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
-            watch = watchdog::resolve(&raw.watchdog, rig, tick_s, raw.duration_s, &mut checks);
+            watch = watchdog::resolve(&raw.watchdog, rig, tick_s, duration_s, &mut checks);
         }
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
@@ -236,6 +237,11 @@ fn tick_possible(tick_hz: f64) -> bool {
     (MIN_TICK_HZ..=MAX_TICK_HZ).contains(&tick_hz)
 }
 
+/// Whether a run can have so many ticks. Where the tick is refused, no number of ticks is known.
+fn length_possible(raw: &Raw) -> bool {
+    !tick_possible(raw.tick_hz) || (1.0..=MAX_TICKS).contains(&(raw.duration_s * raw.tick_hz))
+}
+
 fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     let named = !raw.name.is_empty()
         && raw.name.len() <= 32
@@ -245,16 +251,14 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     });
     checks.require(tick_possible(raw.tick_hz), "tick_hz", || {
         format!(
-            "a tick of {} Hz is outside what latencies are kept for; give a rate from {MIN_TICK_HZ} to {MAX_TICK_HZ} Hz",
+            "{} Hz is outside the range of tick rates; give a rate from {MIN_TICK_HZ} to {MAX_TICK_HZ} Hz",
             raw.tick_hz
         )
     });
-    if tick_possible(raw.tick_hz) {
+    checks.require(length_possible(raw), "duration_s", || {
         let ticks = raw.duration_s * raw.tick_hz;
-        checks.require((1.0..=MAX_TICKS).contains(&ticks), "duration_s", || {
-            format!("{} s is {ticks} ticks; give a length of 1 to {MAX_TICKS:e} ticks", raw.duration_s)
-        });
-    }
+        format!("{} s is {ticks} ticks; give a length of 1 to {MAX_TICKS:e} ticks", raw.duration_s)
+    });
     checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", || {
         "0 would make every tick unsafe; give at least 1".to_owned()
     });

@@ -59,6 +59,17 @@ fn nothing_else_is_said_of_a_tick_that_cannot_be() {
 }
 
 #[test]
+fn nothing_else_is_said_of_a_length_that_cannot_be() {
+    for duration_s in ["0", "-5", "1e-9", "1e12"] {
+        assert_eq!(refused(with(PAIR, "duration_s", duration_s), &[]).len(), 1, "{duration_s}");
+        for (name, text) in SHIPPED {
+            let message = Scenario::parse(&with(text, "duration_s", duration_s), FILE, &[]).unwrap_err().to_string();
+            assert_eq!(message.lines().count(), 1, "{name} for {duration_s} s: {message}");
+        }
+    }
+}
+
+#[test]
 fn a_leader_is_a_body_with_one_hidden_axis() {
     assert_all_refused(&[
         ("leader.inertia_kg_m2", "[0.0, 2.0, 2.5]", "I1 = 0 is not", "above zero"),
