@@ -1,4 +1,4 @@
-//! `corotate check`: validate scenarios and tell what is proven of them.
+//! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
 use crate::{Exit, fail, say};
 use corotate::analysis::{Claim, claims, digits};
@@ -71,7 +71,11 @@ fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     for limit in scenario.rig.limits() {
         writeln!(text, "# limit: {}: {}", limit.name, digits(limit.value))?;
     }
-    claims(scenario).iter().try_for_each(|claim| tell_claim(claim, text))
+    let claims = claims(scenario);
+    if claims.is_empty() {
+        writeln!(text, "# no body is driven, so there is no loop to claim anything of")?;
+    }
+    claims.iter().try_for_each(|claim| tell_claim(claim, text))
 }
 
 fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
@@ -104,5 +108,7 @@ fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
             None => writeln!(text, "#   {metric} from {from} to {limit}: never, it is below the floor")?,
         }
     }
-    claim.warnings.iter().try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
+    // The reason why no rate is claimed is a warning too, and is told above.
+    let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
+    others.try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
 }

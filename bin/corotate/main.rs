@@ -43,7 +43,7 @@ Exit codes: 0 ok, 1 failure while running, 2 usage or configuration, 3 acceptanc
 Examples:
   corotate                                       the shipped scenario rigid-pair
   corotate init rigid-trio > trio.toml           a commented scenario to start from
-  corotate check trio.toml                       validate it, print what is proven of it
+  corotate check trio.toml                       validate it, print what may be claimed of its loop
   corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
   corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
   corotate seat trio.toml follower-a             what that program must know, as JSON
@@ -60,7 +60,7 @@ Examples:
 enum Command {
     /// Run a scenario to its end and tell how it went
     Run(run::Arguments),
-    /// Validate scenarios; print each as resolved, with its convergence certificate
+    /// Validate scenarios; print each as resolved, with what may be claimed of its loop
     Check(check::Arguments),
     /// Print a commented scenario to start from
     Init(init::Arguments),
