@@ -300,7 +300,7 @@ impl Screen {
             Progress::Running { tick, last_tick, metric } => {
                 let bar = self.bar.get_or_insert_with(|| bar(*last_tick));
                 bar.set_position(*tick);
-                bar.set_message(format!("{metric:.2e}"));
+                bar.set_message(if metric.is_nan() { "-".to_owned() } else { format!("{metric:.2e}") });
             }
         }
     }

@@ -62,7 +62,7 @@ pub(crate) fn lyapunov_floor(tick_s: f64) -> f64 {
 pub struct MetricScore {
     /// Its name; the unit is the last part.
     pub name: String,
-    /// At the last tick that could be scored.
+    /// At the last tick that could be scored; NaN where none could.
     pub last: f64,
     /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
     pub settled_max: Option<f64>,

@@ -81,7 +81,7 @@ fn results(summary: &Summary, text: &mut String) {
         let criterion = summary.criteria.iter().find(|criterion| criterion.name == format!("{}_max", metric.name));
         rows.add_row([
             metric.name.clone(),
-            format!("{:.2e}", metric.last),
+            if metric.last.is_nan() { "-".to_owned() } else { format!("{:.2e}", metric.last) },
             metric.settled_max.map_or("-".to_owned(), |value| format!("{value:.2e}")),
             criterion.map_or("-".to_owned(), |criterion| format!("{:.0e}", criterion.limit)),
             metric.settled_at_s.map_or("-".to_owned(), |time| format!("{time:.3} s")),
