@@ -145,8 +145,14 @@ pub(crate) fn require_own(file: &File) -> io::Result<()> {
     if about.is_file() && about.uid() == user() && about.nlink() == 1 {
         return Ok(());
     }
-    let owner = user_name(about.uid());
-    Err(io::Error::other(format!("not a file of this program, but one of {owner} with {} names", about.nlink())))
+    let reason = if !about.is_file() {
+        "it is not a regular file".to_owned()
+    } else if about.uid() != user() {
+        format!("it belongs to {}", user_name(about.uid()))
+    } else {
+        format!("it has {} hard links", about.nlink())
+    };
+    Err(io::Error::other(format!("not a file of this program: {reason}")))
 }
 
 /// A directory that is open, so that what is done in it happens there, whatever becomes of its name.

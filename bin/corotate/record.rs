@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain: `corotate run` names it while it waits for a role, and lists it as `domain` in its summary
+    /// The run's domain, a directory: `corotate run --external ROLE` prints it while it waits for that role
     #[arg(long, value_name = "DIR")]
     domain: PathBuf,
     /// The file to write

@@ -5,8 +5,9 @@
 //! in a directory there that is private too, and `shared` in the domain's directory leads to it; the transport's beside it,
 //! under a prefix that nobody knows before the first of them is made.
 //!
-//! Knows files and locks, and of the transport only which of its files it would leave open to everybody. The lock says whether the run is alive; the kernel lets go of it when the
-//! launcher dies, however it dies. Must not touch a domain whose lock is held, nor what another user has put beside it.
+//! Knows files and locks, and of the transport only which of its files it would leave open to everybody. The lock says whether
+//! the run is alive; the kernel lets go of it when the launcher dies, however it dies. Must not touch a domain whose lock is
+//! held, nor what another user has put beside it.
 
 use crate::files::{PrivacyError, require_private, user, user_name};
 use crate::system::{random_bits, remedy};
@@ -109,14 +110,14 @@ pub enum DomainError {
         /// Files that a run may make.
         needed: u64,
     },
-    /// The directory's path is too long for the transport's sockets.
+    /// The directory's path is too long for the transport's files.
     #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for the transport's files; set XDG_RUNTIME_DIR to a shorter one", path.display())]
     TooLong {
         /// The path.
         path: PathBuf,
     },
     /// The path is not a domain.
-    #[error("{} is not the domain of a run; `corotate run` prints it", path.display())]
+    #[error("{} is not the domain of a run; the domains of your runs are in {}", path.display(), base().display())]
     NotADomain {
         /// The path as given.
         path: PathBuf,

@@ -100,7 +100,7 @@ impl Machine {
                 Check::bad(name, format!("{mode}, of PREEMPT_DYNAMIC"), remedy)
             }
             (_, _, Some(mode)) => Check::warn(name, format!("{mode}, of PREEMPT_DYNAMIC"), remedy),
-            (true, _, None) => Check::warn(name, "PREEMPT_DYNAMIC, in a mode that is not told to us", remedy),
+            (true, _, None) => Check::warn(name, "PREEMPT_DYNAMIC, in a mode that cannot be read", remedy),
             (_, true, None) => Check::warn(name, "PREEMPT", remedy),
             _ if version.is_empty() => Check::warn(name, "unknown", remedy),
             _ => Check::bad(name, "none, or voluntary", remedy),
@@ -219,8 +219,12 @@ impl Machine {
         let average = self.read("proc/loadavg").and_then(|text| text.split_whitespace().next()?.parse::<f64>().ok());
         match average {
             Some(load) if load > cores as f64 => {
-                let found = format!("{load:.2} on {cores} cores: more wants to run than can");
-                Check::warn(name, found, "end what need not run; without SCHED_FIFO the loop gets its share only")
+                let found = format!("{load:.2} on {cores} cores: more threads want to run than there are cores");
+                Check::warn(
+                    name,
+                    found,
+                    "end programs that are not needed; without SCHED_FIFO the loop shares its cores with them",
+                )
             }
             Some(load) => Check::ok(name, format!("{load:.2}")),
             None => Check::ok(name, "unknown"),

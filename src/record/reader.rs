@@ -146,7 +146,7 @@ impl Recording {
         let run = content.metadata.remove(RUN).ok_or_else(|| match flaw.clone() {
             Some(Flaw::Damaged(reason)) if content.begun => RecordError::Damaged { path: path.to_owned(), reason },
             Some(Flaw::Damaged(reason)) => not_ours(reason),
-            Some(Flaw::Cut(reason)) => not_ours(format!("{reason}, before it says anything of a run")),
+            Some(Flaw::Cut(reason)) => not_ours(format!("{reason}, before anything was written about a run")),
             None => not_ours("it says nothing of a run".to_owned()),
         })?;
         let info = RunInfo::read(&run, content.metadata.get(END)).map_err(not_ours)?;
@@ -598,7 +598,7 @@ fn scan(
     Ok(None)
 }
 
-const CUT: &str = "it has no end: its recorder was killed, or there was no room";
+const CUT: &str = "it has no end: its recorder was killed, or the disk was full";
 
 /// A file that becomes shorter while it is read has no end.
 fn cut_meanwhile(error: io::Error) -> io::Result<bool> {

@@ -162,7 +162,11 @@ fn a_command_line_that_makes_no_sense_is_refused() {
         (&["seat", "nosuch.toml", "leader"], "nosuch.toml: cannot be read", "give the path of a scenario file"),
         (&["seat", &pair, "nosuch"], "no role `nosuch`", "it has: leader, follower, observer, controller"),
         (&["seat", &pair, "leader", "--clock", "in-process"], "no seats", "give --clock realtime or lockstep"),
-        (&["seat", &pair, "leader", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
+        (
+            &["seat", &pair, "leader", "--domain", "/nonexistent"],
+            "not the domain of a run",
+            "the domains of your runs are in",
+        ),
         (&["init"], "<NAME>", "--help"),
         (&["init", "nosuch"], "no scenario `nosuch`", "there are: rigid-pair"),
         (&["init", ""], "no scenario ``", "there are: rigid-pair"),
@@ -171,12 +175,16 @@ fn a_command_line_that_makes_no_sense_is_refused() {
         (
             &["plant", "--domain", "/nonexistent", "--body", "leader"],
             "not the domain of a run",
-            "`corotate run` prints it",
+            "the domains of your runs are in",
         ),
-        (&["observer", "--domain", "/nonexistent"], "not the domain of a run", "`corotate run` prints it"),
-        (&["observer", "--domain", path.to_str().unwrap()], "not the domain of a run", "`corotate run` prints it"),
+        (&["observer", "--domain", "/nonexistent"], "not the domain of a run", "the domains of your runs are in"),
+        (
+            &["observer", "--domain", path.to_str().unwrap()],
+            "not the domain of a run",
+            "the domains of your runs are in",
+        ),
         (&["export", "nosuch.mcap"], "<--csv <DIR>|--parquet <DIR>>", "--help"),
-        (&["controller", "--domain", "."], "not the domain of a run", "`corotate run` prints it"),
+        (&["controller", "--domain", "."], "not the domain of a run", "the domains of your runs are in"),
         (&["controller", "--domain", ""], "a value is required for '--domain <DIR>'", "--help"),
     ];
     for (arguments, reason, remedy) in cases {

@@ -61,7 +61,7 @@ impl IoxBus {
             let unfinished =
                 self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
             let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
-            reason = format!("{reason} for {limit_s} s: whoever makes it stands still{files}");
+            reason = format!("{reason} for {limit_s} s: the process that creates it makes no progress{files}");
         } else {
             let remedy = format!("is another process of this run its {end}, or of another version?");
             reason = cause::reason(|| format!("{reason}; {remedy}"));
