@@ -432,7 +432,6 @@ mod tests {
                 "raise tick_hz",
             ),
             (&["leader.initial_rate_rad_s=[0.0, 0.0, 0.8]"], "not observable"),
-            (&["leader.inertia_kg_m2=[1.0, 1.00000000000001, 1.00000000000002]"], ""),
         ] {
             let claim = claim(overrides);
             println!("{overrides:?}: {claim:?}");

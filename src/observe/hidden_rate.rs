@@ -47,8 +47,9 @@ pub enum HiddenRateError {
     },
 }
 
-/// Moments closer than this (relative) count as equal: the conic degenerates to a parabola or the body to a sphere.
-const SYMMETRY_TOLERANCE: f64 = 1e-15;
+/// The coefficients of two measured axes: one below the rounding of the other changes φ by less than rounding does and counts
+/// as zero, a parabola. Both below the rounding of the moments that they are made of are a sphere's.
+const ROUNDING: f64 = f64::EPSILON;
 
 /// The longest turn of (Ω ω_i, a_i ω_j) in one step that is safely told from its complement, rad (π is ambiguous).
 const MAX_TURN_RAD: f64 = 3.0;
@@ -199,7 +200,9 @@ impl HiddenRate {
             return Err(HiddenRateError::NoSuchAxis { axis });
         }
         let a = cyclic(coefficients, axis - 1);
-        let conic = match (a[0].abs() < SYMMETRY_TOLERANCE, a[1].abs() < SYMMETRY_TOLERANCE) {
+        let largest = a[0].abs().max(a[1].abs());
+        let negligible = |a: f64| largest < ROUNDING || a.abs() < ROUNDING * largest;
+        let conic = match (negligible(a[0]), negligible(a[1])) {
             (true, true) => return Err(HiddenRateError::Sphere { axis }),
             (false, true) => Conic::ParabolicFirst,
             (true, false) => Conic::ParabolicSecond,
@@ -234,6 +237,17 @@ impl HiddenRate {
     /// Below this, rad/s, the measured components carry no information.
     pub fn floor_rad_s(&self) -> f64 {
         self.floor_rad_s
+    }
+
+    /// By how much the rounding of the samples may move the hidden component's estimate at `rate_rad_s` and steps of `dt_s`,
+    /// rad/s.
+    ///
+    /// Of \[D\](2), ω̇_i = a_i ω_j ω_k: in one step an error of δ in ω_k changes ω_i by a_i ω_j δ dt, which rounding hides where
+    /// it is below the last bit of ω_i; ω_j the same. What can be told is told by the axis that tells more. Rounding may fall the
+    /// same way at every step, so that no filter takes it out.
+    pub fn rounding_rad_s(&self, rate_rad_s: &Vector3<f64>, dt_s: f64) -> f64 {
+        let ([ai, aj, _], [i, j, _]) = (self.a, cyclic(rate_rad_s, self.hidden));
+        ROUNDING / ((ai * j / i).abs().max((aj * i / j).abs()) * dt_s)
     }
 
     /// Which conic the measured components move on.
@@ -616,6 +630,24 @@ mod tests {
             let floor = run.floor(1e-3, 8.0, 10.0);
             assert!(floor < 1e-11, "{moments:?} axis {axis}: {floor:e}");
         }
+    }
+
+    #[test]
+    fn nearly_equal_moments_cost_no_more_digits_than_rounding_explains() {
+        let start = [0.6, -0.4, 0.8];
+        for exponent in [4, 6, 8, 10, 12] {
+            let d = 10.0_f64.powi(-exponent);
+            for (moments, axis) in
+                [([1.0, 1.0 + d, 1.0 + 2.0 * d], 1), ([1.0, 1.0, 1.0 + d], 2), ([1.0, 1.0 + d, 1.6], 3)]
+            {
+                let mut run = Run::new(moments, axis, start);
+                let (floor, bound) = (run.floor(1e-3, 8.0, 9.0), run.relation.rounding_rad_s(&start.into(), 1e-3));
+                assert!(floor < 10.0 * bound + 1e-11, "{moments:?} axis {axis}: {floor:e}, explained {bound:e}");
+                assert!(axis == 3 || floor > 1e-3 * bound, "{moments:?} axis {axis}: {floor:e}, explained {bound:e}");
+            }
+        }
+        let symmetric = |moments, axis| HiddenRate::new(&Inertia::new(moments).unwrap().coefficients(), axis, 1e-6);
+        assert!(symmetric([1.0, 1.0, 1.6], 1).unwrap().rounding_rad_s(&start.into(), 1e-3) < 1e-12, "axisymmetric");
     }
 
     #[test]

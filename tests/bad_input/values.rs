@@ -76,6 +76,12 @@ fn a_leader_is_a_body_with_one_hidden_axis() {
         ("leader.inertia_kg_m2", "[1.0, -2.0, 2.5]", "I2 = -2 is not", "above zero"),
         ("leader.inertia_kg_m2", "[1.0, 2.0, 3.5]", "triangle inequality", "lower I3"),
         ("leader.inertia_kg_m2", "[2.0, 2.0, 2.0]", "sphere", "give moments of inertia that differ"),
+        (
+            "leader.inertia_kg_m2",
+            "[1.0, 1.000000000001, 1.000000000002]",
+            "rounding",
+            "times as large, or lower tick_hz",
+        ),
         ("leader.inertia_kg_m2", "[1.0, 2.0]", "got 2", "give a list of 3 numbers"),
         ("leader.inertia_kg_m2", "[1.0, 2.0, 2.5, 1.0]", "got 4", "give fewer"),
         ("leader.inertia_kg_m2", "[]", "got 0", "give a list of 3 numbers"),

@@ -13,6 +13,10 @@ use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation,
 use crate::rig::{BodyInfo, FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::{Matrix3, Vector1, Vector3};
 
+/// Part of the leader's rate by which rounding may move the estimate of the hidden component. With fewer than three digits it
+/// is no estimate; a floor between that and the usual one is told with the loop's claim.
+const LARGEST_ROUNDING: f64 = 1e-3;
+
 /// Reads and checks the sections of this rig.
 pub(in crate::rig) fn resolve(
     sections: &Document,
@@ -27,7 +31,7 @@ pub(in crate::rig) fn resolve(
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
     let Some(inertia) = inertia else { return Ok((None, table)) };
     let mut notes = Vec::new();
-    let observer = design_observer(&raw, &inertia, supplied_axis, &mut notes, checks);
+    let observer = design_observer(&raw, &inertia, supplied_axis, frame.tick_s, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
@@ -132,6 +136,7 @@ fn design_observer(
     raw: &Raw,
     inertia: &Inertia,
     supplied_axis: Option<usize>,
+    tick_s: f64,
     notes: &mut Vec<String>,
     checks: &mut Checks<'_>,
 ) -> Option<ObserverDesign> {
@@ -139,7 +144,8 @@ fn design_observer(
     let floor_rad_s = observer.observability_floor_rad_s;
     if let Some(axis) = supplied_axis {
         // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
-        checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
+        let relation = checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
+        check_digits(&relation, inertia, &raw.leader.initial_rate_rad_s.into(), tick_s, checks);
     }
     let filter = FilterDesign::resolve(
         checks,
@@ -172,6 +178,29 @@ fn design_observer(
             Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
         }
     }
+}
+
+/// Rounding leaves the hidden component its digits. A body whose moments are all but equal keeps its initial rates for as long
+/// as any run lasts, so they stand for the whole motion. Where they tell nothing at all, the motion is at fault, not the body:
+/// that is for the analysis of the loop to say.
+fn check_digits(
+    relation: &HiddenRate,
+    inertia: &Inertia,
+    rate_rad_s: &Vector3<f64>,
+    tick_s: f64,
+    checks: &mut Checks<'_>,
+) {
+    let part = relation.rounding_rad_s(rate_rad_s, tick_s) / inertia.rate_bound_rad_s(rate_rad_s);
+    let (axis, lacking) = (relation.hidden() + 1, part / LARGEST_ROUNDING);
+    checks.require(!(lacking > 1.0 && lacking.is_finite()), "leader.inertia_kg_m2", || {
+        format!(
+            "axis {axis} cannot be observed: the moments are so nearly equal that in a tick of {tick_s} s the hidden \
+             component hardly changes the measured ones by more than their rounding, which may move the estimate by {part:.1e} \
+             of the leader's rate; give moments whose differences are at least {:.0} times as large, or lower tick_hz \
+             as many times",
+            lacking.ceil()
+        )
+    });
 }
 
 fn design_identifier(
