@@ -69,9 +69,12 @@ impl OrbitHold {
         self.limited(self.law(&self.ahead(leader, &Vector2::zeros()), &self.ahead(body, applied)))
     }
 
-    /// The thrust limit against what the law asks of `body` for the reference `to`, du/s²: the proof covers what is within.
+    /// The thrust limit against what the law asks of `body`, without thrust so far, for the free reference `to`, du/s²: the
+    /// proof covers what is within.
     pub fn margin(&self, to: &OrbitState, body: &OrbitState) -> Condition {
-        Condition { value: self.thrust_max, required: self.law(to, body).amax() }
+        let coasting = Vector2::zeros();
+        let asked = self.law(&self.ahead(to, &coasting), &self.ahead(body, &coasting));
+        Condition { value: self.thrust_max, required: asked.amax() }
     }
 
     /// The state after the delay; the present one where the model cannot tell.
