@@ -78,6 +78,12 @@ impl<R: Rig> Chain<R> {
         self.rig.score(|index| self.truths.get(index), |_| None, Some(&self.estimate), out);
     }
 
+    /// Which body's motion has ended, and how, if one's has.
+    pub fn loss(&self) -> Option<String> {
+        let losses = self.truths.iter().zip(self.rig.bodies());
+        losses.filter_map(|(truth, body)| Some(format!("{} {}", body.name, self.rig.loss(truth)?))).next()
+    }
+
     /// Every number of the driven body's motion and of the estimate at the last tick that the loop is to control.
     pub fn output(&self, out: &mut Vec<f64>) {
         out.clear();

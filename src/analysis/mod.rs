@@ -304,11 +304,18 @@ impl<'a, R: Rig> Analysis<'a, R> {
         let mut largest = values.clone();
         let ticks = self.ticks_to_settle(rate_per_s);
         let (mut output, mut size) = (Vec::new(), None);
-        for _ in 0..ticks {
+        for tick in 0..ticks {
             chain.advance();
             chain.output(&mut output);
             if exceeds(norm(&output), DIVERGED * *size.get_or_insert(norm(&output))) {
                 return Err("from this start the loop diverges".to_owned());
+            }
+            if let Some(loss) = chain.loss() {
+                return Err(format!(
+                    "from this start the loop fails: {loss} after {} s; raise tick_hz, lower the gains, or begin nearer to \
+                     the reference",
+                    digits(tick as f64 * self.tick_s)
+                ));
             }
             chain.score(&mut values);
             largest.iter_mut().zip(&values).for_each(|(largest, value)| *largest = value.max(*largest));
@@ -437,6 +444,24 @@ mod tests {
             println!("{overrides:?}: {claim:?}");
             assert!(claim.loop_rate_per_s.is_none() && claim.reason.unwrap().contains(reason));
             assert!(!claim.warnings.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_start_that_ends_in_the_central_body_or_beyond_the_region_is_told() {
+        let text = SHIPPED.iter().find(|(name, _)| *name == "orbit-rendezvous").unwrap().1;
+        for (overrides, cause) in [
+            (&["tick_hz=3.0"][..], "follower meets the central body after"),
+            (
+                &["follower.0.initial_radius_du=9.9", "follower.0.initial_velocity_du_s=[2.0, 0.0]"],
+                "follower leaves the region",
+            ),
+        ] {
+            let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
+            let claim = claims(&Scenario::parse(text, "test", &overrides).unwrap()).remove(0);
+            assert!(claim.loop_rate_per_s.is_none(), "{claim:?}");
+            let warned = |part: &str| claim.warnings.iter().any(|warning| warning.contains(part));
+            assert!(warned(cause) && warned("raise tick_hz"), "{claim:?}");
         }
     }
 

@@ -128,6 +128,10 @@ pub trait Rig: Clone + Send + Sync + 'static {
         estimate: Option<&Estimate<Self>>,
         out: &mut [f64],
     );
+    /// How a body's motion has ended, as a verb with its object, if it has.
+    fn loss(&self, _truth: &Truth<Self>) -> Option<&'static str> {
+        None
+    }
     /// This rig with no other driven body than the one with this index, and that a single one, begun there, with or without
     /// noise: for the analysis of its loop. None if the rig cannot tell where that is settled.
     fn alone(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {

@@ -238,14 +238,7 @@ impl Rig for OrbitRig {
             out.fill(f64::INFINITY);
             return;
         }
-        let state = |index| {
-            truth(index).map(|truth| OrbitState {
-                r: truth.radius_du,
-                vr: truth.velocity_du_s[0],
-                theta: truth.angle_rad,
-                vtheta: truth.velocity_du_s[1],
-            })
-        };
+        let state = |index| truth(index).map(state);
         let first = state(0);
         let reference = first.map(|leader| self.reference(leader));
         let errors = self.driven().map(|index| errors(state(index), reference));
@@ -256,6 +249,17 @@ impl Rig for OrbitRig {
             (Some(estimated), Some(first)) => (estimated - Vector2::new(first.vr, first.vtheta)).norm(),
             _ => f64::NAN,
         };
+    }
+
+    /// A frozen body would meet its end again, had it gone on.
+    fn loss(&self, truth: &OrbitTruth) -> Option<&'static str> {
+        let thrust = truth.applied_du_s2.into();
+        let end = || self.field.flow(&state(truth), &thrust, self.tick_s).err();
+        (truth.status & status::FAULT != 0).then(|| match end() {
+            Some(OrbitFault::Collision { .. }) => "meets the central body",
+            Some(OrbitFault::Escape { .. }) => "leaves the region",
+            Some(OrbitFault::Unresolved { .. }) | None => "moves faster than a tick resolves",
+        })
     }
 
     fn certificates(&self) -> Vec<CertificateReport> {
@@ -299,6 +303,11 @@ impl Rig for OrbitRig {
             _ => Vec::new(),
         }
     }
+}
+
+fn state(truth: &OrbitTruth) -> OrbitState {
+    let [vr, vtheta] = truth.velocity_du_s;
+    OrbitState { r: truth.radius_du, vr, theta: truth.angle_rad, vtheta }
 }
 
 /// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)|; NaN where a sample is missing.
