@@ -453,7 +453,7 @@ mod tests {
         for (overrides, cause) in [
             (&["tick_hz=3.0"][..], "follower meets the central body after"),
             (
-                &["follower.0.initial_radius_du=9.9", "follower.0.initial_velocity_du_s=[2.0, 0.0]"],
+                &["tick_hz=50.0", "follower.0.initial_radius_du=9.9", "follower.0.initial_velocity_du_s=[2.0, 0.0]"],
                 "follower leaves the region",
             ),
         ] {

@@ -1,7 +1,7 @@
 //! The rigs `orbit-hold` and `orbit-rendezvous`: bodies about a point mass of which the first one's velocity is not measured.
 //!
 //! In `orbit-hold` that body, the spacecraft, is itself driven to a circular orbit, \[S\]. In `orbit-rendezvous` it is a free
-//! leader, and followers are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
+//! leader, and followers, if there are any, are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
 //! `resolve`, the mathematics in `model`, `observe` and `control`.
 
 mod limits;
@@ -32,11 +32,18 @@ pub struct OrbitRig {
     sensors: Vec<Sensors>,
     filter: FilterDesign<2>,
     initial_guess: Vector2<f64>,
-    gains: OrbitGains,
-    law: OrbitHold,
+    /// None where no body is driven.
+    controller: Option<ControllerDesign>,
     aim: Aim,
     limits: Limits,
     tick_s: f64,
+}
+
+/// The law of the driven bodies.
+#[derive(Debug, Clone, Copy)]
+struct ControllerDesign {
+    gains: OrbitGains,
+    law: OrbitHold,
 }
 
 /// What a body's sensors add to (r, θ, Vr, Vθ).
@@ -60,12 +67,13 @@ impl OrbitRig {
         }
     }
 
-    fn certificate(&self) -> Result<OrbitCertificate, OrbitFault> {
+    fn certificate(&self, controller: &ControllerDesign) -> Result<OrbitCertificate, OrbitFault> {
         // Full-state feedback does not wait for the observer; a gain that varies has no rate to be certified.
         let full_state = matches!(self.aim, Aim::Circle { full_state: true, .. });
         let rates = self.filter.decay_rates().filter(|_| !full_state);
         let decay = rates.map_or(Vector2::repeat(f64::INFINITY), Vector2::from);
-        OrbitCertificate::new(&self.field, &self.law, &self.gains, &decay, self.certified_radius(), self.tick_s)
+        let ControllerDesign { gains, law } = controller;
+        OrbitCertificate::new(&self.field, law, gains, &decay, self.certified_radius(), self.tick_s)
     }
 
     /// What a body is to be like, at the given state of the leader.
@@ -95,7 +103,7 @@ impl OrbitRig {
         (0..self.bodies.len()).filter(|index| self.bodies[*index].driven)
     }
 
-    fn report(&self, index: usize, certificate: &OrbitCertificate) -> CertificateReport {
+    fn report(&self, index: usize, law: &OrbitHold, certificate: &OrbitCertificate) -> CertificateReport {
         let condition = |name: &str, condition: Condition| ConditionReport {
             name: name.to_owned(),
             value: condition.value,
@@ -104,7 +112,7 @@ impl OrbitRig {
         };
         let figure = |name: &str, value: f64| Figure { name: name.to_owned(), value };
         let (reference, body) = self.first_seen(index);
-        let margin = self.law.margin(&reference, &body);
+        let margin = law.margin(&reference, &body);
         CertificateReport {
             body: self.bodies[index].name.clone(),
             conditions: vec![
@@ -207,6 +215,7 @@ impl Rig for OrbitRig {
 
     fn unwatched(&self, watched: Watched) -> Option<&'static str> {
         match watched {
+            _ if self.controller.is_none() => Some("is watched by the controller, and this scenario has none"),
             Watched::Energy | Watched::Momentum if self.bodies[0].driven => {
                 Some("is not constant: thrust changes the energy and the momentum of the observed body")
             }
@@ -217,15 +226,21 @@ impl Rig for OrbitRig {
     }
 
     fn law(&self, _index: usize) -> OrbitLaw {
-        OrbitLaw::new(self.law, self.aim)
+        let Some(controller) = self.controller else {
+            unreachable!("a scenario with a driven body has a controller: checked when it was resolved")
+        };
+        OrbitLaw::new(controller.law, self.aim)
     }
 
     fn metrics(&self) -> &'static [&'static str] {
-        &["radius_error_du", "velocity_error_du_s", "estimate_error_du_s"]
+        match self.controller {
+            Some(_) => &["radius_error_du", "velocity_error_du_s", "estimate_error_du_s"],
+            None => &["estimate_error_du_s"],
+        }
     }
 
-    /// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)| of the worst driven body, and the length of the velocity estimate's error. All
-    /// of them +inf once any body is lost.
+    /// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)| of the worst driven body where one is, and the length of the velocity estimate's
+    /// error. All of them +inf once any body is lost.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
@@ -243,12 +258,15 @@ impl Rig for OrbitRig {
         let reference = first.map(|leader| self.reference(leader));
         let errors = self.driven().map(|index| errors(state(index), reference));
         let worst = errors.reduce(|a, b| [worse(a[0], b[0]), worse(a[1], b[1])]);
-        [out[0], out[1]] = worst.unwrap_or([f64::NAN; 2]);
         let estimated = estimate.map(|estimate| Vector2::from(estimate.velocity_du_s));
-        out[2] = match (estimated, first) {
+        let estimate_error = match (estimated, first) {
             (Some(estimated), Some(first)) => (estimated - Vector2::new(first.vr, first.vtheta)).norm(),
             _ => f64::NAN,
         };
+        if let Some((last, followed)) = out.split_last_mut() {
+            *last = estimate_error;
+            followed.copy_from_slice(&worst.unwrap_or([f64::NAN; 2])[..followed.len()]);
+        }
     }
 
     /// A frozen body would meet its end again, had it gone on.
@@ -263,9 +281,11 @@ impl Rig for OrbitRig {
     }
 
     fn certificates(&self) -> Vec<CertificateReport> {
+        let Some(controller) = &self.controller else { return Vec::new() };
         // A scenario whose loop could not be certified was refused.
-        self.certificate()
-            .map_or(Vec::new(), |certificate| self.driven().map(|index| self.report(index, &certificate)).collect())
+        self.certificate(controller).map_or(Vec::new(), |certificate| {
+            self.driven().map(|index| self.report(index, &controller.law, &certificate)).collect()
+        })
     }
 
     fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
@@ -331,8 +351,8 @@ mod tests {
     use super::*;
     use crate::config::{SHIPPED, Scenario};
     use crate::rig::AnyRig;
-    use crate::role::{Body, Estimator, Law};
-    use crate::sample::{OrbitCommand, OrbitMeasurement};
+    use crate::role::{Body, Estimator, Guard, Law};
+    use crate::sample::{OrbitCommand, OrbitMeasurement, Stamp};
 
     fn rig(name: &str, overrides: &[&str]) -> OrbitRig {
         let text = SHIPPED.iter().find(|(shipped, _)| *shipped == name).unwrap().1;
@@ -356,6 +376,70 @@ mod tests {
         observer.write(0, &mut estimate);
         rig.law(index).command(&estimate, &measured(index), &mut command);
         Vector2::from(command.thrust_du_s2).amax()
+    }
+
+    /// A satellite in a low orbit, observed by nobody but itself, in metres.
+    const LOW_ORBIT: &str = r#"
+        name = "low-orbit"
+        rig = "orbit-rendezvous"
+        clock = "in-process"
+        tick_hz = 10.0
+        duration_s = 60.0
+        [central_body]
+        gravitational_parameter_du3_s2 = 3.986004418e14
+        radius_du = 6.378137e6
+        escape_radius_du = 4.2e7
+        [leader]
+        initial_radius_du = 7.0e6
+        initial_velocity_du_s = [10.0, 7.6e3]
+        [observer]
+        decay_rate_per_s = [1.0, 1.0]
+        [accept]
+        settled_by_s = 40.0
+        estimate_error_du_s_max = 1e-5
+    "#;
+
+    #[test]
+    fn a_free_orbit_without_a_follower_is_observed_in_any_unit() {
+        let scenario = Scenario::parse(LOW_ORBIT, "test", &[]).unwrap();
+        assert_eq!(scenario.rig.roles(), ["leader", "observer"]);
+        let AnyRig::Orbit(rig) = scenario.rig else { unreachable!("it is an orbit") };
+        assert_eq!((rig.metrics(), rig.certificates().len()), (&["estimate_error_du_s"][..], 0));
+        let (mut body, mut observer, mut guard) = (rig.body(0), rig.estimator(), rig.measurement_guard(0, false));
+        let (mut measurement, mut truth, mut estimate) = Default::default();
+        let mut errors = [0.0];
+        for tick in 0..=600 {
+            measurement = OrbitMeasurement { stamp: Stamp { tick, generation: 1, ..Stamp::default() }, ..measurement };
+            body.measure(tick, 0, &mut measurement);
+            assert!(guard.accepts(&measurement), "{measurement:?}");
+            if tick == 0 {
+                observer.start(&measurement)
+            } else {
+                observer.update(&measurement, rig.tick_s)
+            }
+            body.truth(0, &mut truth);
+            observer.write(0, &mut estimate);
+            assert!(rig.estimate_guard().accepts(&estimate), "{estimate:?}");
+            rig.score(|_| Some(&truth), |_| None, Some(&estimate), &mut errors);
+            body.flow(rig.tick_s);
+        }
+        assert!(errors[0] < 1e-6, "of 7600 du/s, {} are left", errors[0]);
+    }
+
+    #[test]
+    fn followers_and_a_controller_go_together() {
+        let gain = "controller.gain={radius_per_s2=1.0, radial_per_s=2.0, transverse_per_s=1.0}";
+        let refusal = |text: &str, overrides: &[&str]| {
+            let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
+            Scenario::parse(text, "test", &overrides).unwrap_err().to_string()
+        };
+        let idle = refusal(LOW_ORBIT, &[gain, "controller.thrust_max_du_s2=1.0"]);
+        assert!(idle.contains("controller: has no follower to drive"), "{idle}");
+        let text = SHIPPED.iter().find(|(shipped, _)| *shipped == "orbit-rendezvous").unwrap().1;
+        let (before, rest) = text.split_once("[controller]").unwrap();
+        let after = rest.split_once("[accept]").unwrap().1;
+        let loose = refusal(&format!("{before}[accept]{after}"), &[]);
+        assert!(loose.contains("controller: is missing; followers need"), "{loose}");
     }
 
     #[test]

@@ -4,11 +4,12 @@
 
 use super::limits::{Limits, RawLimits};
 use super::roles::Aim;
-use super::{BodyInfo, OrbitRig, Sensors};
+use super::{BodyInfo, ControllerDesign, OrbitRig, Sensors};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
 use crate::rig::{FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
+use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -27,9 +28,11 @@ struct RawHold {
 struct RawRendezvous {
     central_body: RawCentralBody,
     leader: RawBody,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     follower: Vec<RawFollower>,
     observer: RawObserver,
-    controller: RawController,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    controller: Option<RawController>,
     #[serde(default, skip_serializing_if = "RawLimits::is_default")]
     limits: RawLimits,
 }
@@ -168,7 +171,8 @@ pub(in crate::rig) fn hold(
     let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
     let full_state = raw.controller.feedback == Feedback::FullState;
     let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
-    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
+    let RawHoldController { gain, thrust_max_du_s2, predict, .. } = &raw.controller;
+    let controller = Some(gain.controller(field, *thrust_max_du_s2, *predict, frame));
     let initial = vec![OrbitState::from(&raw.spacecraft)];
     let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
     let rig = OrbitRig {
@@ -179,8 +183,7 @@ pub(in crate::rig) fn hold(
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
-        gains,
-        law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
+        controller,
         aim,
         tick_s: frame.tick_s,
     };
@@ -203,11 +206,12 @@ pub(in crate::rig) fn rendezvous(
     let field = review.field(&raw.central_body);
     review.place("leader.initial_radius_du", raw.leader.initial_radius_du, field.as_ref());
     review.followers(&raw.follower, field.as_ref());
-    review.loops(&raw.controller.gain, raw.controller.thrust_max_du_s2);
+    review.controller(raw.controller.as_ref(), raw.follower.is_empty());
     review.sensor("leader", &raw.leader.noise);
     let sensors = vec![sensor(frame, 0, &raw.leader.noise, &raw.leader.bias)];
     let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
-    let (gains, lead_s) = (raw.controller.gain.resolved(), if raw.controller.predict { frame.tick_s } else { 0.0 });
+    let thrust_max = raw.controller.as_ref().map_or(0.0, |controller| controller.thrust_max_du_s2);
+    let designed = |raw: &RawController| raw.gain.controller(field, raw.thrust_max_du_s2, raw.predict, frame);
     let mut initial = vec![OrbitState::from(&raw.leader)];
     initial.extend(raw.follower.iter().map(OrbitState::from));
     let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
@@ -215,12 +219,11 @@ pub(in crate::rig) fn rendezvous(
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
         field,
         initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
+        limits: limits(field, speed, &raw.observer, &sensors[0], thrust_max, &raw.limits, frame),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
-        gains,
-        law: OrbitHold::new(field, gains, raw.controller.thrust_max_du_s2, lead_s),
+        controller: raw.controller.as_ref().map(designed),
         aim: Aim::Leader,
         tick_s: frame.tick_s,
     };
@@ -265,12 +268,14 @@ fn limits(
 }
 
 impl RawGain {
-    fn resolved(&self) -> OrbitGains {
-        OrbitGains {
+    fn controller(&self, field: CentralField, thrust_max: f64, predict: bool, frame: Frame) -> ControllerDesign {
+        let gains = OrbitGains {
             radius_per_s2: self.radius_per_s2,
             radial_per_s: self.radial_per_s,
             transverse_per_s: self.transverse_per_s,
-        }
+        };
+        let lead_s = if predict { frame.tick_s } else { 0.0 };
+        ControllerDesign { gains, law: OrbitHold::new(field, gains, thrust_max, lead_s) }
     }
 }
 
@@ -319,7 +324,6 @@ impl Review<'_, '_> {
     }
 
     fn followers(&mut self, followers: &[RawFollower], field: Option<&CentralField>) {
-        self.require(!followers.is_empty(), "follower", || "there is none; add a [[follower]]".to_owned());
         for (index, follower) in followers.iter().enumerate() {
             let taken = followers[..index].iter().map(|other| other.name.as_str());
             check_name(self.checks, &format!("follower[{index}].name"), &follower.name, taken);
@@ -342,6 +346,19 @@ impl Review<'_, '_> {
         design
     }
 
+    /// A controller for followers, and none without.
+    fn controller(&mut self, controller: Option<&RawController>, alone: bool) {
+        match controller {
+            Some(RawController { gain, thrust_max_du_s2, .. }) => self.loops(gain, *thrust_max_du_s2),
+            None => self.require(alone, "controller", || {
+                "is missing; followers need a [controller] with gain and thrust_max_du_s2".to_owned()
+            }),
+        }
+        self.require(controller.is_none() || !alone, "controller", || {
+            "has no follower to drive; add a [[follower]] or remove it".to_owned()
+        });
+    }
+
     fn loops(&mut self, gain: &RawGain, thrust_max: f64) {
         self.positive("controller.gain.radius_per_s2", gain.radius_per_s2);
         self.positive("controller.gain.radial_per_s", gain.radial_per_s);
@@ -351,12 +368,19 @@ impl Review<'_, '_> {
 }
 
 fn check_loop(rig: &OrbitRig, checks: &mut Checks<'_>) {
-    match rig.certificate() {
-        Ok(certificate) => checks.require(certificate.sampled.holds(), "controller.gain", || {
+    let circle = rig.field.circular(rig.certified_radius());
+    // Without a loop, the motion alone.
+    let sampled = match &rig.controller {
+        Some(controller) => rig.certificate(controller).map(|certificate| Some(certificate.sampled)),
+        None => rig.field.flow(&circle, &Vector2::zeros(), rig.tick_s).map(|_| None),
+    };
+    match sampled {
+        Ok(None) => {}
+        Ok(Some(sampled)) => checks.require(sampled.holds(), "controller.gain", || {
             format!(
                 "the sampled loop is unstable: its slowest mode is multiplied by {:.4} from tick to tick; lower the gains \
                  or raise tick_hz",
-                certificate.sampled.required
+                sampled.required
             )
         }),
         Err(_) => checks.refuse(
