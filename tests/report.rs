@@ -127,6 +127,7 @@ fn a_recorded_run_of_bodies_is_shown_whole() {
     let directory = run(&bench, "rigid-pair", &[]);
     let html = page(&bench, &directory);
     check_page(&html);
+    assert!(!html.contains("cripted fault"), "the scenario scripts none");
     let (page, summary) = (parse(&html), summary(&directory));
     let expected = ["verdict", "motion", "errors", "lyapunov", "lateness", "events", "books", "certificate", "machine"];
     assert_eq!(sections(&page), expected);
@@ -193,6 +194,7 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
     }
     let events = rows(section(&page, "events"));
     assert!(events.iter().any(|row| row[3..] == ["noise-burst", "observer"]), "{events:?}");
+    assert!(html.contains("is a scripted fault") && html.contains("scripted faults acted"));
     assert!(events.iter().any(|row| row[1] == "observer" && row[3] == "restarted"), "{events:?}");
 }
 

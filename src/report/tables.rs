@@ -96,12 +96,14 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
     let seconds = |tick: u64| format!("{:.3}", tick as f64 * tick_s);
-    let key = "On every time axis: a band with a number is a scripted fault, a dashed line with a flag an incident, a bar \
-               at the foot ticks of which some role sent no sample.";
-    blocks.push(Block::Text(key.to_owned()));
     let row =
         |fault: &FaultRow| strings(&[&fault.number, &seconds(fault.from_tick), &fault.ticks, &fault.kind, &fault.role]);
     let rows: Vec<_> = faults(source).iter().map(row).collect();
+    let fault = if rows.is_empty() { "" } else { "a band with a number is a scripted fault, " };
+    blocks.push(Block::Text(format!(
+        "On every time axis: {fault}a dashed line with a flag is an incident, a bar at the foot ticks of which some role sent \
+         no sample."
+    )));
     let head = vec!["number", "from, s", "ticks", "fault", "role"];
     blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Scripted faults".to_owned(), head, rows }));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
@@ -158,9 +160,13 @@ pub fn books(source: &Source) -> Section {
     let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
     if let Some(books) = source.summary.as_ref().map(|summary| &summary.books) {
         let balance = if books.balanced { "The books balance." } else { "THE BOOKS DO NOT BALANCE." };
+        let scripted = !faults(source).is_empty() || books.injected_faults > 0;
+        let acted = format!("; scripted faults acted {} times", books.injected_faults);
         blocks.push(Block::Text(format!(
-            "{balance} Missed or starved: {} ticks; rejected: {} samples; scripted faults acted {} times.",
-            books.missed_ticks, books.rejected_samples, books.injected_faults
+            "{balance} Missed or starved: {} ticks; rejected: {} samples{}.",
+            books.missed_ticks,
+            books.rejected_samples,
+            if scripted { &acted } else { "" }
         )));
         blocks.extend(books.problems.iter().map(|problem| Block::Text(problem.clone())));
         if !books.unbooked.is_empty() {
