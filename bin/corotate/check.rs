@@ -1,7 +1,7 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
 use crate::{Exit, fail, say};
-use corotate::analysis::{Claim, claims, digits};
+use corotate::analysis::{Claim, apart, claims, digits};
 use corotate::config::Scenario;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -85,7 +85,7 @@ fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
     }
     for condition in &claim.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
-        let [value, required] = [condition.value, condition.required].map(digits);
+        let [value, required] = apart(condition.value, condition.required);
         let margin = digits(condition.value - condition.required);
         writeln!(text, "#   {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
     }

@@ -355,14 +355,23 @@ impl Claim {
     }
 }
 
-/// A number with enough digits to be told from another, however small it is.
+/// A number in four digits or more, however small it is.
 pub fn digits(value: f64) -> String {
-    if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
-        let text = format!("{value:.4}");
-        text.trim_end_matches('0').trim_end_matches('.').to_owned()
-    } else {
-        format!("{value:.3e}")
-    }
+    let decimals = match value.abs() {
+        0.1..1e6 => 4,
+        0.01..0.1 => 5,
+        1e-3..0.01 => 6,
+        0.0 => return "0".to_owned(),
+        _ => return format!("{value:.3e}"),
+    };
+    let text = format!("{value:.decimals$}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+/// Two numbers that are compared, with enough digits to be told apart.
+pub fn apart(a: f64, b: f64) -> [String; 2] {
+    let few = [a, b].map(digits);
+    if few[0] == few[1] { [a, b].map(|value| value.to_string()) } else { few }
 }
 
 impl Exponent {
@@ -467,6 +476,9 @@ mod tests {
 
     #[test]
     fn small_numbers_have_digits() {
-        assert_eq!([0.0, 4.0, 0.25, 1.5e-7, -2e-4].map(digits), ["0", "4", "0.25", "1.500e-7", "-2.000e-4"]);
+        let told = [0.0, 4.0, 0.25, 0.0123456, 0.002, 1.5e-7, -2e-4].map(digits);
+        assert_eq!(told, ["0", "4", "0.25", "0.01235", "0.002", "1.500e-7", "-2.000e-4"]);
+        assert_eq!(apart(1.0, 0.99999), ["1", "0.99999"]);
+        assert_eq!(apart(0.5, 0.25), ["0.5", "0.25"]);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::outcome::{LinkBook, State};
 use super::{Incident, Summary};
+use crate::analysis::digits;
 use crate::serial::LineBook;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
@@ -83,8 +84,8 @@ fn results(summary: &Summary, text: &mut String) {
             metric.name.clone(),
             if metric.last.is_nan() { "-".to_owned() } else { format!("{:.2e}", metric.last) },
             metric.settled_max.map_or("-".to_owned(), |value| format!("{value:.2e}")),
-            criterion.map_or("-".to_owned(), |criterion| format!("{:.0e}", criterion.limit)),
-            metric.settled_at_s.map_or("-".to_owned(), |time| format!("{time:.3} s")),
+            criterion.map_or("-".to_owned(), |criterion| format!("{:e}", criterion.limit)),
+            metric.settled_at_s.map_or("-".to_owned(), |time| format!("{} s", digits(time))),
             verdict(criterion.and_then(|criterion| criterion.holds)),
         ]);
     }
@@ -111,7 +112,7 @@ fn watchdog(summary: &Summary, text: &mut String) {
     let Some(report) = &summary.watchdog else { return };
     for one in &report.watched {
         let largest = one.largest.map_or("beyond every number".to_owned(), |largest| format!("{largest:.2e}"));
-        let _ = write!(text, "watchdog, {}: {} of {} beyond {:.0e}", one.quantity, one.breaches, one.judged, one.max);
+        let _ = write!(text, "watchdog, {}: {} of {} beyond {:e}", one.quantity, one.breaches, one.judged, one.max);
         let first = one.first_tick.map_or(String::new(), |tick| format!(", first at tick {tick}"));
         let _ = writeln!(text, ", largest {largest}{first}");
     }
@@ -121,7 +122,8 @@ fn watchdog(summary: &Summary, text: &mut String) {
 }
 
 fn times(incident: &Incident) -> String {
-    let told = |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {s:.3} s"));
+    let told =
+        |what: &str, seconds: Option<f64>| seconds.map_or(String::new(), |s| format!(", {what} after {} s", digits(s)));
     told("back", incident.outage_s) + &told("recovered", incident.recovery_s)
 }
 

@@ -287,7 +287,7 @@ fn rescored(source: &Source, traces: &Traces) -> Block {
             number(metric.settled_max),
             number(told.and_then(|told| told.settled_max)),
             number(told.and_then(|told| told.peak)),
-            told.and_then(|told| told.settled_at_s).map_or("–".to_owned(), |time| format!("{time:.3}")),
+            told.and_then(|told| told.settled_at_s).map_or("–".to_owned(), digits),
         ]
     };
     Block::Table {

@@ -3,7 +3,7 @@
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
-use crate::analysis::digits;
+use crate::analysis::{apart, digits};
 use crate::launch::State;
 use crate::telemetry::Ticks;
 
@@ -95,7 +95,7 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
 pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
-    let seconds = |tick: u64| format!("{:.3}", tick as f64 * tick_s);
+    let seconds = |tick: u64| digits(tick as f64 * tick_s);
     let row =
         |fault: &FaultRow| strings(&[&fault.number, &seconds(fault.from_tick), &fault.ticks, &fault.kind, &fault.role]);
     let rows: Vec<_> = faults(source).iter().map(row).collect();
@@ -107,7 +107,7 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let head = vec!["number", "from, s", "ticks", "fault", "role"];
     blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Scripted faults".to_owned(), head, rows }));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
-    let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), |s| format!("{s:.3}"));
+    let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), digits);
     let row = |incident: &super::summary::Incident| {
         let cause = match incident.last_words.as_str() {
             "" => incident.cause.clone(),
@@ -252,7 +252,10 @@ pub fn certificate(source: &Source) -> Section {
     };
     for certificate in &summary.certificates {
         let row = |condition: &super::summary::Condition| {
-            let (value, required) = (number(condition.value), number(condition.required));
+            let [value, required] = match (condition.value, condition.required) {
+                (Some(value), Some(required)) => apart(value, required),
+                (value, required) => [value, required].map(number),
+            };
             let verdict = if condition.holds { "✓ holds" } else { "✗ does not hold" };
             strings(&[&condition.name, &value, &required, &verdict])
         };
