@@ -199,6 +199,28 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
 }
 
 #[test]
+fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
+    let bench = Bench::new();
+    let directory = run(&bench, "gyro-loss", &[]);
+    let html = page(&bench, &directory);
+    check_page(&html);
+    let (document, summary) = (parse(&html), summary(&directory));
+    let marks = document.descendants().find(|node| node.attribute("id") == Some("marks")).unwrap();
+    let bands = marks.descendants().filter(|node| node.attribute("class") == Some("unseen"));
+    let widths: Vec<f64> = bands.map(|band| band.attribute("width").unwrap().parse().unwrap()).collect();
+    // A quarter of the axis is the loss; at one tick the motion told nothing.
+    assert!(widths.len() == 2 && widths.iter().any(|width| (130.0..150.0).contains(width)), "{widths:?}");
+    assert!(html.contains("a grey band is where the estimate lacked something"));
+    let lost = summary["score"]["statuses"]["leader/estimate"]["axis_lost"].as_u64().unwrap().to_string();
+    let events = rows(section(&document, "events"));
+    assert!(events.iter().any(|row| row[..2] == ["axis_lost".to_owned(), lost.clone()]), "{lost}: {events:?}");
+    // A run that saw everything has no such band, and no word of it.
+    let other = Bench::new();
+    let whole = page(&other, &run(&other, "rigid-pair", &["--duration", "2", "--set", "accept={}"]));
+    assert!(!whole.contains("class=\"unseen\"") && !whole.contains("grey band"));
+}
+
+#[test]
 fn every_shipped_scenario_has_a_report() {
     for (scenario, _) in corotate::config::SHIPPED {
         let bench = Bench::new();

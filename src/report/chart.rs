@@ -51,6 +51,8 @@ pub struct Marks {
     pub incidents: Vec<f64>,
     /// From when to when samples are missing.
     pub missing: Vec<(f64, f64)>,
+    /// From when to when an estimate lacked something.
+    pub unseen: Vec<(f64, f64)>,
 }
 
 impl Line {
@@ -242,6 +244,14 @@ pub fn marks(x: &Axis, marks: &Marks) -> String {
     let frame = Frame::TIME;
     let (foot, mut svg) =
         (frame.foot(), String::from("<svg class=\"defs\" width=\"0\" height=\"0\"><defs><g id=\"marks\">"));
+    for (from, to) in &marks.unseen {
+        let (from, to) = (frame.x(x, *from), frame.x(x, *to));
+        let (width, height) = ((to - from).max(1.5), foot - TOP);
+        let _ = write!(
+            svg,
+            "<rect class=\"unseen\" x=\"{from:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{height}\"/>"
+        );
+    }
     let mut labelled = f64::NEG_INFINITY;
     for (from, to, number) in &marks.faults {
         let (from, to) = (frame.x(x, *from), frame.x(x, *to));

@@ -131,12 +131,26 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     };
     let incidents = source.summary.iter().flat_map(|summary| &summary.incidents);
     let (missing, _) = traces.map_or_else(Default::default, Traces::missing);
+    let unseen = traces.iter().flat_map(|traces| traces.unseen.keys().flat_map(|name| traces.unseen_spans(name).0));
+    let seconds = |(from, to): (u64, u64)| (from as f64 * tick_s, to.min(last) as f64 * tick_s);
     let marks = Marks {
+        unseen: merged(unseen.collect()).into_iter().map(seconds).collect(),
         faults: faults.map(span).collect(),
         incidents: incidents.map(|incident| incident.tick as f64 * tick_s).collect(),
         missing: missing.iter().map(|(from, to)| (*from as f64 * tick_s, *to as f64 * tick_s)).collect(),
     };
     (time, marks)
+}
+
+/// Spans that touch each other as one: what is marked twice is no darker.
+fn merged(mut spans: Vec<(u64, u64)>) -> Vec<(u64, u64)> {
+    spans.sort_unstable();
+    spans.dedup_by(|next, last| {
+        let touches = next.0 <= last.1;
+        last.1 = if touches { last.1.max(next.1) } else { last.1 };
+        touches
+    });
+    spans
 }
 
 fn latency_section(source: &Source, latencies: Vec<(String, String, Picture)>) -> Section {

@@ -42,6 +42,7 @@ fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, 
     let orbit = traces.paths.keys().any(|(_, plane)| *plane == "x y");
     let figures = if orbit { orbits(scenario, traces, time)? } else { rates(traces, time, scenario.tick_s()) };
     let mut blocks = vec![Block::Text(decimation(traces, scenario.tick_s()))];
+    blocks.extend(unseen(traces));
     let hidden = traces.bodies.len().saturating_sub(BODIES_SHOWN + 1);
     if hidden > 0 {
         blocks.push(Block::Text(format!("{hidden} more bodies are scored and not drawn.")));
@@ -51,6 +52,14 @@ fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, 
     }
     blocks.push(Block::Figures(figures));
     Ok(Section { id: "motion", title: "Motion", blocks })
+}
+
+/// What the grey bands of the pictures over time are, if there are any.
+fn unseen(traces: &Traces) -> Option<Block> {
+    let names: Vec<&str> = traces.unseen.keys().copied().collect();
+    let text =
+        format!("A grey band over time is where the estimate lacked something and said so: {}.", names.join(", "));
+    (!names.is_empty()).then_some(Block::Text(text))
 }
 
 /// How much a column of a picture stands for.
@@ -224,7 +233,8 @@ fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) ->
                    rate of the sampled loop, where one is claimed, and at the observer's, from the first error on: what is \
                    claimed is the rate of fall once the error is small, not the constant before it. Zeros are drawn at the foot.";
     let picture = over_time("errors over time, logarithmic", time, &y, &lines);
-    let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), rescored(source, traces)];
+    let figure = Block::Figures(vec![(picture, caption.to_owned())]);
+    let blocks = unseen(traces).into_iter().chain([figure, rescored(source, traces)]).collect();
     Section { id: "errors", title: "Synchronisation and estimation error", blocks }
 }
 

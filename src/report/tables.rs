@@ -91,6 +91,19 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
     Section { id: "verdict", title: "Verdict", blocks }
 }
 
+/// What the estimate said that it lacked, and from when to when.
+fn unseen(traces: &Traces, tick_s: f64) -> Block {
+    let row = |name: &&'static str| {
+        let (spans, ticks) = traces.unseen_spans(name);
+        let (from, to) = (spans.first().map_or(0, |span| span.0), spans.last().map_or(0, |span| span.1));
+        let seconds = |tick: u64| digits(tick as f64 * tick_s);
+        strings(&[name, &ticks, &spans.len(), &seconds(from), &seconds(to)])
+    };
+    let head = vec!["status", "ticks", "bands", "first from, s", "last until, s"];
+    let caption = "What the estimate lacked".to_owned();
+    Block::Table { caption, head, rows: traces.unseen.keys().map(row).collect() }
+}
+
 /// What went wrong, and what was made to.
 pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
@@ -100,12 +113,18 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
         |fault: &FaultRow| strings(&[&fault.number, &seconds(fault.from_tick), &fault.ticks, &fault.kind, &fault.role]);
     let rows: Vec<_> = faults(source).iter().map(row).collect();
     let fault = if rows.is_empty() { "" } else { "a band with a number is a scripted fault, " };
+    let lacking = if traces.is_some_and(|traces| !traces.unseen.is_empty()) {
+        "a grey band is where the estimate lacked something, "
+    } else {
+        ""
+    };
     blocks.push(Block::Text(format!(
-        "On every time axis: {fault}a dashed line with a flag is an incident, a bar at the foot ticks of which some role sent \
-         no sample."
+        "On every time axis: {fault}{lacking}a dashed line with a flag is an incident, a bar at the foot ticks of which some \
+         role sent no sample."
     )));
     let head = vec!["number", "from, s", "ticks", "fault", "role"];
     blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Scripted faults".to_owned(), head, rows }));
+    blocks.extend(traces.map(|traces| unseen(traces, tick_s)));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
     let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), digits);
     let row = |incident: &super::summary::Incident| {

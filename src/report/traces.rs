@@ -9,7 +9,7 @@ use crate::launch::lyapunov_floor;
 use crate::record::{Column, RecordError, Recording, SignalInfo};
 use crate::rig::{Command, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
-use crate::sample::{FieldKind, Stamp, VOID};
+use crate::sample::{FieldKind, Message, Sample, Stamp, VOID, status};
 use crate::with_rig;
 use std::collections::BTreeMap;
 
@@ -37,7 +37,12 @@ pub struct Traces {
     pub roles: Vec<RoleTrace>,
     /// Ticks at which every sample of the metrics was there.
     pub scored_ticks: u64,
+    /// At how many ticks an estimate said by which status that something was not seen.
+    pub unseen: BTreeMap<&'static str, Columns<Count>>,
 }
+
+/// The statuses of an estimate that lacks something.
+const UNSEEN: u64 = status::UNOBSERVABLE | status::UNUSABLE | status::AXIS_LOST | status::DEGRADED;
 
 /// Body, signal, field, element.
 pub type Key = (String, &'static str, String, usize);
@@ -220,6 +225,7 @@ impl<R: Rig> Tracer<R> {
                     return false;
                 }
                 self.path(body, tick, sample, index);
+                self.unseen(tick, &estimate);
                 self.keep(tick, |pending| pending.estimate = Some(estimate));
             }
             Kind::Command(guard) => {
@@ -231,6 +237,15 @@ impl<R: Rig> Tracer<R> {
             }
         }
         true
+    }
+
+    /// Counts what an estimate says that it lacks.
+    fn unseen(&mut self, tick: u64, estimate: &Estimate<R>) {
+        let field = Estimate::<R>::FIELDS.iter().find(|field| field.name == "status");
+        let told = field.map_or(0, |field| estimate.words()[field.offset / 8]) & UNSEEN;
+        for (name, _) in status::NAMES.into_iter().filter(|(_, bit)| told & bit != 0) {
+            self.traces.unseen.entry(name).or_default().at(tick).0 += 1;
+        }
     }
 
     fn keep(&mut self, tick: u64, put: impl FnOnce(&mut Pending<R>)) {
@@ -387,6 +402,21 @@ impl Traces {
     /// An element of a field.
     pub fn get(&self, body: &str, signal: &'static str, field: &str, element: usize) -> Option<&Columns<Extremes>> {
         self.values.get(&(body.to_owned(), signal, field.to_owned(), element))
+    }
+
+    /// From when to when a status said that something was not seen, in ticks, and at how many.
+    pub fn unseen_spans(&self, name: &str) -> (Vec<(u64, u64)>, u64) {
+        let (mut spans, mut total) = (Vec::<(u64, u64)>::new(), 0);
+        let columns =
+            self.unseen.get(name).into_iter().flat_map(|columns| columns.iter().map(|c| (columns.stride(), c)));
+        for (stride, (from, count)) in columns.filter(|(_, (_, count))| count.0 > 0) {
+            total += count.0;
+            match spans.last_mut().filter(|(_, end)| *end == from) {
+                Some((_, end)) => *end = from + stride,
+                None => spans.push((from, from + stride)),
+            }
+        }
+        (spans, total)
     }
 
     /// From when to when some role has fewer samples than ticks, in ticks; and how many ticks those are, over all roles.
