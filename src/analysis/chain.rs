@@ -87,12 +87,9 @@ impl<R: Rig> Chain<R> {
     /// Every number of the driven body's motion and of the estimate at the last tick that the loop is to control.
     pub fn output(&self, out: &mut Vec<f64>) {
         out.clear();
-        for field in numbers::<Truth<R>>().filter(|field| R::FREE != Some(field.name)) {
-            out.extend(values(self.truth(), field));
-        }
-        for field in numbers::<Estimate<R>>().filter(|field| R::FREE != Some(field.name)) {
-            out.extend(values(&self.estimate, field));
-        }
+        let controlled = |field: &&Field| R::CONTROLLED.contains(&field.name);
+        numbers::<Truth<R>>().filter(controlled).for_each(|field| out.extend(values(self.truth(), field)));
+        numbers::<Estimate<R>>().filter(controlled).for_each(|field| out.extend(values(&self.estimate, field)));
     }
 
     /// The driven body's coordinate that the loop does not control.

@@ -18,16 +18,21 @@ use serde::Serialize;
 
 /// The distance of the two loops, over the size of what they say.
 const DISTANCE: f64 = 1e-5;
-/// It is set back once it has fallen to, or grown by, so much.
-const FALLEN: f64 = 1e-3;
+/// It is set back once it has fallen to, or grown by, so much. What the loop does not control does not fall, so it must not
+/// wait for long: squares of it would show beside the distance.
+const FALLEN: f64 = 0.1;
 const GROWN: f64 = 10.0;
 /// Below this, over the size of what they say, it is rounding.
 const ROUNDING: f64 = 1e-11;
 /// Ticks that are looked at, at the least and at the most.
 const TICKS_MIN: u64 = 2_000;
-const TICKS_MAX: u64 = 64_000;
-/// The two halves of the ticks looked at must give one rate, to within this part of it.
-const AGREEMENT: f64 = 0.02;
+const TICKS_MAX: u64 = 256_000;
+/// An error has settled after so many of its time constants, and a quarter of them more is looked at.
+const SETTLED: f64 = 60.0;
+/// The parts of the ticks looked at must give one rate, to within this part of it: two of them where the error fell by
+/// e^-[`FALL`] in all, else four.
+const AGREEMENT: f64 = 0.03;
+const FALL: f64 = 20.0;
 /// A start is small, and the linearisation speaks of it, below this part of the largest error.
 const SMALL: f64 = 1e-2;
 /// A loop whose floor is above this part of what it says synchronises nothing.
@@ -105,9 +110,9 @@ struct Analysis<'a, R> {
 
 /// An exponent, and how much of the motion it speaks of.
 struct Exponent {
-    /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over the halves of those.
+    /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over equal parts of those.
     rate_per_s: f64,
-    halves_per_s: [f64; 2],
+    parts_per_s: Vec<f64>,
     /// Part of the ticks at which the observer was told nothing.
     unobserved: f64,
     /// The size of what the loop says where it is settled.
@@ -127,9 +132,9 @@ impl<'a, R: Rig> Analysis<'a, R> {
                 match self.judge(&exponent) {
                     Err(reason) => (Err(reason), Vec::new()),
                     Ok(rate) => {
-                        let floors = self.floors(self.ticks_to_settle(rate));
+                        let mut floors = self.floors(self.ticks_to_settle(rate));
                         let useful = floors.iter().all(|floor| *floor <= USELESS * exponent.size);
-                        let arrives = || self.arrives(rate, &floors).map(|()| rate);
+                        let mut arrives = || self.arrives(rate, &mut floors).map(|()| rate);
                         let rate = if useful { arrives() } else { Err(USELESS_REASON.to_owned()) };
                         (rate, floors)
                     }
@@ -193,7 +198,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
         let (mut fallen, mut since, mut unobserved) = (0.0, None, 0_u64);
         // The logarithm by which the distance has fallen, after every tick.
         let mut falls = Vec::new();
-        let mut end = TICKS_MIN.max(self.scenario.last_tick.min(TICKS_MAX / 8));
+        let mut end = TICKS_MIN.max(self.scenario.last_tick.min(TICKS_MAX / 32));
         loop {
             while (falls.len() as u64) < end {
                 reference.advance();
@@ -220,12 +225,18 @@ impl<'a, R: Rig> Analysis<'a, R> {
                     since = Some(DISTANCE * size);
                 }
             }
-            let slope = |from: usize, to: usize| (falls[to - 1] - falls[from - 1]) / ((to - from) as f64 * self.tick_s);
+            let slope = |from: usize, to: usize| slope(&falls[from..to]) / self.tick_s;
             let (begin, end_at) = (falls.len() / 4, falls.len());
-            let middle = (begin + end_at) / 2;
+            let part = |parts: usize, index: usize| {
+                let length = (end_at - begin) / parts;
+                slope(begin + index * length, begin + (index + 1) * length)
+            };
+            let rate_per_s = slope(begin, end_at);
+            // A slow swing may look straight in two parts, as long as little of the fall was seen.
+            let parts = if rate_per_s * (end_at - begin) as f64 * self.tick_s < FALL { 4 } else { 2 };
             let exponent = Exponent {
-                rate_per_s: slope(begin, end_at),
-                halves_per_s: [slope(begin, middle), slope(middle, end_at)],
+                rate_per_s,
+                parts_per_s: (0..parts).map(|index| part(parts, index)).collect(),
                 unobserved: unobserved as f64 / end as f64,
                 size,
             };
@@ -238,7 +249,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
 
     /// Whether the exponent is a rate.
     fn judge(&self, exponent: &Exponent) -> Result<f64, String> {
-        let Exponent { rate_per_s, halves_per_s: [first, second], unobserved, .. } = exponent;
+        let Exponent { rate_per_s, parts_per_s, unobserved, .. } = exponent;
         if *unobserved > 0.5 {
             return Err(format!(
                 "not observable: at {:.0} % of the ticks the measured components tell nothing of the hidden one",
@@ -257,19 +268,20 @@ impl<'a, R: Rig> Analysis<'a, R> {
             ));
         }
         if !exponent.agrees() {
+            let (least, greatest) = range(parts_per_s);
             return Err(format!(
-                "no one rate along this motion: {} 1/s in one half of what was looked at, {} 1/s in the other",
-                digits(*first),
-                digits(*second)
+                "the decay rate is not uniform along this motion: from {} to {} 1/s",
+                digits(least),
+                digits(greatest)
             ));
         }
         Ok(*rate_per_s)
     }
 
-    /// Ticks after which an error that falls at this rate has settled.
+    /// Ticks after whose first three quarters an error that falls at this rate has settled; at least those of the scenario.
     fn ticks_to_settle(&self, rate_per_s: f64) -> u64 {
-        let ticks = 40.0 / (rate_per_s.max(0.0) * self.tick_s);
-        (ticks.min(TICKS_MAX as f64) as u64).clamp(TICKS_MIN, TICKS_MAX)
+        let ticks = SETTLED / (rate_per_s.max(0.0) * self.tick_s);
+        (ticks.min(TICKS_MAX as f64) as u64).max(self.scenario.last_tick).clamp(TICKS_MIN, TICKS_MAX)
     }
 
     /// The largest error per metric of a loop that was synchronised from the start, with all that disturbs it.
@@ -286,7 +298,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
                     return vec![f64::INFINITY; floors.len()];
                 }
                 chain.score(&mut values);
-                if tick >= ticks / 2 {
+                if tick >= ticks - ticks / 4 {
                     floors.iter_mut().zip(&values).for_each(|(floor, value)| *floor = value.max(*floor));
                 }
             }
@@ -294,22 +306,23 @@ impl<'a, R: Rig> Analysis<'a, R> {
         floors
     }
 
-    /// Whether the scenario's own start leads where the rate speaks of.
-    fn arrives(&self, rate_per_s: f64, floors: &[f64]) -> Result<(), String> {
-        let Some(rig) = self.rig.alone(self.index, Start::Given, false) else {
+    /// Whether the scenario's own start leads where the rate speaks of. A start that does may end at a floor above that of the
+    /// settled loop, where rounding alone is left; `floors` rise to it.
+    fn arrives(&self, rate_per_s: f64, floors: &mut [f64]) -> Result<(), String> {
+        let Some(rig) = self.rig.alone(self.index, Start::Given, true) else {
             return Ok(());
         };
         let mut chain = Chain::new(&rig, self.tick_s);
         let mut values = vec![0.0; floors.len()];
-        let mut largest = values.clone();
+        // The largest errors of all, in the second quarter, and in the last.
+        let (mut largest, mut halfway, mut last) = (values.clone(), values.clone(), values.clone());
         let ticks = self.ticks_to_settle(rate_per_s);
+        let part = ticks / 4;
         let (mut output, mut size) = (Vec::new(), None);
         for tick in 0..ticks {
             chain.advance();
             chain.output(&mut output);
-            if exceeds(norm(&output), DIVERGED * *size.get_or_insert(norm(&output))) {
-                return Err("from this start the loop diverges".to_owned());
-            }
+            chain.score(&mut values);
             if let Some(loss) = chain.loss() {
                 return Err(format!(
                     "from this start the loop fails: {loss} after {} s; raise tick_hz, lower the gains, or begin nearer to \
@@ -317,18 +330,35 @@ impl<'a, R: Rig> Analysis<'a, R> {
                     digits(tick as f64 * self.tick_s)
                 ));
             }
-            chain.score(&mut values);
+            let lost = exceeds(norm(&output), DIVERGED * *size.get_or_insert(norm(&output)));
+            if lost || values.iter().any(|value| !value.is_finite()) {
+                return Err("from this start the loop diverges".to_owned());
+            }
+            let seen: &mut [f64] = match tick {
+                tick if tick >= ticks - part => &mut last,
+                tick if (ticks / 2 - part..ticks / 2).contains(&tick) => &mut halfway,
+                _ => &mut [],
+            };
+            seen.iter_mut().zip(&values).for_each(|(seen, value)| *seen = value.max(*seen));
             largest.iter_mut().zip(&values).for_each(|(largest, value)| *largest = value.max(*largest));
-            let small = |((value, largest), floor): ((&f64, &f64), &f64)| *value <= (SMALL * largest).max(2.0 * floor);
-            if values.iter().zip(&largest).zip(floors).all(small) {
-                return Ok(());
+        }
+        // What falls for longer than is looked at falls at this rate already.
+        let fall = (-0.8 * rate_per_s * (ticks / 2) as f64 * self.tick_s).exp();
+        let capped = SETTLED > rate_per_s * ticks as f64 * self.tick_s;
+        for (index, (last, floor)) in last.iter().zip(floors).enumerate() {
+            let small = *last <= (SMALL * largest[index]).max(2.0 * *floor);
+            if !(small || capped && fall < 0.7 && *last <= fall * halfway[index]) {
+                return Err(format!(
+                    "from this start the loop does not synchronise: {} is still {last:.1e} after {:.3} s",
+                    self.rig.metrics()[index],
+                    ticks as f64 * self.tick_s
+                ));
+            }
+            if !capped && *last <= SMALL * largest[index] {
+                *floor = last.max(*floor);
             }
         }
-        let (name, value) = self.rig.metrics().iter().zip(&values).next().unwrap_or((&"error", &f64::NAN));
-        Err(format!(
-            "from this start the loop does not synchronise: {name} is still {value:.1e} after {:.3} s",
-            ticks as f64 * self.tick_s
-        ))
+        Ok(())
     }
 }
 
@@ -376,18 +406,32 @@ pub fn apart(a: f64, b: f64) -> [String; 2] {
 
 impl Exponent {
     /// That of a loop which does not even stay where it is settled.
-    const GROWS: Self =
-        Self { rate_per_s: f64::NEG_INFINITY, halves_per_s: [f64::NEG_INFINITY; 2], unobserved: 0.0, size: 0.0 };
+    const GROWS: Self = Self { rate_per_s: f64::NEG_INFINITY, parts_per_s: Vec::new(), unobserved: 0.0, size: 0.0 };
 
     fn agrees(&self) -> bool {
-        let [first, second] = self.halves_per_s;
-        (first - second).abs() <= AGREEMENT * self.rate_per_s.abs()
+        let (least, greatest) = range(&self.parts_per_s);
+        greatest - least <= AGREEMENT * self.rate_per_s.abs()
     }
 }
 
 /// Whether a size is beyond a limit, or no number.
 fn exceeds(size: f64, limit: f64) -> bool {
     size.is_nan() || size > limit.max(f64::MIN_POSITIVE)
+}
+
+/// The least and the greatest value.
+fn range(values: &[f64]) -> (f64, f64) {
+    values
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, greatest), value| (value.min(least), value.max(greatest)))
+}
+
+/// The slope of the straight line that is nearest to evenly spaced values, per step: what swings about the line counts little.
+fn slope(values: &[f64]) -> f64 {
+    let middle = 0.5 * (values.len() as f64 - 1.0);
+    let moment = |(step, value): (usize, &f64)| (step as f64 - middle) * value;
+    let count = values.len() as f64;
+    values.iter().enumerate().map(moment).sum::<f64>() * 12.0 / (count * (count * count - 1.0))
 }
 
 fn norm(values: &[f64]) -> f64 {

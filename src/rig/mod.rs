@@ -85,8 +85,9 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type Fleet: Fleet<Estimate<Self>>;
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
     const AXES: usize;
-    /// The field of truths and estimates that the loop does not control, if there is one: a motion that is shifted in it is
-    /// as good.
+    /// The fields of truths and estimates that the loop controls: their errors are to vanish.
+    const CONTROLLED: &'static [&'static str];
+    /// The field of truths that the loop does not control, if there is one: a motion that is shifted in it is as good.
     const FREE: Option<&'static str> = None;
 
     /// The bodies; the first is the observed one.

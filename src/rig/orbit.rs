@@ -166,6 +166,7 @@ impl Rig for OrbitRig {
     type CommandGuard = CommandGuard;
     type Fleet = NoFleet;
     const AXES: usize = 4;
+    const CONTROLLED: &'static [&'static str] = &["radius_du", "velocity_du_s"];
     const FREE: Option<&'static str> = Some("angle_rad");
 
     fn bodies(&self) -> &[BodyInfo] {

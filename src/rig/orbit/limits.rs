@@ -14,6 +14,8 @@ use serde::{Deserialize, Serialize};
 
 /// A default speed limit lies so far above what the initial orbits reach.
 const SPEED_MARGIN: f64 = 3.0;
+/// And above the speed of a fall to the central body.
+const FALL_MARGIN: f64 = 1.5;
 /// Rounding of a limit that is itself a permitted value.
 const ROUNDING: f64 = 1e-12;
 
@@ -47,7 +49,8 @@ pub(super) struct Limits {
 }
 
 impl Limits {
-    /// The speed given, or well above that of the initial orbits where they are fastest and of the target circle.
+    /// The speed given, or well above that of the initial orbits where they are fastest, of the target circle, and of a fall
+    /// to the central body.
     pub fn resolve(
         raw: &RawLimits,
         field: CentralField,
@@ -73,7 +76,10 @@ impl Limits {
             });
         }
         let fastest = states.iter().map(pericentre).fold(initial.max(circle), f64::max);
-        raw.speed_du_s.unwrap_or(SPEED_MARGIN * fastest)
+        // A body that is thrust off its orbit falls to the centre at the worst.
+        let energy = states.iter().map(|state| field.energy(state)).fold(0.0, f64::max);
+        let falling = (2.0 * (energy + field.mu() / field.inner())).sqrt();
+        raw.speed_du_s.unwrap_or((SPEED_MARGIN * fastest).max(FALL_MARGIN * falling))
     }
 
     /// For people.

@@ -200,6 +200,7 @@ impl Rig for RigidBodyRig {
     type CommandGuard = CommandGuard;
     type Fleet = RateFleet;
     const AXES: usize = 3;
+    const CONTROLLED: &'static [&'static str] = &["omega_rad_s", "coefficients"];
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies
@@ -369,7 +370,10 @@ impl Rig for RigidBodyRig {
             match &mut rig.observer {
                 ObserverDesign::Hidden { guess_rad_s, .. } => *guess_rad_s = leader[self.supplied()] + off,
                 ObserverDesign::Learner(parts) => {
-                    parts.identifier = parts.identifier.clone().begun_at(&self.inertia.coefficients());
+                    // Coefficients are at most 1 where rates are of the leader's size.
+                    let off = off / leader.norm().max(f64::MIN_POSITIVE);
+                    let begun = self.inertia.coefficients().add_scalar(off);
+                    parts.identifier = parts.identifier.clone().begun_at(&begun);
                 }
             }
         }
