@@ -24,6 +24,28 @@ pub trait Words {
         self.word(&mut bits);
         *value = f64::from_bits(bits);
     }
+
+    /// Passes a number that weighs what is estimated and is no part of it: a covariance.
+    #[inline]
+    fn weight(&mut self, value: &mut f64) {
+        self.number(value);
+    }
+}
+
+/// Passes the numbers of a state as [weights](Words::weight).
+#[derive(Debug)]
+pub struct Weights<'a, W>(pub &'a mut W);
+
+impl<W: Words> Words for Weights<'_, W> {
+    #[inline]
+    fn word(&mut self, value: &mut u64) {
+        self.0.word(value);
+    }
+
+    #[inline]
+    fn number(&mut self, value: &mut f64) {
+        self.0.weight(value);
+    }
 }
 
 /// Counts words and changes nothing.

@@ -159,14 +159,28 @@ struct Stretch<'a> {
     factor: f64,
 }
 
+impl Stretch<'_> {
+    /// The next number of where the distance is measured from, and of what is taken away.
+    fn next(&mut self) -> Option<(f64, f64)> {
+        let (from, rest) = self.from.split_first()?;
+        let (away, further) = self.away.split_first().unwrap_or((&0.0, &[]));
+        (self.from, self.away) = (rest, further);
+        Some((*from, *away))
+    }
+}
+
 impl Words for Stretch<'_> {
     fn word(&mut self, _: &mut u64) {}
 
     fn number(&mut self, value: &mut f64) {
-        let Some((from, rest)) = self.from.split_first() else { return };
-        let (away, further) = self.away.split_first().unwrap_or((&0.0, &[]));
+        let Some((from, away)) = self.next() else { return };
         let moved = from + self.factor * (*value - from - away);
-        (self.from, self.away) = (rest, further);
-        *value = if moved.is_finite() { moved } else { *from };
+        *value = if moved.is_finite() { moved } else { from };
+    }
+
+    /// Where nothing errs, weights change nothing: a small difference in them is no part of the linearised loop. It falls more
+    /// slowly than the error, and would outgrow it by being stretched with it.
+    fn weight(&mut self, value: &mut f64) {
+        *value = self.next().map_or(*value, |(from, _)| from);
     }
 }

@@ -261,18 +261,18 @@ impl<'a, R: Rig> Analysis<'a, R> {
                 "this sampled loop diverges even from where it is settled; lower the gains or raise tick_hz".to_owned()
             );
         }
-        if rate_per_s.is_nan() || *rate_per_s <= 0.0 {
-            return Err(format!(
-                "the error of this sampled loop grows, by {} 1/s; lower the gains or raise tick_hz",
-                digits(-rate_per_s)
-            ));
-        }
         if !exponent.agrees() {
             let (least, greatest) = range(parts_per_s);
             return Err(format!(
                 "the decay rate is not uniform along this motion: from {} to {} 1/s",
                 digits(least),
                 digits(greatest)
+            ));
+        }
+        if rate_per_s.is_nan() || *rate_per_s <= 0.0 {
+            return Err(format!(
+                "the error of this sampled loop grows, by {} 1/s; lower the gains or raise tick_hz",
+                digits(-rate_per_s)
             ));
         }
         Ok(*rate_per_s)

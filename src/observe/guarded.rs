@@ -11,7 +11,7 @@
 
 use super::{HiddenRate, HiddenRateError, KalmanFilter, Observation, RateSample};
 use crate::model::{euler, rk4_step};
-use crate::state::persist_fields;
+use crate::state::{Persist, Weights, Words};
 use nalgebra::{Matrix3, Vector1, Vector3};
 
 /// How many of the guard's standard deviations the estimate may be away from it.
@@ -165,4 +165,10 @@ impl GuardedKalman {
     }
 }
 
-persist_fields!(GuardedKalman, guard, state, covariance);
+impl Persist for GuardedKalman {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.guard.persist(words);
+        self.state.persist(words);
+        self.covariance.persist(&mut Weights(words));
+    }
+}

@@ -8,7 +8,7 @@
 //! the state is the residual r = φ − φ̂.
 
 use super::{Increment, StepAgain};
-use crate::state::{Persist, Words, persist_fields};
+use crate::state::{Persist, Weights, Words, persist_fields};
 use nalgebra::SVector;
 
 /// Second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
@@ -223,7 +223,7 @@ impl<const N: usize> Persist for KalmanFilter<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.estimate.persist(words);
         self.residual.persist(words);
-        self.covariance.persist(words);
+        self.covariance.persist(&mut Weights(words));
         self.based.persist(words);
     }
 }

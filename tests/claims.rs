@@ -1,0 +1,452 @@
+//! What `corotate check` claims of a loop, held against what the loop does: random scenarios of all kinds.
+//!
+//! A claim is false if the loop does not converge, if its error falls at another rate than the printed one, or if it ends at
+//! another floor. Converging loops of which nothing is claimed are counted: to promise nothing is easy.
+//!
+//! `tests/claims-campaign N` draws N scenarios; without a number it is a short run.
+
+use corotate::analysis::{Claim, claims};
+use corotate::bus::memory::MemoryBus;
+use corotate::bus::{Reader, Signal};
+use corotate::config::Scenario;
+use corotate::rig::{Estimate, Rig, Truth};
+use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, report, topic};
+use corotate::sample::{FieldKind, Sample};
+use corotate::with_rig;
+use rand_pcg::Pcg64;
+use rand_pcg::rand_core::{Rng, SeedableRng};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A run is no longer than this.
+const TICKS_MAX: u64 = 200_000;
+/// The rate must be the printed one to within this part, over so many decades of the error, and a whole number of periods of
+/// the leader's motion.
+const RATE: f64 = 0.05;
+const DECADES: f64 = 3.0;
+/// The floor must be the printed one to within this factor.
+const FLOOR: f64 = 10.0;
+/// An error is small, and the linearised loop speaks of it, below this part of the largest.
+const SMALL: f64 = 1e-2;
+/// A loop whose error has fallen to this part of the largest, and of what it follows, has converged.
+const CONVERGED: f64 = 1e-3;
+
+struct Draw(Pcg64);
+
+impl Draw {
+    fn uniform(&mut self, from: f64, to: f64) -> f64 {
+        from + (to - from) * (self.0.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// With an evenly distributed logarithm.
+    fn log(&mut self, from: f64, to: f64) -> f64 {
+        self.uniform(from.ln(), to.ln()).exp()
+    }
+
+    fn chance(&mut self, part: f64) -> bool {
+        self.uniform(0.0, 1.0) < part
+    }
+
+    fn below(&mut self, limit: u64) -> u64 {
+        self.0.next_u64() % limit
+    }
+
+    fn sign(&mut self) -> f64 {
+        if self.chance(0.5) { 1.0 } else { -1.0 }
+    }
+
+    fn direction(&mut self) -> [f64; 3] {
+        loop {
+            let v = [(); 3].map(|()| self.uniform(-1.0, 1.0));
+            let norm = v.iter().map(|v| v * v).sum::<f64>().sqrt();
+            if (0.1..1.0).contains(&norm) {
+                return v.map(|v| v / norm);
+            }
+        }
+    }
+
+    fn inertia(&mut self, axisymmetric: bool) -> [f64; 3] {
+        let scale = self.log(1e-6, 1e4);
+        let (a, b) = (1.0, if axisymmetric { 1.0 } else { self.uniform(0.3, 1.0) });
+        let c = match self.below(4) {
+            // A plate, or nearly.
+            0 => (a + b) * (1.0 - self.log(1e-6, 1e-1)),
+            // Nearly a sphere.
+            1 => b * (1.0 + self.log(1e-6, 1e-1)),
+            _ => self.uniform(a - b + 0.05, a + b),
+        };
+        let mut moments = [a, b, c].map(|moment| moment * scale);
+        if !axisymmetric {
+            moments.rotate_left(self.below(3) as usize);
+        }
+        moments
+    }
+
+    /// A leader's rate: any, on a separatrix, or about a principal axis, exactly or nearly.
+    fn rate(&mut self, inertia: [f64; 3]) -> [f64; 3] {
+        let size = self.log(1e-3, 50.0);
+        match self.below(10) {
+            0 => {
+                let mut order = [0, 1, 2];
+                order.sort_by(|i, j| inertia[*i].total_cmp(&inertia[*j]));
+                let [i, j, k] = order;
+                let ratio = (inertia[i] * (inertia[j] - inertia[i]) / (inertia[k] * (inertia[k] - inertia[j]))).sqrt();
+                let mut rate = [0.0; 3];
+                (rate[i], rate[k]) = (size, if ratio.is_finite() { ratio * size } else { size });
+                rate
+            }
+            1 => {
+                let mut rate = [0.0; 3];
+                rate[self.below(3) as usize] = size;
+                if self.chance(0.5) {
+                    rate[self.below(3) as usize] += size * self.log(1e-6, 1e-1);
+                }
+                rate
+            }
+            _ => self.direction().map(|v| v * size),
+        }
+    }
+
+    /// The text of a scenario, which may be refused.
+    fn scenario(&mut self) -> String {
+        if self.chance(0.15) { self.orbit() } else { self.rigid_body() }
+    }
+
+    fn rigid_body(&mut self) -> String {
+        let kind = self.below(20);
+        let axisymmetric = kind == 0;
+        let learner = kind < 3;
+        let inertia = self.inertia(axisymmetric);
+        let rate = self.rate(inertia);
+        let size = rate.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let tick_hz = self.log(5.0, 1e4);
+        let gain = self.log(1e-3, 1.99) * tick_hz;
+        let decay = self.log(0.05, 1e3);
+        let hidden = 1 + self.below(3);
+        let measured: Vec<u64> = (1..=3).filter(|axis| learner || *axis != hidden).collect();
+        let noise = if self.chance(0.15) || kind == 4 { self.log(1e-6, 1e-2) * size } else { 0.0 };
+        let noises = [1, 2, 3].map(|axis| if measured.contains(&axis) { noise } else { 0.0 });
+        let reach = self.log(0.1, 3.0);
+        let own = self.direction().map(|v| v * size * reach);
+        let guess = if learner { 0.0 } else { self.sign() * size * self.log(0.1, 50.0) };
+        let filter = match kind {
+            0 => format!(
+                "kind = \"axisymmetric-inertia\"\nsymmetry_axis = 3\nidentifier_decay = [{decay:?}, {decay:?}, {decay:?}]\n\
+                 decay_rate_per_s = {decay:?}"
+            ),
+            1 | 2 => format!(
+                "kind = \"inertia\"\nidentifier_decay = [{decay:?}, {decay:?}, {decay:?}]\ndecay_rate_per_s = {decay:?}"
+            ),
+            3 => format!("bandwidth_rad_s = {decay:?}\ninitial_guess_rad_s = {guess:?}"),
+            4 => format!(
+                "process_noise_rad2_s3 = {:?}\ninitial_guess_rad_s = {guess:?}",
+                self.log(1e-10, 1e-2) * size * size
+            ),
+            _ => format!("decay_rate_per_s = {decay:?}\ninitial_guess_rad_s = {guess:?}"),
+        };
+        let (predict, learned) = (self.chance(0.5), if learner { "learned" } else { "known" });
+        let factor = if self.chance(0.1) { [(); 3].map(|()| self.uniform(0.97, 1.03)) } else { [1.0; 3] };
+        format!(
+            "name = \"random\"\nrig = \"rigid-body\"\nclock = \"in-process\"\ntick_hz = {tick_hz:?}\nduration_s = 1.0\n\
+             [leader]\ninertia_kg_m2 = {inertia:?}\ninitial_rate_rad_s = {rate:?}\nmeasured_axes = {measured:?}\n\
+             noise_rad_s = {noises:?}\n[[follower]]\nname = \"follower\"\ninitial_rate_rad_s = {own:?}\n\
+             inertia_factor = {factor:?}\n[observer]\n{filter}\n[controller]\ngain_per_s = {:?}\npredict = {predict}\n\
+             coefficients = \"{learned}\"\n",
+            [gain; 3]
+        )
+    }
+
+    fn orbit(&mut self) -> String {
+        let tick_hz = self.log(5.0, 1e4);
+        let decay = self.log(0.05, 1e3);
+        let (radius, slow) = (self.uniform(0.5, 2.0), self.uniform(0.8, 1.1));
+        let velocity = |radius: f64, slow: f64| slow / radius.sqrt();
+        let guess = [(); 2].map(|()| self.uniform(-3.0, 3.0));
+        let (damping, fast) = (self.uniform(0.3, 1.5), self.log(0.1, 10.0));
+        let predict = self.chance(0.5);
+        let thrust = self.log(0.3, 30.0);
+        let noise = if self.chance(0.15) { self.log(1e-8, 1e-4) } else { 0.0 };
+        let filter = match self.below(4) {
+            0 => format!("bandwidth_rad_s = {:?}", [decay; 2]),
+            1 if noise > 0.0 => format!("process_noise_du2_s3 = {:?}", self.log(1e-10, 1e-4)),
+            _ => format!("decay_rate_per_s = {:?}", [decay; 2]),
+        };
+        let sensors = format!("noise = {{ radius_du = {noise:?}, angle_rad = {noise:?} }}");
+        let common = format!(
+            "[central_body]\ngravitational_parameter_du3_s2 = 1.0\nradius_du = 0.05\nescape_radius_du = 10.0\n[observer]\n\
+             {filter}\ninitial_guess_du_s = {guess:?}\n[controller]\nthrust_max_du_s2 = {thrust:?}\npredict = {predict}\n\
+             gain = {{ radius_per_s2 = {:?}, radial_per_s = {:?}, transverse_per_s = {:?} }}\n",
+            fast * fast,
+            2.0 * damping * fast,
+            fast * self.uniform(0.5, 2.0)
+        );
+        let head = |rig: &str| {
+            format!(
+                "name = \"random\"\nrig = \"{rig}\"\nclock = \"in-process\"\ntick_hz = {tick_hz:?}\nduration_s = 1.0\n"
+            )
+        };
+        let body = |name: &str, radius: f64, slow: f64, vr: f64| {
+            format!(
+                "{name}\ninitial_radius_du = {radius:?}\ninitial_velocity_du_s = {:?}\n",
+                [vr, velocity(radius, slow)]
+            )
+        };
+        let (vr, other) = (self.uniform(-0.2, 0.2), radius * self.uniform(0.8, 1.2));
+        if self.chance(0.5) {
+            let spacecraft = body("[spacecraft]", radius, slow, vr);
+            head("orbit-hold") + &common + &format!("target_radius_du = {other:?}\n") + &spacecraft + &sensors + "\n"
+        } else {
+            let leader = body("[leader]", radius, slow, vr);
+            let follower = body("[[follower]]\nname = \"follower\"", other, self.uniform(0.9, 1.1), 0.0);
+            head("orbit-rendezvous") + &common + &leader + &sensors + "\n" + &follower
+        }
+    }
+}
+
+/// What a loop did.
+struct Trace {
+    tick_s: f64,
+    /// The rig's metrics, tick by tick.
+    errors: Vec<Vec<f64>>,
+    /// What the leader's motion was, but for an angle that only grows.
+    motion: Vec<Vec<f64>>,
+    /// Samples that a guard has refused.
+    rejected: u64,
+}
+
+fn run(scenario: &Scenario) -> Trace {
+    fn typed<R: Rig>(rig: &R, scenario: &Scenario) -> Trace {
+        let bus = MemoryBus::new(depths(scenario));
+        let seats: Vec<_> =
+            RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
+        let mut nodes: Vec<_> =
+            seats.iter().map(|(role, ledger)| build(rig, scenario, *role, &bus, ledger).unwrap()).collect();
+        let bodies = rig.bodies();
+        let mut truths: Vec<Input<MemoryBus, Truth<R>>> = (bodies.iter())
+            .map(|body| Input::watch(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
+            .collect();
+        let mut estimate: Input<MemoryBus, Estimate<R>> =
+            Input::watch(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+        let numbers: Vec<_> = Truth::<R>::FIELDS
+            .iter()
+            .filter(|field| field.kind == FieldKind::F64 && R::CONTROLLED.contains(&field.name))
+            .collect();
+        let (mut errors, mut motion) = (Vec::new(), Vec::new());
+        let each = |_: u64| {
+            truths.iter_mut().for_each(|truth| assert!(truth.advance().unwrap()));
+            estimate.advance().unwrap();
+            let mut values = vec![0.0; rig.metrics().len()];
+            rig.score(|index| truths[index].sample(), |_| None, estimate.sample(), &mut values);
+            errors.push(values);
+            let words = corotate::sample::Message::words(truths[0].sample().unwrap());
+            let of = |field: &&corotate::sample::Field| words[field.offset / 8..][..field.count].to_vec();
+            motion.push(numbers.iter().flat_map(of).map(f64::from_bits).collect());
+            true
+        };
+        in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
+        let read = seats.iter().flat_map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()).read);
+        let rejected = read.map(|link| link.rejected).sum();
+        Trace { tick_s: scenario.tick_s(), errors, motion, rejected }
+    }
+    with_rig!(&scenario.rig, rig => typed(rig, scenario))
+}
+
+fn norm(values: &[f64]) -> f64 {
+    values.iter().map(|value| value * value).sum::<f64>().sqrt()
+}
+
+fn list(values: &[f64]) -> String {
+    values.iter().map(|value| format!("{value:.1e}")).collect::<Vec<_>>().join(", ")
+}
+
+fn distance(one: &[f64], other: &[f64]) -> f64 {
+    norm(&one.iter().zip(other).map(|(one, other)| one - other).collect::<Vec<_>>())
+}
+
+impl Trace {
+    /// The ticks after which the leader's motion is what it was: one if it rests, none if it does not come back.
+    fn period(&self) -> Option<usize> {
+        let (first, size) = (&self.motion[0], norm(&self.motion[0]));
+        let away = |tick: usize| distance(&self.motion[tick], first);
+        let left = (0..self.motion.len()).find(|tick| away(*tick) > 0.05 * size);
+        let Some(left) = left else { return Some(1) };
+        let near = |tick: &usize| away(*tick) <= away(tick - 1) && away(*tick) < away(tick + 1);
+        // The nearest samples of a motion that comes back lie half a step off.
+        let step = |tick: usize| distance(&self.motion[tick], &self.motion[tick - 1]);
+        (left + 1..self.motion.len() - 1).filter(near).find(|tick| away(*tick) <= 0.02 * size + step(*tick))
+    }
+
+    /// All errors of a tick as one, each in parts of its own largest.
+    fn combined(&self) -> (Vec<f64>, Vec<f64>) {
+        let metrics = self.errors[0].len();
+        let largest: Vec<f64> =
+            (0..metrics).map(|i| self.errors.iter().map(|row| row[i]).fold(f64::MIN_POSITIVE, f64::max)).collect();
+        let all = self.errors.iter().map(|row| row.iter().zip(&largest).map(|(error, largest)| error / largest).sum());
+        (all.collect(), largest)
+    }
+
+    /// The largest error of each kind over the last quarter of the run.
+    fn tail(&self) -> Vec<f64> {
+        let from = self.errors.len() * 3 / 4;
+        let of = |i: usize| {
+            let errors = self.errors[from..].iter().map(|row| if row[i].is_nan() { f64::INFINITY } else { row[i] });
+            errors.fold(0.0, f64::max)
+        };
+        (0..self.errors[0].len()).map(of).collect()
+    }
+
+    /// Whether every error has become small, beside what it was and what there is to follow.
+    fn converged(&self) -> bool {
+        let (_, largest) = self.combined();
+        let size = norm(&self.motion[0]).max(1e-300);
+        let small = |(tail, largest): (&f64, &f64)| {
+            tail.is_finite() && *tail <= CONVERGED * largest && *tail <= 0.05 * size.max(*largest)
+        };
+        self.tail().iter().zip(&largest).all(small)
+    }
+
+    /// The rates at which the error fell once it was small, 1/s: over the last decades above so many times its floor, between
+    /// whole periods of the leader's motion; and over all of them, by the nearest straight line, as other modes and slow swings
+    /// count least there. None if the fall was too short to be told.
+    fn rates(&self, floors: &[f64]) -> Result<[f64; 2], &'static str> {
+        let period = self.period().unwrap_or(1);
+        let (all, largest) = self.combined();
+        let floor: f64 = floors.iter().zip(&largest).map(|(floor, largest)| floor / largest).sum();
+        let floor = floor.max(1e-14) * 2.0 * FLOOR;
+        let end = all.iter().position(|error| *error <= floor).ok_or("the floor is not reached")?;
+        let small = all[..end].iter().rposition(|error| *error >= SMALL).map_or(0, |tick| tick + 1);
+        let high = all[end] * 10_f64.powf(DECADES);
+        let begin = all[..end].iter().rposition(|error| *error >= high).ok_or("the floor is too high")?;
+        let ticks = (end - begin).div_ceil(period) * period;
+        let begin = end.checked_sub(ticks).filter(|begin| *begin >= small).ok_or("the fall is too short")?;
+        let last = (all[begin] / all[end]).ln() / (ticks as f64 * self.tick_s);
+        let times = (small..end).map(|tick| tick as f64 * self.tick_s);
+        let (count, logarithms) = ((end - small) as f64, all[small..end].iter().map(|error| error.ln()));
+        let middle = 0.5 * (small + end - 1) as f64 * self.tick_s;
+        let mean = logarithms.clone().sum::<f64>() / count;
+        let moments = times.zip(logarithms).fold((0.0, 0.0), |(cross, square), (time, logarithm)| {
+            (cross + (time - middle) * (logarithm - mean), square + (time - middle) * (time - middle))
+        });
+        Ok([last, -moments.0 / moments.1])
+    }
+}
+
+/// What came of a scenario.
+#[derive(Debug)]
+enum Verdict {
+    /// The claim holds; its rate could be fitted, or why not.
+    Holds(Result<[f64; 2], &'static str>),
+    /// The claim is false.
+    False(String),
+    /// Nothing is claimed of a loop that does not converge, as far as can be seen.
+    Silent,
+    /// Nothing is claimed of a loop that converges.
+    Missed(String),
+    /// The claim is of a fall that takes longer than a run may.
+    Slow,
+}
+
+/// A scenario that is not refused, its claim, and what came of it.
+fn judge(text: &str) -> Option<(Claim, Verdict)> {
+    let with = |duration_s: f64| Scenario::parse(text, "random", &[format!("duration_s={duration_s:?}")]);
+    let first = with(1.0).ok()?;
+    let (tick_s, guessed) = (first.tick_s(), claims(&first).remove(0));
+    // From the largest error that a double can tell from its rounding, and a transient before.
+    let ticks = |rate_per_s: f64| 60.0 / (rate_per_s * tick_s) + 2_000.0;
+    let needed = ticks(guessed.loop_rate_per_s.or(guessed.continuous_rate_per_s).unwrap_or(1.0)).min(TICKS_MAX as f64);
+    let scenario = with(needed * tick_s).ok()?;
+    let claim = claims(&scenario).remove(0);
+    let trace = run(&scenario);
+    let Some(rate) = claim.loop_rate_per_s else {
+        let reason = claim.reason.clone().unwrap_or_default();
+        return Some((claim, if trace.converged() { Verdict::Missed(reason) } else { Verdict::Silent }));
+    };
+    let whole = ticks(rate) <= TICKS_MAX as f64;
+    if !whole && !trace.converged() {
+        return Some((claim, Verdict::Slow));
+    }
+    let (tail, floors): (_, Vec<f64>) = (trace.tail(), claim.floors.iter().map(|floor| floor.value).collect());
+    let rounding = 8.0 * f64::EPSILON * norm(&trace.motion[0]).max(1e-3);
+    let within = |lower: &[f64], higher: &[f64]| {
+        let mut pairs = lower.iter().zip(higher);
+        !whole || pairs.all(|(lower, higher)| *lower <= FLOOR * higher.max(rounding))
+    };
+    let fitted = trace.rates(&floors);
+    // A swing that is as long as the fall tilts the two lines to different sides.
+    let off = |fitted: [f64; 2]| {
+        fitted.iter().all(|fitted| *fitted > rate * (1.0 + RATE))
+            || fitted.iter().all(|fitted| *fitted < rate * (1.0 - RATE))
+    };
+    let verdict = if !within(&tail, &floors) {
+        let what = format!("ends at {}, not at {}", list(&tail), list(&floors));
+        Verdict::False(format!("{what}; {} samples rejected", trace.rejected))
+    } else if !within(&floors, &tail) {
+        Verdict::False(format!("ends at {}, far below {}", list(&tail), list(&floors)))
+    } else if fitted.is_ok_and(off) {
+        Verdict::False(format!("falls at {fitted:.4?} 1/s, not at {rate:.4}"))
+    } else {
+        Verdict::Holds(fitted)
+    };
+    Some((claim, verdict))
+}
+
+#[test]
+fn what_is_claimed_holds() {
+    let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
+    let (count, seed) = (of("COROTATE_CLAIMS", 200), of("COROTATE_SEED", 1));
+    let (next, refused) = (AtomicU64::new(0), AtomicU64::new(0));
+    let counts = Mutex::new(BTreeMap::<&str, u64>::new());
+    let unfitted = Mutex::new(BTreeMap::<&str, u64>::new());
+    let (wrong, missed) = (Mutex::new(String::new()), Mutex::new(BTreeMap::<String, u64>::new()));
+    std::thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                loop {
+                    let number = next.fetch_add(1, Ordering::Relaxed);
+                    if number >= count {
+                        break;
+                    }
+                    let mut draw = Draw(Pcg64::seed_from_u64(seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15)));
+                    let (text, (_, verdict)) = loop {
+                        let text = draw.scenario();
+                        if let Some(judged) = judge(&text) {
+                            break (text, judged);
+                        }
+                        refused.fetch_add(1, Ordering::Relaxed);
+                    };
+                    let name = match verdict {
+                        Verdict::Holds(Ok(_)) => "holds, rate fitted",
+                        Verdict::Holds(Err(why)) => {
+                            *unfitted.lock().unwrap().entry(why).or_default() += 1;
+                            "holds, rate not to be fitted"
+                        }
+                        Verdict::Silent => "no claim, does not converge",
+                        Verdict::Slow => "takes too long to be judged",
+                        Verdict::Missed(reason) => {
+                            println!("{number}: nothing is claimed: {reason}\n{text}");
+                            *missed.lock().unwrap().entry(reason.chars().take(40).collect()).or_default() += 1;
+                            "no claim, and yet it converges"
+                        }
+                        Verdict::False(what) => {
+                            println!("{number}: false: {what}\n{text}");
+                            writeln!(wrong.lock().unwrap(), "{number}: {what}\n{text}").unwrap();
+                            "false claim"
+                        }
+                    };
+                    *counts.lock().unwrap().entry(name).or_default() += 1;
+                }
+            });
+        }
+    });
+    let (counts, wrong) = (counts.into_inner().unwrap(), wrong.into_inner().unwrap());
+    println!("{count} scenarios with seed {seed}, {} more refused: {counts:#?}", refused.into_inner());
+    println!("why no rate was fitted: {:#?}", unfitted.into_inner().unwrap());
+    println!("why nothing was claimed of loops that converge: {:#?}", missed.into_inner().unwrap());
+    assert!(wrong.is_empty(), "false claims:\n{wrong}");
+    let of = |name: &str| *counts.get(name).unwrap_or(&0) as f64;
+    let claimed = of("holds, rate fitted") + of("holds, rate not to be fitted");
+    let all = claimed + of("no claim, and yet it converges");
+    assert!(claimed >= 0.8 * all, "of {all} loops that converge, only {claimed} carry a claim");
+}
