@@ -8,7 +8,7 @@
 use corotate::analysis::{Claim, claims};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::config::Scenario;
+use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Estimate, Rig, Truth};
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, report, topic};
 use corotate::sample::{FieldKind, Sample};
@@ -319,9 +319,13 @@ impl Trace {
         let small = all[..end].iter().rposition(|error| *error >= SMALL).map_or(0, |tick| tick + 1);
         let high = all[end] * 10_f64.powf(DECADES);
         let begin = all[..end].iter().rposition(|error| *error >= high).ok_or("the floor is too high")?;
-        let ticks = (end - begin).div_ceil(period) * period;
-        let begin = end.checked_sub(ticks).filter(|begin| *begin >= small).ok_or("the fall is too short")?;
-        let last = (all[begin] / all[end]).ln() / (ticks as f64 * self.tick_s);
+        if begin < small {
+            return Err("the fall is too short");
+        }
+        // A fall that is over before the leader's motion has come back is that of the place where it happened.
+        let whole = end.checked_sub((end - begin).div_ceil(period) * period).filter(|begin| *begin >= small);
+        let begin = whole.unwrap_or(begin);
+        let last = (all[begin] / all[end]).ln() / ((end - begin) as f64 * self.tick_s);
         let times = (small..end).map(|tick| tick as f64 * self.tick_s);
         let (count, logarithms) = ((end - small) as f64, all[small..end].iter().map(|error| error.ln()));
         let middle = 0.5 * (small + end - 1) as f64 * self.tick_s;
@@ -349,8 +353,12 @@ enum Verdict {
 }
 
 /// A scenario that is not refused, its claim, and what came of it.
-fn judge(text: &str) -> Option<(Claim, Verdict)> {
-    let with = |duration_s: f64| Scenario::parse(text, "random", &[format!("duration_s={duration_s:?}")]);
+fn judge(text: &str, overrides: &[&str]) -> Option<(Claim, Verdict, Trace)> {
+    let with = |duration_s: f64| {
+        let duration = format!("duration_s={duration_s:?}");
+        let overrides = overrides.iter().map(|text| (*text).to_owned()).chain([duration]).collect::<Vec<_>>();
+        Scenario::parse(text, "random", &overrides)
+    };
     let first = with(1.0).ok()?;
     let (tick_s, guessed) = (first.tick_s(), claims(&first).remove(0));
     // From the largest error that a double can tell from its rounding, and a transient before.
@@ -361,11 +369,12 @@ fn judge(text: &str) -> Option<(Claim, Verdict)> {
     let trace = run(&scenario);
     let Some(rate) = claim.loop_rate_per_s else {
         let reason = claim.reason.clone().unwrap_or_default();
-        return Some((claim, if trace.converged() { Verdict::Missed(reason) } else { Verdict::Silent }));
+        let verdict = if trace.converged() { Verdict::Missed(reason) } else { Verdict::Silent };
+        return Some((claim, verdict, trace));
     };
     let whole = ticks(rate) <= TICKS_MAX as f64;
     if !whole && !trace.converged() {
-        return Some((claim, Verdict::Slow));
+        return Some((claim, Verdict::Slow, trace));
     }
     let (tail, floors): (_, Vec<f64>) = (trace.tail(), claim.floors.iter().map(|floor| floor.value).collect());
     let rounding = 8.0 * f64::EPSILON * norm(&trace.motion[0]).max(1e-3);
@@ -389,7 +398,45 @@ fn judge(text: &str) -> Option<(Claim, Verdict)> {
     } else {
         Verdict::Holds(fitted)
     };
-    Some((claim, verdict))
+    Some((claim, verdict, trace))
+}
+
+/// Loops whose rate is not that of the continuous law, and shipped ones: the table of the README.
+#[test]
+fn a_sampled_loop_is_claimed_to_do_what_it_does() {
+    let fast = "observer.decay_rate_per_s=200.0";
+    let gain = |gain: &str| format!("controller.gain_per_s=[{gain}, {gain}, {gain}]");
+    let gains = ["50.0", "70.0", "90.0", "190.0"].map(gain);
+    let [half, more, most, ahead] = gains.each_ref().map(|gain| &**gain);
+    let turns =
+        ["leader.inertia_kg_m2=[1.0, 1.1, 2.05]", "leader.initial_rate_rad_s=[16.0, -11.0, 22.0]", "tick_hz=20.0"];
+    println!("| loop | continuous law, 1/s | claimed, 1/s | observed |\n|---|---|---|---|");
+    for (name, scenario, overrides, claimed) in [
+        ("gain times tick 0.5", "rigid-pair", &["tick_hz=100.0", fast, half][..], true),
+        ("gain times tick 0.7", "rigid-pair", &["tick_hz=100.0", fast, more], true),
+        ("gain times tick 0.9", "rigid-pair", &["tick_hz=100.0", fast, most], true),
+        ("1.9, predicted", "rigid-pair", &["tick_hz=100.0", fast, ahead, "controller.predict=true"], true),
+        ("28 rad/s at 20 Hz", "rigid-pair", &turns, false),
+        ("about the hidden axis", "rigid-pair", &["leader.initial_rate_rad_s=[0.0, 0.0, 0.8]"], false),
+        ("orbit-hold from (0, 0.6)", "orbit-hold", &["spacecraft.initial_velocity_du_s=[0.0, 0.6]"], true),
+        ("orbit-hold", "orbit-hold", &[], true),
+        ("orbit-rendezvous", "orbit-rendezvous", &[], true),
+        ("orbit-rendezvous at 3 Hz", "orbit-rendezvous", &["tick_hz=3.0"], false),
+        ("rigid-pair", "rigid-pair", &[], true),
+        ("rigid-pair-hyperbolic", "rigid-pair-hyperbolic", &[], true),
+    ] {
+        let text = SHIPPED.iter().find(|(shipped, _)| *shipped == scenario).unwrap().1;
+        let overrides = [&["clock=in-process", "accept={}"], overrides].concat();
+        let (claim, verdict, trace) = judge(text, &overrides).unwrap();
+        let shown = |rate: Option<f64>| rate.map_or("none".to_owned(), |rate| format!("{rate:.4}"));
+        let observed = match verdict {
+            Verdict::Holds(Ok([last, _])) => format!("{last:.4} 1/s"),
+            _ => format!("{} at the end", list(&trace.tail())),
+        };
+        println!("| {name} | {} | {} | {observed} |", shown(claim.continuous_rate_per_s), shown(claim.loop_rate_per_s));
+        let holds = if claimed { matches!(verdict, Verdict::Holds(Ok(_))) } else { matches!(verdict, Verdict::Silent) };
+        assert!(holds, "{name}: {verdict:?} of {claim:?}");
+    }
 }
 
 #[test]
@@ -409,9 +456,9 @@ fn what_is_claimed_holds() {
                         break;
                     }
                     let mut draw = Draw(Pcg64::seed_from_u64(seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15)));
-                    let (text, (_, verdict)) = loop {
+                    let (text, (_, verdict, _)) = loop {
                         let text = draw.scenario();
-                        if let Some(judged) = judge(&text) {
+                        if let Some(judged) = judge(&text, &[]) {
                             break (text, judged);
                         }
                         refused.fetch_add(1, Ordering::Relaxed);
