@@ -3,6 +3,7 @@
 use crate::role::{die_with, terminated_by_signals};
 use crate::{Exit, fail, remark, say};
 use corotate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Options of `corotate record`.
@@ -79,6 +80,7 @@ pub fn exit_of(error: &RecordError) -> Exit {
             Exit::Usage
         }
         RecordError::Layout { .. } | RecordError::Missing { .. } => Exit::Usage,
+        RecordError::Read { source, .. } if source.kind() == ErrorKind::NotFound => Exit::Usage,
         RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,
         RecordError::Bus(_) | RecordError::Full { .. } | RecordError::Write { .. } | RecordError::Read { .. } => {
             Exit::Failure

@@ -122,7 +122,10 @@ impl Failure {
 pub fn run(arguments: &Arguments) -> Exit {
     let run = match new_run() {
         Ok(run) => run,
-        Err(error) => return fail(Exit::Failure, &format!("no random numbers for the run's identifier: {error}")),
+        Err(error) => {
+            let reason = "a sandbox may forbid getrandom: allow it";
+            return fail(Exit::Failure, &format!("the run gets no identifier: no random numbers: {error}; {reason}"));
+        }
     };
     let loaded = arguments.scenario().map(|scenario| Scenario { run: Some(run), ..scenario });
     let name = loaded.as_ref().map_or_else(|_| arguments.stem(), |scenario| scenario.name.clone());

@@ -1,9 +1,9 @@
-//! One driven body's loop in one place: the roles' own state machines, tick by tick, without links, guards and clocks.
+//! One driven body's loop in one place: the roles' own state machines, tick by tick, without links and clocks.
 //!
 //! It gives the bits of an undisturbed run. Must not compute anything that a role computes.
 
 use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{Actuation, Controller, Observer, Plant, Rearm};
+use crate::role::{Actuation, Controller, DOUBTS, Guard, Observer, Plant, Rearm};
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
 use crate::state::{Persist, Words};
 
@@ -129,6 +129,47 @@ impl<R: Rig> Chain<R> {
     /// Takes from every number of the state what `away` has, and then makes its distance from `from` so many times as large.
     pub fn stretch(&mut self, from: &[f64], away: &[f64], factor: f64) {
         self.state(&mut Stretch { from, away, factor });
+    }
+}
+
+/// The guards of the loop's readers. They look on: what they refuse takes part in the loop all the same.
+pub(super) struct Guards<R: Rig> {
+    measurement: R::MeasurementGuard,
+    estimate: R::EstimateGuard,
+    own: R::MeasurementGuard,
+    command: R::CommandGuard,
+    /// How many samples in a row each has refused.
+    refused: [u64; 4],
+}
+
+impl<R: Rig> Guards<R> {
+    /// Those of a rig whose last body is the driven one.
+    pub fn new(rig: &R) -> Self {
+        let last = rig.bodies().len() - 1;
+        Self {
+            measurement: rig.measurement_guard(0, false),
+            estimate: rig.estimate_guard(),
+            own: rig.measurement_guard(last, true),
+            command: rig.command_guard(last),
+            refused: [0; 4],
+        }
+    }
+
+    /// Judges the samples of the last tick. Tells which of them has been refused for longer than a guard doubts what is
+    /// right, if one has.
+    pub fn refuse(&mut self, chain: &Chain<R>) -> Option<&'static str> {
+        let own = if chain.driven.is_some() { &chain.own } else { &chain.measurement };
+        let accepted = [
+            ("the measurement of the observed body", self.measurement.accepts(&chain.measurement)),
+            ("the estimate", self.estimate.accepts(&chain.estimate)),
+            ("the measurement of the driven body", self.own.accepts(own)),
+            ("the command", self.command.accepts(&chain.command)),
+        ];
+        let mut counted = self.refused.iter_mut().zip(accepted);
+        counted.find_map(|(refused, (name, accepted))| {
+            *refused = if accepted { 0 } else { *refused + 1 };
+            (*refused > DOUBTS).then_some(name)
+        })
     }
 }
 

@@ -13,7 +13,7 @@ use crate::config::Scenario;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use crate::sample::status;
 use crate::with_rig;
-use chain::Chain;
+use chain::{Chain, Guards};
 use serde::Serialize;
 
 /// The distance of the two loops, over the size of what they say.
@@ -306,13 +306,13 @@ impl<'a, R: Rig> Analysis<'a, R> {
         floors
     }
 
-    /// Whether the scenario's own start leads where the rate speaks of. A start that does may end at a floor above that of the
-    /// settled loop, where rounding alone is left; `floors` rise to it.
+    /// Whether the scenario's own start leads where the rate speaks of. Where rounding alone is left, one that does may end at
+    /// another floor than the settled loop; `floors` become its own.
     fn arrives(&self, rate_per_s: f64, floors: &mut [f64]) -> Result<(), String> {
         let Some(rig) = self.rig.alone(self.index, Start::Given, true) else {
             return Ok(());
         };
-        let mut chain = Chain::new(&rig, self.tick_s);
+        let (mut chain, mut guards) = (Chain::new(&rig, self.tick_s), Guards::new(&rig));
         let mut values = vec![0.0; floors.len()];
         // The largest errors of all, in the second quarter, and in the last.
         let (mut largest, mut halfway, mut last) = (values.clone(), values.clone(), values.clone());
@@ -334,6 +334,13 @@ impl<'a, R: Rig> Analysis<'a, R> {
             if lost || values.iter().any(|value| !value.is_finite()) {
                 return Err("from this start the loop diverges".to_owned());
             }
+            if let Some(what) = guards.refuse(&chain) {
+                return Err(format!(
+                    "from this start the guards refuse {what} at {} s and longer than they may; raise tick_hz or [limits], \
+                     lower the gains, or begin nearer to the reference",
+                    digits(tick as f64 * self.tick_s)
+                ));
+            }
             let seen: &mut [f64] = match tick {
                 tick if tick >= ticks - part => &mut last,
                 tick if (ticks / 2 - part..ticks / 2).contains(&tick) => &mut halfway,
@@ -354,8 +361,8 @@ impl<'a, R: Rig> Analysis<'a, R> {
                     ticks as f64 * self.tick_s
                 ));
             }
-            if !capped && *last <= SMALL * largest[index] {
-                *floor = last.max(*floor);
+            if !capped {
+                *floor = *last;
             }
         }
         Ok(())

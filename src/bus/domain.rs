@@ -65,7 +65,7 @@ pub enum DomainError {
         path: PathBuf,
     },
     /// An identifier that can be guessed is none.
-    #[error("the system has no random numbers: {source}; {}", remedy(source))]
+    #[error("the system gives no random numbers: {source}; a sandbox may forbid getrandom: allow it")]
     Random {
         /// The system's reason.
         source: io::Error,

@@ -39,8 +39,8 @@ use std::path::{Path, PathBuf};
 /// Why there is no report.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
-    /// There is nothing.
-    #[error("there is no {}; give the directory of a run, or its run.mcap", path.display())]
+    /// There is no such file or directory.
+    #[error("{} does not exist; give the directory of a run, or its run.mcap", path.display())]
     Nothing {
         /// What was given.
         path: PathBuf,

@@ -285,7 +285,9 @@ pub fn certificate(source: &Source) -> Section {
         let rows = certificate.conditions.iter().map(row).collect();
         blocks.push(Block::Table { caption, head: vec!["condition", "value", "required", ""], rows });
         blocks.push(Block::Text(told_of_loop(certificate)));
-        blocks.extend(certificate.warnings.iter().map(|warning| Block::Text(format!("Warning: {warning}."))));
+        // Why no rate is claimed is told already.
+        let others = certificate.warnings.iter().filter(|warning| certificate.reason.as_ref() != Some(*warning));
+        blocks.extend(others.map(|warning| Block::Text(format!("Warning: {warning}."))));
     }
     if let Some(score) = &summary.score.certificate {
         blocks.push(Block::Text(format!(
@@ -309,12 +311,13 @@ fn told_of_loop(certificate: &super::summary::Certificate) -> String {
     };
     let floor = |floor: &super::summary::Figure| format!("{} {}", floor.name, number(floor.value));
     let floors: Vec<String> = certificate.floors.iter().map(floor).collect();
+    let floors = if floors.is_empty() { String::new() } else { format!(" Floors to expect: {}.", floors.join(", ")) };
     let reach = |reach: &super::summary::Reach| match reach.after_s {
         Some(after_s) => format!("{} ≤ {} after {} s at that rate", reach.metric, digits(reach.limit), digits(after_s)),
         None => format!("{} ≤ {} is below the floor", reach.metric, digits(reach.limit)),
     };
     let reaches: String = certificate.reaches.iter().map(|one| format!(" From the start, {}.", reach(one))).collect();
-    format!("The sampled loop of {}: {rate}. Floors to expect: {}.{reaches}", certificate.body, floors.join(", "))
+    format!("The sampled loop of {}: {rate}.{floors}{reaches}", certificate.body)
 }
 
 /// Where it ran, with which privileges, and the scenario.

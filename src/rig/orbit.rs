@@ -116,7 +116,7 @@ impl OrbitRig {
         CertificateReport {
             body: self.bodies[index].name.clone(),
             conditions: vec![
-                condition("sampled: 1 > |z| of the slowest mode", certificate.sampled),
+                condition("sampled loop: stability limit > |z| of the slowest mode", certificate.sampled),
                 condition("thrust limit > thrust asked for at the start, as the law sees it, du/s^2", margin),
             ],
             continuous_rate_per_s: self.constant_rate().then_some(certificate.rate_per_s),

@@ -30,6 +30,21 @@ fn what_is_no_file_is_refused() {
 }
 
 #[test]
+fn a_recording_that_does_not_exist_is_refused() {
+    let bench = Bench::new();
+    let commands: [&[&str]; 4] = [
+        &["report", "no.mcap"],
+        &["replay", "no.mcap"],
+        &["export", "no.mcap", "--csv", "tables"],
+        &["diff", "no.mcap", "no.mcap"],
+    ];
+    for command in commands {
+        let done = bench.run(command);
+        assert!(done.code == Some(2) && done.stderr.contains("no.mcap"), "{command:?}: {done:?}");
+    }
+}
+
+#[test]
 fn an_override_that_cannot_be_read_is_refused() {
     let deep = format!("{}=1", vec!["a"; 60_000].join("."));
     let nested = format!("tick_hz={}", "[".repeat(100_000));

@@ -415,7 +415,7 @@ impl Rig for RigidBodyRig {
             condition(&format!("[D](19) |k{j}| > |a{j}| M, 1/s"), certificate.paper[1]),
             condition("[D](19) decay rate > |ai| M + |aj| M + |kk|/2, 1/s", certificate.paper[2]),
             condition("exact (Schur) decay rate, 1/s", certificate.exact),
-            condition("sampled: limit > |k| h", certificate.gain_step),
+            condition("sampled axis: stability limit > |k| h", certificate.gain_step),
         ];
         let mut warnings = Vec::new();
         if certificate.coarse_tick() {
