@@ -18,6 +18,7 @@ mod watch;
 
 use clap::{Parser, Subcommand};
 use corotate::bus::domain::Domain;
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -183,13 +184,26 @@ fn main() -> ExitCode {
     // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
     let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
     let command = Arguments::parse().command;
+    tell_defects();
     // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
-    let exit = std::panic::catch_unwind(|| obey(command)).unwrap_or_else(|_| {
-        let reason =
-            "a defect of this program or of iceoryx2, where the lines above say; run it again, and report them";
-        fail(Exit::Failure, &reason)
-    });
+    let exit = std::panic::catch_unwind(|| obey(command))
+        .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
     exit.into()
+}
+
+/// Tells a panic as any error is told, and with RUST_BACKTRACE where it came from.
+fn tell_defects() {
+    std::panic::set_hook(Box::new(|panic| {
+        let place = panic.location().map_or(String::new(), |at| format!(" at {}:{}", at.file(), at.line()));
+        let payload = panic.payload();
+        let words = payload.downcast_ref::<String>().map(String::as_str).or(payload.downcast_ref().copied());
+        let words = words.unwrap_or("no reason given").trim();
+        remark(&format!("a defect of this program or of iceoryx2{place}: {words}"));
+        let trace = Backtrace::capture();
+        if trace.status() == BacktraceStatus::Captured {
+            remark(&trace);
+        }
+    }));
 }
 
 /// Does what the command line asks for.
