@@ -426,6 +426,27 @@ fn a_domain_that_cannot_be_locked_is_an_error() {
     bench.assert_clean(&[]);
 }
 
+/// A watcher puts away what it made anew in a run that is gone; a run that it cannot look at is not gone.
+#[test]
+fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
+    let bench = Bench::new();
+    let scenario = Target::Watch.scenario(&bench);
+    let run = bench.start(&scenario.iter().map(String::as_str).collect::<Vec<_>>());
+    bench.await_role("controller");
+    let domains = bench.domains();
+    let (domain, lock) = (domains[0].to_str().unwrap(), domains[0].with_extension("lock"));
+    // It looks once as it joins.
+    let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=2+"];
+    let done =
+        bench.start_program(Path::new("strace"), &[&fails[..], &[PROGRAM, "watch", domain, "--once", "1"]].concat());
+    let done = done.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert!(lock.exists());
+    run.signal(libc::SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    bench.assert_clean(&domains);
+}
+
 /// A janitor that hangs keeps nobody waiting.
 #[test]
 fn a_stopped_janitor_holds_no_run_up() {

@@ -205,8 +205,10 @@ fn the_foreign_follower_may_die_anywhere() {
         for (call, n) in deaths.by_ref() {
             let done = killed_at(&bench, call, n, &command(&seat)).wait();
             killed += usize::from(done.signal == Some(SIGKILL));
-            assert!(done.signal == Some(SIGKILL) || done.code == Some(0), "at {call} {n}: {done:?}");
-            if !domain.join("follower.seat.json").is_file() || running.has_ended() {
+            // One that died as it left may have been the last that the run waited for: the next comes too late.
+            let late = matches!(done.code, Some(1 | 2)) && !seat.is_file();
+            assert!(done.signal == Some(SIGKILL) || done.code == Some(0) || late, "at {call} {n}: {done:?}");
+            if late || !domain.join("follower.seat.json").is_file() || running.has_ended() {
                 break;
             }
         }

@@ -30,9 +30,13 @@ const TICKS_MAX: u64 = 256_000;
 /// An error has settled after so many of its time constants, and a quarter of them more is looked at.
 const SETTLED: f64 = 60.0;
 /// The parts of the ticks looked at must give one rate, to within this part of it: two of them where the error fell by
-/// e^-[`FALL`] in all, else four.
+/// e^-[`FALL`] in all, as it must unless that takes more than [`TICKS_MAX`]: before, what falls more slowly may not have
+/// shown; else four.
 const AGREEMENT: f64 = 0.03;
 const FALL: f64 = 20.0;
+/// Wherever the error falls by so much, e^-depth, it must do so at that rate to within this factor: a run may come to its
+/// floor before the motion comes back, or before the error has swung once. Three decades, and six.
+const UNIFORM: [(f64, f64); 2] = [(6.9, 1.6), (13.8, 1.15)];
 /// A start is small, and the linearisation speaks of it, below this part of the largest error.
 const SMALL: f64 = 1e-2;
 /// A loop whose floor is above this part of what it says synchronises nothing.
@@ -113,6 +117,8 @@ struct Exponent {
     /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over equal parts of those.
     rate_per_s: f64,
     parts_per_s: Vec<f64>,
+    /// The slowest and the fastest of all falls so deep as [`UNIFORM`] has them, 1/s.
+    local_per_s: [[f64; 2]; 2],
     /// Part of the ticks at which the observer was told nothing.
     unobserved: f64,
     /// The size of what the loop says where it is settled.
@@ -237,10 +243,13 @@ impl<'a, R: Rig> Analysis<'a, R> {
             let exponent = Exponent {
                 rate_per_s,
                 parts_per_s: (0..parts).map(|index| part(parts, index)).collect(),
+                local_per_s: UNIFORM
+                    .map(|(depth, _)| range(&stretches(&falls[begin..], depth)).map(|per_tick| per_tick / self.tick_s)),
                 unobserved: unobserved as f64 / end as f64,
                 size,
             };
-            if exponent.agrees() || end >= TICKS_MAX {
+            let shown = rate_per_s.abs() * (end_at - begin) as f64 * self.tick_s >= FALL;
+            if shown && exponent.agrees() || end >= TICKS_MAX {
                 return exponent;
             }
             end *= 2;
@@ -249,7 +258,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
 
     /// Whether the exponent is a rate.
     fn judge(&self, exponent: &Exponent) -> Result<f64, String> {
-        let Exponent { rate_per_s, parts_per_s, unobserved, .. } = exponent;
+        let Exponent { rate_per_s, parts_per_s, local_per_s, unobserved, .. } = exponent;
         if *unobserved > 0.5 {
             return Err(format!(
                 "not observable: at {:.0} % of the ticks the measured components tell nothing of the hidden one",
@@ -261,13 +270,12 @@ impl<'a, R: Rig> Analysis<'a, R> {
                 "this sampled loop diverges even from where it is settled; lower the gains or raise tick_hz".to_owned()
             );
         }
+        let not_uniform = |[least, greatest]: [f64; 2]| {
+            let [least, greatest] = [least, greatest].map(digits);
+            Err(format!("the decay rate is not uniform along this motion: from {least} to {greatest} 1/s"))
+        };
         if !exponent.agrees() {
-            let (least, greatest) = range(parts_per_s);
-            return Err(format!(
-                "the decay rate is not uniform along this motion: from {} to {} 1/s",
-                digits(least),
-                digits(greatest)
-            ));
+            return not_uniform(range(parts_per_s));
         }
         if rate_per_s.is_nan() || *rate_per_s <= 0.0 {
             return Err(format!(
@@ -275,7 +283,10 @@ impl<'a, R: Rig> Analysis<'a, R> {
                 digits(-rate_per_s)
             ));
         }
-        Ok(*rate_per_s)
+        let uneven = |(range, (_, factor)): &(&[f64; 2], (f64, f64))| {
+            range[0] * factor < *rate_per_s || range[1] > factor * rate_per_s
+        };
+        local_per_s.iter().zip(UNIFORM).find(uneven).map_or(Ok(*rate_per_s), |(range, _)| not_uniform(*range))
     }
 
     /// Ticks after whose first three quarters an error that falls at this rate has settled; at least those of the scenario.
@@ -351,7 +362,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
         }
         // What falls for longer than is looked at falls at this rate already.
         let fall = (-0.8 * rate_per_s * (ticks / 2) as f64 * self.tick_s).exp();
-        let capped = SETTLED > rate_per_s * ticks as f64 * self.tick_s;
+        let capped = SETTLED > rate_per_s * TICKS_MAX as f64 * self.tick_s;
         for (index, (last, floor)) in last.iter().zip(floors).enumerate() {
             let small = *last <= (SMALL * largest[index]).max(2.0 * *floor);
             if !(small || capped && fall < 0.7 && *last <= fall * halfway[index]) {
@@ -413,10 +424,16 @@ pub fn apart(a: f64, b: f64) -> [String; 2] {
 
 impl Exponent {
     /// That of a loop which does not even stay where it is settled.
-    const GROWS: Self = Self { rate_per_s: f64::NEG_INFINITY, parts_per_s: Vec::new(), unobserved: 0.0, size: 0.0 };
+    const GROWS: Self = Self {
+        rate_per_s: f64::NEG_INFINITY,
+        parts_per_s: Vec::new(),
+        local_per_s: [[f64::NEG_INFINITY; 2]; 2],
+        unobserved: 0.0,
+        size: 0.0,
+    };
 
     fn agrees(&self) -> bool {
-        let (least, greatest) = range(&self.parts_per_s);
+        let [least, greatest] = range(&self.parts_per_s);
         greatest - least <= AGREEMENT * self.rate_per_s.abs()
     }
 }
@@ -427,10 +444,23 @@ fn exceeds(size: f64, limit: f64) -> bool {
 }
 
 /// The least and the greatest value.
-fn range(values: &[f64]) -> (f64, f64) {
-    values
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, greatest), value| (value.min(least), value.max(greatest)))
+fn range(values: &[f64]) -> [f64; 2] {
+    let extend = |[least, greatest]: [f64; 2], value: &f64| [value.min(least), value.max(greatest)];
+    values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], extend)
+}
+
+/// How fast each stretch of a fall goes that is at least so deep, per step. What rises again has not fallen.
+fn stretches(falls: &[f64], depth: f64) -> Vec<f64> {
+    let mut falls = falls.to_vec();
+    (1..falls.len()).rev().for_each(|step| falls[step - 1] = falls[step - 1].min(falls[step]));
+    let mut end = 0;
+    let of = |begin: usize| {
+        while end < falls.len() && falls[end] - falls[begin] < depth {
+            end += 1;
+        }
+        falls.get(end).map(|fallen| (fallen - falls[begin]) / (end - begin) as f64)
+    };
+    (0..falls.len()).map_while(of).collect()
 }
 
 /// The slope of the straight line that is nearest to evenly spaced values, per step: what swings about the line counts little.

@@ -225,9 +225,9 @@ impl Domain {
         &self.root
     }
 
-    /// Whether its run has not been cleared away yet.
+    /// Whether its run has not been cleared away yet. What cannot be looked at is there.
     pub fn exists(&self) -> bool {
-        lock_path(&self.root).is_file()
+        lock_path(&self.root).try_exists().unwrap_or(true)
     }
 
     /// Removes what a process that left late has made anew in a domain that is gone.
@@ -288,7 +288,8 @@ impl Domain {
         });
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
-        if !self.root.exists() && self.in_shared_memory().next().is_none() {
+        let gone = matches!(self.root.try_exists(), Ok(false));
+        if gone && self.in_shared_memory().next().is_none() {
             let _ = fs::remove_file(lock_path(&self.root));
         }
         // The directory of all domains goes with the last; it is not empty while another run lives.

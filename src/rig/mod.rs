@@ -61,7 +61,8 @@ pub enum Start {
     Given,
     /// Where it is to get: the driven body at what it follows, the observer at the truth.
     Settled,
-    /// Off that by so much in every component that the loop controls, in their units.
+    /// Off that by about so much in every component that the loop controls, in their units: by other parts of it in each, and
+    /// the guess by others than the body, so that every mode of the error is excited.
     Off(f64),
     /// Off that by so much in the one that it does not control ([`Rig::FREE`]).
     Shifted(f64),

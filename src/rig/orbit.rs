@@ -307,9 +307,10 @@ impl Rig for OrbitRig {
                 Start::Given | Start::Settled => (0.0, 0.0),
             };
             let OrbitState { r, vr, theta, vtheta } = settled;
-            let driven = OrbitState { r: r + off, vr: vr + off, theta: theta + shift, vtheta: vtheta + off };
+            let driven =
+                OrbitState { r: r + off, vr: vr - 0.7 * off, theta: theta + shift, vtheta: vtheta + 1.3 * off };
             rig.initial = if index == 0 { vec![driven] } else { vec![self.initial[0], driven] };
-            rig.initial_guess = Vector2::new(vr + off, vtheta + off);
+            rig.initial_guess = Vector2::new(vr + 0.6 * off, vtheta - 0.9 * off);
         }
         Some(rig)
     }

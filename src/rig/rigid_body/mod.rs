@@ -366,13 +366,13 @@ impl Rig for RigidBodyRig {
         if start != Start::Given {
             let off = if let Start::Off(off) = start { off } else { 0.0 };
             let leader = self.initial_rates[0];
-            rig.initial_rates[1..].fill(leader.add_scalar(off));
+            rig.initial_rates[1..].fill(leader + Vector3::new(1.0, -0.7, 1.3) * off);
             match &mut rig.observer {
                 ObserverDesign::Hidden { guess_rad_s, .. } => *guess_rad_s = leader[self.supplied()] + off,
                 ObserverDesign::Learner(parts) => {
                     // Coefficients are at most 1 where rates are of the leader's size.
                     let off = off / leader.norm().max(f64::MIN_POSITIVE);
-                    let begun = self.inertia.coefficients().add_scalar(off);
+                    let begun = self.inertia.coefficients() + Vector3::new(1.0, -0.6, 0.8) * off;
                     parts.identifier = parts.identifier.clone().begun_at(&begun);
                 }
             }
