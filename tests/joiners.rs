@@ -220,6 +220,11 @@ fn the_foreign_follower_may_die_anywhere() {
         let done = running.wait();
         assert!([Some(0), Some(4)].contains(&done.code), "{done:?}");
         assert!(done.code == Some(0) || done.stderr.contains("follower"), "{done:?}");
+        // What one makes anew who joins as the run goes, and is killed, the next run removes.
+        let next = shipped("rigid-pair");
+        let next =
+            ["run", next.to_str().unwrap(), "--clock=lockstep", "--duration=0.01", "--set=accept={}", "--out=out"];
+        assert_eq!(bench.run(&next).code, Some(0));
         bench.assert_clean(&[domain]);
     }
     println!("the foreign follower: {killed} deaths");

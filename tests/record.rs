@@ -3,15 +3,14 @@
 mod common;
 
 use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped, skipped};
+use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
-use corotate::bus::{Carried, Read, Reader, Topic};
 use corotate::clock::{Grid, monotonic_ns};
 use corotate::config::Scenario;
 use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process, topic_of};
 use corotate::runtime::{
-    Gate, Poll, ReadyNode, RoleId, Visit, build, depths, in_turn, private_ledger, report, shared_ledger, visit_writes,
+    Gate, Poll, ReadyNode, RoleId, build, depths, in_turn, ports, private_ledger, report, shared_ledger,
 };
-use corotate::sample::{FleetLayout, FleetSample, Sample};
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
 use corotate::with_rig;
@@ -37,38 +36,13 @@ fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
     bench.run(&[&["replay", file.to_str().unwrap()], options].concat())
 }
 
-type Tap = (String, Box<dyn FnMut(&mut Vec<u8>)>);
-
-fn tap<S: Carried + ?Sized>(bus: &MemoryBus, topic: &Topic, bodies: usize) -> Tap {
-    let mut reader = S::reader(bus, topic, Reader::Scorer, bodies).unwrap();
-    let take = move |bytes: &mut Vec<u8>| {
-        while reader.advance().unwrap() {
-            bytes.extend_from_slice(bytemuck::cast_slice(reader.current().unwrap().words()));
-        }
-    };
-    (topic.to_string(), Box::new(take))
-}
-
-/// Opens a signal to take its bytes as they were sent.
-struct Open<'a>(&'a MemoryBus);
-
-impl Visit for Open<'_> {
-    type Made = Tap;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Tap {
-        tap::<S>(self.0, &topic, 1)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Tap {
-        tap::<FleetSample<L>>(self.0, &topic, bodies)
-    }
-}
-
 /// Everything that is published in a run in this thread, byte by byte, by service; no recorder takes part.
 fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let bus = MemoryBus::new(depths(scenario));
     let roles = RoleId::all(scenario);
-    let mut taps: Vec<Tap> = roles.iter().flat_map(|role| visit_writes(scenario, *role, &mut Open(&bus))).collect();
+    let writes = roles.iter().flat_map(|role| ports(scenario, *role).writes);
+    let mut taps: Vec<_> =
+        writes.map(|port| (port.topic.to_string(), port.reader(&bus, Reader::Scorer).unwrap())).collect();
     let mut all: BTreeMap<String, Vec<u8>> = BTreeMap::new();
     let node = |role: &RoleId| {
         let ledger = private_ledger(scenario, *role);
@@ -79,7 +53,11 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let grid = Grid { epoch_ns: 0, period_ns: scenario.period_ns };
     nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
     in_turn(&mut nodes, scenario.last_tick, none, |_| {
-        taps.iter_mut().for_each(|(service, take)| take(all.entry(service.clone()).or_default()));
+        for (service, reader) in &mut taps {
+            while let Some(words) = reader.next().unwrap() {
+                all.entry(service.clone()).or_default().extend_from_slice(bytemuck::cast_slice(words));
+            }
+        }
         true
     })
     .unwrap();

@@ -13,6 +13,7 @@ use crate::files::{PrivacyError, require_private, user, user_name};
 use crate::system::{random_bits, remedy};
 use rustix::fs::{FlockOperation, OFlags, flock, fstat, statvfs};
 use rustix::io::Errno;
+use std::ffi::OsStr;
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, symlink};
@@ -195,7 +196,7 @@ impl Domain {
     /// # Errors
     /// [`DomainError::NotADomain`], [`DomainError::Privacy`].
     pub fn join(root: &Path) -> Result<Self, DomainError> {
-        let named = root.file_name().is_some_and(|name| name.len() == ID_LENGTH);
+        let named = root.file_name().is_some_and(is_id);
         if named && root.is_dir() && lock_path(root).is_file() {
             Ok(Self { root: require_private(root)? })
         } else {
@@ -381,7 +382,21 @@ fn remove_dead(base: &Path) -> Vec<Domain> {
         domain.remove();
         Some(domain)
     };
-    locks(base).filter_map(remove).collect()
+    let mut removed: Vec<Domain> = locks(base).filter_map(remove).collect();
+    removed.extend(remade(base).inspect(Domain::remove));
+    removed
+}
+
+/// Domains that are gone and were made anew by somebody who joined too late, and was killed: a launcher makes the lock before
+/// the directory, and removes it after.
+fn remade(base: &Path) -> impl Iterator<Item = Domain> {
+    let entries = fs::read_dir(base).into_iter().flatten().flatten();
+    let named = entries.map(|entry| entry.path()).filter(|root| root.file_name().is_some_and(is_id));
+    named.filter(|root| matches!(lock_path(root).try_exists(), Ok(false))).map(|root| Domain { root })
+}
+
+fn is_id(name: &OsStr) -> bool {
+    name.len() == ID_LENGTH && name.as_encoded_bytes().iter().all(u8::is_ascii_hexdigit)
 }
 
 fn lock_path(root: &Path) -> PathBuf {
@@ -461,7 +476,9 @@ mod tests {
     #[test]
     fn the_dead_are_removed_and_the_living_are_not() {
         let base = tempfile::tempdir().unwrap();
-        let (dead, living) = (base.path().join("0000dead"), base.path().join("00000001"));
+        let at = |name: &str| base.path().join(format!("{name:0>ID_LENGTH$}"));
+        let (dead, living, remade, other) = (at("dead"), at("1"), at("2"), base.path().join("other"));
+        [&remade, &other].into_iter().for_each(|root| fs::create_dir(root).unwrap());
         let mut held = None;
         for root in [&dead, &living] {
             fs::create_dir(root).unwrap();
@@ -474,5 +491,6 @@ mod tests {
         assert_eq!((alive(&dead), alive(&living)), (None, Some(true)));
         assert!(!dead.exists() && !lock_path(&dead).exists());
         assert!(living.exists() && held.is_some());
+        assert!(!remade.exists() && other.exists());
     }
 }

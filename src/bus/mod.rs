@@ -10,9 +10,11 @@ pub mod memory;
 mod names;
 pub(crate) mod raw;
 mod unfinished;
+mod words;
 
 pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};
+pub use words::{AnyBus, Ends, ReadWords, WordReader, WordWriter, WriteWords};
 
 use crate::sample::{FleetLayout, FleetSample, Sample};
 
@@ -190,6 +192,11 @@ pub trait Read<S: ?Sized> {
     fn advance(&mut self) -> Result<bool, BusError>;
     /// The sample at hand, in place; none before the first.
     fn current(&self) -> Option<&S>;
+    /// Whether somebody has the writing end open; one that was killed has until its remains are cleared. Within one thread it
+    /// is always open.
+    fn written(&self) -> bool {
+        true
+    }
     /// Sleeps until there may be a next sample, at most until `until_ns` on the monotonic clock. Where nobody else could
     /// bring one meanwhile it does not sleep.
     ///

@@ -4,11 +4,11 @@
 //! its signals have a writer, runs once they carry samples, and is done when all of them have reached the last tick. And it
 //! tells which sample of any external role is missing, and what came instead. Must not judge a role that reports its health.
 
-use crate::bus::iox::{IoxBus, IoxFleetReader, IoxReader};
-use crate::bus::{Bus, BusError, Read, Reader, Signal, Topic};
+use crate::bus::iox::IoxBus;
+use crate::bus::{BusError, Reader, Signal, Topic, WordReader};
 use crate::config::Scenario;
-use crate::runtime::{RoleId, Visit, ports, visit_writes};
-use crate::sample::{FleetLayout, Health, Message, RoleState, Sample, Stamp, VOID};
+use crate::runtime::{RoleId, ports};
+use crate::sample::{Health, RoleState, Stamp, VOID};
 use std::fmt;
 
 /// The signals of an external role, watched.
@@ -20,7 +20,8 @@ pub(super) struct Trace {
 /// One signal, and who needs it.
 struct Traced {
     signal: Signal,
-    end: Box<dyn End>,
+    end: WordReader,
+    seen: Seen,
     readers: Vec<RoleId>,
 }
 
@@ -83,10 +84,10 @@ impl Trace {
     pub fn open(scenario: &Scenario, role: RoleId, bus: &IoxBus) -> Result<Self, BusError> {
         let roles = RoleId::all(scenario);
         let reads = |role: &RoleId, topic: &Topic| ports(scenario, *role).reads.iter().any(|port| port.topic == *topic);
-        let ends = visit_writes(scenario, role, &mut Open(bus)).into_iter();
-        let signals = ends.zip(ports(scenario, role).writes).map(|(end, port)| {
+        let signals = ports(scenario, role).writes.into_iter().map(|port| {
             let readers = roles.iter().copied().filter(|role| reads(role, &port.topic)).collect();
-            Ok(Traced { signal: port.topic.signal, end: end?, readers })
+            let (signal, end) = (port.topic.signal, port.reader(bus, Reader::Role)?);
+            Ok(Traced { signal, end, seen: Seen::default(), readers })
         });
         Ok(Self { signals: signals.collect::<Result<_, BusError>>()?, last_tick: scenario.last_tick })
     }
@@ -105,7 +106,7 @@ impl Trace {
         realtime: bool,
     ) -> Option<Lack> {
         self.signals.iter().find_map(|traced| {
-            let (signal, seen) = (traced.signal, traced.end.seen());
+            let (signal, seen) = (traced.signal, &traced.seen);
             let (tick, came) = (traced.needed(next_tick, scored)?, seen.came);
             match realtime {
                 true => Some(Lack::AnySample { signal, tick, came }),
@@ -118,7 +119,7 @@ impl Trace {
     pub fn look(&mut self) -> Result<Health, BusError> {
         let mut next_tick = u64::MAX;
         for traced in &mut self.signals {
-            next_tick = next_tick.min(traced.end.look()?.next_tick);
+            next_tick = next_tick.min(traced.look()?);
         }
         let written = self.written();
         let state = match next_tick {
@@ -133,6 +134,14 @@ impl Trace {
 }
 
 impl Traced {
+    /// Takes what has come; gives the tick after the newest.
+    fn look(&mut self) -> Result<u64, BusError> {
+        while let Some(words) = self.end.next()? {
+            self.seen.take(bytemuck::pod_read_unaligned(&bytemuck::cast_slice(words)[..size_of::<Stamp>()]));
+        }
+        Ok(self.seen.next_tick)
+    }
+
     /// The least tick of which somebody still needs a sample. A body needs the command of the tick before its own.
     fn needed(&self, next_tick: impl Fn(RoleId) -> Option<u64>, scored: Option<u64>) -> Option<u64> {
         let of = |role: &RoleId| match role {
@@ -142,14 +151,6 @@ impl Traced {
         let scored = scored.filter(|_| self.signal != Signal::Measurement);
         self.readers.iter().filter_map(of).chain(scored).min()
     }
-}
-
-/// One watched signal.
-trait End {
-    fn written(&self) -> bool;
-    /// Takes what has come.
-    fn look(&mut self) -> Result<&Seen, BusError>;
-    fn seen(&self) -> &Seen;
 }
 
 /// What has come of one signal.
@@ -184,69 +185,11 @@ impl Seen {
     }
 }
 
-struct Watched<T> {
-    reader: T,
-    seen: Seen,
-}
-
-impl<S: Sample> End for Watched<IoxReader<S>> {
-    fn written(&self) -> bool {
-        self.reader.written()
-    }
-
-    fn look(&mut self) -> Result<&Seen, BusError> {
-        follow(&mut self.reader, &mut self.seen)
-    }
-
-    fn seen(&self) -> &Seen {
-        &self.seen
-    }
-}
-
-impl<L: FleetLayout> End for Watched<IoxFleetReader<L>> {
-    fn written(&self) -> bool {
-        self.reader.written()
-    }
-
-    fn look(&mut self) -> Result<&Seen, BusError> {
-        follow(&mut self.reader, &mut self.seen)
-    }
-
-    fn seen(&self) -> &Seen {
-        &self.seen
-    }
-}
-
-/// Takes what has come.
-fn follow<'a, S: Message + ?Sized>(reader: &mut impl Read<S>, seen: &'a mut Seen) -> Result<&'a Seen, BusError> {
-    while reader.advance()? {
-        if let Some(sample) = reader.current() {
-            seen.take(*sample.stamp());
-        }
-    }
-    Ok(seen)
-}
-
-/// Opens signals to watch them.
-struct Open<'a>(&'a IoxBus);
-
-impl Visit for Open<'_> {
-    type Made = Result<Box<dyn End>, BusError>;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Ok(Box::new(Watched { reader: self.0.reader::<S>(&topic, Reader::Role)?, seen: Seen::default() }))
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        Ok(Box::new(Watched { reader: self.0.fleet_reader::<L>(&topic, Reader::Role, bodies)?, seen: Seen::default() }))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::bus::domain::OwnedDomain;
-    use crate::bus::{Signal, Write};
+    use crate::bus::{Bus, Signal, Write};
     use crate::config::SHIPPED;
     use crate::runtime::{depths, topic};
     use crate::sample::{RateMeasurement, RateTruth};

@@ -4,7 +4,7 @@ use super::RecordError;
 use super::layout::Layout;
 use super::taps::{Book, Taps};
 use super::writer::Writer;
-use crate::bus::Bus;
+use crate::bus::AnyBus;
 use crate::clock::monotonic_ns;
 use crate::config::Scenario;
 use crate::runtime::{RoleId, ports};
@@ -125,7 +125,7 @@ impl Recorder {
     ///
     /// # Errors
     /// [`RecordError::Bus`], [`RecordError::Write`].
-    pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B, path: &Path) -> Result<Self, RecordError> {
+    pub fn open<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>, path: &Path) -> Result<Self, RecordError> {
         Ok(Self {
             taps: Taps::open(scenario, bus)?,
             signals: Vec::new(),

@@ -7,13 +7,12 @@ use super::RecordError;
 use super::reader::{Recording, Track};
 use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
-use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic, Write};
+use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
 use crate::config::Scenario;
-use crate::runtime::{Gate, Poll, ReadyNode, RoleId, Visit, build, depths, private_ledger, visit_reads, visit_writes};
-use crate::sample::{FieldKind, FleetLayout, FleetSample, Sample, Stamp, VOID};
+use crate::runtime::{Gate, Poll, ReadyNode, RoleId, build, depths, ports, private_ledger};
+use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::Ledger;
 use crate::with_rig;
-use std::marker::PhantomData;
 
 /// The columns that say by which of a role's processes a sample was sent, and when: no output of the role.
 const SENDER: [&str; 2] = ["generation", "sent_ns"];
@@ -51,84 +50,18 @@ pub struct RoleReplay {
 }
 
 /// Writing ends for a role's inputs.
-pub struct Inlets(Vec<Box<dyn Inlet>>);
+pub struct Inlets(Vec<WordWriter>);
 /// Reading ends for a role's outputs.
-pub struct Outlets(Vec<Box<dyn Outlet>>);
-
-trait Inlet {
-    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError>;
-    fn refresh(&mut self) -> Result<(), BusError>;
-}
-
-trait Outlet {
-    fn next(&mut self) -> Result<Option<&[u8]>, BusError>;
-}
-
-struct InletOf<W, S: ?Sized>(W, PhantomData<S>);
-struct OutletOf<R, S: ?Sized>(R, PhantomData<S>);
-
-impl<W: Write<S>, S: Carried + ?Sized> Inlet for InletOf<W, S> {
-    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
-        self.0.send(|sample| bytemuck::cast_slice_mut(sample.words_mut()).copy_from_slice(bytes))
-    }
-
-    fn refresh(&mut self) -> Result<(), BusError> {
-        self.0.refresh()
-    }
-}
-
-impl<R: Read<S>, S: Carried + ?Sized> Outlet for OutletOf<R, S> {
-    fn next(&mut self) -> Result<Option<&[u8]>, BusError> {
-        Ok(if self.0.advance()? { self.0.current().map(|sample| bytemuck::cast_slice(sample.words())) } else { None })
-    }
-}
-
-struct OpenInlets<'a, B>(&'a B);
-struct OpenOutlets<'a, B>(&'a B);
-
-impl<B: Bus + 'static> OpenInlets<'_, B> {
-    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Inlet>, BusError> {
-        Ok(Box::new(InletOf::<_, S>(S::writer(self.0, topic, bodies, 1)?, PhantomData)))
-    }
-}
-
-impl<B: Bus + 'static> Visit for OpenInlets<'_, B> {
-    type Made = Result<Box<dyn Inlet>, BusError>;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        self.open::<S>(&topic, 1)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        self.open::<FleetSample<L>>(&topic, bodies)
-    }
-}
-
-impl<B: Bus + 'static> OpenOutlets<'_, B> {
-    fn open<S: Carried + ?Sized>(&self, topic: &Topic, bodies: usize) -> Result<Box<dyn Outlet>, BusError> {
-        Ok(Box::new(OutletOf::<_, S>(S::reader(self.0, topic, Reader::Scorer, bodies)?, PhantomData)))
-    }
-}
-
-impl<B: Bus + 'static> Visit for OpenOutlets<'_, B> {
-    type Made = Result<Box<dyn Outlet>, BusError>;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        self.open::<S>(&topic, 1)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        self.open::<FleetSample<L>>(&topic, bodies)
-    }
-}
+pub struct Outlets(Vec<WordReader>);
 
 impl Inlets {
     /// Opens a role's inputs for writing.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn open<B: Bus + 'static>(scenario: &Scenario, role: RoleId, bus: &B) -> Result<Self, BusError> {
-        Ok(Self(visit_reads(scenario, role, &mut OpenInlets(bus)).into_iter().collect::<Result<_, _>>()?))
+    pub fn open<'a>(scenario: &Scenario, role: RoleId, bus: impl Into<AnyBus<'a>>) -> Result<Self, BusError> {
+        let bus = bus.into();
+        Ok(Self(ports(scenario, role).reads.iter().map(|port| port.writer(bus)).collect::<Result<_, _>>()?))
     }
 
     /// Sends a sample, given as its bytes, on an input.
@@ -153,8 +86,9 @@ impl Outlets {
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn open<B: Bus + 'static>(scenario: &Scenario, role: RoleId, bus: &B) -> Result<Self, BusError> {
-        Ok(Self(visit_writes(scenario, role, &mut OpenOutlets(bus)).into_iter().collect::<Result<_, _>>()?))
+    pub fn open<'a>(scenario: &Scenario, role: RoleId, bus: impl Into<AnyBus<'a>>) -> Result<Self, BusError> {
+        let (bus, writes) = (bus.into(), ports(scenario, role).writes);
+        Ok(Self(writes.iter().map(|port| port.reader(bus, Reader::Scorer)).collect::<Result<_, _>>()?))
     }
 }
 
@@ -195,9 +129,9 @@ impl<'a> Comparer<'a> {
     pub fn take(&mut self, outlets: &mut Outlets) -> Result<bool, BusError> {
         let mut some = false;
         for (output, outlet) in outlets.0.iter_mut().enumerate() {
-            while let Some(bytes) = outlet.next()? {
+            while let Some(words) = outlet.next()? {
                 some = true;
-                self.compare(output, bytes);
+                self.compare(output, bytemuck::cast_slice(words));
             }
         }
         Ok(some)

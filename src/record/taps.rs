@@ -5,11 +5,11 @@
 
 use super::RecordError;
 use super::layout::Layout;
-use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
+use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
-use crate::runtime::{RoleId, Visit, visit_writes};
-use crate::sample::{FleetLayout, FleetSample, Sample, Stamp, VOID};
+use crate::runtime::{Port, RoleId, ports};
+use crate::sample::{Stamp, VOID};
 use std::collections::BTreeMap;
 
 /// The most gaps that are told one by one.
@@ -95,29 +95,21 @@ struct Desk<'a> {
 }
 
 /// One signal.
-trait Tap {
-    /// Passes on whatever has come; returns how many samples.
-    fn drain(&mut self, desk: &mut Desk<'_>) -> Result<u64, RecordError>;
-    fn announce(&mut self, sink: &mut dyn MessageSink) -> Result<(), RecordError>;
-    fn book(&mut self) -> &mut Book;
-    fn service(&self) -> String;
-}
-
-struct SignalTap<B: Bus, S: Carried + ?Sized> {
-    topic: Topic,
+struct Tap {
+    port: Port,
     role: String,
-    reader: S::Reader<B>,
-    bodies: usize,
+    reader: WordReader,
     channel: Channel,
     book: Book,
 }
 
-impl<B: Bus, S: Carried + ?Sized> Tap for SignalTap<B, S> {
+impl Tap {
+    /// Passes on whatever has come; returns how many samples.
     fn drain(&mut self, desk: &mut Desk<'_>) -> Result<u64, RecordError> {
         let mut taken = 0;
-        while self.reader.advance()? {
-            let Some(sample) = self.reader.current() else { break };
-            let stamp = *sample.stamp();
+        while let Some(words) = self.reader.next()? {
+            let body = bytemuck::cast_slice(words);
+            let stamp: Stamp = bytemuck::pod_read_unaligned(&body[..size_of::<Stamp>()]);
             if stamp.generation == 0 && !self.book.begun {
                 continue;
             }
@@ -129,7 +121,6 @@ impl<B: Bus, S: Carried + ?Sized> Tap for SignalTap<B, S> {
                 (false, false) => desk.last_tick,
             };
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
-            let body = bytemuck::cast_slice(sample.words());
             desk.sink.message(self.channel, stamp.tick as u32, due_ns, now_ns, body)?;
             self.book.enter(&stamp, due);
             taken += 1;
@@ -138,56 +129,23 @@ impl<B: Bus, S: Carried + ?Sized> Tap for SignalTap<B, S> {
     }
 
     fn announce(&mut self, sink: &mut dyn MessageSink) -> Result<(), RecordError> {
+        let Port { topic, type_name, fields, .. } = &self.port;
         let about = [
-            ("service", self.topic.to_string()),
-            ("type_name", S::type_name().to_owned()),
+            ("service", topic.to_string()),
+            ("type_name", (*type_name).to_owned()),
             ("role", self.role.clone()),
-            ("body", self.topic.body.clone()),
-            ("signal", self.topic.signal.name().to_owned()),
+            ("body", topic.body.clone()),
+            ("signal", topic.signal.name().to_owned()),
         ];
         let about = about.map(|(key, value)| (key.to_owned(), value)).into();
-        self.channel = sink.channel(&self.service(), &Layout::of(S::type_name(), &S::fields(self.bodies)), about)?;
+        self.channel = sink.channel(&topic.to_string(), &Layout::of(type_name, fields), about)?;
         Ok(())
-    }
-
-    fn book(&mut self) -> &mut Book {
-        &mut self.book
-    }
-
-    fn service(&self) -> String {
-        self.topic.to_string()
-    }
-}
-
-/// Opens the signals of one role.
-struct Open<'a, B> {
-    bus: &'a B,
-    role: &'a str,
-}
-
-impl<B: Bus + 'static> Open<'_, B> {
-    fn tap<S: Carried + ?Sized>(&self, topic: Topic, bodies: usize) -> Result<Box<dyn Tap>, BusError> {
-        let reader = S::reader(self.bus, &topic, Reader::Scorer, bodies)?;
-        let role = self.role.to_owned();
-        Ok(Box::new(SignalTap::<B, S> { topic, role, reader, bodies, channel: 0, book: Book::default() }))
-    }
-}
-
-impl<B: Bus + 'static> Visit for Open<'_, B> {
-    type Made = Result<Box<dyn Tap>, BusError>;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        self.tap::<S>(topic, 1)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        self.tap::<FleetSample<L>>(topic, bodies)
     }
 }
 
 /// Every signal of a run.
 pub struct Taps {
-    taps: Vec<Box<dyn Tap>>,
+    taps: Vec<Tap>,
     grid: Grid,
     last_tick: u64,
     realtime: bool,
@@ -198,11 +156,13 @@ impl Taps {
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
-        let mut taps = Vec::new();
+    pub fn open<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>) -> Result<Self, BusError> {
+        let (bus, mut taps) = (bus.into(), Vec::new());
         for role in RoleId::all(scenario) {
-            let made = visit_writes(scenario, role, &mut Open { bus, role: role.name(scenario) });
-            taps.extend(made.into_iter().collect::<Result<Vec<_>, _>>()?);
+            for port in ports(scenario, role).writes {
+                let (reader, role) = (port.reader(bus, Reader::Scorer)?, role.name(scenario).to_owned());
+                taps.push(Tap { port, role, reader, channel: 0, book: Book::default() });
+            }
         }
         Ok(Self {
             taps,
@@ -240,13 +200,13 @@ impl Taps {
     }
 
     /// The tick of which not every signal is here yet.
-    pub fn next_tick(&mut self) -> u64 {
-        self.taps.iter_mut().map(|tap| tap.book().next).min().unwrap_or(0)
+    pub fn next_tick(&self) -> u64 {
+        self.taps.iter().map(|tap| tap.book.next).min().unwrap_or(0)
     }
 
     /// Closes every signal; gives services and what came of them.
     pub fn close(&mut self) -> Vec<(String, Book)> {
-        let close = |mut tap: Box<dyn Tap>| (tap.service(), std::mem::take(tap.book()));
+        let close = |tap: Tap| (tap.port.topic.to_string(), tap.book);
         std::mem::take(&mut self.taps).into_iter().map(close).collect()
     }
 }

@@ -20,8 +20,8 @@ pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
-    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, Visit, build, ports, private_ledger, report,
-    shared_ledger, topic, visit_reads, visit_writes,
+    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, build, ports, private_ledger, report, shared_ledger,
+    topic,
 };
 pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};

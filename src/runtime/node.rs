@@ -9,7 +9,7 @@ mod observer;
 mod plant;
 mod ports;
 
-pub use ports::{Port, Ports, Visit, ports, visit_reads, visit_writes};
+pub use ports::{Port, Ports, ports};
 
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};

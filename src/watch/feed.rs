@@ -5,13 +5,13 @@
 
 use super::model::{Model, RoleLine, Series, SignalLine};
 use crate::bus::iox::IoxBus;
-use crate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic};
+use crate::bus::{Bus, BusError, Read, Reader, Signal, Topic, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::fault::{Action, Fault, Interruption, Transport};
 use crate::rig::{Command, Estimate, Rig, Truth};
-use crate::runtime::{RoleId, Visit, topic, visit_writes, window_ticks};
-use crate::sample::{Field, FieldKind, FleetLayout, FleetSample, Health, RoleState, Sample, Stamp, VOID, status};
+use crate::runtime::{Port, RoleId, ports, topic, window_ticks};
+use crate::sample::{Field, FieldKind, FleetSample, Health, RoleState, Sample, Stamp, VOID, status};
 use crate::with_rig;
 use std::collections::VecDeque;
 
@@ -38,26 +38,13 @@ const EVENTFUL: u64 = status::HOLDING
     | status::FAULT
     | status::REJECTED;
 
-/// A reading end whose samples are words.
-trait Link {
-    fn next(&mut self) -> Result<Option<&[u64]>, BusError>;
-}
-
-struct TypedLink<S: Carried + ?Sized>(S::Reader<IoxBus>);
-
-impl<S: Carried + ?Sized> Link for TypedLink<S> {
-    fn next(&mut self) -> Result<Option<&[u64]>, BusError> {
-        Ok(if self.0.advance()? { self.0.current().map(|sample| sample.words()) } else { None })
-    }
-}
-
 /// One signal.
 struct Tap {
     topic: Topic,
     fields: Vec<Field>,
     /// The word of the status, if it has one.
     status: Option<usize>,
-    link: Box<dyn Link>,
+    link: WordReader,
     /// Samples of every so-many-th tick, the newest last.
     kept: VecDeque<Vec<u64>>,
     /// The stamps that the last look took.
@@ -69,9 +56,9 @@ struct Tap {
 }
 
 impl Tap {
-    fn open<S: Carried + ?Sized>(bus: &IoxBus, topic: Topic, bodies: usize) -> Result<Self, BusError> {
-        let link = Box::new(TypedLink::<S>(S::reader(bus, &topic, Reader::Scorer, bodies)?));
-        let fields = S::fields(bodies);
+    fn open(bus: &IoxBus, port: Port) -> Result<Self, BusError> {
+        let link = port.reader(bus, Reader::Scorer)?;
+        let Port { topic, fields, .. } = port;
         let status = fields.iter().find(|field| field.name == "status").map(|field| field.offset / size_of::<u64>());
         let (kept, news, sent) = (VecDeque::new(), Vec::new(), vec![(u64::MAX, 0); SENT]);
         Ok(Self { topic, fields, status, link, kept, news, bits: 0, sent })
@@ -160,21 +147,6 @@ fn bit_names(bits: u64) -> Vec<&'static str> {
     status::NAMES.into_iter().filter(|(_, bit)| bits & bit != 0).map(|(name, _)| name).collect()
 }
 
-/// Opens the signals of a role.
-struct Open<'a>(&'a IoxBus);
-
-impl Visit for Open<'_> {
-    type Made = Result<Tap, BusError>;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made {
-        Tap::open::<S>(self.0, topic, 1)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made {
-        Tap::open::<FleetSample<L>>(self.0, topic, bodies)
-    }
-}
-
 /// What the samples of one tick come to, for a rig whose samples have types.
 trait Judge {
     /// Writes every metric; `words` gives the sample of a body's signal.
@@ -235,8 +207,8 @@ impl Feed {
         let (mut taps, mut roles, mut outputs) = (Vec::new(), Vec::new(), Vec::new());
         for role in RoleId::all(scenario) {
             outputs.push(taps.len());
-            for made in visit_writes(scenario, role, &mut Open(bus)) {
-                taps.push(made?);
+            for port in ports(scenario, role).writes {
+                taps.push(Tap::open(bus, port)?);
             }
         }
         let find = |signal| taps.iter().position(|tap: &Tap| tap.topic.signal == signal);

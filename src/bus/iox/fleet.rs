@@ -131,11 +131,6 @@ impl<L: FleetLayout> IoxFleetReader<L> {
         Ok(Self { service, subscriber, current: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
     }
 
-    /// Whether somebody has the writing end open.
-    pub fn written(&self) -> bool {
-        super::is_written(&self.service)
-    }
-
     #[cold]
     fn failed(&self, reason: String) -> BusError {
         BusError::Receive { service: self.topic.to_string(), reason }
@@ -161,6 +156,10 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     #[inline]
     fn current(&self) -> Option<&FleetSample<L>> {
         self.current.as_ref().map(|sample| FleetSample::over(Word::peel_slice(sample.payload())))
+    }
+
+    fn written(&self) -> bool {
+        super::is_written(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

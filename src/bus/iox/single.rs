@@ -147,11 +147,6 @@ pub(super) enum Current<S: Sample> {
 }
 
 impl<S: Sample> IoxReader<S> {
-    /// Whether somebody has the writing end open. One that was killed has until its remains are cleared.
-    pub fn written(&self) -> bool {
-        is_written(&self.service)
-    }
-
     #[cold]
     fn failed(&self, reason: String) -> BusError {
         BusError::Receive { service: self.topic.to_string(), reason }
@@ -207,6 +202,10 @@ impl<S: Sample> Read<S> for IoxReader<S> {
             (Current::InLane, Lane::Open(latest)) => Some(latest.sample()),
             _ => None,
         }
+    }
+
+    fn written(&self) -> bool {
+        is_written(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

@@ -4,14 +4,14 @@
 
 use super::{RoleId, topic};
 use crate::bus::iox::Qos;
-use crate::bus::{Carried, Depths, Signal, Topic};
+use crate::bus::{AnyBus, BusError, Carried, Depths, Ends, Reader, Signal, Topic, WordReader, WordWriter};
 use crate::config::Scenario;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, Measurement, Rig, Truth};
-use crate::sample::{Field, FleetLayout, FleetSample, Health, Sample, Schedule};
+use crate::sample::{Field, FleetSample, Health, Schedule};
 use crate::with_rig;
 
 /// One signal as it travels: where, and what its bytes mean.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct Port {
     /// The signal and its service.
     pub topic: Topic,
@@ -23,6 +23,8 @@ pub struct Port {
     pub fields: Vec<Field>,
     /// Whether it tells of a fleet, and travels as a slice of words.
     pub fleet: bool,
+    bodies: usize,
+    ends: Ends,
 }
 
 impl Port {
@@ -31,10 +33,26 @@ impl Port {
         let signal = self.topic.signal;
         if self.fleet { Qos::of_fleet(signal, depths) } else { Qos::of(signal, depths) }
     }
+
+    /// Opens it for reading, as words.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn reader<'a>(&self, bus: impl Into<AnyBus<'a>>, reader: Reader) -> Result<WordReader, BusError> {
+        self.ends.reader(bus.into(), &self.topic, self.bodies, reader)
+    }
+
+    /// Opens it for writing, as words.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn writer<'a>(&self, bus: impl Into<AnyBus<'a>>) -> Result<WordWriter, BusError> {
+        self.ends.writer(bus.into(), &self.topic, self.bodies)
+    }
 }
 
 /// The signals of a role.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub struct Ports {
     /// What it writes for the loop.
     pub writes: Vec<Port>,
@@ -46,35 +64,15 @@ pub struct Ports {
     pub schedule: Port,
 }
 
-/// Does something with a signal whose type is known.
-pub trait Visit {
-    /// What comes of it.
-    type Made;
-    /// Does it.
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Self::Made;
-    /// Does it where the signal is that of a fleet of so many bodies.
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Self::Made;
-}
-
 /// The signals of a role of a scenario.
 pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
-    let describe = &mut Describe;
+    let (writes, reads) = with_rig!(&scenario.rig, rig => of_role(rig, scenario, role));
     Ports {
-        writes: visit_writes(scenario, role, describe),
-        reads: visit_reads(scenario, role, describe),
-        health: describe.visit::<Health>(topic(scenario, role.name(scenario), Signal::Health)),
-        schedule: describe.visit::<Schedule>(topic(scenario, "run", Signal::Schedule)),
+        writes,
+        reads,
+        health: port::<Health>(topic(scenario, role.name(scenario), Signal::Health), None),
+        schedule: port::<Schedule>(topic(scenario, "run", Signal::Schedule), None),
     }
-}
-
-/// Visits the signals that a role writes for the loop, in their order.
-pub fn visit_writes<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    with_rig!(&scenario.rig, rig => writes(rig, scenario, role, visit))
-}
-
-/// Visits the signals that a role reads of the loop, in their order.
-pub fn visit_reads<V: Visit>(scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    with_rig!(&scenario.rig, rig => reads(rig, scenario, role, visit))
 }
 
 /// The layouts of a rig's fleets.
@@ -82,40 +80,31 @@ type TruthOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth;
 type MeasurementOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement;
 type CommandOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command;
 
-/// Which of a body's signals, single or fleet's.
-struct Signals<'a, R, V> {
+/// A body's signals, single or fleet's.
+struct Signals<'a, R> {
     rig: &'a R,
     scenario: &'a Scenario,
-    visit: &'a mut V,
 }
 
-impl<R: Rig, V: Visit> Signals<'_, R, V> {
-    fn estimate(&mut self) -> V::Made {
-        self.visit.visit::<Estimate<R>>(topic(self.scenario, &self.rig.bodies()[0].name, Signal::Estimate))
+impl<R: Rig> Signals<'_, R> {
+    fn topic(&self, body: &BodyInfo, signal: Signal) -> Topic {
+        topic(self.scenario, &body.name, signal)
     }
 
-    fn truth(&mut self, body: &BodyInfo) -> V::Made {
-        let topic = topic(self.scenario, &body.name, Signal::Truth);
-        match body.fleet {
-            None => self.visit.visit::<Truth<R>>(topic),
-            Some(bodies) => self.visit.visit_fleet::<TruthOf<R>>(topic, bodies),
-        }
+    fn estimate(&self) -> Port {
+        port::<Estimate<R>>(self.topic(&self.rig.bodies()[0], Signal::Estimate), None)
     }
 
-    fn measurement(&mut self, body: &BodyInfo) -> V::Made {
-        let topic = topic(self.scenario, &body.name, Signal::Measurement);
-        match body.fleet {
-            None => self.visit.visit::<Measurement<R>>(topic),
-            Some(bodies) => self.visit.visit_fleet::<MeasurementOf<R>>(topic, bodies),
-        }
+    fn truth(&self, body: &BodyInfo) -> Port {
+        either::<Truth<R>, FleetSample<TruthOf<R>>>(self.topic(body, Signal::Truth), body.fleet)
     }
 
-    fn command(&mut self, body: &BodyInfo) -> V::Made {
-        let topic = topic(self.scenario, &body.name, Signal::Command);
-        match body.fleet {
-            None => self.visit.visit::<Command<R>>(topic),
-            Some(bodies) => self.visit.visit_fleet::<CommandOf<R>>(topic, bodies),
-        }
+    fn measurement(&self, body: &BodyInfo) -> Port {
+        either::<Measurement<R>, FleetSample<MeasurementOf<R>>>(self.topic(body, Signal::Measurement), body.fleet)
+    }
+
+    fn command(&self, body: &BodyInfo) -> Port {
+        either::<Command<R>, FleetSample<CommandOf<R>>>(self.topic(body, Signal::Command), body.fleet)
     }
 }
 
@@ -125,61 +114,44 @@ pub(super) fn driven<R: Rig>(rig: &R) -> impl Iterator<Item = (usize, &BodyInfo)
     driven().filter(|(_, body)| body.fleet.is_none()).chain(driven().filter(|(_, body)| body.fleet.is_some()))
 }
 
-fn writes<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    let mut signals = Signals { rig, scenario, visit };
+/// What a role writes, and what it reads.
+fn of_role<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
+    let signals = Signals { rig, scenario };
     match role {
         RoleId::Plant(index) => {
             let body = &rig.bodies()[index];
-            vec![signals.measurement(body), signals.truth(body)]
+            let command = body.driven.then(|| signals.command(body));
+            (vec![signals.measurement(body), signals.truth(body)], command.into_iter().collect())
         }
-        RoleId::Observer => vec![signals.estimate()],
-        RoleId::Controller => driven(rig).map(|(_, body)| signals.command(body)).collect(),
-    }
-}
-
-fn reads<R: Rig, V: Visit>(rig: &R, scenario: &Scenario, role: RoleId, visit: &mut V) -> Vec<V::Made> {
-    let mut signals = Signals { rig, scenario, visit };
-    match role {
-        RoleId::Plant(index) => {
-            let driven = Some(&rig.bodies()[index]).filter(|body| body.driven);
-            driven.map(|body| signals.command(body)).into_iter().collect()
-        }
-        RoleId::Observer => vec![signals.measurement(&rig.bodies()[0])],
+        RoleId::Observer => (vec![signals.estimate()], vec![signals.measurement(&rig.bodies()[0])]),
         RoleId::Controller => {
-            let estimate = signals.estimate();
             let measurements = driven(rig).map(|(_, body)| signals.measurement(body));
-            std::iter::once(estimate).chain(measurements).collect()
+            let reads = std::iter::once(signals.estimate()).chain(measurements);
+            (driven(rig).map(|(_, body)| signals.command(body)).collect(), reads.collect())
         }
     }
 }
 
-/// Tells the layout.
-struct Describe;
-
-impl Visit for Describe {
-    type Made = Port;
-
-    fn visit<S: Sample>(&mut self, topic: Topic) -> Port {
-        describe::<S>(topic, 1, false)
-    }
-
-    fn visit_fleet<L: FleetLayout>(&mut self, topic: Topic, bodies: usize) -> Port {
-        describe::<FleetSample<L>>(topic, bodies, true)
-    }
+/// The signal of a single body, or of a fleet.
+fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
+    if fleet.is_some() { port::<Many>(topic, fleet) } else { port::<One>(topic, None) }
 }
 
-fn describe<S: Carried + ?Sized>(topic: Topic, bodies: usize, fleet: bool) -> Port {
+fn port<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
+    let bodies = fleet.unwrap_or(1);
     let size = S::length(bodies) * size_of::<u64>();
-    Port { topic, type_name: S::type_name(), size, fields: S::fields(bodies), fleet }
+    let (type_name, fields, ends) = (S::type_name(), S::fields(bodies), Ends::of::<S>());
+    Port { topic, type_name, size, fields, fleet: fleet.is_some(), bodies, ends }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bus::Bus;
     use crate::bus::memory::MemoryBus;
-    use crate::bus::{Bus, BusError, Reader};
     use crate::config::SHIPPED;
     use crate::runtime::{build, depths, private_ledger};
+    use crate::sample::{FleetLayout, Sample};
     use std::cell::RefCell;
 
     type Opened = RefCell<Vec<(Topic, &'static str)>>;
