@@ -6,11 +6,13 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
-use corotate::runtime::{DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, depths, private_ledger, serve, topic};
+use corotate::runtime::{
+    DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, Service, build_rig, depths, private_ledger, serve, topic,
+};
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::serial::{Device, Hello};
 use corotate::telemetry::RoleReport;
-use corotate::with_rig;
+use corotate::with_shipped_rig;
 use rustix::fd::OwnedFd;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -148,7 +150,10 @@ fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &Owned
     let terminated = AtomicBool::new(false);
     let mut result = None;
     let ledger = private_ledger(scenario, role);
-    serve(scenario, occupant, &bus, &ledger, &terminated, Privileges::default(), |report| {
+    let build = |occupant| with_shipped_rig!(scenario.rig, rig => build_rig(rig, scenario, occupant, &bus, &ledger));
+    let privileges = Privileges::default();
+    let service = Service { scenario, bus: &bus, ledger: &ledger, terminated: &terminated, privileges };
+    serve(service, occupant, build, |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })
@@ -196,7 +201,7 @@ fn line() -> (OwnedFd, PathBuf) {
 
 /// A device that is a body of the scenario, until the other end hangs up.
 fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
-    with_rig!(&scenario.rig, rig => {
+    with_shipped_rig!(scenario.rig, rig => {
         let (mut device, mut bytes) = (Device::new("test", |_: &Hello<'_>| Some(rig.body(index))), [0; 512]);
         while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
             device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));

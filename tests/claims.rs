@@ -13,7 +13,7 @@ use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Estimate, Rig, Truth};
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, report, topic};
 use corotate::sample::{FieldKind, Sample};
-use corotate::with_rig;
+use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 use std::collections::BTreeMap;
@@ -225,7 +225,7 @@ fn run(scenario: &Scenario) -> Trace {
         let seats: Vec<_> =
             RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
         let mut nodes: Vec<_> =
-            seats.iter().map(|(role, ledger)| build(rig, scenario, *role, &bus, ledger).unwrap()).collect();
+            seats.iter().map(|(role, ledger)| build(scenario, *role, &bus, ledger).unwrap()).collect();
         let bodies = rig.bodies();
         let mut truths: Vec<Input<MemoryBus, Truth<R>>> = (bodies.iter())
             .map(|body| Input::watch(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
@@ -253,7 +253,7 @@ fn run(scenario: &Scenario) -> Trace {
         let rejected = read.map(|link| link.rejected).sum();
         Trace { tick_s: scenario.tick_s(), errors, motion, rejected }
     }
-    with_rig!(&scenario.rig, rig => typed(rig, scenario))
+    with_shipped_rig!(scenario.rig, rig => typed(rig, scenario))
 }
 
 fn norm(values: &[f64]) -> f64 {

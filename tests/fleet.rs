@@ -9,7 +9,6 @@ use corotate::bus::{Carried, Reader, Signal};
 use corotate::config::Scenario;
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{FleetTruth, RateTruth};
-use corotate::with_rig;
 use serde_json::Value;
 
 const SIGKILL: i32 = 9;
@@ -26,7 +25,7 @@ fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], bodies: usize, m
     let bus = MemoryBus::new(depths(&scenario));
     let node = |role| {
         let ledger = private_ledger(&scenario, role);
-        with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+        build(&scenario, role, &bus, &ledger).unwrap()
     };
     let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
     let body = &scenario.rig.bodies()[1].name;

@@ -9,7 +9,6 @@ use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth, status};
-use corotate::with_rig;
 
 /// What is known of one tick.
 struct Row {
@@ -44,10 +43,7 @@ fn rows(overrides: &[&str]) -> Vec<Row> {
     let bus = MemoryBus::new(depths(&scenario));
     let mut nodes: Vec<_> = RoleId::all(&scenario)
         .into_iter()
-        .map(|role| {
-            with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &private_ledger(&scenario, role)))
-                .unwrap()
-        })
+        .map(|role| build(&scenario, role, &bus, &private_ledger(&scenario, role)).unwrap())
         .collect();
     let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
         Input::watch(&bus, &topic(&scenario, body, Signal::Truth), Reader::Scorer).unwrap()

@@ -15,7 +15,6 @@ use corotate::runtime::{
 use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
 };
-use corotate::with_rig;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -150,7 +149,7 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
     let bus = MemoryBus::new(depths(&scenario));
     let node = |role: RoleId| {
         let ledger = private_ledger(&scenario, role);
-        with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+        build(&scenario, role, &bus, &ledger).unwrap()
     };
     let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
     let mut measurement = reader(&bus, &scenario, Signal::Measurement);
@@ -239,7 +238,7 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let bus = MemoryBus::new(depths(scenario));
     let follower = RoleId::named(scenario, "follower").unwrap();
     let ledger = private_ledger(scenario, follower);
-    let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, follower, &bus, &ledger)).unwrap();
+    let mut node = build(scenario, follower, &bus, &ledger).unwrap();
     let mut truth = reader::<RateTruth>(&bus, scenario, Signal::Truth);
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut seen = Vec::new();

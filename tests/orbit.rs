@@ -12,7 +12,6 @@ use corotate::model::{CentralField, OrbitState};
 use corotate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{OrbitEstimate, OrbitTruth};
-use corotate::with_rig;
 use nalgebra::{Vector2, Vector4};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -147,9 +146,7 @@ fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> 
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
         .into_iter()
-        .map(|role| {
-            with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &private_ledger(scenario, role))).unwrap()
-        })
+        .map(|role| build(scenario, role, &bus, &private_ledger(scenario, role)).unwrap())
         .collect();
     let bodies = scenario.rig.bodies();
     let mut truths: Vec<Input<MemoryBus, OrbitTruth>> = bodies

@@ -13,7 +13,6 @@ use corotate::runtime::{
 };
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
-use corotate::with_rig;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -46,7 +45,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let mut all: BTreeMap<String, Vec<u8>> = BTreeMap::new();
     let node = |role: &RoleId| {
         let ledger = private_ledger(scenario, *role);
-        with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, &ledger)).unwrap()
+        build(scenario, *role, &bus, &ledger).unwrap()
     };
     let mut nodes: Vec<_> = roles.iter().map(node).collect();
     let none = |_| panic!("no role dies here");
@@ -439,7 +438,7 @@ impl<'a> Scheduled<'a> {
     /// A role takes its seat, and executes no tick before this one.
     fn begin(&mut self, index: usize, first_tick: u64) {
         let (scenario, role, bus, ledger) = (self.scenario, self.roles[index], self.bus, &self.ledgers[index]);
-        let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, role, bus, ledger)).unwrap();
+        let mut node = build(scenario, role, bus, ledger).unwrap();
         node.restore().unwrap();
         let first_tick = first_tick.max(node.next_tick());
         node.start(self.grid, first_tick).unwrap();

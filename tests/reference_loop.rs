@@ -8,7 +8,6 @@ use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;
 use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth};
-use corotate::with_rig;
 use serde_json::Value;
 
 /// What the columns of `let_pair*.csv` may differ by.
@@ -35,9 +34,7 @@ fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
         .into_iter()
-        .map(|role| {
-            with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &private_ledger(scenario, role))).unwrap()
-        })
+        .map(|role| build(scenario, role, &bus, &private_ledger(scenario, role)).unwrap())
         .collect();
     let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
         Input::watch(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()

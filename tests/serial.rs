@@ -10,7 +10,7 @@ use corotate::config::Scenario;
 use corotate::role::SingleBody;
 use corotate::runtime::Line;
 use corotate::serial::{Decoder, Device, Hello, MAX_FRAME, encode};
-use corotate::with_rig;
+use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 use rustix::fd::OwnedFd;
@@ -167,7 +167,7 @@ impl Powered {
     fn of_rig(path: &Path, scenario: Scenario, body: usize) -> Self {
         let path = path.to_owned();
         Self::new(move |on| {
-            with_rig!(&scenario.rig, rig => {
+            with_shipped_rig!(scenario.rig, rig => {
                 live(&path, &mut Device::new("any", |_: &Hello<'_>| Some(corotate::rig::Rig::body(rig, body))), on)
             })
         })

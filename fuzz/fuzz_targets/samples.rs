@@ -32,7 +32,7 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
     let of = |body: &str, signal| topic(scenario, body, signal);
     let role = |role: RoleId| -> ReadyNode {
         let ledger = private_ledger(scenario, role);
-        let mut node = corotate::with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &ledger)).unwrap();
+        let mut node = build(scenario, role, &bus, &ledger).unwrap();
         node.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, 0).unwrap();
         node
     };

@@ -2,7 +2,7 @@
 #![no_main]
 
 use corotate::config::{SHIPPED, Scenario};
-use corotate::rig::{AnyRig, Rig};
+use corotate::rig::{Rig, RigidBodyRig};
 use corotate::serial::{Device, Hello, Host, MAX_FRAME, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
@@ -12,7 +12,7 @@ thread_local! {
 }
 
 fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
-    let AnyRig::RigidBody(rig) = &scenario.rig else { unreachable!("the first shipped scenario is of rigid bodies") };
+    let rig = scenario.rig.downcast_ref::<RigidBodyRig>().expect("the first shipped scenario is of rigid bodies");
     let mut device = Device::new("fuzz", |_: &Hello<'_>| Some(rig.body(1)));
     let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), measurement_length: 64, truth_length: 56 });
     let mut frame = [0; MAX_FRAME];

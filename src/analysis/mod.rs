@@ -12,7 +12,6 @@ mod chain;
 use crate::config::Scenario;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use crate::sample::status;
-use crate::with_rig;
 use chain::{Chain, Guards};
 use serde::Serialize;
 
@@ -93,15 +92,15 @@ pub struct Reach {
 
 /// What may be claimed of every driven body's loop.
 pub fn claims(scenario: &Scenario) -> Vec<Claim> {
-    fn of_rig<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<Claim> {
-        let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
-        let certificates = rig.certificates();
-        let certificate = |name: &str| certificates.iter().find(|certificate| certificate.body == name);
-        driven
-            .map(|(index, body)| Analysis::new(rig, index, scenario).claim(&body.name, certificate(&body.name)))
-            .collect()
-    }
-    with_rig!(&scenario.rig, rig => of_rig(rig, scenario))
+    scenario.rig.face().claims(scenario)
+}
+
+/// The same for a rig whose type is known.
+pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<Claim> {
+    let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+    let certificates = rig.certificates();
+    let certificate = |name: &str| certificates.iter().find(|certificate| certificate.body == name);
+    driven.map(|(index, body)| Analysis::new(rig, index, scenario).claim(&body.name, certificate(&body.name))).collect()
 }
 
 /// The analysis of one driven body's loop.

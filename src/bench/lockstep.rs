@@ -12,7 +12,7 @@ use crate::rig::{Command, Estimate, Measurement, Rig};
 use crate::role::{Body, Controller, Observer};
 use crate::runtime::{RoleId, build, depths, in_turn, private_ledger};
 use crate::sample::Message;
-use crate::with_rig;
+use crate::with_shipped_rig;
 use std::hint::black_box;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -50,7 +50,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
             let per_second = in_one_thread(scenario)?;
             board.add(Row::Lockstep, &format!("in one thread, {name}"), "ticks/s", floor, per_second);
         }
-        let per_second = with_rig!(&pair.rig, rig => arithmetic_alone(rig, &pair));
+        let per_second = with_shipped_rig!(pair.rig, rig => arithmetic_alone(rig, &pair));
         board.add(Row::Lockstep, arithmetic, "ticks/s", None, per_second);
     }
     Ok(())
@@ -93,8 +93,7 @@ fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Resu
 /// Ticks per second of all roles in one thread: plants, observer, controller, links, books, hash.
 fn in_one_thread(scenario: &Scenario) -> Result<f64, BenchError> {
     let bus = MemoryBus::new(depths(scenario));
-    let node =
-        |role| with_rig!(&scenario.rig, rig => build(rig, scenario, role, &bus, &private_ledger(scenario, role)));
+    let node = |role| build(scenario, role, &bus, &private_ledger(scenario, role));
     let mut nodes = RoleId::all(scenario).into_iter().map(node).collect::<Result<Vec<_>, _>>()?;
     let began = Instant::now();
     in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), |_| true)?;

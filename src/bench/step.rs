@@ -13,10 +13,10 @@ use crate::observe::{
     Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise,
     SecondOrderFilter,
 };
-use crate::rig::{AnyRig, Command, Estimate, Measurement, RateLaw, Rig};
+use crate::rig::{Command, Estimate, Measurement, RateLaw, Rig, RigidBodyRig};
 use crate::role::{Body, Controller, Guard, Observer};
 use crate::sample::{Message, RateEstimate, RateMeasurement, Sample, status};
-use crate::with_rig;
+use crate::with_shipped_rig;
 use nalgebra::{Vector1, Vector3};
 use std::hint::black_box;
 use std::sync::OnceLock;
@@ -304,7 +304,7 @@ fn agreement(library: &Compiled, kind: &'static str, scenario: &Scenario) -> Res
     let (prefix, parameters) = parameters(kind, scenario);
     let mut in_c = InC::new(library, prefix, parameters)?;
     in_c.restart();
-    with_rig!(&scenario.rig, rig => {
+    with_shipped_rig!(scenario.rig, rig => {
         let mut ours = Ours::new(rig, scenario);
         Ok(agreement_of(kind, rig, scenario, &mut ours, &mut in_c))
     })
@@ -363,7 +363,7 @@ fn portable_library() -> Result<&'static Compiled, String> {
 
 /// The same job by a textbook's filter: measured rates in, command of the same law out.
 fn by_ekf(scenario: &Scenario) -> Option<Contestant<'_>> {
-    let AnyRig::RigidBody(rig) = &scenario.rig else { return None };
+    let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
     let inertia: [f64; 3] = numbers(&scenario.to_toml().parse().ok()?, "leader.inertia_kg_m2").try_into().ok()?;
     let coefficients = crate::model::Inertia::new(inertia).ok()?.coefficients();
@@ -401,7 +401,7 @@ fn ekf_step(
 
 /// The samples in and out and nothing else: what any step takes.
 fn bare_copy(scenario: &Scenario) -> Option<Contestant<'_>> {
-    let AnyRig::RigidBody(rig) = &scenario.rig else { return None };
+    let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
     Some(Contestant::new("bare copy of its samples", None, move || {
         let copy: fn(&_, &_, &mut _, &mut _) = black_box(copy_samples);
@@ -435,7 +435,7 @@ fn kind<'a>(kind: &'static str, scenario: &'a Scenario, board: &mut Board) -> Ve
     let (prefix, parameters) = parameters(kind, scenario);
     for (library, suffix) in [(library(), ""), (portable_library(), ", for any machine")] {
         match library.and_then(|library| InC::new(library, prefix, parameters.clone())) {
-            Ok(mut in_c) => contestants.push(with_rig!(&scenario.rig, rig => {
+            Ok(mut in_c) => contestants.push(with_shipped_rig!(scenario.rig, rig => {
                 let samples = measurements(rig, scenario);
                 let name = format!("{}{suffix}", floor.unwrap_or_default());
                 Contestant::new(name, None, move || pass_in_c(rig, &mut in_c, &samples))
@@ -451,7 +451,7 @@ fn pass_in_c<R: Rig>(_: &R, in_c: &mut InC<'_>, samples: &[[Measurement<R>; 2]])
 }
 
 fn ours<'a>(name: &str, floor: Option<&'static str>, scenario: &'a Scenario) -> Contestant<'a> {
-    with_rig!(&scenario.rig, rig => {
+    with_shipped_rig!(scenario.rig, rig => {
         let samples = measurements(rig, scenario);
         Contestant::new(name, floor, move || Ours::new(rig, scenario).pass(&samples))
     })
@@ -459,7 +459,7 @@ fn ours<'a>(name: &str, floor: Option<&'static str>, scenario: &'a Scenario) -> 
 
 /// What the receiving ends check before any of it: the observed body's measurement, and a driven body's.
 fn guards<'a>(name: &str, scenario: &'a Scenario) -> Option<Contestant<'a>> {
-    with_rig!(&scenario.rig, rig => {
+    with_shipped_rig!(scenario.rig, rig => {
         let driven = driven(rig)?;
         let samples = measurements(rig, scenario);
         Some(Contestant::new(format!("guards of its two measurements, {name}"), None, move || {

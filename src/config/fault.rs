@@ -8,7 +8,6 @@ use crate::bus::Carried;
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
 use crate::rig::{AnyRig, Command, Estimate, FleetCommand, FleetMeasurement, Measurement, Rig};
 use crate::sample::FieldKind;
-use crate::with_rig;
 use serde::{Deserialize, Serialize};
 
 /// The most faults of one scenario.
@@ -230,7 +229,7 @@ impl One<'_, '_, '_> {
             }
             Kind::Kill => Action::Role(Interruption::Kill),
             _ => {
-                let fields = with_rig!(self.setting.rig, rig => fields(rig, &raw.role, fleet));
+                let fields = self.setting.rig.face().fields(&raw.role, fleet);
                 Action::Content(self.tamper(&fields)?)
             }
         })
@@ -309,7 +308,7 @@ impl One<'_, '_, '_> {
 }
 
 /// What a signal's sample is made of.
-struct Fields {
+pub(crate) struct Fields {
     all: Vec<(&'static str, Words, FieldKind)>,
     first: &'static str,
     content: Words,
@@ -318,7 +317,7 @@ struct Fields {
 }
 
 /// The fields of what a role sends about a body, or a fleet of so many.
-fn fields<R: Rig>(_: &R, role: &str, fleet: Option<usize>) -> Fields {
+pub(crate) fn fields<R: Rig>(role: &str, fleet: Option<usize>) -> Fields {
     fn of<S: Carried + ?Sized>(bodies: usize, axes: usize) -> Fields {
         let fields = S::fields(bodies);
         // In a fleet's sample what is said of the whole comes before the vectors.

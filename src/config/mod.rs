@@ -15,6 +15,7 @@ pub use accept::Accept;
 pub use document::Document;
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
+pub(crate) use fault::{Fields, fields};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use run_id::{NoRunId, RunId};
 pub use scenario::Scenario;

@@ -9,7 +9,6 @@ use crate::record::Recorder;
 use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
 use crate::system::tell;
 use crate::telemetry::{Ledger, RoleReport};
-use crate::with_rig;
 use std::cell::RefCell;
 use std::sync::atomic::Ordering;
 
@@ -22,8 +21,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let scorer = RefCell::new(score::open(scenario, &bus)?);
     let seats: Vec<(RoleId, Ledger)> =
         RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
-    let node =
-        |(role, ledger): &(RoleId, Ledger)| with_rig!(&scenario.rig, rig => build(rig, scenario, *role, &bus, ledger));
+    let node = |(role, ledger): &(RoleId, Ledger)| build(scenario, *role, &bus, ledger);
     let mut nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
     let mut incidents = Vec::new();
     let revive = |index: usize| {

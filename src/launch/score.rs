@@ -2,14 +2,13 @@
 //!
 //! Must not hold the loop up, except by the credit it gives in lockstep.
 
-use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
+use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
 use crate::rig::{Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{Horizon, Input, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
-use crate::with_rig;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -105,11 +104,17 @@ pub trait Scorer {
 ///
 /// # Errors
 /// [`BusError::Open`].
-pub fn open<B: Bus + 'static>(scenario: &Scenario, bus: &B) -> Result<Box<dyn Scorer>, BusError> {
-    fn typed<R: Rig, B: Bus + 'static>(rig: &R, scenario: &Scenario, bus: &B) -> Result<Box<dyn Scorer>, BusError> {
-        Ok(Box::new(RigScorer::open(rig, scenario, bus)?))
-    }
-    with_rig!(&scenario.rig, rig => typed(rig, scenario, bus))
+pub fn open<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>) -> Result<Box<dyn Scorer>, BusError> {
+    scenario.rig.face().scorer(scenario, bus.into())
+}
+
+/// The same for a rig whose type is known.
+pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
+    rig: &R,
+    scenario: &Scenario,
+    bus: &B,
+) -> Result<Box<dyn Scorer>, BusError> {
+    Ok(Box::new(RigScorer::open(rig, scenario, bus)?))
 }
 
 /// A driven body, for the live certificate.

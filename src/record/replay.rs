@@ -12,7 +12,6 @@ use crate::config::Scenario;
 use crate::runtime::{Gate, Poll, ReadyNode, RoleId, build, depths, ports, private_ledger};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::Ledger;
-use crate::with_rig;
 
 /// The columns that say by which of a role's processes a sample was sent, and when: no output of the role.
 const SENDER: [&str; 2] = ["generation", "sent_ns"];
@@ -302,7 +301,7 @@ impl Stage<'_> {
                 left.finish()?;
             }
             let (script, scenario) = (self.script, self.scenario);
-            let mut node = with_rig!(&scenario.rig, rig => build(rig, scenario, script.role, self.bus, self.ledger))?;
+            let mut node = build(scenario, script.role, self.bus, self.ledger)?;
             // Memory of one's own is always open. A life without a tick hands on what it was given.
             if node.restore().is_ok() && self.ledger.generation() >= step.generation {
                 // Others than a body pass over what the outage took tick by tick: of a long one the links would not hold all.

@@ -30,6 +30,8 @@ mod summary;
 mod tables;
 mod traces;
 
+pub(crate) use traces::{Traces, trace_rig};
+
 use crate::config::{ConfigError, RunId};
 use crate::record::RecordError;
 use source::Source;

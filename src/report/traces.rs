@@ -10,7 +10,6 @@ use crate::record::{Column, RecordError, Recording, SignalInfo};
 use crate::rig::{Command, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::sample::{FieldKind, Message, Sample, Stamp, VOID, status};
-use crate::with_rig;
 use std::collections::BTreeMap;
 
 /// So many ticks behind the newest, a tick is scored with the samples that it has.
@@ -73,7 +72,12 @@ pub struct MetricTrace {
 /// [`RecordError`], if its samples have another layout, too.
 pub fn trace(recording: &Recording, scenario: &Scenario) -> Result<Traces, RecordError> {
     recording.check_layouts(scenario)?;
-    with_rig!(&scenario.rig, rig => Tracer::new(rig, scenario, recording).run(recording))
+    scenario.rig.face().traces(scenario, recording)
+}
+
+/// The same for a rig whose type is known.
+pub(crate) fn trace_rig<R: Rig>(rig: &R, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError> {
+    Tracer::new(rig, scenario, recording).run(recording)
 }
 
 /// What is known of a signal while its samples pass.

@@ -3,10 +3,12 @@
 //! A new rig is its mathematics, one file here, one line in each of the places marked "registry" below, and a
 //! scenario in `config/`. Must not know how roles are driven, nor what carries their samples.
 
+mod any;
 mod fleet;
 mod orbit;
 mod rigid_body;
 
+pub use any::AnyRig;
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use rigid_body::{RateLaw, RigidBodyRig};
@@ -208,64 +210,21 @@ pub struct ConditionReport {
     pub holds: bool,
 }
 
-/// Registry: any of the rigs.
-#[derive(Debug)]
-#[allow(clippy::large_enum_variant, reason = "there is one in a process")]
-pub enum AnyRig {
-    /// Rigid bodies turning about their centres of mass.
-    RigidBody(RigidBodyRig),
-    /// Bodies about a point mass: orbit hold and rendezvous.
-    Orbit(OrbitRig),
-}
-
-/// Registry: runs an expression with the rig at hand, whichever it is.
+/// Runs an expression with the rig at hand, whichever of those in this crate it is: for tests, and for the suite, which measures
+/// them.
+///
+/// # Panics
+/// With any other rig.
 #[macro_export]
-macro_rules! with_rig {
+macro_rules! with_shipped_rig {
     ($any:expr, $rig:ident => $body:expr) => {
-        match $any {
-            $crate::rig::AnyRig::RigidBody($rig) => $body,
-            $crate::rig::AnyRig::Orbit($rig) => $body,
+        if let Some($rig) = $any.downcast_ref::<$crate::rig::RigidBodyRig>() {
+            $body
+        } else {
+            let $rig = $any.downcast_ref::<$crate::rig::OrbitRig>().expect("this is for the rigs of this crate");
+            $body
         }
     };
-}
-
-impl AnyRig {
-    /// The bodies; the first is the observed one.
-    pub fn bodies(&self) -> &[BodyInfo] {
-        with_rig!(self, rig => rig.bodies())
-    }
-
-    /// The names of all roles, in the order in which one tick passes through them.
-    pub fn roles(&self) -> Vec<&str> {
-        let controller = self.bodies().iter().any(|body| body.driven).then_some("controller");
-        let bodies = self.bodies().iter().map(|body| body.name.as_str());
-        bodies.chain(["observer"]).chain(controller).collect()
-    }
-
-    /// What a run is scored by.
-    pub fn metrics(&self) -> &'static [&'static str] {
-        with_rig!(self, rig => rig.metrics())
-    }
-
-    /// What is proven of the closed loop.
-    pub fn certificates(&self) -> Vec<CertificateReport> {
-        with_rig!(self, rig => rig.certificates())
-    }
-
-    /// The physical bounds that the guards work with.
-    pub fn limits(&self) -> Vec<Figure> {
-        with_rig!(self, rig => rig.limits())
-    }
-
-    /// Why a quantity cannot be watched in this scenario, if so.
-    pub fn unwatched(&self, watched: Watched) -> Option<&'static str> {
-        with_rig!(self, rig => rig.unwatched(watched))
-    }
-
-    /// What a reader of the results must know of the scenario.
-    pub fn notes(&self) -> Vec<String> {
-        with_rig!(self, rig => rig.notes())
-    }
 }
 
 /// Checks that a body's name can name a process and is not `taken` by a role or another body.
@@ -378,15 +337,15 @@ pub(crate) fn resolve(
     match name {
         "rigid-body" => {
             let (rig, table) = rigid_body::resolve(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::RigidBody), table))
+            Ok((rig.map(AnyRig::new), table))
         }
         "orbit-hold" => {
             let (rig, table) = orbit::hold(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::Orbit), table))
+            Ok((rig.map(AnyRig::new), table))
         }
         "orbit-rendezvous" => {
             let (rig, table) = orbit::rendezvous(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::Orbit), table))
+            Ok((rig.map(AnyRig::new), table))
         }
         _ => {
             checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &NAMES)));

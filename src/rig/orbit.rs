@@ -352,17 +352,13 @@ fn worse(a: f64, b: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::config::{SHIPPED, Scenario};
-    use crate::rig::AnyRig;
     use crate::role::{Body, Estimator, Guard, Law};
     use crate::sample::{OrbitCommand, OrbitMeasurement, Stamp};
 
     fn rig(name: &str, overrides: &[&str]) -> OrbitRig {
         let text = SHIPPED.iter().find(|(shipped, _)| *shipped == name).unwrap().1;
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
-        match Scenario::parse(text, "test", &overrides).unwrap().rig {
-            AnyRig::Orbit(rig) => rig,
-            AnyRig::RigidBody(_) => unreachable!("these are orbits"),
-        }
+        Scenario::parse(text, "test", &overrides).unwrap().rig.downcast_ref::<OrbitRig>().unwrap().clone()
     }
 
     /// What the roles' own code commands at the first tick, du/s².
@@ -405,7 +401,7 @@ mod tests {
     fn a_free_orbit_without_a_follower_is_observed_in_any_unit() {
         let scenario = Scenario::parse(LOW_ORBIT, "test", &[]).unwrap();
         assert_eq!(scenario.rig.roles(), ["leader", "observer"]);
-        let AnyRig::Orbit(rig) = scenario.rig else { unreachable!("it is an orbit") };
+        let rig = scenario.rig.downcast_ref::<OrbitRig>().unwrap();
         assert_eq!((rig.metrics(), rig.certificates().len()), (&["estimate_error_du_s"][..], 0));
         let (mut body, mut observer, mut guard) = (rig.body(0), rig.estimator(), rig.measurement_guard(0, false));
         let (mut measurement, mut truth, mut estimate) = Default::default();

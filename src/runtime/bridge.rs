@@ -12,7 +12,6 @@ use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::Rearm;
 use crate::sample::{Sample, content_length};
 use crate::serial::{Answer, Heard, Hello, Host, LineBook, Refuse, Terms, VERSION};
-use crate::with_rig;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -159,10 +158,15 @@ impl DeviceLink {
     /// # Errors
     /// [`DeviceError::Line`] and [`DeviceError::TooSlow`].
     pub fn open(seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
-        with_rig!(&scenario.rig, rig => Self::of_rig(rig, seat, scenario, run))
+        scenario.rig.face().device(seat, scenario, run)
     }
 
-    fn of_rig<R: Rig>(rig: &R, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
+    pub(crate) fn of_rig<R: Rig>(
+        rig: &R,
+        seat: &DeviceSeat,
+        scenario: &Scenario,
+        run: u64,
+    ) -> Result<Self, DeviceError> {
         let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
         check_speed(seat.baud, scenario, command + measurement)?;
         let greeting = Greeting::new(rig, scenario, &seat.body, run);

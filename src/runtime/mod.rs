@@ -20,13 +20,13 @@ pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{Horizon, Input, Output, Seek};
 pub use node::{
-    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, build, ports, private_ledger, report, shared_ledger,
-    topic,
+    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, build, build_rig, ports, private_ledger, report,
+    shared_ledger, topic,
 };
-pub(crate) use node::{horizon, next_tick, shared_memory_bytes};
+pub(crate) use node::{horizon, next_tick, ports_of_rig, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{hurried, join_beside, release as release_priority, take as take_privileges};
-pub use process::{RoleError, RoleSeat, run_role, serve};
+pub use process::{RoleError, RoleSeat, Service, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 

@@ -9,6 +9,7 @@ mod observer;
 mod plant;
 mod ports;
 
+pub(crate) use ports::ports_of_rig;
 pub use ports::{Port, Ports, ports};
 
 use super::bridge::DeviceLink;
@@ -17,7 +18,7 @@ use super::hooks::{self, Place};
 use super::link::{self, Horizon, Input, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::memory::MemoryBus;
-use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
+use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
 use crate::control::Watchdog;
@@ -449,7 +450,20 @@ pub fn topic(scenario: &Scenario, body: &str, signal: Signal) -> Topic {
 ///
 /// # Errors
 /// [`BusError::Open`].
-pub fn build<R: Rig, B: Bus + 'static>(
+pub fn build<'a>(
+    scenario: &Scenario,
+    occupant: impl Into<Occupant>,
+    bus: impl Into<AnyBus<'a>>,
+    ledger: &Ledger,
+) -> Result<ReadyNode, BusError> {
+    scenario.rig.face().node(scenario, occupant.into(), bus.into(), ledger)
+}
+
+/// The same for a rig whose type is known, on a bus of any type.
+///
+/// # Errors
+/// [`BusError::Open`].
+pub fn build_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Scenario,
     occupant: impl Into<Occupant>,
@@ -486,7 +500,6 @@ mod tests {
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
     use crate::config::SHIPPED;
-    use crate::with_rig;
 
     #[test]
     fn every_role_of_a_scenario_has_the_name_that_the_rig_gives_it() {
@@ -508,7 +521,7 @@ mod tests {
             let bus = IoxBus::enter(domain.domain(), "test", crate::runtime::depths(&scenario)).unwrap();
             let node = |role| {
                 let ledger = private_ledger(&scenario, role);
-                with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap()
+                build(&scenario, role, &bus, &ledger).unwrap()
             };
             let mut nodes: Vec<ReadyNode> = RoleId::all(&scenario).into_iter().map(node).collect();
             nodes.iter_mut().for_each(|node| node.warm_up().unwrap());

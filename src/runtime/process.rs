@@ -17,7 +17,6 @@ use crate::files;
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
-use crate::with_rig;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -173,7 +172,9 @@ pub(super) fn in_domain(
     hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Place::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
-    serve(scenario, occupant, &bus, &ledger, terminated, privileges, |report| {
+    let build = |occupant| node::build(scenario, occupant, &bus, &ledger);
+    let service = Service { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
+    serve(service, occupant, build, |report| {
         reported(report);
         write_report(domain, report)
     })
@@ -207,20 +208,32 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&part, path)
 }
 
-/// Serves a seat on a bus: the phases of a run, from open links to the report of each of its roles. `privileges` are what the
-/// caller has taken, and `ledger` the books, new or a predecessor's.
+/// What a seat is served with.
+pub struct Service<'a, B> {
+    /// The scenario.
+    pub scenario: &'a Scenario,
+    /// The bus.
+    pub bus: &'a B,
+    /// The books, new or a predecessor's.
+    pub ledger: &'a Ledger,
+    /// Whether this process was asked to end.
+    pub terminated: &'a AtomicBool,
+    /// What the caller has taken.
+    pub privileges: Privileges,
+}
+
+/// Serves a seat on a bus: the phases of a run, from open links to the report of each of its roles. `build` opens the links of
+/// the loop and builds the node.
 ///
 /// # Errors
 /// [`RoleError`].
 pub fn serve<B: Bus + 'static>(
-    scenario: &Scenario,
+    service: Service<'_, B>,
     occupant: impl Into<Occupant>,
-    bus: &B,
-    ledger: &Ledger,
-    terminated: &AtomicBool,
-    privileges: Privileges,
+    build: impl FnOnce(Occupant) -> Result<ReadyNode, BusError>,
     mut deliver: impl FnMut(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
+    let Service { scenario, bus, ledger, terminated, privileges } = service;
     let occupant = occupant.into();
     let (role, books) = (occupant.role(), occupant.books(ledger));
     let voice = |(role, ledger): &(RoleId, Ledger)| {
@@ -230,7 +243,7 @@ pub fn serve<B: Bus + 'static>(
     };
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
     let voices = books.iter().map(voice).collect::<Result<_, BusError>>()?;
-    let mut node = with_rig!(&scenario.rig, rig => node::build(rig, scenario, occupant, bus, ledger))?;
+    let mut node = build(occupant)?;
     node.restore()?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,

@@ -12,7 +12,6 @@ use crate::fault::{Action, Fault, Interruption, Transport};
 use crate::rig::{Command, Estimate, Rig, Truth};
 use crate::runtime::{Port, RoleId, ports, topic, window_ticks};
 use crate::sample::{Field, FieldKind, FleetSample, Health, RoleState, Sample, Stamp, VOID, status};
-use crate::with_rig;
 use std::collections::VecDeque;
 
 /// Between two looks, ns: seldom enough that their traces are not in the 99 % of a loop at 1 kHz, and less than what waits.
@@ -148,7 +147,7 @@ fn bit_names(bits: u64) -> Vec<&'static str> {
 }
 
 /// What the samples of one tick come to, for a rig whose samples have types.
-trait Judge {
+pub(crate) trait Judge {
     /// Writes every metric; `words` gives the sample of a body's signal.
     fn score<'a>(&self, words: &dyn Fn(&str, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
     /// The largest V of all driven bodies; NaN if none is told.
@@ -238,7 +237,7 @@ impl Feed {
             told: vec![(0, f64::NEG_INFINITY); taps.len()],
             taps,
             roles,
-            judge: with_rig!(&scenario.rig, rig => Box::new(rig.clone())),
+            judge: scenario.rig.face().judge(),
             faults,
             realtime,
             stride: if realtime { (LOOK_NS / 2 / scenario.period_ns).max(1) } else { 1 },
@@ -418,7 +417,7 @@ mod tests {
     #[test]
     fn the_judge_reads_words_as_the_rig_s_samples() {
         let scenario = Scenario::parse(crate::config::SHIPPED[0].1, "test", &[]).unwrap();
-        let judge: Box<dyn Judge> = with_rig!(&scenario.rig, rig => Box::new(rig.clone()));
+        let judge = scenario.rig.face().judge();
         let truth = |rate: f64| RateTruth { omega_rad_s: [rate, 0.0, 0.0], ..RateTruth::default() };
         let (leader, follower) = (truth(1.0), truth(3.0));
         let estimate = RateEstimate { omega_rad_s: [1.0, 0.0, 0.5], ..RateEstimate::default() };

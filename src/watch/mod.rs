@@ -18,6 +18,7 @@ mod screen;
 mod session;
 mod terminal;
 
+pub(crate) use feed::Judge;
 pub use input::{Action, action};
 pub use model::{Event, History, Model, RoleLine, Series, SignalLine, Window};
 pub use screen::{draw, text};

@@ -359,15 +359,13 @@ mod tests {
     use super::*;
     use crate::bus::FleetBuffer;
     use crate::config::{SHIPPED, Scenario};
-    use crate::rig::{AnyRig, Rig};
+    use crate::rig::Rig;
     use crate::sample::{RateMeasurement, Stamp};
 
     fn rig(overrides: &[&str]) -> RigidBodyRig {
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
-        match Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap().rig {
-            AnyRig::RigidBody(rig) => rig,
-            AnyRig::Orbit(_) => unreachable!("the first scenario is of rigid bodies"),
-        }
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
+        scenario.rig.downcast_ref::<RigidBodyRig>().unwrap().clone()
     }
 
     /// Over whatever comes: steady motion, jumps, gaps, numbers that are none, new lives of the sender.

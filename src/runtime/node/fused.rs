@@ -163,7 +163,7 @@ mod tests {
     use crate::config::{SHIPPED, Scenario};
     use crate::runtime::{ReadyNode, build, depths, private_ledger, report};
     use crate::telemetry::Ledger;
-    use crate::with_rig;
+    use crate::with_shipped_rig;
 
     const LAST: u64 = 6;
     /// The leader's measurement of this tick is dropped.
@@ -195,7 +195,7 @@ mod tests {
         let roles = [RoleId::Plant(0), RoleId::Plant(1)];
         let bus = enter(&domain, scenario);
         let plant_books = roles.map(|role| private_ledger(scenario, role));
-        let plant = |(role, books): (&RoleId, &Ledger)| build(rig, scenario, *role, &bus, books).unwrap();
+        let plant = |(role, books): (&RoleId, &Ledger)| build(scenario, *role, &bus, books).unwrap();
         let mut plants: Vec<ReadyNode> = roles.iter().zip(&plant_books).map(plant).collect();
         let books = [RoleId::Observer, RoleId::Controller].map(|role| private_ledger(scenario, role));
 
@@ -238,6 +238,6 @@ mod tests {
         let fault = format!("fault=[{{kind=\"drop\", role=\"leader\", from_tick={LOST}}}]");
         let overrides = ["clock=lockstep", "duration_s=0.1", "accept={}", &fault].map(str::to_owned);
         let scenario = Scenario::parse(text, name, &overrides).unwrap();
-        with_rig!(&scenario.rig, rig => die_with_a_void_between_them(rig, &scenario));
+        with_shipped_rig!(scenario.rig, rig => die_with_a_void_between_them(rig, &scenario));
     }
 }

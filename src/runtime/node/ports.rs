@@ -8,7 +8,6 @@ use crate::bus::{AnyBus, BusError, Carried, Depths, Ends, Reader, Signal, Topic,
 use crate::config::Scenario;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, Measurement, Rig, Truth};
 use crate::sample::{Field, FleetSample, Health, Schedule};
-use crate::with_rig;
 
 /// One signal as it travels: where, and what its bytes mean.
 #[derive(Debug, Clone)]
@@ -66,7 +65,7 @@ pub struct Ports {
 
 /// The signals of a role of a scenario.
 pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
-    let (writes, reads) = with_rig!(&scenario.rig, rig => of_role(rig, scenario, role));
+    let (writes, reads) = scenario.rig.face().ports(scenario, role);
     Ports {
         writes,
         reads,
@@ -115,7 +114,7 @@ pub(super) fn driven<R: Rig>(rig: &R) -> impl Iterator<Item = (usize, &BodyInfo)
 }
 
 /// What a role writes, and what it reads.
-fn of_role<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
+pub(crate) fn ports_of_rig<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
     let signals = Signals { rig, scenario };
     match role {
         RoleId::Plant(index) => {
@@ -150,8 +149,9 @@ mod tests {
     use crate::bus::Bus;
     use crate::bus::memory::MemoryBus;
     use crate::config::SHIPPED;
-    use crate::runtime::{build, depths, private_ledger};
+    use crate::runtime::{build_rig, depths, private_ledger};
     use crate::sample::{FleetLayout, Sample};
+    use crate::with_shipped_rig;
     use std::cell::RefCell;
 
     type Opened = RefCell<Vec<(Topic, &'static str)>>;
@@ -204,7 +204,7 @@ mod tests {
                 let bus = MemoryBus::new(depths(&scenario));
                 let bus = Watched { bus, written: Opened::default(), read: Opened::default() };
                 let ledger = private_ledger(&scenario, role);
-                with_rig!(&scenario.rig, rig => build(rig, &scenario, role, &bus, &ledger)).unwrap();
+                with_shipped_rig!(scenario.rig, rig => build_rig(rig, &scenario, role, &bus, &ledger)).unwrap();
                 let ports = ports(&scenario, role);
                 let listed = |ports: &[Port]| -> Vec<_> {
                     ports.iter().map(|port| (port.topic.clone(), port.type_name)).collect()

@@ -1,0 +1,174 @@
+//! A rig whose types only itself knows: what the program asks of any rig, answered once for every [`Rig`].
+//!
+//! Must not compute anything: each answer is the generic code of the module that asks.
+
+use super::{BodyInfo, CertificateReport, Figure, Rig};
+use crate::analysis::{self, Claim};
+use crate::bus::{AnyBus, BusError};
+use crate::config::{Fields, Scenario, fields};
+use crate::control::Watched;
+use crate::launch::{Scorer, score_rig};
+use crate::record::{RecordError, Recording};
+use crate::report::{Traces, trace_rig};
+use crate::runtime::{DeviceError, DeviceLink, DeviceSeat, Occupant, Port, ReadyNode, RoleId, build_rig, ports_of_rig};
+use crate::telemetry::Ledger;
+use crate::watch::Judge;
+use std::any::Any;
+use std::fmt;
+
+/// Any rig.
+pub struct AnyRig(Box<dyn Face>);
+
+/// What is asked of a rig, whichever it is.
+pub(crate) trait Face: Any + Send + Sync {
+    fn bodies(&self) -> &[BodyInfo];
+    fn metrics(&self) -> &'static [&'static str];
+    fn certificates(&self) -> Vec<CertificateReport>;
+    fn limits(&self) -> Vec<Figure>;
+    fn unwatched(&self, watched: Watched) -> Option<&'static str>;
+    fn notes(&self) -> Vec<String>;
+    fn fields(&self, role: &str, fleet: Option<usize>) -> Fields;
+    fn claims(&self, scenario: &Scenario) -> Vec<Claim>;
+    fn ports(&self, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>);
+    fn node(
+        &self,
+        scenario: &Scenario,
+        occupant: Occupant,
+        bus: AnyBus<'_>,
+        ledger: &Ledger,
+    ) -> Result<ReadyNode, BusError>;
+    fn device(&self, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError>;
+    fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
+    fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
+    fn judge(&self) -> Box<dyn Judge>;
+}
+
+impl<R: Rig> Face for R {
+    fn bodies(&self) -> &[BodyInfo] {
+        Rig::bodies(self)
+    }
+
+    fn metrics(&self) -> &'static [&'static str] {
+        Rig::metrics(self)
+    }
+
+    fn certificates(&self) -> Vec<CertificateReport> {
+        Rig::certificates(self)
+    }
+
+    fn limits(&self) -> Vec<Figure> {
+        Rig::limits(self)
+    }
+
+    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        Rig::unwatched(self, watched)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        Rig::notes(self)
+    }
+
+    fn fields(&self, role: &str, fleet: Option<usize>) -> Fields {
+        fields::<R>(role, fleet)
+    }
+
+    fn claims(&self, scenario: &Scenario) -> Vec<Claim> {
+        analysis::of_rig(self, scenario)
+    }
+
+    fn ports(&self, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
+        ports_of_rig(self, scenario, role)
+    }
+
+    fn node(
+        &self,
+        scenario: &Scenario,
+        occupant: Occupant,
+        bus: AnyBus<'_>,
+        ledger: &Ledger,
+    ) -> Result<ReadyNode, BusError> {
+        match bus {
+            AnyBus::Memory(bus) => build_rig(self, scenario, occupant, bus, ledger),
+            AnyBus::Shared(bus) => build_rig(self, scenario, occupant, bus, ledger),
+        }
+    }
+
+    fn device(&self, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError> {
+        DeviceLink::of_rig(self, seat, scenario, run)
+    }
+
+    fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError> {
+        match bus {
+            AnyBus::Memory(bus) => score_rig(self, scenario, bus),
+            AnyBus::Shared(bus) => score_rig(self, scenario, bus),
+        }
+    }
+
+    fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError> {
+        trace_rig(self, scenario, recording)
+    }
+
+    fn judge(&self) -> Box<dyn Judge> {
+        Box::new(self.clone())
+    }
+}
+
+impl AnyRig {
+    /// A rig as any.
+    pub fn new(rig: impl Rig) -> Self {
+        Self(Box::new(rig))
+    }
+
+    /// The rig, if it is of this type.
+    pub fn downcast_ref<R: Rig>(&self) -> Option<&R> {
+        (&*self.0 as &dyn Any).downcast_ref()
+    }
+
+    /// What only the program's own parts ask of it.
+    pub(crate) fn face(&self) -> &dyn Face {
+        &*self.0
+    }
+
+    /// The bodies; the first is the observed one.
+    pub fn bodies(&self) -> &[BodyInfo] {
+        self.0.bodies()
+    }
+
+    /// The names of all roles, in the order in which one tick passes through them.
+    pub fn roles(&self) -> Vec<&str> {
+        let controller = self.bodies().iter().any(|body| body.driven).then_some("controller");
+        let bodies = self.bodies().iter().map(|body| body.name.as_str());
+        bodies.chain(["observer"]).chain(controller).collect()
+    }
+
+    /// What a run is scored by.
+    pub fn metrics(&self) -> &'static [&'static str] {
+        self.0.metrics()
+    }
+
+    /// What is proven of the closed loop.
+    pub fn certificates(&self) -> Vec<CertificateReport> {
+        self.0.certificates()
+    }
+
+    /// The physical bounds that the guards work with.
+    pub fn limits(&self) -> Vec<Figure> {
+        self.0.limits()
+    }
+
+    /// Why a quantity cannot be watched in this scenario, if so.
+    pub fn unwatched(&self, watched: Watched) -> Option<&'static str> {
+        self.0.unwatched(watched)
+    }
+
+    /// What a reader of the results must know of the scenario.
+    pub fn notes(&self) -> Vec<String> {
+        self.0.notes()
+    }
+}
+
+impl fmt::Debug for AnyRig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("AnyRig").field(&self.bodies()).finish()
+    }
+}
