@@ -18,10 +18,9 @@ pub use fault::ScriptedFault;
 pub(crate) use fault::{Fields, fields};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use run_id::{NoRunId, RunId};
-pub use scenario::Scenario;
+pub use scenario::{Checks, Scenario, finite_positive};
 
 pub(crate) use document::nearest;
-pub(crate) use scenario::{Checks, finite_positive};
 
 /// The scenarios that ship with the program: name and text.
 pub const SHIPPED: [(&str, &str); 12] = [

@@ -4,7 +4,7 @@ use super::fault::{self, ScriptedFault};
 use super::raw::{Launch, Policy, Raw};
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
 use crate::control::WatchBounds;
-use crate::rig::{self, AnyRig, Frame};
+use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
 use std::path::Path;
 
@@ -14,26 +14,10 @@ const MIN_TICK_HZ: f64 = 0.1;
 const MAX_TICK_HZ: f64 = 1e5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
-/// The tables whose content belongs to the rig.
-const RIG_SECTIONS: [&str; 7] =
-    ["central_body", "leader", "spacecraft", "follower", "observer", "controller", "limits"];
 /// The roles that `launch.fused` makes one process of.
 const FUSED: [&str; 2] = ["observer", "controller"];
-/// The keys that hold one table each.
-const TABLES: [&str; 12] = [
-    "central_body",
-    "leader",
-    "spacecraft",
-    "observer",
-    "controller",
-    "limits",
-    "actuator",
-    "realtime",
-    "launch",
-    "supervision",
-    "watchdog",
-    "accept",
-];
+/// The keys that hold one table each, whatever the rig.
+const TABLES: [&str; 6] = ["actuator", "realtime", "launch", "supervision", "watchdog", "accept"];
 
 /// A scenario that can be run.
 #[derive(Debug)]
@@ -101,15 +85,15 @@ impl Scenario {
         for argument in overrides {
             document.set(argument)?;
         }
-        document.refuse_lists(&TABLES)?;
-        let sections = document.split_off(&RIG_SECTIONS);
+        document.refuse_lists(&[&rig::tables()[..], &TABLES].concat())?;
+        let sections = document.split_off(&rig::sections());
         let raw: Raw = document.read_into()?;
         let mut checks = Checks::new(&document);
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
-        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Frame { tick_s, seed: raw.seed }, &mut checks)?;
+        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Context { tick_s, seed: raw.seed }, &mut checks)?;
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         // Nothing is concluded from a length or a tick that is refused.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
@@ -192,7 +176,7 @@ impl Scenario {
 }
 
 /// Collects findings, so that all of them are told at once.
-pub(crate) struct Checks<'a> {
+pub struct Checks<'a> {
     document: &'a Document,
     problems: Vec<Problem>,
 }
@@ -229,7 +213,7 @@ impl<'a> Checks<'a> {
 }
 
 /// Notes a number that is not positive. Non-finite numbers never get so far.
-pub(crate) fn finite_positive(checks: &mut Checks<'_>, key: &str, value: f64) {
+pub fn finite_positive(checks: &mut Checks<'_>, key: &str, value: f64) {
     checks.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
 }
 

@@ -1,19 +1,21 @@
 //! Rigs: which plant, observer and control law belong together, with their parameters.
 //!
-//! A new rig is its mathematics, one file here, one line in each of the places marked "registry" below, and a
-//! scenario in `config/`. Must not know how roles are driven, nor what carries their samples.
+//! Must not know how roles are driven, nor what carries their samples; `any.rs` alone knows who asks.
 
 mod any;
 mod fleet;
 mod orbit;
+mod registry;
 mod rigid_body;
 
 pub use any::AnyRig;
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
+pub use registry::{RigKind, register};
+pub(crate) use registry::{resolve, sections, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
 
-use crate::config::{Checks, ConfigError, Document, finite_positive, nearest};
+use crate::config::{Checks, ConfigError, Document, finite_positive};
 use crate::control::Watched;
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use crate::role::{Body, Estimator, Guard, Law, SingleBody};
@@ -86,6 +88,12 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type CommandGuard: Guard<Command<Self>> + Persist;
     /// Many bodies in one process; [`NoFleet`] where the rig has none.
     type Fleet: Fleet<Estimate<Self>>;
+    /// By which a scenario's key `rig` names it.
+    const NAMES: &'static [&'static str];
+    /// The keys of a scenario's tables that are its own, each of one table.
+    const TABLES: &'static [&'static str];
+    /// The same, each of a list of tables.
+    const LISTS: &'static [&'static str] = &[];
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
     const AXES: usize;
     /// The fields of truths and estimates that the loop controls: their errors are to vanish.
@@ -93,6 +101,17 @@ pub trait Rig: Clone + Send + Sync + 'static {
     /// The field of truths that the loop does not control, if there is one: a motion that is shifted in it is as good.
     const FREE: Option<&'static str> = None;
 
+    /// The rig of this name as its tables describe it, or none if `checks` noted a problem with it; and the tables with every
+    /// default filled in.
+    ///
+    /// # Errors
+    /// [`ConfigError`] for keys that are unknown, missing or of the wrong type.
+    fn resolve(
+        name: &str,
+        sections: &Document,
+        context: Context,
+        checks: &mut Checks<'_>,
+    ) -> Result<(Option<Self>, toml::Table), ConfigError>;
     /// The bodies; the first is the observed one.
     fn bodies(&self) -> &[BodyInfo];
     /// A body at its initial state.
@@ -239,7 +258,7 @@ fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut taken: imp
 
 /// What a rig must know of the scenario around it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Frame {
+pub struct Context {
     /// The period h, s.
     pub tick_s: f64,
     /// The seed of all randomness.
@@ -316,40 +335,6 @@ impl<const N: usize> FilterDesign<N> {
             Self::First(decay) => Some(*decay),
             Self::Second(bandwidth) => Some(bandwidth.map(|bandwidth| DAMPING * bandwidth)),
             Self::Kalman(_) => None,
-        }
-    }
-}
-
-/// Registry: the names of the rigs.
-const NAMES: [&str; 3] = ["rigid-body", "orbit-hold", "orbit-rendezvous"];
-
-/// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.
-///
-/// # Errors
-/// [`ConfigError`] for keys that are unknown, missing or of the wrong type.
-pub(crate) fn resolve(
-    name: &str,
-    sections: &Document,
-    frame: Frame,
-    checks: &mut Checks<'_>,
-) -> Result<(Option<AnyRig>, toml::Table), ConfigError> {
-    // Registry.
-    match name {
-        "rigid-body" => {
-            let (rig, table) = rigid_body::resolve(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::new), table))
-        }
-        "orbit-hold" => {
-            let (rig, table) = orbit::hold(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::new), table))
-        }
-        "orbit-rendezvous" => {
-            let (rig, table) = orbit::rendezvous(sections, frame, checks)?;
-            Ok((rig.map(AnyRig::new), table))
-        }
-        _ => {
-            checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &NAMES)));
-            Ok((None, toml::Table::new()))
         }
     }
 }

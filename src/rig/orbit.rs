@@ -9,12 +9,12 @@ mod resolve;
 mod roles;
 
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
-pub(super) use resolve::{hold, rendezvous};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, FleetTruth, NoFleet, Rig, Start, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, FleetTruth, NoFleet, Rig, Start, pair,
 };
+use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold, Watched};
 use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
@@ -166,8 +166,25 @@ impl Rig for OrbitRig {
     type CommandGuard = CommandGuard;
     type Fleet = NoFleet;
     const AXES: usize = 4;
+    const NAMES: &'static [&'static str] = &["orbit-hold", "orbit-rendezvous"];
+    const TABLES: &'static [&'static str] =
+        &["central_body", "leader", "spacecraft", "observer", "controller", "limits"];
+    const LISTS: &'static [&'static str] = &["follower"];
     const CONTROLLED: &'static [&'static str] = &["radius_du", "velocity_du_s"];
     const FREE: Option<&'static str> = Some("angle_rad");
+
+    fn resolve(
+        name: &str,
+        sections: &Document,
+        context: Context,
+        checks: &mut Checks<'_>,
+    ) -> Result<(Option<Self>, toml::Table), ConfigError> {
+        if name == "orbit-hold" {
+            resolve::hold(sections, context, checks)
+        } else {
+            resolve::rendezvous(sections, context, checks)
+        }
+    }
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies

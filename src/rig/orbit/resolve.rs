@@ -8,7 +8,7 @@ use super::{BodyInfo, ControllerDesign, OrbitRig, Sensors};
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
-use crate::rig::{FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
+use crate::rig::{Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 
@@ -153,9 +153,9 @@ impl From<&RawFollower> for OrbitState {
 }
 
 /// Reads and checks a scenario of the rig `orbit-hold`.
-pub(in crate::rig) fn hold(
+pub(super) fn hold(
     sections: &Document,
-    frame: Frame,
+    context: Context,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawHold = sections.read_into()?;
@@ -167,25 +167,25 @@ pub(in crate::rig) fn hold(
     review.place("controller.target_radius_du", raw.controller.target_radius_du, field.as_ref());
     review.loops(&raw.controller.gain, raw.controller.thrust_max_du_s2);
     review.sensor("spacecraft", &raw.spacecraft.noise);
-    let sensors = vec![sensor(frame, 0, &raw.spacecraft.noise, &raw.spacecraft.bias)];
+    let sensors = vec![sensor(context, 0, &raw.spacecraft.noise, &raw.spacecraft.bias)];
     let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
     let full_state = raw.controller.feedback == Feedback::FullState;
     let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
     let RawHoldController { gain, thrust_max_du_s2, predict, .. } = &raw.controller;
-    let controller = Some(gain.controller(field, *thrust_max_du_s2, *predict, frame));
+    let controller = Some(gain.controller(field, *thrust_max_du_s2, *predict, context));
     let initial = vec![OrbitState::from(&raw.spacecraft)];
     let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
     let rig = OrbitRig {
         bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true, fleet: None }],
         field,
         initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, frame),
+        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, context),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
         controller,
         aim,
-        tick_s: frame.tick_s,
+        tick_s: context.tick_s,
     };
     if sound {
         check_loop(&rig, checks);
@@ -194,9 +194,9 @@ pub(in crate::rig) fn hold(
 }
 
 /// Reads and checks a scenario of the rig `orbit-rendezvous`.
-pub(in crate::rig) fn rendezvous(
+pub(super) fn rendezvous(
     sections: &Document,
-    frame: Frame,
+    context: Context,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawRendezvous = sections.read_into()?;
@@ -208,10 +208,10 @@ pub(in crate::rig) fn rendezvous(
     review.followers(&raw.follower, field.as_ref());
     review.controller(raw.controller.as_ref(), raw.follower.is_empty());
     review.sensor("leader", &raw.leader.noise);
-    let sensors = vec![sensor(frame, 0, &raw.leader.noise, &raw.leader.bias)];
+    let sensors = vec![sensor(context, 0, &raw.leader.noise, &raw.leader.bias)];
     let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
     let thrust_max = raw.controller.as_ref().map_or(0.0, |controller| controller.thrust_max_du_s2);
-    let designed = |raw: &RawController| raw.gain.controller(field, raw.thrust_max_du_s2, raw.predict, frame);
+    let designed = |raw: &RawController| raw.gain.controller(field, raw.thrust_max_du_s2, raw.predict, context);
     let mut initial = vec![OrbitState::from(&raw.leader)];
     initial.extend(raw.follower.iter().map(OrbitState::from));
     let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
@@ -219,17 +219,17 @@ pub(in crate::rig) fn rendezvous(
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
         field,
         initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], thrust_max, &raw.limits, frame),
+        limits: limits(field, speed, &raw.observer, &sensors[0], thrust_max, &raw.limits, context),
         sensors,
         filter,
         initial_guess: raw.observer.initial_guess_du_s.into(),
         controller: raw.controller.as_ref().map(designed),
         aim: Aim::Leader,
-        tick_s: frame.tick_s,
+        tick_s: context.tick_s,
     };
     for follower in &raw.follower {
         rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true, fleet: None });
-        rig.sensors.push(sensor(frame, rig.sensors.len() as u64, &follower.noise, &follower.bias));
+        rig.sensors.push(sensor(context, rig.sensors.len() as u64, &follower.noise, &follower.bias));
     }
     if sound {
         check_loop(&rig, checks);
@@ -237,9 +237,9 @@ pub(in crate::rig) fn rendezvous(
     Ok((Some(rig), table))
 }
 
-fn sensor(frame: Frame, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sensors {
+fn sensor(context: Context, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sensors {
     Sensors {
-        noise: Noise::new(frame.seed, stream, noise.components(), bias.components()),
+        noise: Noise::new(context.seed, stream, noise.components(), bias.components()),
         deviation: noise.components(),
         bias: bias.components(),
     }
@@ -253,7 +253,7 @@ fn limits(
     sensors: &Sensors,
     thrust_du_s2: f64,
     raw: &RawLimits,
-    frame: Frame,
+    context: Context,
 ) -> Limits {
     let guess = observer.initial_guess_du_s.iter().fold(0.0, |largest: f64, guess| largest.max(guess.abs()));
     let noisy = sensors.deviation != [0.0; 4] || observer.decay_rate_per_s.is_none();
@@ -262,19 +262,19 @@ fn limits(
         speed_du_s,
         transient_du_s: speed_du_s + guess + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
         thrust_du_s2,
-        tick_s: frame.tick_s,
+        tick_s: context.tick_s,
         repeats: raw.repeats.unwrap_or(u64::MAX),
     }
 }
 
 impl RawGain {
-    fn controller(&self, field: CentralField, thrust_max: f64, predict: bool, frame: Frame) -> ControllerDesign {
+    fn controller(&self, field: CentralField, thrust_max: f64, predict: bool, context: Context) -> ControllerDesign {
         let gains = OrbitGains {
             radius_per_s2: self.radius_per_s2,
             radial_per_s: self.radial_per_s,
             transverse_per_s: self.transverse_per_s,
         };
-        let lead_s = if predict { frame.tick_s } else { 0.0 };
+        let lead_s = if predict { context.tick_s } else { 0.0 };
         ControllerDesign { gains, law: OrbitHold::new(field, gains, thrust_max, lead_s) }
     }
 }

@@ -19,10 +19,11 @@ pub use learner::Learner;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
-pub(super) use resolve::resolve;
 
-use super::{BodyInfo, CertificateReport, ConditionReport, Figure, FilterDesign, Rig, Start, UNKNOWN_DEVIATION, pair};
-use crate::config::Checks;
+use super::{
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Rig, Start, UNKNOWN_DEVIATION, pair,
+};
+use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{HiddenRate, RateNoise};
@@ -200,7 +201,19 @@ impl Rig for RigidBodyRig {
     type CommandGuard = CommandGuard;
     type Fleet = RateFleet;
     const AXES: usize = 3;
+    const NAMES: &'static [&'static str] = &["rigid-body"];
+    const TABLES: &'static [&'static str] = &["leader", "observer", "controller", "limits"];
+    const LISTS: &'static [&'static str] = &["follower"];
     const CONTROLLED: &'static [&'static str] = &["omega_rad_s", "coefficients"];
+
+    fn resolve(
+        _name: &str,
+        sections: &Document,
+        context: Context,
+        checks: &mut Checks<'_>,
+    ) -> Result<(Option<Self>, toml::Table), ConfigError> {
+        resolve::resolve(sections, context, checks)
+    }
 
     fn bodies(&self) -> &[BodyInfo] {
         &self.bodies

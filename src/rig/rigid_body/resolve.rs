@@ -10,7 +10,7 @@ use super::{ControllerDesign, ObserverDesign, RigidBodyRig, learner};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
-use crate::rig::{BodyInfo, FilterDesign, Frame, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
+use crate::rig::{BodyInfo, Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::{Matrix3, Vector1, Vector3};
 
 /// Part of the leader's rate by which rounding may move the estimate of the hidden component. With fewer than three digits it
@@ -18,26 +18,26 @@ use nalgebra::{Matrix3, Vector1, Vector3};
 const LARGEST_ROUNDING: f64 = 1e-3;
 
 /// Reads and checks the sections of this rig.
-pub(in crate::rig) fn resolve(
+pub(super) fn resolve(
     sections: &Document,
-    frame: Frame,
+    context: Context,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
     let raw: Raw = sections.read_into()?;
     let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
     config::check(&raw, checks);
     let supplied_axis = config::hidden_axis(&raw, checks);
-    let outages = resolve_outages(&raw, frame.tick_s, checks);
+    let outages = resolve_outages(&raw, context.tick_s, checks);
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
     let Some(inertia) = inertia else { return Ok((None, table)) };
     let mut notes = Vec::new();
-    let observer = design_observer(&raw, &inertia, supplied_axis, frame.tick_s, &mut notes, checks);
+    let observer = design_observer(&raw, &inertia, supplied_axis, context.tick_s, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
         bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
         inertia,
         spreads: vec![Vector3::zeros()],
-        seed: frame.seed,
+        seed: context.seed,
         initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
         inertia_factors: vec![Vector3::repeat(1.0)],
         measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
@@ -45,12 +45,12 @@ pub(in crate::rig) fn resolve(
         supplied_axis,
         observer,
         controller: raw.controller.as_ref().map(ControllerDesign::from),
-        noise: vec![noise(frame, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
+        noise: vec![noise(context, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
         deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
         biases_rad_s: vec![raw.leader.bias_rad_s.into()],
         limits: design_limits(&raw, &inertia, supplied_axis, checks),
         notes,
-        tick_s: frame.tick_s,
+        tick_s: context.tick_s,
         certificate: None,
     };
     rig.certificate = rig.certify();
@@ -62,7 +62,7 @@ pub(in crate::rig) fn resolve(
         rig.spreads.push(follower.spread_rad_s().into());
         rig.bodies.push(BodyInfo { fleet: follower.fleet(), name: follower.name, driven: true });
         rig.inertia_factors.push(factor);
-        rig.noise.push(noise(frame, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
+        rig.noise.push(noise(context, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
         rig.deviations_rad_s.push(follower.noise_rad_s.into());
         rig.biases_rad_s.push(follower.bias_rad_s.into());
     }
@@ -70,8 +70,8 @@ pub(in crate::rig) fn resolve(
     Ok((Some(rig), table))
 }
 
-fn noise(frame: Frame, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
-    Noise::new(frame.seed, stream, deviation, bias)
+fn noise(context: Context, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
+    Noise::new(context.seed, stream, deviation, bias)
 }
 
 impl From<&config::RawController> for ControllerDesign {

@@ -1,0 +1,65 @@
+//! The rigs that scenarios of this program may name.
+//!
+//! Must not know more of a rig than how it is named, which tables are its own, and how it is made of them.
+
+use super::{AnyRig, Context, OrbitRig, Rig, RigidBodyRig};
+use crate::config::{Checks, ConfigError, Document, nearest};
+use std::sync::OnceLock;
+
+/// A rig that scenarios may name.
+#[derive(Clone, Copy)]
+pub struct RigKind {
+    names: &'static [&'static str],
+    tables: &'static [&'static str],
+    lists: &'static [&'static str],
+    resolve: fn(&str, &Document, Context, &mut Checks<'_>) -> Resolved,
+}
+
+/// A rig, unless a problem with it was noted, and its tables with every default filled in.
+type Resolved = Result<(Option<AnyRig>, toml::Table), ConfigError>;
+
+impl RigKind {
+    /// That of a rig.
+    pub fn of<R: Rig>() -> Self {
+        let resolve = |name: &str, sections: &Document, context: Context, checks: &mut Checks<'_>| {
+            let (rig, table) = R::resolve(name, sections, context, checks)?;
+            Ok((rig.map(AnyRig::new), table))
+        };
+        Self { names: R::NAMES, tables: R::TABLES, lists: R::LISTS, resolve }
+    }
+}
+
+static KINDS: OnceLock<Vec<RigKind>> = OnceLock::new();
+
+/// Makes these the rigs of this program. Must come before its first scenario is read; then it is too late, and false.
+pub fn register(kinds: Vec<RigKind>) -> bool {
+    KINDS.set(kinds).is_ok()
+}
+
+/// The rigs of this program: those of this crate where none were registered.
+fn kinds() -> &'static [RigKind] {
+    KINDS.get_or_init(|| vec![RigKind::of::<RigidBodyRig>(), RigKind::of::<OrbitRig>()])
+}
+
+/// The keys of tables that belong to a rig, whichever it is: those that hold one table.
+pub(crate) fn tables() -> Vec<&'static str> {
+    kinds().iter().flat_map(|kind| kind.tables).copied().collect()
+}
+
+/// The same, and those that hold a list of tables.
+pub(crate) fn sections() -> Vec<&'static str> {
+    tables().into_iter().chain(kinds().iter().flat_map(|kind| kind.lists).copied()).collect()
+}
+
+/// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.
+///
+/// # Errors
+/// [`ConfigError`] for keys that are unknown, missing or of the wrong type.
+pub(crate) fn resolve(name: &str, sections: &Document, context: Context, checks: &mut Checks<'_>) -> Resolved {
+    if let Some(kind) = kinds().iter().find(|kind| kind.names.contains(&name)) {
+        return (kind.resolve)(name, sections, context, checks);
+    }
+    let names: Vec<&str> = kinds().iter().flat_map(|kind| kind.names).copied().collect();
+    checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &names)));
+    Ok((None, toml::Table::new()))
+}
