@@ -92,6 +92,13 @@ impl<R: Rig> Chain<R> {
         numbers::<Estimate<R>>().filter(controlled).for_each(|field| out.extend(values(&self.estimate, field)));
     }
 
+    /// Every number of the observed body's motion that the loop is to control.
+    pub fn observed(&self, out: &mut Vec<f64>) {
+        out.clear();
+        let controlled = |field: &&Field| R::CONTROLLED.contains(&field.name);
+        numbers::<Truth<R>>().filter(controlled).for_each(|field| out.extend(values(&self.truths[0], field)));
+    }
+
     /// The driven body's coordinate that the loop does not control.
     pub fn free(&self) -> f64 {
         let field = numbers::<Truth<R>>().find(|field| R::FREE == Some(field.name));
