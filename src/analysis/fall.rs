@@ -61,7 +61,7 @@ impl Fall {
         let begin = end.checked_sub((end - begin).next_multiple_of(self.period()?)).filter(|begin| *begin >= small)?;
         let last = (all[begin] / all[end]).ln() / (end - begin) as f64;
         let logarithms: Vec<f64> = all[small..end].iter().map(|error| -error.ln()).collect();
-        Some([last, super::slope(&logarithms)])
+        Some([last, super::exponent::slope(&logarithms)])
     }
 }
 
@@ -86,7 +86,7 @@ mod tests {
         let [last, all] = fall(400, |tick| (-0.1 * tick).exp().max(1e-15), rests).rates(&[1e-15]).unwrap();
         assert!((last - 0.1).abs() < 1e-9 && (all - 0.1).abs() < 1e-9);
         let [last, all] = fall(800, |tick| (1.0 + tick).powi(2) * (-0.1 * tick).exp(), rests).rates(&[1e-15]).unwrap();
-        assert!(last < 0.1 / 1.035 && all < 0.1 / 1.035, "{last} {all}");
+        assert!(last < 0.1 / 1.048 && all < 0.1 / 1.048, "{last} {all}");
     }
 
     #[test]

@@ -1,0 +1,185 @@
+//! The largest exponent of a loop's error, and whether it is one rate.
+//!
+//! Must not derive by hand what the code does: two loops run beside each other, and the logarithm of their distance tells.
+
+use super::{Analysis, LOST, TICKS_MAX, TICKS_MIN, digits, exceeds, norm};
+use crate::analysis::chain::Chain;
+use crate::rig::{Rig, Start};
+use crate::sample::status;
+
+/// The distance of the two loops, over the size of what they say.
+const DISTANCE: f64 = 1e-5;
+/// It is set back once it has fallen to, or grown by, so much. What the loop does not control does not fall, so it must not
+/// wait for long: squares of it would show beside the distance.
+const FALLEN: f64 = 0.1;
+const GROWN: f64 = 10.0;
+/// Below this, over the size of what they say, it is rounding.
+const ROUNDING: f64 = 1e-11;
+/// The parts of the ticks looked at must give one rate, to within this part of it: two of them where the error fell by
+/// e^-[`FALL`] in all, as it must unless that takes more than [`TICKS_MAX`]: before, what falls more slowly may not have
+/// shown; else four.
+const AGREEMENT: f64 = 0.03;
+const FALL: f64 = 20.0;
+/// Wherever the error falls by so much, e^-depth, it must do so at that rate to within this factor: a run may come to its
+/// floor before the motion comes back, or before the error has swung once. Three decades, and six.
+const UNIFORM: [(f64, f64); 2] = [(6.9, 1.6), (13.8, 1.15)];
+
+/// An exponent, and how much of the motion it speaks of.
+pub(super) struct Exponent {
+    /// How fast the distance fell, 1/s: over all ticks looked at but the first quarter, and over equal parts of those.
+    rate_per_s: f64,
+    parts_per_s: Vec<f64>,
+    /// The slowest and the fastest of all falls so deep as [`UNIFORM`] has them, 1/s.
+    local_per_s: [[f64; 2]; 2],
+    /// Part of the ticks at which the observer was told nothing.
+    unobserved: f64,
+    /// The size of what the loop says where it is settled.
+    pub size: f64,
+}
+
+impl<R: Rig> Analysis<'_, R> {
+    /// The largest exponent of the loop about the motion that it is to follow.
+    pub fn exponent(&self, ideal: &R) -> Exponent {
+        let begun = |start| self.rig.alone(self.index, start, false).map(|rig| Chain::new(&rig, self.tick_s));
+        let (mut here, mut there) = (Vec::new(), Vec::new());
+        let mut reference = Chain::new(ideal, self.tick_s);
+        reference.advance();
+        reference.output(&mut here);
+        let size = norm(&here).max(f64::MIN_POSITIVE);
+        let Some(mut near) = begun(Start::Off(DISTANCE * size)) else { unreachable!("as the settled one was") };
+        // What the loop does not control does not decay, and is taken out again and again.
+        let mut shifted = R::FREE.and_then(|_| begun(Start::Shifted(DISTANCE)));
+        near.advance();
+        shifted.iter_mut().for_each(Chain::advance);
+        let (mut fallen, mut since, mut unobserved) = (0.0, None, 0_u64);
+        // The logarithm by which the distance has fallen, after every tick.
+        let mut falls = Vec::new();
+        let mut end = TICKS_MIN.max(self.scenario.last_tick.min(TICKS_MAX / 32));
+        loop {
+            while (falls.len() as u64) < end {
+                reference.advance();
+                near.advance();
+                shifted.iter_mut().for_each(Chain::advance);
+                reference.output(&mut here);
+                if exceeds(norm(&here), LOST * size) {
+                    return Exponent::GROWS;
+                }
+                near.output(&mut there);
+                here.iter_mut().zip(&there).for_each(|(here, there)| *here -= there);
+                let distance = norm(&here);
+                let from = *since.get_or_insert(distance);
+                falls.push(fallen + (from / distance.max(ROUNDING * size)).ln());
+                unobserved += u64::from(reference.status() & (status::UNOBSERVABLE | status::UNUSABLE) != 0);
+                if !(FALLEN * DISTANCE * size..GROWN * DISTANCE * size).contains(&distance) {
+                    fallen = falls[falls.len() - 1];
+                    let from = reference.numbers();
+                    let away = shifted.as_mut().map_or(Vec::new(), |shifted| {
+                        let part = (near.free() - reference.free()) / (shifted.free() - reference.free());
+                        shifted.numbers().iter().zip(&from).map(|(shifted, from)| part * (shifted - from)).collect()
+                    });
+                    near.stretch(&from, &away, DISTANCE * size / distance.max(ROUNDING * size));
+                    since = Some(DISTANCE * size);
+                }
+            }
+            let slope = |from: usize, to: usize| slope(&falls[from..to]) / self.tick_s;
+            let (begin, end_at) = (falls.len() / 4, falls.len());
+            let part = |parts: usize, index: usize| {
+                let length = (end_at - begin) / parts;
+                slope(begin + index * length, begin + (index + 1) * length)
+            };
+            let rate_per_s = slope(begin, end_at);
+            // A slow swing may look straight in two parts, as long as little of the fall was seen.
+            let parts = if rate_per_s * (end_at - begin) as f64 * self.tick_s < FALL { 4 } else { 2 };
+            let exponent = Exponent {
+                rate_per_s,
+                parts_per_s: (0..parts).map(|index| part(parts, index)).collect(),
+                local_per_s: UNIFORM
+                    .map(|(depth, _)| range(&stretches(&falls[begin..], depth)).map(|per_tick| per_tick / self.tick_s)),
+                unobserved: unobserved as f64 / end as f64,
+                size,
+            };
+            let shown = rate_per_s.abs() * (end_at - begin) as f64 * self.tick_s >= FALL;
+            if shown && exponent.agrees() || end >= TICKS_MAX {
+                return exponent;
+            }
+            end *= 2;
+        }
+    }
+
+    /// Whether the exponent is a rate.
+    pub fn judge(&self, exponent: &Exponent) -> Result<f64, String> {
+        let Exponent { rate_per_s, parts_per_s, local_per_s, unobserved, .. } = exponent;
+        if *unobserved > 0.5 {
+            return Err(format!(
+                "not observable: at {:.0} % of the ticks the measured components tell nothing of the hidden one",
+                1e2 * unobserved
+            ));
+        }
+        if *rate_per_s == f64::NEG_INFINITY {
+            return Err(
+                "this sampled loop diverges even from where it is settled; lower the gains or raise tick_hz".to_owned()
+            );
+        }
+        let not_uniform = |[least, greatest]: [f64; 2]| {
+            let [least, greatest] = [least, greatest].map(digits);
+            Err(format!("the decay rate is not uniform along this motion: from {least} to {greatest} 1/s"))
+        };
+        if !exponent.agrees() {
+            return not_uniform(range(parts_per_s));
+        }
+        if rate_per_s.is_nan() || *rate_per_s <= 0.0 {
+            return Err(format!(
+                "the error of this sampled loop grows, by {} 1/s; lower the gains or raise tick_hz",
+                digits(-rate_per_s)
+            ));
+        }
+        let uneven = |(range, (_, factor)): &(&[f64; 2], (f64, f64))| {
+            range[0] * factor < *rate_per_s || range[1] > factor * rate_per_s
+        };
+        local_per_s.iter().zip(UNIFORM).find(uneven).map_or(Ok(*rate_per_s), |(range, _)| not_uniform(*range))
+    }
+}
+
+impl Exponent {
+    /// That of a loop which does not even stay where it is settled.
+    const GROWS: Self = Self {
+        rate_per_s: f64::NEG_INFINITY,
+        parts_per_s: Vec::new(),
+        local_per_s: [[f64::NEG_INFINITY; 2]; 2],
+        unobserved: 0.0,
+        size: 0.0,
+    };
+
+    fn agrees(&self) -> bool {
+        let [least, greatest] = range(&self.parts_per_s);
+        greatest - least <= AGREEMENT * self.rate_per_s.abs()
+    }
+}
+
+/// The least and the greatest value.
+fn range(values: &[f64]) -> [f64; 2] {
+    let extend = |[least, greatest]: [f64; 2], value: &f64| [value.min(least), value.max(greatest)];
+    values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], extend)
+}
+
+/// How fast each stretch of a fall goes that is at least so deep, per step. What rises again has not fallen.
+fn stretches(falls: &[f64], depth: f64) -> Vec<f64> {
+    let mut falls = falls.to_vec();
+    (1..falls.len()).rev().for_each(|step| falls[step - 1] = falls[step - 1].min(falls[step]));
+    let mut end = 0;
+    let of = |begin: usize| {
+        while end < falls.len() && falls[end] - falls[begin] < depth {
+            end += 1;
+        }
+        falls.get(end).map(|fallen| (fallen - falls[begin]) / (end - begin) as f64)
+    };
+    (0..falls.len()).map_while(of).collect()
+}
+
+/// The slope of the straight line that is nearest to evenly spaced values, per step: what swings about the line counts little.
+pub(super) fn slope(values: &[f64]) -> f64 {
+    let middle = 0.5 * (values.len() as f64 - 1.0);
+    let moment = |(step, value): (usize, &f64)| (step as f64 - middle) * value;
+    let count = values.len() as f64;
+    values.iter().enumerate().map(moment).sum::<f64>() * 12.0 / (count * (count * count - 1.0))
+}
