@@ -410,7 +410,7 @@ fn bad_input_is_told_and_never_a_panic() {
         assert_eq!(done.code, Some(code), "{}: {done:?}", source.display());
         assert!(words.iter().all(|word| done.stderr.contains(word)) && !done.stderr.contains("panicked"), "{done:?}");
     };
-    told(&bench.path("none"), 2, &["there is no", "run.mcap"]);
+    told(&bench.path("none"), 2, &["does not exist", "run.mcap"]);
     std::fs::create_dir(bench.path("empty")).unwrap();
     told(&bench.path("empty"), 2, &["neither summary.json nor run.mcap"]);
     let file = |name: &str, bytes: &[u8]| {
