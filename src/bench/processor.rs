@@ -89,9 +89,9 @@ mod tests {
     fn a_process_that_works_has_an_account_and_one_that_is_none_has_not() {
         let own = std::process::id() as i32;
         let before = processor_ns(own).unwrap();
-        let own_time = || clock_gettime(ClockId::ThreadCPUTime).tv_nsec;
-        let began = own_time();
-        while own_time().abs_diff(began) < 20_000_000 {}
+        let own_time = || Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap();
+        let end = own_time() + Duration::from_millis(20);
+        while own_time() < end {}
         assert!(processor_ns(own).unwrap() > before + 10_000_000);
         assert_eq!(processor_ns(-1), None);
     }
