@@ -259,7 +259,8 @@ impl<'a, R: Rig> Analysis<'a, R> {
                     || rates.iter().all(|rate| *rate * OWN < rate_per_s) =>
             {
                 Err(format!(
-                    "from this start the error comes to its floor at {} 1/s, before the loop's slowest mode of {} 1/s shows",
+                    "from this start the error falls at {} 1/s until it comes to its floor, not at the {} 1/s of the loop's \
+                     slowest mode",
                     digits(rates[0]),
                     digits(rate_per_s)
                 ))

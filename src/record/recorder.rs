@@ -102,8 +102,8 @@ impl RecordingReport {
         // Whoever began in the midst of a run knew that.
         if let (true, None, 1..) = (self.whole, &self.problem, lost) {
             self.problem = Some(format!(
-                "{lost} samples were published and are not in the recording: it did not keep up; record again with fewer \
-                 other programs, or at a lower tick_hz"
+                "{lost} samples were published and are not in the recording; if it did not keep up, record again with \
+                 fewer other programs, or at a lower tick_hz"
             ));
         }
         self.complete = self.whole && self.problem.is_none();
