@@ -1,18 +1,24 @@
-//! Instructions per estimate-and-control step, counted by callgrind: a regression shows however noisy the machine is.
+//! Instructions per estimate-and-control step, and per tick of a run in one thread, counted by callgrind: a regression shows
+//! however noisy the machine is.
 //!
 //! `cargo bench --features hooks,foxglove,parquet --bench instructions` (the features of the tests: others inline differently)
 //! compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The
 //! figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
 use corotate::bench::{STEP_KINDS, repeat_step};
+use corotate::config::{SHIPPED, Scenario};
+use corotate::launch::{Launch, run};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
+use std::sync::atomic::AtomicUsize;
 
 /// Passes over a second of samples in the two runs whose difference counts: everything else is in both.
 const PASSES: [u64; 2] = [1, 51];
 const STEPS_PER_PASS: u64 = 1000;
+/// A tick of `rigid-pair` through all roles in one thread: hashes, guards, counters and score included.
+const TICK: &str = "in-process tick";
 /// How many more instructions than were kept are a regression, %.
 const TOLERANCE_PERCENT: f64 = 5.0;
 
@@ -27,7 +33,7 @@ struct Kept {
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     let done = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["--repeat", kind, passes] => passes.parse().map(|n| repeat_step(kind, n)).map_err(|error| error.to_string()),
+        ["--repeat", kind, passes] => passes.parse().map(|n| repeat(kind, n)).map_err(|error| error.to_string()),
         ["--save"] => save(),
         [] => compare(),
         _ => Err("give nothing, or --save".to_owned()),
@@ -41,12 +47,31 @@ fn main() -> ExitCode {
     }
 }
 
+fn repeat(kind: &str, passes: u64) {
+    if kind != TICK {
+        return repeat_step(kind, passes);
+    }
+    // At 1 kHz a pass is a second.
+    let overrides = ["clock=in-process", "accept={}", &format!("duration_s={passes}")].map(str::to_owned);
+    let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &overrides).expect("shipped scenarios are valid");
+    let mut launch = Launch {
+        program: PathBuf::new(),
+        external: Vec::new(),
+        record: None,
+        foxglove: None,
+        require_realtime: false,
+        signal: &AtomicUsize::new(0),
+        progress: &mut |_| {},
+    };
+    run(&scenario, &mut launch).expect("a run in one thread needs nothing that could fail");
+}
+
 fn path() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/instructions.json")
 }
 
 fn count_all() -> Result<BTreeMap<String, f64>, String> {
-    STEP_KINDS.iter().map(|kind| Ok(((*kind).to_owned(), per_step(kind)?))).collect()
+    STEP_KINDS.into_iter().chain([TICK]).map(|kind| Ok((kind.to_owned(), per_step(kind)?))).collect()
 }
 
 /// Instructions per step of a kind, to a tenth.

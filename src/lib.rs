@@ -8,7 +8,7 @@
 //! | [`observe`] | invariant relations and the filter that serves them all | yes, `no_std` |
 //! | [`control`] | control laws and their certificates | yes, `no_std` |
 //! | [`fault`] | scripted faults: what goes wrong with a sample or a role, and when | yes, `no_std` |
-//! | [`sample`] | the fixed-size samples that travel between roles | yes, `no_std` |
+//! | [`sample`](mod@sample) | the fixed-size samples that travel between roles | yes, `no_std` |
 //! | [`state`] | what a state machine remembers, as words: written, read back, counted | yes, `no_std` |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
@@ -27,6 +27,7 @@
 //! | `bench` | what all of it costs beside its floors | no |
 //! | `doctor` | whether this machine is fit for real time | no |
 //! | `watch` | a screen on a running loop | no |
+//! | `program` | the command line, for every program that names its rigs | no |
 //! | `foxglove` | a running loop on a Foxglove WebSocket, with the feature of that name | no |
 //!
 //! The sources that the documentation cites: \[D\] I. S. Dmytryshyn, *Synchronisation of angular velocities of identical
@@ -34,6 +35,12 @@
 //! \[S\] S. A. Shatkov, *State observers in the restricted two-body problem*.
 
 #![cfg_attr(not(feature = "runtime"), no_std)]
+
+// What the exported macros name: their code stands in other crates, and in this one.
+extern crate self as corotate;
+#[doc(hidden)]
+pub use bytemuck;
+pub use nalgebra;
 
 pub mod control;
 pub mod fault;
@@ -65,6 +72,8 @@ pub mod foxglove;
 #[cfg(feature = "runtime")]
 pub mod launch;
 #[cfg(feature = "runtime")]
+mod program;
+#[cfg(feature = "runtime")]
 pub mod record;
 #[cfg(feature = "runtime")]
 pub mod report;
@@ -80,3 +89,6 @@ pub mod system;
 pub mod telemetry;
 #[cfg(feature = "runtime")]
 pub mod watch;
+
+#[cfg(feature = "runtime")]
+pub use program::Program;

@@ -154,6 +154,19 @@ persist_tuple!(A: 0, B: 1);
 persist_tuple!(A: 0, B: 1, C: 2);
 
 /// Implements [`Persist`] for a type by the fields that are its state.
+///
+/// ```
+/// struct Motor {
+///     inertia_kg_m2: f64,
+///     speed_rad_s: f64,
+/// }
+/// // The inertia is a parameter: a successor has it from the scenario.
+/// corotate::persist_fields!(Motor, speed_rad_s);
+///
+/// let mut motor = Motor { inertia_kg_m2: 0.1, speed_rad_s: 3.0 };
+/// assert_eq!(corotate::state::length(&mut motor), 1);
+/// ```
+#[macro_export]
 macro_rules! persist_fields {
     ($type:ty, $($field:ident),*) => {
         impl $crate::state::Persist for $type {
@@ -165,7 +178,7 @@ macro_rules! persist_fields {
         }
     };
 }
-pub(crate) use persist_fields;
+pub use crate::persist_fields;
 
 #[cfg(test)]
 mod tests {

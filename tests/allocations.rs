@@ -211,7 +211,7 @@ fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
 
 /// The link to that device, greeted.
 fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
-    let body = scenario.rig.bodies()[index].name.clone();
+    let body = scenario.rig.bodies()[index].name.to_string();
     let seat = DeviceSeat { domain: PathBuf::new(), body, path: path.to_owned(), baud: None, patience_s: 60.0 };
     let mut link = DeviceLink::open(&seat, scenario, 1).unwrap();
     assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());

@@ -412,7 +412,7 @@ fn judge(text: &str, overrides: &[&str]) -> Option<(Claim, Verdict, Trace)> {
     Some((claim, verdict, trace))
 }
 
-/// Loops whose rate is not that of the continuous law, and shipped ones: the table of the README.
+/// Loops whose rate is not that of the continuous law, and shipped ones: the table of docs/claims.md.
 #[test]
 fn a_sampled_loop_is_claimed_to_do_what_it_does() {
     let fast = "observer.decay_rate_per_s=200.0";

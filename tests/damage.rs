@@ -72,7 +72,7 @@ fn packed(bytes: &[u8]) -> Vec<std::ops::Range<usize>> {
         let next = at + 9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
         if bytes[at] == mcap::records::op::CHUNK {
             // 40 bytes and the name of the compression are before.
-            found.push(at + 9 + 40 + 4..next);
+            found.push(at + 9 + 40 + 3..next);
         }
         at = next;
     }

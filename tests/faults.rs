@@ -239,7 +239,7 @@ fn the_watchdog_counts_what_breaks_the_physics() {
     let wrong = fault("noise-burst", "observer", 300, 100, "deviation = 0.01");
     let tight = ["watchdog.energy_drift_max=1e-3", "watchdog.momentum_drift_max=1e-3"];
     let done = Disturbed::of(&wrong, &[&SETTLED[..], &tight].concat());
-    for quantity in ["energy", "momentum"] {
+    for quantity in ["energy_drift", "momentum_drift"] {
         let watched = done.summary["watchdog"]["watched"].as_array().unwrap();
         let one = watched.iter().find(|one| one["quantity"] == quantity).unwrap();
         assert!(one["breaches"].as_u64().unwrap() > 50, "{one}");
@@ -437,7 +437,7 @@ fn limits_and_watchdog_that_make_no_sense_are_refused() {
         ("faults", "watchdog.on_breach=panic", "there is no choice `panic`"),
         ("rigid-pair", "watchdog.on_breach=safe", "no bound is given"),
         ("orbit-hold", "watchdog.energy_drift_max=0.1", "thrust changes the energy"),
-        ("orbit-rendezvous", "watchdog.lyapunov_rad2_s2_max=0.1", "is not published by the controller"),
+        ("orbit-rendezvous", "watchdog.lyapunov_rad2_s2_max=0.1", "there is no such quantity"),
         ("noisy-pair", "watchdog.innovation_rad_s_max=0.1", "is not published by the Kalman filter"),
         ("inertia", "watchdog.energy_drift_max=0.1", "this scenario has none"),
         ("rigid-pair", "accept.peak_from_s=1.0", "no criterion is a peak"),

@@ -365,6 +365,24 @@ fn a_follower_that_says_nothing_of_itself_is_seen_by_its_samples() {
     }
 }
 
+/// In real time the last tick may be missed as any other; nobody is taken for dead for it.
+#[test]
+fn a_silent_follower_that_misses_its_last_ticks_is_done() {
+    let bench = Bench::new();
+    let limit = "supervision.heartbeat_timeout_s=0.5";
+    let brief = ["--duration", "1", "--set", "accept={}", "--set", limit];
+    let (running, _) = start_waiting(&bench, &[&["--clock", "realtime"], &brief[..]].concat());
+    let domains = bench.domains();
+    let partner = Partner::new(&domains[0], |tick, _| (tick < 990, tick < 990));
+    let done = running.wait();
+    drop(partner);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
+    assert_eq!(summary["books"]["unbooked"], serde_json::json!(["follower"]));
+    bench.assert_clean(&domains);
+}
+
 /// Whether it told of itself or not: the run ends in order, by name and cause.
 #[test]
 fn a_follower_that_is_killed_ends_the_run() {

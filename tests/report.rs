@@ -105,7 +105,8 @@ fn check_verdict(page: &Document<'_>, summary: &Value) {
 /// Copies a recording with another name for a layout.
 fn relabel(from: &Path, to: &Path, old: &str, new: &str) {
     let bytes = std::fs::read(from).unwrap();
-    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Lz4));
+    let mut writer = options.create(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
     for index in &mcap::Summary::read(&bytes).unwrap().unwrap().metadata_indexes {
         writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
     }

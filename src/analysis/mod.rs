@@ -139,8 +139,8 @@ impl<'a, R: Rig> Analysis<'a, R> {
     }
 
     fn named(&self, values: &[f64]) -> Vec<Figure> {
-        let named = self.rig.metrics().iter().zip(values);
-        named.map(|(name, value)| Figure { name: (*name).to_owned(), value: *value }).collect()
+        let named = self.rig.metrics().into_iter().zip(values);
+        named.map(|(name, value)| Figure { name: name.to_owned(), value: *value }).collect()
     }
 
     /// When each limit of the scenario is reached, from its error at the start.
@@ -153,11 +153,11 @@ impl<'a, R: Rig> Analysis<'a, R> {
         chain.advance();
         chain.score(&mut start);
         let limits = &self.scenario.accept.metric_max;
-        let limited = self.rig.metrics().iter().zip(start.iter().zip(floors));
-        let reach = |(metric, (from, floor)): (&&str, (&f64, &f64))| {
-            let limit = *limits.get(*metric)?;
+        let limited = self.rig.metrics().into_iter().zip(start.iter().zip(floors));
+        let reach = |(metric, (from, floor)): (&str, (&f64, &f64))| {
+            let limit = *limits.get(metric)?;
             let after_s = (limit > *floor).then(|| ((from / limit).ln() / rate_per_s).max(0.0));
-            Some(Reach { metric: (*metric).to_owned(), limit, from: *from, after_s })
+            Some(Reach { metric: metric.to_owned(), limit, from: *from, after_s })
         };
         limited.filter_map(reach).collect()
     }

@@ -87,12 +87,14 @@ mod tests {
 
     #[test]
     fn a_process_that_works_has_an_account_and_one_that_is_none_has_not() {
-        let own = std::process::id() as i32;
-        let before = processor_ns(own).unwrap();
-        let own_time = || Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap();
-        let end = own_time() + Duration::from_millis(20);
-        while own_time() < end {}
-        assert!(processor_ns(own).unwrap() > before + 10_000_000);
+        // A process of its own: of this one, threads end meanwhile, and their time with them.
+        let mut busy = std::process::Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
+        let pid = busy.id() as i32;
+        while processor_ns(pid).unwrap() < 10_000_000 {
+            std::thread::yield_now();
+        }
+        busy.kill().unwrap();
+        busy.wait().unwrap();
         assert_eq!(processor_ns(-1), None);
     }
 }

@@ -125,6 +125,18 @@ impl Document {
         Self { table, places: self.places.clone(), origin: self.origin.clone(), run: None, elsewhere: Vec::new() }
     }
 
+    /// Takes the keys of a table that are to be taken out into a document of their own, in a table of the same name.
+    pub fn split_off_within(&mut self, table: &str, taken: impl Fn(&str) -> bool) -> Self {
+        let keys = self.table.get_mut(table).and_then(Value::as_table_mut);
+        let split = keys.map_or_else(Table::new, |keys| {
+            let (out, kept) = std::mem::take(keys).into_iter().partition(|(key, _)| taken(key));
+            *keys = kept;
+            out
+        });
+        let table = Table::from_iter([(table.to_owned(), Value::Table(split))]);
+        Self { table, places: self.places.clone(), origin: self.origin.clone(), run: None, elsewhere: Vec::new() }
+    }
+
     /// Refuses a list, as `[[key]]` makes one, at top-level keys that hold one table each: serde would take its elements
     /// for the table's values.
     ///

@@ -3,7 +3,7 @@
 //! Must refuse a fault that would do nothing, or something else than its author meant.
 
 use super::nearest;
-use super::scenario::{Checks, finite_positive};
+use super::scenario::Checks;
 use crate::bus::Carried;
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
 use crate::rig::{AnyRig, Command, Estimate, FleetCommand, FleetMeasurement, Measurement, Rig};
@@ -180,8 +180,8 @@ impl One<'_, '_, '_> {
     /// The bodies whose signals are concerned; none, once, for a fault of the role itself.
     fn bodies(&mut self) -> Option<Vec<Option<String>>> {
         let (raw, bodies) = (self.raw, self.setting.rig.bodies());
-        let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| body.name.as_str()).collect();
-        let mut roles: Vec<&str> = bodies.iter().map(|body| body.name.as_str()).chain(["observer"]).collect();
+        let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
+        let mut roles: Vec<&str> = bodies.iter().map(|body| &*body.name).chain(["observer"]).collect();
         roles.extend((!driven.is_empty()).then_some("controller"));
         self.require(roles.contains(&&*raw.role), "role", || {
             format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
@@ -201,8 +201,8 @@ impl One<'_, '_, '_> {
         self.require(raw.body.is_none(), "body", || {
             "is for the controller, which has a command for each driven body; remove it".to_owned()
         })?;
-        let body = if raw.role == "observer" { &bodies[0].name } else { &raw.role };
-        Some(vec![Some(body.clone())])
+        let body = if raw.role == "observer" { &*bodies[0].name } else { &*raw.role };
+        Some(vec![Some(body.to_owned())])
     }
 
     /// What happens to the samples about this body, or to the role itself.
@@ -260,7 +260,7 @@ impl One<'_, '_, '_> {
             Kind::NoiseBurst => {
                 let deviation = raw.deviation?;
                 let key = self.key("deviation");
-                finite_positive(self.checks, &key, deviation);
+                self.checks.positive(&key, deviation);
                 Change::Noise(deviation)
             }
             _ => {

@@ -18,7 +18,7 @@ pub use fault::ScriptedFault;
 pub(crate) use fault::{Fields, fields};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use run_id::{NoRunId, RunId};
-pub use scenario::{Checks, Scenario, finite_positive};
+pub use scenario::{Checks, Scenario};
 
 pub(crate) use document::nearest;
 

@@ -175,34 +175,14 @@ impl Default for Launch {
     }
 }
 
-/// What the controller holds its inputs and its V against. A bound that is left out is not watched.
+/// What follows where the controller's inputs or its commands are beyond a bound. The bounds are keys of the rig's.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Watchdog {
     pub from_s: f64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub energy_drift_max: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub momentum_drift_max: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub innovation_rad_s_max: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lyapunov_rad2_s2_max: Option<f64>,
     pub on_breach: OnBreach,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub latch_after_ticks: Option<u64>,
-}
-
-impl Watchdog {
-    /// The bounds with their keys, in the order of [`crate::control::Watched::ALL`].
-    pub fn bounds(&self) -> [(&'static str, Option<f64>); 4] {
-        [
-            ("watchdog.energy_drift_max", self.energy_drift_max),
-            ("watchdog.momentum_drift_max", self.momentum_drift_max),
-            ("watchdog.innovation_rad_s_max", self.innovation_rad_s_max),
-            ("watchdog.lyapunov_rad2_s2_max", self.lyapunov_rad2_s2_max),
-        ]
-    }
 }
 
 /// What follows from a breach.

@@ -6,6 +6,8 @@ use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervis
 use crate::control::WatchBounds;
 use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
+use serde::Deserialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The slowest tick: a period must lie well within what a latency histogram holds.
@@ -18,6 +20,13 @@ const MAX_TICKS: f64 = 3.2e11;
 const FUSED: [&str; 2] = ["observer", "controller"];
 /// The keys that hold one table each, whatever the rig.
 const TABLES: [&str; 6] = ["actuator", "realtime", "launch", "supervision", "watchdog", "accept"];
+
+/// The bounds of the watchdog, by their keys, which are the rig's.
+#[derive(Deserialize)]
+struct Maxima {
+    #[serde(default)]
+    watchdog: BTreeMap<String, f64>,
+}
 
 /// A scenario that can be run.
 #[derive(Debug)]
@@ -87,6 +96,7 @@ impl Scenario {
         }
         document.refuse_lists(&[&rig::tables()[..], &TABLES].concat())?;
         let sections = document.split_off(&rig::sections());
+        let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
         let raw: Raw = document.read_into()?;
         let mut checks = Checks::new(&document);
         check_common(&raw, &mut checks);
@@ -97,7 +107,8 @@ impl Scenario {
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         // Nothing is concluded from a length or a tick that is refused.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
-        let accept = accept::resolve(&raw.accept, duration_s, rig.as_ref().map(AnyRig::metrics), &mut checks);
+        let metrics = rig.as_ref().map(AnyRig::metrics);
+        let accept = accept::resolve(&raw.accept, duration_s, metrics.as_deref(), &mut checks);
         check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
@@ -105,11 +116,14 @@ impl Scenario {
             let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
             let setting = fault::Setting { rig, last_tick, seed: raw.seed };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
-            watch = watchdog::resolve(&raw.watchdog, rig, tick_s, duration_s, &mut checks);
+            watch = watchdog::resolve(&raw.watchdog, &maxima.watchdog, rig, tick_s, duration_s, &mut checks);
         }
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
+        if let Some(toml::Value::Table(watchdog)) = resolved.get_mut("watchdog") {
+            watchdog.extend(maxima.watchdog.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
+        }
         Ok(Self {
             name: raw.name,
             clock: raw.clock,
@@ -199,6 +213,11 @@ impl<'a> Checks<'a> {
         }
     }
 
+    /// Notes a number that is not positive. Non-finite numbers never get so far.
+    pub fn positive(&mut self, key: &str, value: f64) {
+        self.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
+    }
+
     /// Takes the value, or notes why there is none.
     pub fn accept<T>(&mut self, key: &str, value: Result<T, impl std::fmt::Display>) -> Option<T> {
         value.map_err(|error| self.refuse(key, error.to_string())).ok()
@@ -210,11 +229,6 @@ impl<'a> Checks<'a> {
             _ => Err(ConfigError::Invalid { problems: self.problems }),
         }
     }
-}
-
-/// Notes a number that is not positive. Non-finite numbers never get so far.
-pub fn finite_positive(checks: &mut Checks<'_>, key: &str, value: f64) {
-    checks.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
 }
 
 fn tick_possible(tick_hz: f64) -> bool {

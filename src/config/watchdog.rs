@@ -2,27 +2,39 @@
 //!
 //! Must refuse a bound on what a rig does not tell: it would never be broken.
 
+use super::nearest;
 use super::raw::{OnBreach, Watchdog};
-use super::scenario::{Checks, finite_positive};
-use crate::control::{WatchBounds, Watched};
+use super::scenario::Checks;
+use crate::control::WatchBounds;
 use crate::rig::AnyRig;
+use std::collections::BTreeMap;
 
 /// Checks the bounds and resolves them to ticks.
 pub(super) fn resolve(
     raw: &Watchdog,
+    maxima: &BTreeMap<String, f64>,
     rig: &AnyRig,
     tick_s: f64,
     duration_s: f64,
     checks: &mut Checks<'_>,
 ) -> WatchBounds {
     let mut bounds = WatchBounds { from_tick: (raw.from_s / tick_s).round() as u64, ..WatchBounds::NONE };
-    for (watched, (key, max)) in Watched::ALL.into_iter().zip(raw.bounds()) {
-        let Some(max) = max else { continue };
-        finite_positive(checks, key, max);
-        if let Some(reason) = rig.unwatched(watched) {
-            checks.refuse(key, format!("{reason}; remove it"));
+    let monitors = rig.monitors();
+    let keys: Vec<String> = monitors.iter().map(|(name, _)| format!("{name}_max")).collect();
+    for (name, max) in maxima {
+        let key = format!("watchdog.{name}");
+        let Some(index) = keys.iter().position(|known| known == name) else {
+            let known: Vec<&str> = keys.iter().map(String::as_str).collect();
+            let remedy =
+                if known.is_empty() { "this rig tells nothing to watch".to_owned() } else { nearest(name, &known) };
+            checks.refuse(&key, format!("there is no such quantity; {remedy}"));
+            continue;
+        };
+        checks.positive(&key, *max);
+        if let Some(reason) = monitors[index].1 {
+            checks.refuse(&key, format!("{reason}; remove it"));
         }
-        bounds.max[watched as usize] = max;
+        bounds.max[index] = *max;
     }
     checks.require(raw.from_s >= 0.0 && raw.from_s < duration_s, "watchdog.from_s", || {
         format!("{} s is not within the run of {duration_s} s; give an instant from 0 on, before its end", raw.from_s)
@@ -30,7 +42,7 @@ pub(super) fn resolve(
     let watches = bounds != WatchBounds { from_tick: bounds.from_tick, ..WatchBounds::NONE };
     let safe = raw.on_breach == OnBreach::Safe;
     checks.require(watches || !safe, "watchdog.on_breach", || {
-        "has nothing to follow from: no bound is given; add one, such as lyapunov_rad2_s2_max".to_owned()
+        "has nothing to follow from: no bound is given; add one".to_owned()
     });
     checks.require(safe || raw.latch_after_ticks.is_none(), "watchdog.latch_after_ticks", || {
         "is for on_breach = \"safe\"; set that, or remove it".to_owned()

@@ -14,4 +14,4 @@ pub use fleet::FleetLaw;
 pub use orbit_certificate::OrbitCertificate;
 pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::{Synchronizer, limited};
-pub use watchdog::{Breaches, WatchBounds, Watchdog, Watched};
+pub use watchdog::{Breaches, WATCHED_MAX, WatchBounds, Watchdog};

@@ -8,52 +8,26 @@ use crate::state::persist_fields;
 /// Values from which a reference is taken: their median, so that one bad sample spoils nothing.
 const REFERENCE_SAMPLES: usize = 5;
 
-/// What is watched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Watched {
-    /// The observed body's kinetic (rigid body) or orbital energy, as a drift relative to the reference. Constant in free
-    /// motion.
-    Energy,
-    /// The magnitude of its angular momentum, likewise.
-    Momentum,
-    /// The magnitude of the observer's innovation.
-    Innovation,
-    /// V of the controller.
-    Lyapunov,
-}
-
-impl Watched {
-    /// All of them, in the order of [`WatchBounds::max`].
-    pub const ALL: [Self; 4] = [Self::Energy, Self::Momentum, Self::Innovation, Self::Lyapunov];
-
-    /// Its name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Energy => "energy",
-            Self::Momentum => "momentum",
-            Self::Innovation => "innovation",
-            Self::Lyapunov => "lyapunov",
-        }
-    }
-}
+/// The most quantities that one watchdog watches.
+pub const WATCHED_MAX: usize = 8;
 
 /// The bounds of a watchdog.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WatchBounds {
     /// Nothing is judged before this tick; the references are taken from here on.
     pub from_tick: u64,
-    /// The largest value of each of [`Watched::ALL`], drifts relative; +inf where it is not watched.
-    pub max: [f64; 4],
+    /// The largest value of each quantity, drifts relative; +inf where it is not watched.
+    pub max: [f64; WATCHED_MAX],
     /// After so many ticks in a row with a breach the safe command is latched; never if absent.
     pub latch_after_ticks: Option<u64>,
 }
 
 impl WatchBounds {
     /// Nothing is watched.
-    pub const NONE: Self = Self { from_tick: 0, max: [f64::INFINITY; 4], latch_after_ticks: None };
+    pub const NONE: Self = Self { from_tick: 0, max: [f64::INFINITY; WATCHED_MAX], latch_after_ticks: None };
 }
 
-/// How one of the watched quantities fared.
+/// How a quantity that is watched fared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Breaches {
     /// How often it was judged.
@@ -72,8 +46,8 @@ pub struct Watchdog {
     bounds: WatchBounds,
     /// Whether anything is watched.
     active: bool,
-    references: [Reference; 2],
-    breaches: [Breaches; 4],
+    references: [Reference; WATCHED_MAX],
+    breaches: [Breaches; WATCHED_MAX],
     /// The last tick with a breach, and how many there were in a row.
     streak: (u64, u64),
     latched_at: Option<u64>,
@@ -85,8 +59,8 @@ impl Watchdog {
         Self {
             active: bounds.max.iter().any(|max| *max < f64::INFINITY),
             bounds,
-            references: [Reference::default(); 2],
-            breaches: [Breaches::default(); 4],
+            references: [Reference::default(); WATCHED_MAX],
+            breaches: [Breaches::default(); WATCHED_MAX],
             streak: (0, 0),
             latched_at: None,
         }
@@ -98,31 +72,32 @@ impl Watchdog {
         self.active
     }
 
-    /// Looks at the energy and the momentum of the observed body, in any unit.
+    /// Whether this quantity is watched at a tick.
     #[inline]
-    pub fn invariants(&mut self, tick: u64, values: [f64; 2]) {
-        if tick < self.bounds.from_tick {
-            return;
-        }
-        for (index, (watched, value)) in [Watched::Energy, Watched::Momentum].into_iter().zip(values).enumerate() {
-            if self.bounds.max[watched as usize] < f64::INFINITY
-                && let Some(drift) = self.references[index].drift(value)
-            {
-                self.judge(watched, tick, drift);
-            }
+    pub fn watches(&self, quantity: usize, tick: u64) -> bool {
+        tick >= self.bounds.from_tick && self.bounds.max[quantity] < f64::INFINITY
+    }
+
+    /// Looks at what must stay constant, in any unit.
+    #[inline]
+    pub fn constant(&mut self, quantity: usize, tick: u64, value: f64) {
+        if self.watches(quantity, tick)
+            && let Some(drift) = self.references[quantity].drift(value)
+        {
+            self.judge(quantity, tick, drift);
         }
     }
 
-    /// Looks at an innovation or a V.
+    /// Looks at what must stay small.
     #[inline]
-    pub fn magnitude(&mut self, watched: Watched, tick: u64, value: f64) {
-        if tick >= self.bounds.from_tick && self.bounds.max[watched as usize] < f64::INFINITY {
-            self.judge(watched, tick, value.abs());
+    pub fn magnitude(&mut self, quantity: usize, tick: u64, value: f64) {
+        if self.watches(quantity, tick) {
+            self.judge(quantity, tick, value.abs());
         }
     }
 
-    fn judge(&mut self, watched: Watched, tick: u64, value: f64) {
-        let (max, breaches) = (self.bounds.max[watched as usize], &mut self.breaches[watched as usize]);
+    fn judge(&mut self, quantity: usize, tick: u64, value: f64) {
+        let (max, breaches) = (self.bounds.max[quantity], &mut self.breaches[quantity]);
         breaches.judged += 1;
         // What is not a number is beyond every bound.
         let value = if value.is_nan() { f64::INFINITY } else { value };
@@ -151,8 +126,8 @@ impl Watchdog {
         self.latched_at
     }
 
-    /// How each of [`Watched::ALL`] fared.
-    pub fn breaches(&self) -> &[Breaches; 4] {
+    /// How each quantity fared.
+    pub fn breaches(&self) -> &[Breaches; WATCHED_MAX] {
         &self.breaches
     }
 
@@ -193,19 +168,24 @@ mod tests {
     use super::*;
 
     fn watchdog(latch_after_ticks: Option<u64>) -> Watchdog {
-        Watchdog::new(WatchBounds { from_tick: 10, max: [0.01, 0.01, 0.5, f64::INFINITY], latch_after_ticks })
+        let mut max = [f64::INFINITY; WATCHED_MAX];
+        max[..3].copy_from_slice(&[0.01, 0.01, 0.5]);
+        Watchdog::new(WatchBounds { from_tick: 10, max, latch_after_ticks })
     }
 
     #[test]
     fn the_reference_is_the_median_of_the_first_values_from_its_tick_on() {
         let mut watchdog = watchdog(None);
-        (0..10).for_each(|tick| watchdog.invariants(tick, [99.0, 99.0]));
+        let invariants = |watchdog: &mut Watchdog, tick, values: [f64; 2]| {
+            values.iter().enumerate().for_each(|(quantity, value)| watchdog.constant(quantity, tick, *value));
+        };
+        (0..10).for_each(|tick| invariants(&mut watchdog, tick, [99.0, 99.0]));
         [2.0, 1e300, 2.0, 2.0, f64::NAN]
             .iter()
             .zip(10..)
-            .for_each(|(value, tick)| watchdog.invariants(tick, [*value, 4.0]));
+            .for_each(|(value, tick)| invariants(&mut watchdog, tick, [*value, 4.0]));
         assert_eq!(watchdog.breaches()[0], Breaches::default(), "nothing is judged while the reference is taken");
-        watchdog.invariants(15, [2.01, 4.1]);
+        invariants(&mut watchdog, 15, [2.01, 4.1]);
         let [energy, momentum, ..] = *watchdog.breaches();
         assert_eq!((energy.judged, energy.count), (1, 0));
         assert_eq!((momentum.count, momentum.first_tick), (1, Some(15)));
@@ -216,10 +196,10 @@ mod tests {
     fn what_is_no_number_is_a_breach_and_what_is_not_watched_is_none() {
         let mut watchdog = watchdog(None);
         for (tick, value) in [(9, 9.0), (10, 0.5), (11, -0.6), (12, f64::NAN), (13, f64::INFINITY)] {
-            watchdog.magnitude(Watched::Innovation, tick, value);
-            watchdog.magnitude(Watched::Lyapunov, tick, value);
+            watchdog.magnitude(2, tick, value);
+            watchdog.magnitude(3, tick, value);
         }
-        let [.., innovation, lyapunov] = *watchdog.breaches();
+        let [_, _, innovation, lyapunov, ..] = *watchdog.breaches();
         assert_eq!((innovation.judged, innovation.count, innovation.first_tick), (4, 3, Some(11)));
         assert_eq!(innovation.largest, f64::INFINITY);
         assert_eq!(lyapunov, Breaches::default());
@@ -230,11 +210,11 @@ mod tests {
     fn latches_after_breaches_in_a_row_and_for_good() {
         let mut watchdog = watchdog(Some(3));
         for tick in [10, 11, 13, 14, 14, 14] {
-            watchdog.magnitude(Watched::Innovation, tick, 1.0);
+            watchdog.magnitude(2, tick, 1.0);
         }
         assert_eq!(watchdog.latched_at(), None, "twice in a row, however many breaches a tick has");
-        watchdog.magnitude(Watched::Innovation, 15, 1.0);
-        watchdog.magnitude(Watched::Innovation, 16, 0.0);
+        watchdog.magnitude(2, 15, 1.0);
+        watchdog.magnitude(2, 16, 0.0);
         assert_eq!(watchdog.latched_at(), Some(15));
     }
 }

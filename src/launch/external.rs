@@ -92,7 +92,8 @@ impl ExternalWatch {
         let scored = (scored_tick <= scenario.last_tick && !realtime).then_some(scored_tick);
         let others_done = members.iter().all(|member| member.external || member.state() == RoleState::Done);
         let lack = |member: &Member| {
-            let unfinished = others_done && member.state() < RoleState::Done;
+            // One that missed its last ticks has no sample more to send.
+            let unfinished = others_done && member.state() < RoleState::Done && !member.spent();
             let state = unfinished.then_some(Lack::State(member.state()));
             member.trace()?.lack(next_tick, scored, realtime).or(state)
         };

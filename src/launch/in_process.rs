@@ -1,6 +1,7 @@
-//! A run in one thread: the same roles over links in memory. No iceoryx2, no files, no clock.
+//! A run in one thread: the same roles over links in memory, or without links where nothing disturbs them. No iceoryx2, no
+//! files, no clock.
 
-use super::score::{self, Scorer};
+use super::score;
 use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
@@ -17,6 +18,14 @@ const TURN_TICKS: u64 = 1024;
 
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
+    match scenario.rig.face().direct(scenario, launch) {
+        Some(outcome) => Ok(outcome),
+        None => run_nodes(scenario, launch),
+    }
+}
+
+/// The same over links, whatever happens.
+fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     let bus = MemoryBus::new(depths(scenario));
     let scorer = RefCell::new(score::open(scenario, &bus)?);
     let seats: Vec<(RoleId, Ledger)> =
@@ -51,7 +60,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
             unrecorded.iter().for_each(|error| tell(format_args!("corotate: {error}; the run goes on")));
         }
         match scorer.poll(1) {
-            Ok(_) => proceed(&**scorer, scenario, launch, tick),
+            Ok(_) => proceed(|| scorer.latest(), scenario, launch, tick),
             Err(error) => {
                 failure = Some(error);
                 false
@@ -93,10 +102,72 @@ fn incident(scenario: &Scenario, (role, ledger): &(RoleId, Ledger)) -> Incident 
     Incident::without_process(name, ledger, if again { Action::Restarted } else { Action::Stopped })
 }
 
-fn proceed(scorer: &dyn Scorer, scenario: &Scenario, launch: &mut Launch<'_>, tick: u64) -> bool {
+/// Now and then tells how far the run is; false if a signal asked for its end.
+#[inline]
+pub(super) fn proceed(latest: impl FnOnce() -> f64, scenario: &Scenario, launch: &mut Launch<'_>, tick: u64) -> bool {
     if !tick.is_multiple_of(TURN_TICKS) {
         return true;
     }
-    (launch.progress)(&Progress::Running { tick, last_tick: scenario.last_tick, metric: scorer.latest() });
+    (launch.progress)(&Progress::Running { tick, last_tick: scenario.last_tick, metric: latest() });
     launch.signal.load(Ordering::Relaxed) == 0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+    use std::sync::atomic::AtomicUsize;
+
+    fn outcome(scenario: &Scenario, direct: bool, signal: usize) -> Option<Outcome> {
+        let signal = AtomicUsize::new(signal);
+        let mut launch = Launch {
+            program: std::path::PathBuf::new(),
+            external: Vec::new(),
+            record: None,
+            foxglove: None,
+            require_realtime: false,
+            signal: &signal,
+            progress: &mut |_| {},
+        };
+        match direct {
+            true => scenario.rig.face().direct(scenario, &mut launch),
+            false => Some(run_nodes(scenario, &mut launch).unwrap()),
+        }
+    }
+
+    /// Reports, hashes, counters, scores: everything is as the nodes make it, also of a run that was stopped, and where a guard
+    /// refuses anything there is no direct run.
+    #[test]
+    fn a_direct_run_is_what_the_nodes_make_of_it() {
+        let mut direct = 0;
+        for (name, text) in SHIPPED {
+            for (overrides, signal) in [(&[][..], 0), (&["duration_s=0.9", "accept={}"], 0), (&["accept={}"], 15)] {
+                let overrides: Vec<String> =
+                    ["clock=in-process"].iter().chain(overrides).map(|one| (*one).to_owned()).collect();
+                // Some scenarios have faults or limits that a shorter run does not have room for.
+                let Ok(scenario) = Scenario::parse(text, name, &overrides) else {
+                    continue;
+                };
+                if let Some(told) = outcome(&scenario, true, signal) {
+                    direct += 1;
+                    let by_nodes = outcome(&scenario, false, signal).unwrap();
+                    assert_eq!(format!("{told:?}"), format!("{by_nodes:?}"), "{name} {overrides:?}");
+                }
+            }
+        }
+        assert!(direct >= 15, "{direct} of the shipped scenarios' runs were direct");
+    }
+
+    /// A follower whose sensors say the same for too long.
+    #[test]
+    fn where_a_sample_is_not_believed_the_nodes_run() {
+        let still = ["leader.initial_rate_rad_s=[0.0, 0.0, 0.8]", "follower.0.initial_rate_rad_s=[0.0, 0.0, 0.8]"];
+        let overrides = [&["clock=in-process", "limits.repeats=5", "accept={}"], &still[..]].concat();
+        let overrides: Vec<String> = overrides.into_iter().map(str::to_owned).collect();
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
+        assert!(outcome(&scenario, true, 0).is_none());
+        let by_nodes = outcome(&scenario, false, 0).unwrap();
+        let rejected: u64 = by_nodes.reports.iter().flat_map(|report| &report.read).map(|link| link.rejected).sum();
+        assert!(rejected > 0, "the nodes count them");
+    }
 }

@@ -3,6 +3,7 @@
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
 mod children;
+mod direct;
 mod external;
 mod foxglove;
 mod in_process;
@@ -18,6 +19,7 @@ mod supervision;
 mod table;
 mod trace;
 
+pub(crate) use direct::run_rig as run_directly;
 pub use janitor::janitor;
 pub use junit::junit;
 pub(crate) use outcome::State;

@@ -345,9 +345,12 @@ impl<'a> Crew<'a> {
     /// Notices roles that have failed and brings them back; false if the run is to end for that.
     fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
+        let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
+        let over = self.scenario.clock == ClockKind::Realtime && now_ns > self.word.epoch_ns.saturating_add(ticks_ns);
         self.recorder.supervise(self.janitor);
         self.foxglove.supervise(self.janitor);
         for member in &mut self.members {
+            member.set_over(over);
             let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.failure(self.scenario, self.janitor) {
                 let incident = match complete {

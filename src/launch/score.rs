@@ -5,7 +5,7 @@
 use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
-use crate::rig::{Estimate, FleetTruth, Rig, Truth};
+use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{Horizon, Input, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
@@ -215,35 +215,34 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
 }
 
 struct RigScorer<R: Rig, B: Bus> {
+    truths: Vec<TruthInput<R, B>>,
+    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
+    last_tick: u64,
+    scoring: Scoring<R>,
+}
+
+/// The score in the making, whoever has the samples.
+pub(super) struct Scoring<R: Rig> {
     rig: R,
     accept: Accept,
     tick_s: f64,
-    truths: Vec<TruthInput<R, B>>,
-    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     driven: Vec<DrivenBody>,
     /// Of the estimate, and of every body's truth.
     statuses: Vec<Statuses>,
     next_tick: u64,
-    last_tick: u64,
     /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
     incidents: Vec<(u64, u64)>,
     values: Vec<f64>,
     score: Score,
 }
 
-impl<R: Rig, B: Bus> RigScorer<R, B> {
-    fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
+impl<R: Rig> Scoring<R> {
+    pub fn new(rig: &R, scenario: &Scenario) -> Self {
         let bodies = rig.bodies().iter();
-        let horizon = crate::runtime::horizon(scenario, None);
         // The certificate is about single bodies.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
         let estimates = Statuses::new::<Estimate<R>>(&rig.bodies()[0].name, Signal::Estimate);
         let truths = bodies.clone().map(|body| Statuses::new::<Truth<R>>(&body.name, Signal::Truth));
-        // What no role uses is not scored either.
-        let mut estimate =
-            Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
-                .guarded(rig.estimate_guard());
-        estimate.expect(horizon);
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
@@ -254,18 +253,13 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             limit: scenario.accept.metric_max.get(*name).copied().unwrap_or(f64::INFINITY),
             last_above: None,
         };
-        Ok(Self {
+        Self {
             rig: rig.clone(),
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
-            truths: bodies
-                .map(|body| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet))
-                .collect::<Result<_, _>>()?,
-            estimate,
             driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
             statuses: core::iter::once(estimates).chain(truths).collect(),
             next_tick: 0,
-            last_tick: scenario.last_tick,
             incidents: Vec::new(),
             values: vec![f64::NAN; rig.metrics().len()],
             score: Score {
@@ -277,44 +271,45 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
                 statuses: BTreeMap::new(),
                 recoveries_s: Vec::new(),
             },
-        })
-    }
-
-    /// Whether no sample of the next tick can still come.
-    fn settled(&mut self) -> Result<bool, BusError> {
-        let mut settled = self.estimate.seek(self.next_tick)? != Seek::NotYet;
-        for truth in &mut self.truths {
-            settled &= truth.seek(self.next_tick)? != Seek::NotYet;
         }
-        Ok(settled)
     }
 
-    fn score_tick(&mut self) {
+    /// The latest value of the first metric.
+    pub fn latest(&self) -> f64 {
+        self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
+    }
+
+    /// Scores the next tick by the samples of it that there are; `complete` tells whether these are all.
+    #[inline]
+    pub fn take<'a>(
+        &mut self,
+        truth: impl Fn(usize) -> Option<&'a Truth<R>> + Copy,
+        fleet: impl Fn(usize) -> Option<&'a FleetTruth<R>>,
+        estimate: Option<&Estimate<R>>,
+        complete: bool,
+    ) {
         let tick = self.next_tick;
-        let estimate = at(&self.estimate, tick);
-        let complete =
-            estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
         *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
-        let (truth, fleet) = (|body: usize| self.truths[body].one(tick), |body: usize| self.truths[body].fleet(tick));
         self.rig.score(truth, fleet, estimate, &mut self.values);
         self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
         let time_s = tick as f64 * self.tick_s;
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);
         }
-        if !self.within()
+        if !self.incidents.is_empty()
+            && !self.within()
             && let Some((_, last)) = self.incidents.iter_mut().rfind(|(from, _)| *from <= tick)
         {
             *last = tick;
         }
         let (estimates, truths) = self.statuses.split_at_mut(1);
         estimate.iter().for_each(|estimate| estimates[0].take(estimate.words()));
-        let told = truths.iter_mut().zip(&self.truths);
-        told.for_each(|(statuses, truth)| truth.one(tick).iter().for_each(|truth| statuses.take(truth.words())));
+        let told = truths.iter_mut().enumerate();
+        told.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(truth.words())));
         // What the observer was not told of cannot be judged.
         let seen = estimate.filter(|estimate| estimates[0].of(estimate.words()) & BLIND == 0);
         for driven in &mut self.driven {
-            let (observed, own) = (self.truths[0].one(tick), self.truths[driven.body].one(tick));
+            let (observed, own) = (truth(0), truth(driven.body));
             let now = match (observed, own, seen) {
                 (Some(observed), Some(own), Some(estimate)) => self.rig.true_lyapunov(observed, own, estimate),
                 _ => None,
@@ -325,9 +320,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         }
         self.next_tick += 1;
     }
-}
 
-impl<R: Rig, B: Bus> RigScorer<R, B> {
     /// Whether every metric that has a limit is known and within it.
     fn within(&self) -> bool {
         self.score.metrics.iter().zip(&self.values).all(|(metric, value)| *value <= metric.limit)
@@ -341,6 +334,60 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
             judged.then(|| back.saturating_sub(from) as f64 * self.tick_s)
         };
         self.incidents.iter().map(recovery).collect()
+    }
+
+    /// Closes the account.
+    pub fn finish(&mut self) -> Score {
+        self.score.recoveries_s = self.recoveries_s();
+        if let Some(certificate) = &mut self.score.certificate {
+            let steps = self.next_tick * self.driven.len() as u64;
+            certificate.unjudged = steps - certificate.held - certificate.broken;
+        }
+        let told = |statuses: &Statuses| (statuses.signal.clone(), statuses.told().collect::<BTreeMap<_, _>>());
+        self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
+        let (tick_s, ticks) = (self.tick_s, self.next_tick);
+        for metric in &mut self.score.metrics {
+            let first_within = metric.last_above.map_or(0, |tick| tick + 1);
+            let limited = self.accept.metric_max.contains_key(&metric.name);
+            metric.settled_at_s = (limited && first_within < ticks).then_some(first_within as f64 * tick_s);
+        }
+        self.score.clone()
+    }
+}
+
+impl<R: Rig, B: Bus> RigScorer<R, B> {
+    fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
+        // What no role uses is not scored either.
+        let mut estimate =
+            Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
+                .guarded(rig.estimate_guard());
+        estimate.expect(crate::runtime::horizon(scenario, None));
+        let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);
+        Ok(Self {
+            truths: rig.bodies().iter().map(truth).collect::<Result<_, _>>()?,
+            estimate,
+            last_tick: scenario.last_tick,
+            scoring: Scoring::new(rig, scenario),
+        })
+    }
+
+    /// Whether no sample of the next tick can still come.
+    fn settled(&mut self) -> Result<bool, BusError> {
+        let next = self.scoring.next_tick;
+        let mut settled = self.estimate.seek(next)? != Seek::NotYet;
+        for truth in &mut self.truths {
+            settled &= truth.seek(next)? != Seek::NotYet;
+        }
+        Ok(settled)
+    }
+
+    fn score_tick(&mut self) {
+        let tick = self.scoring.next_tick;
+        let estimate = at(&self.estimate, tick);
+        let complete =
+            estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
+        let truths = &self.truths;
+        self.scoring.take(|body| truths[body].one(tick), |body| truths[body].fleet(tick), estimate, complete);
     }
 }
 
@@ -396,19 +443,22 @@ impl MetricScore {
 
 impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     fn poll(&mut self, budget: u64) -> Result<u64, BusError> {
-        let before = self.next_tick;
-        while self.next_tick <= self.last_tick && self.next_tick < before.saturating_add(budget) && self.settled()? {
+        let before = self.next_tick();
+        while self.next_tick() <= self.last_tick
+            && self.next_tick() < before.saturating_add(budget)
+            && self.settled()?
+        {
             self.score_tick();
         }
-        Ok(self.next_tick - before)
+        Ok(self.next_tick() - before)
     }
 
     fn next_tick(&self) -> u64 {
-        self.next_tick
+        self.scoring.next_tick
     }
 
     fn latest(&self) -> f64 {
-        self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
+        self.scoring.latest()
     }
 
     fn start(&mut self, grid: Grid) {
@@ -418,33 +468,20 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     }
 
     fn incident(&mut self, tick: u64) {
-        self.incidents.push((tick, tick));
+        self.scoring.incidents.push((tick, tick));
     }
 
     fn finish(&mut self) -> Result<Score, BusError> {
         // What has not come by now never will: go on as long as anything newer waits anywhere.
         loop {
             self.poll(u64::MAX)?;
-            let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.next_tick);
+            let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.scoring.next_tick);
             let more = newest(self.estimate.last_tick()) || self.truths.iter().any(|truth| newest(truth.last_tick()));
-            if !more || self.next_tick > self.last_tick {
+            if !more || self.next_tick() > self.last_tick {
                 break;
             }
             self.score_tick();
         }
-        self.score.recoveries_s = self.recoveries_s();
-        if let Some(certificate) = &mut self.score.certificate {
-            let steps = self.next_tick * self.driven.len() as u64;
-            certificate.unjudged = steps - certificate.held - certificate.broken;
-        }
-        let told = |statuses: &Statuses| (statuses.signal.clone(), statuses.told().collect::<BTreeMap<_, _>>());
-        self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
-        let (tick_s, ticks) = (self.tick_s, self.next_tick);
-        for metric in &mut self.score.metrics {
-            let first_within = metric.last_above.map_or(0, |tick| tick + 1);
-            let limited = self.accept.metric_max.contains_key(&metric.name);
-            metric.settled_at_s = (limited && first_within < ticks).then_some(first_within as f64 * tick_s);
-        }
-        Ok(self.score.clone())
+        Ok(self.scoring.finish())
     }
 }

@@ -130,6 +130,8 @@ pub(super) struct Member {
     generation: u64,
     silent_ns: u64,
     looked_ns: u64,
+    /// No more tick will be due.
+    over: bool,
     started_ns: u64,
     restarts: u64,
     /// When the successor is due, and when the failure was noticed, ns.
@@ -161,6 +163,7 @@ impl Member {
             last: Health::default(),
             generation: 1,
             silent_ns: 0,
+            over: false,
             looked_ns: now_ns,
             started_ns: now_ns,
             restarts: 0,
@@ -203,12 +206,23 @@ impl Member {
         }
         if let Some(trace) = &mut self.trace {
             let told = trace.look()?;
-            if !self.health.written() && told != self.last {
+            if !self.health.written() && told != self.last && self.state() < RoleState::Done {
                 self.last = told;
                 self.silent_ns = 0;
             }
         }
         Ok(())
+    }
+
+    /// Hears whether no more tick will be due.
+    pub fn set_over(&mut self, over: bool) {
+        self.over = over;
+    }
+
+    /// Whether nothing more will come of it, though it need not have come to its last tick: it is seen by its samples alone,
+    /// and none is due.
+    pub fn spent(&self) -> bool {
+        self.over && self.trace.is_some() && !self.health.written()
     }
 
     /// What it sends, if it is external.
@@ -251,8 +265,9 @@ impl Member {
     }
 
     /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next
-    /// is due; in lockstep that is when the others let it, so there it fails only by leaving.
-    fn fell_silent(&self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
+    /// is due; in lockstep that is when the others let it, so there it fails only by leaving. In real time it may have missed
+    /// its last ticks: then it is done, if it is still there once its remains would have been put away.
+    fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
@@ -271,6 +286,12 @@ impl Member {
         }
         match (tells, state, scenario.clock) {
             (true, ..) => fail(format!("it said nothing for {limit_s} s")),
+            (false, RoleState::Running, ClockKind::Realtime) if self.over => {
+                if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
+                    self.last.state = RoleState::Done as u64;
+                }
+                None
+            }
             (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),
             _ => None,
         }

@@ -94,6 +94,24 @@ impl From<f64> for Span {
 }
 
 /// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, or as e^{𝒜W}, at any step size.
+///
+/// On numbers of your own: the slope of a line of which only points are measured. ρ = 1, so φ is the line itself, and its
+/// increment from one point to the next is the potential.
+///
+/// ```
+/// use corotate::nalgebra::Vector1;
+/// use corotate::observe::{Increment, InvariantFilter};
+///
+/// let mut filter = InvariantFilter::new(Vector1::new(2.0), Vector1::new(0.0)); // 1/s, and the guess
+/// let line = |t: f64| 7.0 - 3.0 * t;
+/// for step in 0..500 {
+///     let (t, h) = (f64::from(step) * 0.01, 0.01);
+///     let potential = Vector1::new(line(t + h) - line(t));
+///     filter.step(&Increment::exact(potential, h, Vector1::zeros(), Vector1::zeros()));
+/// }
+/// // After 5 s the error of the guess has fallen by e^-10.
+/// assert!((filter.estimate().x + 3.0).abs() < 3.1 * f64::exp(-10.0));
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InvariantFilter<const N: usize> {
     decay: Decay<N>,

@@ -136,6 +136,32 @@ pub enum Observation {
 }
 
 /// The relation for one hidden axis of one body.
+///
+/// The third component of a tumbling body's angular velocity from the other two:
+///
+/// ```
+/// use corotate::model::{Inertia, RigidBody};
+/// use corotate::nalgebra::{Vector1, Vector3};
+/// use corotate::observe::{HiddenRate, InvariantFilter, Observation, RateSample};
+///
+/// let inertia = Inertia::new([1.0, 2.0, 2.5]).unwrap();
+/// let (body, h) = (RigidBody::new(&inertia), 1e-3);
+/// let relation = HiddenRate::new(&inertia.coefficients(), 3, 1e-6).unwrap();
+/// let mut filter = InvariantFilter::new(Vector1::new(6.0), Vector1::new(0.0));
+/// let mut rate = Vector3::new(0.6, -0.4, 0.8);
+/// let sight = |rate: Vector3<f64>| {
+///     relation.sight(&RateSample { rate_rad_s: rate, torque_rad_s2: Vector3::zeros() })
+/// };
+/// for _ in 0..5000 {
+///     let next = body.flow(&rate, &Vector3::zeros(), h);
+///     match relation.observe(&sight(rate), &sight(next), h, filter.estimate().x) {
+///         Observation::Seen(increment) => filter.step(&increment),
+///         Observation::Unobservable { drift } => filter.predict(&drift),
+///     }
+///     rate = next;
+/// }
+/// assert!((filter.estimate().x - rate.z).abs() < 1e-9);
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HiddenRate {
     /// Index of the hidden component.

@@ -45,6 +45,31 @@ impl<const N: usize> Identification<N> {
 
 /// The relation for (a1, a2, a3): ρ = |ω1 ω2 ω3|, (rad/s)³, g = 0. Its filter's rates are in s²/rad³.
 ///
+/// What a body's own tumbling tells of its moments of inertia:
+///
+/// ```
+/// use corotate::model::{Inertia, RigidBody};
+/// use corotate::nalgebra::Vector3;
+/// use corotate::observe::{Identification, InertiaRatios, InertiaRelation, InvariantFilter, RateSample};
+///
+/// let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
+/// let (relation, h) = (InertiaRelation::new(1e-6), 1e-3);
+/// let mut filter = InvariantFilter::new(Vector3::repeat(10.0), Vector3::zeros());
+/// let sample = |rate| RateSample { rate_rad_s: rate, torque_rad_s2: Vector3::zeros() };
+/// let mut rate = Vector3::new(1.2, 0.8, 1.6);
+/// for _ in 0..60_000 {
+///     let next = body.flow(&rate, &Vector3::zeros(), h);
+///     if let Identification::Excited(increment) =
+///         relation.observe(&sample(rate), &sample(next), h, filter.estimate())
+///     {
+///         filter.step(&increment);
+///     }
+///     rate = next;
+/// }
+/// let ratios = InertiaRatios::new(filter.estimate()).unwrap();
+/// assert!((ratios.second - 2.0).abs() < 1e-6 && (ratios.third - 2.5).abs() < 1e-6);
+/// ```
+///
 /// One step of h seconds is good to the fifth order in h, so the settled estimate is to the fourth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InertiaRelation {

@@ -32,6 +32,33 @@ const READ_BYTES: usize = 64 << 10;
 const RECORD_HEAD: usize = 9;
 
 /// A recording that was opened.
+///
+/// ```
+/// use corotate::config::{SHIPPED, Scenario};
+/// use corotate::launch::{Launch, run};
+/// use corotate::record::Recording;
+/// use std::sync::atomic::AtomicUsize;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let directory = tempfile::tempdir()?;
+/// # let file = directory.path().join("run.mcap");
+/// let overrides = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
+/// let scenario = Scenario::parse(SHIPPED[0].1, "rigid-pair.toml", &overrides)?;
+/// let signal = AtomicUsize::new(0);
+/// # let mut launch = Launch {
+/// #     program: std::env::current_exe()?, external: Vec::new(), record: Some(file.clone()), foxglove: None,
+/// #     require_realtime: false, signal: &signal, progress: &mut |_| {},
+/// # };
+/// run(&scenario, &mut launch)?; // with `record: Some(file)` in its `Launch`, as `corotate run --record` does
+///
+/// let recording = Recording::open(&file)?;
+/// recording.require_whole()?;
+/// let estimate = recording.tracks(|signal| signal.body == "leader" && signal.signal == "estimate")?.remove(0);
+/// let hidden = estimate.column("omega_rad_s", 2).expect("an estimate of this rig has it");
+/// assert_eq!((estimate.ticks().len(), hidden.len()), (1001, 1001));
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct Recording {
     path: PathBuf,
@@ -481,7 +508,7 @@ impl Content {
         let Record::Chunk { header, .. } = mcap::parse_record(op::CHUNK, record).map_err(words)? else {
             return Err("a chunk is none".to_owned());
         };
-        if header.compression != "zstd" || header.uncompressed_crc == 0 || self.data_ended {
+        if header.compression != "lz4" || header.uncompressed_crc == 0 || self.data_ended {
             return Err("it has a chunk that this program does not write".to_owned());
         }
         let room = reader.insert(RECORD_HEAD + record.len());

@@ -74,9 +74,7 @@ impl Writer {
         let options = WriteOptions::new()
             .profile("ros2")
             .library(concat!("corotate ", env!("CARGO_PKG_VERSION")))
-            .compression(Some(mcap::Compression::Zstd))
-            .compression_level(1)
-            .compression_threads(0)
+            .compression(Some(mcap::Compression::Lz4))
             .chunk_size(None);
         let mcap = options.create(BufWriter::with_capacity(64 << 10, sink)).map_err(|error| wrong(path, error))?;
         Ok(Self {

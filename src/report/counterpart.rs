@@ -1,4 +1,4 @@
-//! The run that an orbit's is compared with: the same scenario, undisturbed, its law given the true velocity, \[S\] Fig. 1.
+//! The run that a report compares another with: the same scenario, undisturbed, as its rig would have it.
 //!
 //! It is computed here, in one thread. Must not be told as if it had been measured.
 
@@ -12,18 +12,16 @@ use std::sync::atomic::AtomicUsize;
 /// Longer runs are not computed again: it would take a while, and an orbit repeats itself.
 const TICKS_MAX: u64 = 200_000;
 
-/// The traces of the same motion with full-state feedback; none where the scenario has no such choice, has it already, or is
-/// too long.
+/// The traces of that run; none where the rig names none, or this one is too long.
 pub fn counterpart(scenario: &Scenario) -> Result<Option<Traces>, ReportError> {
-    let controller = scenario.resolved.get("controller").and_then(|table| table.get("feedback"));
-    if controller.and_then(toml::Value::as_str) != Some("estimate") || scenario.last_tick > TICKS_MAX {
+    let changes = scenario.rig.counterpart();
+    if changes.is_empty() || scenario.last_tick > TICKS_MAX {
         return Ok(None);
     }
     let failed = |error: &dyn std::fmt::Display| ReportError::Counterpart { reason: error.to_string() };
-    let overrides =
-        ["controller.feedback=full-state", "clock=in-process", "launch.external=[]", "fault=[]", "accept={}"];
-    let scenario =
-        Scenario::parse(&scenario.to_toml(), "the same scenario with full state", &overrides.map(str::to_owned))?;
+    let plain = ["clock=in-process", "launch.external=[]", "fault=[]", "accept={}"];
+    let overrides: Vec<String> = changes.iter().chain(&plain).map(|change| (*change).to_owned()).collect();
+    let scenario = Scenario::parse(&scenario.to_toml(), "the run that this one is compared with", &overrides)?;
     let directory = tempfile::tempdir().map_err(|error| failed(&error))?;
     let file = directory.path().join("run.mcap");
     let launch = &mut Launch {

@@ -3,6 +3,7 @@
 use super::ReportError;
 use super::axis::Axis;
 use super::chart::{Marks, Picture, marks};
+use super::counterpart::counterpart;
 use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
@@ -76,7 +77,8 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
     let (time, events) = times(source, traces.as_ref());
     let mut sections = vec![tables::verdict(source, traces.as_ref())];
     if let Some(traces) = &traces {
-        sections.extend(pictures::sections(source, traces, &time)?);
+        let full = source.scenario.as_ref().map_or(Ok(None), counterpart)?;
+        sections.extend(pictures::sections(source, traces, full.as_ref(), &time));
     }
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {

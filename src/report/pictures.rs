@@ -1,15 +1,14 @@
 //! Which pictures the samples of a run give: motion, errors, V, and how late what was sent.
 
-use super::ReportError;
 use super::axis::Axis;
 use super::chart::{Line, Picture, SHADES, over_time, plane, range, strip};
 use super::columns::{Columns, Extremes};
-use super::counterpart::counterpart;
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::{BODIES_SHOWN, MetricTrace, Traces};
 use crate::analysis::{claims, digits};
 use crate::config::Scenario;
+use crate::rig;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
 const ERROR_FLOOR: f64 = 1e-18;
@@ -22,25 +21,41 @@ const COMPONENTS: [&str; 4] = ["o d0", "b d1", "g d3", "p d4"];
 /// Lateness from the lightest to the darkest shade, µs: 1 µs to 100 ms, more is as dark.
 const SHADE_DECADES: f64 = 5.0;
 
+/// What the observed body's motion is called beside that of its counterpart.
+const OBSERVED: &str = "with the observer (this run)";
+const COMPARED: &str = "with full state (computed here)";
+
 type Figures = Vec<(Picture, String)>;
 
-/// The sections that the samples give.
-pub fn sections(source: &Source, traces: &Traces, time: &Axis) -> Result<Vec<Section>, ReportError> {
-    let Some(scenario) = &source.scenario else { return Ok(Vec::new()) };
+/// The sections that the samples give, of this run and of the one that it is compared with.
+pub fn sections(source: &Source, traces: &Traces, full: Option<&Traces>, time: &Axis) -> Vec<Section> {
+    let Some(scenario) = &source.scenario else { return Vec::new() };
     let tick_s = scenario.tick_s();
-    let mut sections = vec![motion(scenario, traces, time)?];
+    let mut sections = vec![motion(scenario, traces, full, time)];
     sections.push(errors(source, scenario, traces, time));
-    let certificate = lyapunov(traces, time, tick_s);
+    let pictures = scenario.rig.pictures().into_iter();
+    let certificate: Figures = pictures
+        .filter_map(|picture| if let rig::Picture::Lyapunov(of) = picture { Some(of) } else { None })
+        .flat_map(|of| lyapunov(&of, traces, time, tick_s))
+        .collect();
     if !certificate.is_empty() {
         let blocks = vec![Block::Figures(certificate)];
         sections.push(Section { id: "lyapunov", title: "V and its bound", blocks });
     }
-    Ok(sections)
+    sections
 }
 
-fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, ReportError> {
-    let orbit = traces.paths.keys().any(|(_, plane)| *plane == "x y");
-    let figures = if orbit { orbits(scenario, traces, time)? } else { rates(traces, time, scenario.tick_s()) };
+fn motion(scenario: &Scenario, traces: &Traces, full: Option<&Traces>, time: &Axis) -> Section {
+    let tick_s = scenario.tick_s();
+    let mut figures = Vec::new();
+    for picture in scenario.rig.pictures() {
+        match picture {
+            rig::Picture::Plane(of) => figures.extend(plane_figure(&of, traces, full)),
+            rig::Picture::Graph(of) => figures.extend(graph(&of, traces, full, time, tick_s)),
+            rig::Picture::Inputs(of) => figures.extend(inputs(&of, traces, time, tick_s)),
+            rig::Picture::Lyapunov(_) => {}
+        }
+    }
     let mut blocks = vec![Block::Text(decimation(traces, scenario.tick_s()))];
     blocks.extend(unseen(traces));
     let hidden = traces.bodies.len().saturating_sub(BODIES_SHOWN + 1);
@@ -51,7 +66,7 @@ fn motion(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Section, 
         blocks.push(Block::Text("A fleet is a band from the least to the greatest of its bodies.".to_owned()));
     }
     blocks.push(Block::Figures(figures));
-    Ok(Section { id: "motion", title: "Motion", blocks })
+    Section { id: "motion", title: "Motion", blocks }
 }
 
 /// What the grey bands of the pictures over time are, if there are any.
@@ -82,44 +97,6 @@ fn present<'a>(
     lines.into_iter().flatten().unzip()
 }
 
-fn rates(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
-    let mut figures = Vec::new();
-    for (name, names) in [("ω1 ω2", ["ω1, rad/s", "ω2, rad/s"]), ("ω2 ω3", ["ω2, rad/s", "ω3, rad/s"])] {
-        let lines = paths(traces, name);
-        if !lines.is_empty() {
-            let caption = "Angular velocity in a plane. A dot is where a path begins.".to_owned();
-            figures.push((plane(&format!("angular velocities in the plane {name}"), names, &lines, false), caption));
-        }
-    }
-    for axis in 0..3 {
-        let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
-        let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
-            traces.get(body, "truth", "omega_rad_s", axis).map(|columns| line(class, body, columns))
-        });
-        let leader = traces.bodies.first().map(String::as_str).unwrap_or_default();
-        let own = traces.get(leader, "truth", "omega_rad_s", axis).map(|columns| line("k d0", leader, columns));
-        let seen = traces.get(leader, "estimate", "omega_rad_s", axis).map(|columns| line("b d1", "observer", columns));
-        let (columns, lines) = present(followers.chain([own, seen]));
-        if !lines.is_empty() {
-            let y = Axis::around(&format!("ω{}, rad/s", axis + 1), range(columns, false));
-            let title = format!("angular velocity about axis {} over time", axis + 1);
-            figures.push((
-                over_time(&title, time, &y, &lines),
-                format!("Angular velocity ω{} in the body's axes.", axis + 1),
-            ));
-        }
-    }
-    figures.extend(controls(
-        traces,
-        time,
-        tick_s,
-        "applied_rad_s2",
-        "control acceleration, rad/s²",
-        &["u1", "u2", "u3"],
-    ));
-    figures
-}
-
 /// The paths of all bodies and of the observer in a plane.
 fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
     let path = |owner: &str, class, label: &str| {
@@ -130,89 +107,64 @@ fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
     followers.chain([path(leader, "k d0", leader), path("observer", "b d1", "observer")]).flatten().collect()
 }
 
+/// A plane with all its paths, or with the observed body's beside that of its counterpart.
+fn plane_figure(of: &rig::Plane, traces: &Traces, full: Option<&Traces>) -> Option<(Picture, String)> {
+    let path = |traces: &Traces, class, label: &str| {
+        let body = traces.bodies.first().cloned().unwrap_or_default();
+        traces.paths.get(&(body, of.title)).map(|columns| Line::path(class, label, columns))
+    };
+    let (lines, caption) = match (full, of.compared) {
+        (Some(full), Some(caption)) => {
+            let both = [path(full, "k d0", COMPARED), path(traces, "b d1", OBSERVED)];
+            (both.into_iter().flatten().collect(), caption)
+        }
+        _ => (paths(traces, of.title), of.caption),
+    };
+    (!lines.is_empty()).then(|| (plane(of.title, of.axes, &lines, of.centred), caption.to_owned()))
+}
+
+/// An element of a field over time: of every body, of the estimate, and of the counterpart.
+fn graph(
+    of: &rig::Graph,
+    traces: &Traces,
+    full: Option<&Traces>,
+    time: &Axis,
+    tick_s: f64,
+) -> Option<(Picture, String)> {
+    let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
+    let first = traces.bodies.first().map(String::as_str).unwrap_or_default();
+    let own_classes = if full.is_some() { ["b d1", "s d2"] } else { ["k d0", "b d1"] };
+    let own_label = if full.is_some() { OBSERVED } else { first };
+    let compared = full.and_then(|full| full.get(first, "truth", of.field, of.element));
+    let compared = compared.map(|columns| line("k d0", COMPARED, columns));
+    let followers =
+        traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
+            traces.get(body, "truth", of.field, of.element).map(|columns| line(class, body, columns))
+        });
+    let own = traces.get(first, "truth", of.field, of.element);
+    let own = own.map(|columns| line(own_classes[0], own_label, columns));
+    let seen = traces.get(first, "estimate", of.field, of.element);
+    let seen = seen.map(|columns| line(own_classes[1], "observer", columns));
+    let (columns, lines) = present(followers.chain([compared, own, seen]));
+    let y = Axis::around(&of.axis, range(columns, false));
+    (!lines.is_empty()).then(|| (over_time(&of.title, time, &y, &lines), of.caption.clone()))
+}
+
 /// What the actuators of each driven body applied.
-fn controls(traces: &Traces, time: &Axis, tick_s: f64, field: &str, unit: &str, names: &[&str]) -> Figures {
+fn inputs(of: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
     for body in traces.bodies.iter().take(BODIES_SHOWN + 1) {
         let component = |(element, name): (usize, &&str)| {
-            let columns = traces.get(body, "truth", field, element)?;
-            Some((columns, Line::of(COMPONENTS[element], name, columns, tick_s)))
+            let columns = traces.get(body, "truth", of.field, element)?;
+            Some((columns, Line::of(COMPONENTS[element % COMPONENTS.len()], name, columns, tick_s)))
         };
-        let (columns, lines) = present(names.iter().enumerate().map(component));
+        let (columns, lines) = present(of.components.iter().enumerate().map(component));
         let (low, high) = range(columns, false);
         // A body that nobody drives has nothing to show.
         if low < 0.0 || high > 0.0 {
             let title = format!("control of {body} over time");
-            let picture = over_time(&title, time, &Axis::around(unit, (low, high)), &lines);
+            let picture = over_time(&title, time, &Axis::around(of.axis, (low, high)), &lines);
             figures.push((picture, format!("What the actuators of {body} applied.")));
-        }
-    }
-    figures
-}
-
-fn orbits(scenario: &Scenario, traces: &Traces, time: &Axis) -> Result<Figures, ReportError> {
-    let full = counterpart(scenario)?;
-    let mut figures = vec![orbit_plane(traces, full.as_ref())];
-    let velocities = paths(traces, "Vr Vθ");
-    if !velocities.is_empty() {
-        let names = ["Vr, du/s", "Vθ, du/s"];
-        let caption = "Velocity as it was, and as the observer saw it, which begins at its guess.".to_owned();
-        figures.push((plane("velocities in the plane Vr Vθ", names, &velocities, false), caption));
-    }
-    figures.extend(orbit_states(traces, full.as_ref(), time, scenario.tick_s()));
-    Ok(figures)
-}
-
-/// \[S\] Fig. 1: the motion with full state in black, with the observer in blue. Where there is no such pair, the bodies.
-fn orbit_plane(traces: &Traces, full: Option<&Traces>) -> (Picture, String) {
-    let names = ["x, du", "y, du"];
-    let path = |traces: &Traces, class, label: &str| {
-        let body = traces.bodies.first().cloned().unwrap_or_default();
-        traces.paths.get(&(body, "x y")).map(|columns| Line::path(class, label, columns))
-    };
-    let Some(full) = full else {
-        let lines = paths(traces, "x y");
-        let caption = "Paths in the plane; the cross is the central body, a dot is where a path begins.".to_owned();
-        return (plane("paths in the plane", names, &lines, true), caption);
-    };
-    let pair =
-        [path(full, "k d0", "with full state (computed here)"), path(traces, "b d1", "with the observer (this run)")];
-    let lines: Vec<Line> = pair.into_iter().flatten().collect();
-    let caption = "Motion in the plane, as Fig. 1 of [S]: with full state in black, computed for this report from the same \
-                   scenario; with the observer in blue, as recorded. The cross is the central body.";
-    (plane("motion in the plane with full state and with the observer", names, &lines, true), caption.to_owned())
-}
-
-/// \[S\] Fig. 2: states and controls over time.
-fn orbit_states(traces: &Traces, full: Option<&Traces>, time: &Axis, tick_s: f64) -> Figures {
-    let states = [
-        ("radius_du", 0, "r, du", "Distance from the centre."),
-        ("velocity_du_s", 0, "Vr, du/s", "Radial velocity."),
-        ("velocity_du_s", 1, "Vθ, du/s", "Transverse velocity."),
-        ("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
-        ("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
-        ("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
-    ];
-    let first = traces.bodies.first().map(String::as_str).unwrap_or_default();
-    let mut figures = Vec::new();
-    for (field, element, unit, caption) in states {
-        let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
-        let of = |traces: &'_ Traces, body: &str, signal| traces.get(body, signal, field, element).cloned();
-        let full = full.and_then(|full| of(full, first, "truth"));
-        let full = full.as_ref().map(|columns| line("k d0", "with full state (computed here)", columns));
-        let others =
-            traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
-                traces.get(body, "truth", field, element).map(|columns| line(class, body, columns))
-            });
-        let own_class = if full.is_some() { "b d1" } else { "k d0" };
-        let own_label = if full.is_some() { "with the observer (this run)" } else { first };
-        let own = traces.get(first, "truth", field, element).map(|columns| line(own_class, own_label, columns));
-        let seen = (field == "velocity_du_s").then(|| traces.get(first, "estimate", field, element)).flatten();
-        let seen = seen.map(|columns| line("s d2", "estimate", columns));
-        let (columns, lines) = present(others.chain([full, own, seen]));
-        if !lines.is_empty() {
-            let y = Axis::around(unit, range(columns, false));
-            figures.push((over_time(&format!("{unit} over time"), time, &y, &lines), caption.to_owned()));
         }
     }
     figures
@@ -315,29 +267,29 @@ fn rescored(source: &Source, traces: &Traces) -> Block {
     }
 }
 
-fn lyapunov(traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
+fn lyapunov(of: &rig::Lyapunov, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
     let bodies = traces.bodies.iter().skip(1).zip(COMPONENTS);
     let v = bodies.filter_map(|(body, class)| {
-        let columns = traces.get(body, "command", "lyapunov_rad2_s2", 0)?;
+        let columns = traces.get(body, "command", of.field, 0)?;
         Some((columns, Line::of(class, body, columns, tick_s)))
     });
     let (columns, lines): (Vec<_>, Vec<_>) = v.unzip();
     let (low, high) = range(columns, true);
     if high > 0.0 {
-        let y = Axis::decades("V, rad²/s²", (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
-        let caption =
-            "V = ½(|e|² + ε²) of [D](15) as the controller sees it: of its own estimate, not of the truth.".to_owned();
+        let y = Axis::decades(of.axes[0], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let caption = format!("{} as the controller sees it: of its own estimate, not of the truth.", of.function);
         figures.push((over_time("V over time, logarithmic", time, &y, &lines), caption));
     }
     for (body, [fell, bound]) in &traces.falls {
         let (low, high) = range([bound], true);
-        let y = Axis::decades("−dV/dt, rad²/s³", (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let y = Axis::decades(of.axes[1], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
         let lines =
             [Line::of("o d0", "measured, tick to tick", fell, tick_s), Line::of("k d1", "bound", bound, tick_s)];
         let caption = format!(
-            "How fast V of {body} fell, and the bound of [D](18) that it may not fall slower than: the certificate holds \
-             where the measured line is not below. Drawn as long as V is more than rounding; where it rose, at the foot."
+            "How fast V of {body} fell, and {} that it may not fall slower than: the certificate holds where the measured \
+             line is not below. Drawn as long as V is more than rounding; where it rose, at the foot.",
+            of.bound
         );
         figures.push((over_time("rate of fall of V and its bound", time, &y, &lines), caption));
     }

@@ -282,8 +282,11 @@ pub fn certificate(source: &Source) -> Section {
             format!("; the error of the continuous law falls at least as exp(−{} t)", digits(rate))
         });
         let caption = format!("{}{continuous}", certificate.body);
-        let rows = certificate.conditions.iter().map(row).collect();
-        blocks.push(Block::Table { caption, head: vec!["condition", "value", "required", ""], rows });
+        let rows: Vec<_> = certificate.conditions.iter().map(row).collect();
+        blocks.push(match rows.is_empty() {
+            true => Block::Text(format!("{caption}: its rig proves nothing of the law in continuous time.")),
+            false => Block::Table { caption, head: vec!["condition", "value", "required", ""], rows },
+        });
         blocks.push(Block::Text(told_of_loop(certificate)));
         // Why no rate is claimed is told already.
         let others = certificate.warnings.iter().filter(|warning| certificate.reason.as_ref() != Some(*warning));

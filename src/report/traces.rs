@@ -7,7 +7,7 @@ use super::columns::{Columns, Corners, Count, Extremes};
 use crate::config::Scenario;
 use crate::launch::lyapunov_floor;
 use crate::record::{Column, RecordError, Recording, SignalInfo};
-use crate::rig::{Command, Estimate, FleetTruth, Rig, Truth};
+use crate::rig::{Command, Estimate, FleetTruth, Picture, Plane, Rig, Truth};
 use crate::role::Guard;
 use crate::sample::{FieldKind, Message, Sample, Stamp, VOID, status};
 use std::collections::BTreeMap;
@@ -26,7 +26,7 @@ pub struct Traces {
     pub bodies: Vec<String>,
     /// Values by body, signal, field and element. All bodies of a fleet have one.
     pub values: BTreeMap<Key, Columns<Extremes>>,
-    /// Paths by body and by the two axes of the plane.
+    /// Paths by body and by the title of the plane.
     pub paths: BTreeMap<(String, &'static str), Columns<Corners>>,
     /// Each metric over time.
     pub metrics: Vec<MetricTrace>,
@@ -130,7 +130,12 @@ struct Tracer<R: Rig> {
     /// V and the bound on its rate by body, at its last command.
     before: BTreeMap<usize, (u64, f64, f64)>,
     metrics: Vec<f64>,
+    planes: Vec<Plane>,
     traces: Traces,
+}
+
+fn plane(picture: Picture) -> Option<Plane> {
+    if let Picture::Plane(plane) = picture { Some(plane) } else { None }
 }
 
 impl<R: Rig> Tracer<R> {
@@ -143,7 +148,7 @@ impl<R: Rig> Tracer<R> {
             last_tick: 0,
             settled_max: None,
         };
-        let bodies = rig.bodies().iter().map(|body| body.name.clone()).collect();
+        let bodies = rig.bodies().iter().map(|body| body.name.to_string()).collect();
         let mut traces = Traces { bodies, metrics: rig.metrics().iter().map(metric).collect(), ..Traces::default() };
         let signals = recording.signals().iter().map(|signal| Signal::new(rig, signal, &mut traces)).collect();
         Self {
@@ -158,6 +163,7 @@ impl<R: Rig> Tracer<R> {
             newest: 0,
             before: BTreeMap::new(),
             metrics: vec![f64::NAN; rig.metrics().len()],
+            planes: R::pictures().into_iter().filter_map(plane).collect(),
             traces,
         }
     }
@@ -313,20 +319,15 @@ impl<R: Rig> Tracer<R> {
             Kind::Estimate(_) => "observer".to_owned(),
             _ => self.traces.bodies[body].clone(),
         };
-        let field = |name: &str| self.signals[index].fields.iter().find(|field| field.is(name));
-        let paths = &mut self.traces.paths;
-        let mut put = |plane, x, y| paths.entry((owner.clone(), plane)).or_default().at(tick).take(tick, x, y);
-        if let Some(omega) = field("omega_rad_s") {
-            let w = |axis| omega.value(sample, axis);
-            put("ω1 ω2", w(0), w(1));
-            put("ω2 ω3", w(1), w(2));
-        }
-        if let (Some(radius), Some(angle)) = (field("radius_du"), field("angle_rad")) {
-            let (r, angle) = (radius.value(sample, 0), angle.value(sample, 0));
-            put("x y", r * angle.cos(), r * angle.sin());
-        }
-        if let Some(velocity) = field("velocity_du_s") {
-            put("Vr Vθ", velocity.value(sample, 0), velocity.value(sample, 1));
+        let fields = &self.signals[index].fields;
+        let element = |name: &str, element| {
+            let field = fields.iter().find(|field| field.is(name))?;
+            (element < field.count).then(|| field.value(sample, element))
+        };
+        for plane in &self.planes {
+            if let Some([x, y]) = (plane.point)(&element) {
+                self.traces.paths.entry((owner.clone(), plane.title)).or_default().at(tick).take(tick, x, y);
+            }
         }
     }
 }
@@ -385,9 +386,6 @@ impl Field {
     }
 
     fn value(&self, sample: &[u8], element: usize) -> f64 {
-        if element >= self.count {
-            return f64::NAN;
-        }
         bytemuck::pod_read_unaligned(&sample[self.offset + 8 * element..][..8])
     }
 

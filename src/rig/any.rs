@@ -2,12 +2,11 @@
 //!
 //! Must not compute anything: each answer is the generic code of the module that asks.
 
-use super::{BodyInfo, CertificateReport, Figure, Rig};
+use super::{BodyInfo, CertificateReport, Figure, Picture, Rig};
 use crate::analysis::{self, Claim};
 use crate::bus::{AnyBus, BusError};
 use crate::config::{Fields, Scenario, fields};
-use crate::control::Watched;
-use crate::launch::{Scorer, score_rig};
+use crate::launch::{Launch, Outcome, Scorer, run_directly, score_rig};
 use crate::record::{RecordError, Recording};
 use crate::report::{Traces, trace_rig};
 use crate::runtime::{DeviceError, DeviceLink, DeviceSeat, Occupant, Port, ReadyNode, RoleId, build_rig, ports_of_rig};
@@ -22,11 +21,13 @@ pub struct AnyRig(Box<dyn Face>);
 /// What is asked of a rig, whichever it is.
 pub(crate) trait Face: Any + Send + Sync {
     fn bodies(&self) -> &[BodyInfo];
-    fn metrics(&self) -> &'static [&'static str];
+    fn metrics(&self) -> Vec<&'static str>;
     fn certificates(&self) -> Vec<CertificateReport>;
     fn limits(&self) -> Vec<Figure>;
-    fn unwatched(&self, watched: Watched) -> Option<&'static str>;
+    fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)>;
     fn notes(&self) -> Vec<String>;
+    fn pictures(&self) -> Vec<Picture>;
+    fn counterpart(&self) -> &'static [&'static str];
     fn fields(&self, role: &str, fleet: Option<usize>) -> Fields;
     fn claims(&self, scenario: &Scenario) -> Vec<Claim>;
     fn ports(&self, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>);
@@ -39,6 +40,7 @@ pub(crate) trait Face: Any + Send + Sync {
     ) -> Result<ReadyNode, BusError>;
     fn device(&self, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError>;
     fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
+    fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>;
     fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
     fn judge(&self) -> Box<dyn Judge>;
 }
@@ -48,7 +50,7 @@ impl<R: Rig> Face for R {
         Rig::bodies(self)
     }
 
-    fn metrics(&self) -> &'static [&'static str] {
+    fn metrics(&self) -> Vec<&'static str> {
         Rig::metrics(self)
     }
 
@@ -60,12 +62,20 @@ impl<R: Rig> Face for R {
         Rig::limits(self)
     }
 
-    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
-        Rig::unwatched(self, watched)
+    fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)> {
+        R::monitors().iter().map(|monitor| (monitor.name, (monitor.absent)(self))).collect()
     }
 
     fn notes(&self) -> Vec<String> {
         Rig::notes(self)
+    }
+
+    fn pictures(&self) -> Vec<Picture> {
+        R::pictures()
+    }
+
+    fn counterpart(&self) -> &'static [&'static str] {
+        Rig::counterpart(self)
     }
 
     fn fields(&self, role: &str, fleet: Option<usize>) -> Fields {
@@ -104,6 +114,10 @@ impl<R: Rig> Face for R {
         }
     }
 
+    fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
+        run_directly(self, scenario, launch)
+    }
+
     fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError> {
         trace_rig(self, scenario, recording)
     }
@@ -137,12 +151,12 @@ impl AnyRig {
     /// The names of all roles, in the order in which one tick passes through them.
     pub fn roles(&self) -> Vec<&str> {
         let controller = self.bodies().iter().any(|body| body.driven).then_some("controller");
-        let bodies = self.bodies().iter().map(|body| body.name.as_str());
+        let bodies = self.bodies().iter().map(|body| &*body.name);
         bodies.chain(["observer"]).chain(controller).collect()
     }
 
     /// What a run is scored by.
-    pub fn metrics(&self) -> &'static [&'static str] {
+    pub fn metrics(&self) -> Vec<&'static str> {
         self.0.metrics()
     }
 
@@ -156,9 +170,19 @@ impl AnyRig {
         self.0.limits()
     }
 
-    /// Why a quantity cannot be watched in this scenario, if so.
-    pub fn unwatched(&self, watched: Watched) -> Option<&'static str> {
-        self.0.unwatched(watched)
+    /// The quantities that the controller can watch, each with the reason why it cannot in this scenario, if so.
+    pub fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)> {
+        self.0.monitors()
+    }
+
+    /// What a report draws of the motion.
+    pub fn pictures(&self) -> Vec<Picture> {
+        self.0.pictures()
+    }
+
+    /// See [`Rig::counterpart`].
+    pub fn counterpart(&self) -> &'static [&'static str] {
+        self.0.counterpart()
     }
 
     /// What a reader of the results must know of the scenario.

@@ -5,24 +5,28 @@
 mod any;
 mod fleet;
 mod orbit;
+mod pictures;
 mod registry;
 mod rigid_body;
+mod simple;
 
 pub use any::AnyRig;
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
-pub use registry::{RigKind, register};
+pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
+pub use registry::{RigKind, register, shipped};
 pub(crate) use registry::{resolve, sections, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
+pub use simple::{Bounded, Difference, SimpleRig};
 
-use crate::config::{Checks, ConfigError, Document, finite_positive};
-use crate::control::Watched;
+use crate::config::{Checks, ConfigError, Document};
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use crate::role::{Body, Estimator, Guard, Law, SingleBody};
 use crate::sample::FleetSample;
 use crate::state::Persist;
 use nalgebra::SVector;
 use serde::Serialize;
+use std::borrow::Cow;
 
 /// The samples of a rig, by signal.
 pub type Truth<R> = <<R as Rig>::Body as Body>::Truth;
@@ -44,7 +48,7 @@ pub type FleetCommand<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BodyInfo {
     /// The name of its role and its part of service names.
-    pub name: String,
+    pub name: Cow<'static, str>,
     /// Whether the controller drives it.
     pub driven: bool,
     /// How many bodies it is, if it is a fleet: many in one process, driven as one.
@@ -90,17 +94,17 @@ pub trait Rig: Clone + Send + Sync + 'static {
     type Fleet: Fleet<Estimate<Self>>;
     /// By which a scenario's key `rig` names it.
     const NAMES: &'static [&'static str];
-    /// The keys of a scenario's tables that are its own, each of one table.
-    const TABLES: &'static [&'static str];
-    /// The same, each of a list of tables.
+    /// The keys of a scenario that are its own, each of a list of tables.
     const LISTS: &'static [&'static str] = &[];
     /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
-    const AXES: usize;
+    const AXES: usize = 0;
     /// The fields of truths and estimates that the loop controls: their errors are to vanish.
-    const CONTROLLED: &'static [&'static str];
+    const CONTROLLED: &'static [&'static str] = &[];
     /// The field of truths that the loop does not control, if there is one: a motion that is shifted in it is as good.
     const FREE: Option<&'static str> = None;
 
+    /// The keys of a scenario that are its own, each of one table.
+    fn tables() -> Vec<&'static str>;
     /// The rig of this name as its tables describe it, or none if `checks` noted a problem with it; and the tables with every
     /// default filled in.
     ///
@@ -131,17 +135,15 @@ pub trait Rig: Clone + Send + Sync + 'static {
         None
     }
     /// The physical bounds that the guards work with.
-    fn limits(&self) -> Vec<Figure>;
-    /// Energy and angular momentum of the observed body as estimated, in any unit, if they are to stay constant.
-    fn invariants(&self, estimate: &Estimate<Self>) -> Option<[f64; 2]>;
-    /// The observer's innovation.
-    fn innovation(_estimate: &Estimate<Self>) -> f64 {
-        0.0
+    fn limits(&self) -> Vec<Figure> {
+        Vec::new()
     }
-    /// Why a quantity cannot be watched in this scenario, if so.
-    fn unwatched(&self, watched: Watched) -> Option<&'static str>;
+    /// What the controller can hold against a bound of the scenario's `[watchdog]`; at most [`WATCHED_MAX`](crate::control::WATCHED_MAX).
+    fn monitors() -> &'static [Monitor<Self>] {
+        &[]
+    }
     /// What a run is scored by; the unit is the last part of each name.
-    fn metrics(&self) -> &'static [&'static str];
+    fn metrics(&self) -> Vec<&'static str>;
     /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample, +inf once a body is
     /// lost. `truth` gives the truth of a body by its index, `fleet` that of a fleet.
     fn score<'a>(
@@ -161,7 +163,9 @@ pub trait Rig: Clone + Send + Sync + 'static {
         None
     }
     /// What is proven of the closed loop, one entry per driven body.
-    fn certificates(&self) -> Vec<CertificateReport>;
+    fn certificates(&self) -> Vec<CertificateReport> {
+        Vec::new()
+    }
     /// Whether a body applied what it was told to at this tick.
     fn undisturbed(_truth: &Truth<Self>) -> bool {
         true
@@ -180,10 +184,39 @@ pub trait Rig: Clone + Send + Sync + 'static {
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None
     }
+    /// What a report draws of the motion; every number of the truth over time unless the rig knows better.
+    fn pictures() -> Vec<Picture> {
+        graphs::<Truth<Self>>()
+    }
+    /// Overrides that make of this scenario one whose motion a report draws beside that of the run, if there is such a one.
+    fn counterpart(&self) -> &'static [&'static str] {
+        &[]
+    }
     /// What a reader of the results must know of the scenario, such as a declared exception to a rule.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
+}
+
+/// A quantity that the controller can watch.
+pub struct Monitor<R: Rig> {
+    /// Its name, with its unit as the last part; the key of its bound is `<name>_max`.
+    pub name: &'static str,
+    /// How it is told.
+    pub of: Watched<R>,
+    /// Why it cannot be watched in this scenario, if so.
+    pub absent: fn(&R) -> Option<&'static str>,
+}
+
+/// Of what a quantity that is watched is told, and how it is judged.
+pub enum Watched<R: Rig> {
+    /// Of what the law works on, and not of the truth: constant in a sound loop. Its drift relative to its first values is
+    /// judged.
+    Constant(fn(&R, &Estimate<R>) -> f64),
+    /// Of what the law works on: small in a sound loop.
+    Small(fn(&R, &Estimate<R>) -> f64),
+    /// Of a command, if that tells it: small in a sound loop.
+    Commanded(fn(&Command<R>) -> Option<f64>),
 }
 
 /// The observed body's entry of a list, and another one's unless that is the same.
@@ -293,7 +326,7 @@ impl<const N: usize> FilterDesign<N> {
     ) -> Option<Self> {
         let keys = ["observer.decay_rate_per_s", "observer.bandwidth_rad_s", &format!("observer.{}", density.0)];
         for (key, values) in [(keys[0], &decay), (keys[1], &bandwidth)] {
-            values.iter().flatten().for_each(|value| finite_positive(checks, key, *value));
+            values.iter().flatten().for_each(|value| checks.positive(key, *value));
         }
         checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], || {
             "a density below zero is none; give 0 for a perfect model, or more".to_owned()

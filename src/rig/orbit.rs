@@ -12,10 +12,11 @@ pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, FleetTruth, NoFleet, Rig, Start, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, FleetTruth, Graph, Monitor, NoFleet,
+    Picture, Plane, Rig, Start, Watched, pair,
 };
 use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold, Watched};
+use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
 use crate::sample::{OrbitEstimate, OrbitTruth, status};
@@ -114,7 +115,7 @@ impl OrbitRig {
         let (reference, body) = self.first_seen(index);
         let margin = law.margin(&reference, &body);
         CertificateReport {
-            body: self.bodies[index].name.clone(),
+            body: self.bodies[index].name.to_string(),
             conditions: vec![
                 condition("sampled loop: stability limit > |z| of the slowest mode", certificate.sampled),
                 condition("thrust limit > thrust asked for at the start, as the law sees it, du/s^2", margin),
@@ -157,6 +158,35 @@ impl OrbitRig {
     }
 }
 
+/// What the controller can watch: orbital energy per mass, du²/s², and angular momentum per mass, du²/s, of a free leader.
+const MONITORS: [Monitor<OrbitRig>; 2] = [
+    Monitor {
+        name: "energy_drift",
+        of: Watched::Constant(|rig, estimate| rig.field.energy(&estimated(estimate))),
+        absent: OrbitRig::no_constant,
+    },
+    Monitor {
+        name: "momentum_drift",
+        of: Watched::Constant(|_, estimate| estimated(estimate).momentum()),
+        absent: OrbitRig::no_constant,
+    },
+];
+
+fn estimated(estimate: &OrbitEstimate) -> OrbitState {
+    let [vr, vtheta] = estimate.velocity_du_s;
+    OrbitState { r: estimate.radius_du, vr, theta: estimate.angle_rad, vtheta }
+}
+
+impl OrbitRig {
+    /// Why energy and momentum are nothing to watch, if so.
+    fn no_constant(&self) -> Option<&'static str> {
+        let none = self.controller.is_none().then_some("is watched by the controller, and this scenario has none");
+        none.or(self.bodies[0]
+            .driven
+            .then_some("is not constant: thrust changes the energy and the momentum of the observed body"))
+    }
+}
+
 impl Rig for OrbitRig {
     type Body = OrbitPlant;
     type Estimator = OrbitObserver;
@@ -167,11 +197,13 @@ impl Rig for OrbitRig {
     type Fleet = NoFleet;
     const AXES: usize = 4;
     const NAMES: &'static [&'static str] = &["orbit-hold", "orbit-rendezvous"];
-    const TABLES: &'static [&'static str] =
-        &["central_body", "leader", "spacecraft", "observer", "controller", "limits"];
     const LISTS: &'static [&'static str] = &["follower"];
     const CONTROLLED: &'static [&'static str] = &["radius_du", "velocity_du_s"];
     const FREE: Option<&'static str> = Some("angle_rad");
+
+    fn tables() -> Vec<&'static str> {
+        vec!["central_body", "leader", "spacecraft", "observer", "controller", "limits"]
+    }
 
     fn resolve(
         name: &str,
@@ -224,23 +256,8 @@ impl Rig for OrbitRig {
         self.limits.figures()
     }
 
-    /// \[orbital energy per mass, du²/s²; angular momentum per mass, du²/s\] of a free leader.
-    fn invariants(&self, estimate: &OrbitEstimate) -> Option<[f64; 2]> {
-        let [vr, vtheta] = estimate.velocity_du_s;
-        let state = OrbitState { r: estimate.radius_du, vr, theta: estimate.angle_rad, vtheta };
-        (!self.bodies[0].driven).then(|| [self.field.energy(&state), state.momentum()])
-    }
-
-    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
-        match watched {
-            _ if self.controller.is_none() => Some("is watched by the controller, and this scenario has none"),
-            Watched::Energy | Watched::Momentum if self.bodies[0].driven => {
-                Some("is not constant: thrust changes the energy and the momentum of the observed body")
-            }
-            Watched::Energy | Watched::Momentum => None,
-            Watched::Innovation => Some("is not published by the observer of this rig"),
-            Watched::Lyapunov => Some("is not published by the controller of this rig"),
-        }
+    fn monitors() -> &'static [Monitor<Self>] {
+        &MONITORS
     }
 
     fn law(&self, _index: usize) -> OrbitLaw {
@@ -250,10 +267,10 @@ impl Rig for OrbitRig {
         OrbitLaw::new(controller.law, self.aim)
     }
 
-    fn metrics(&self) -> &'static [&'static str] {
+    fn metrics(&self) -> Vec<&'static str> {
         match self.controller {
-            Some(_) => &["radius_error_du", "velocity_error_du_s", "estimate_error_du_s"],
-            None => &["estimate_error_du_s"],
+            Some(_) => vec!["radius_error_du", "velocity_error_du_s", "estimate_error_du_s"],
+            None => vec!["estimate_error_du_s"],
         }
     }
 
@@ -330,6 +347,50 @@ impl Rig for OrbitRig {
             rig.initial_guess = Vector2::new(vr + 0.6 * off, vtheta - 0.9 * off);
         }
         Some(rig)
+    }
+
+    /// \[S\] Fig. 1, the motion in the plane, and Fig. 2, states and controls over time.
+    fn pictures() -> Vec<Picture> {
+        let graph = |field, element, axis: &str, caption: &str| {
+            let (title, axis, caption) = (format!("{axis} over time"), axis.to_owned(), caption.to_owned());
+            Picture::Graph(Graph { title, field, element, axis, caption })
+        };
+        vec![
+            Picture::Plane(Plane {
+                title: "motion in the plane",
+                axes: ["x, du", "y, du"],
+                caption: "Paths in the plane; the cross is the central body, a dot is where a path begins.",
+                point: |of| {
+                    let (r, angle) = (of("radius_du", 0)?, of("angle_rad", 0)?);
+                    Some([r * angle.cos(), r * angle.sin()])
+                },
+                centred: true,
+                compared: Some(
+                    "Motion in the plane, as Fig. 1 of [S]: with full state in black, computed for this report from the same \
+                     scenario; with the observer in blue, as recorded. The cross is the central body.",
+                ),
+            }),
+            Picture::Plane(Plane {
+                title: "velocities in the plane Vr Vθ",
+                axes: ["Vr, du/s", "Vθ, du/s"],
+                caption: "Velocity as it was, and as the observer saw it, which begins at its guess.",
+                point: |of| Some([of("velocity_du_s", 0)?, of("velocity_du_s", 1)?]),
+                centred: false,
+                compared: None,
+            }),
+            graph("radius_du", 0, "r, du", "Distance from the centre."),
+            graph("velocity_du_s", 0, "Vr, du/s", "Radial velocity."),
+            graph("velocity_du_s", 1, "Vθ, du/s", "Transverse velocity."),
+            graph("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
+            graph("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
+            graph("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
+        ]
+    }
+
+    /// The same spacecraft with its law given the true velocity, \[S\] Fig. 1.
+    fn counterpart(&self) -> &'static [&'static str] {
+        let estimate = self.controller.is_some() && matches!(self.aim, Aim::Circle { full_state: false, .. });
+        if estimate { &["controller.feedback=full-state"] } else { &[] }
     }
 
     fn notes(&self) -> Vec<String> {
@@ -419,7 +480,7 @@ mod tests {
         let scenario = Scenario::parse(LOW_ORBIT, "test", &[]).unwrap();
         assert_eq!(scenario.rig.roles(), ["leader", "observer"]);
         let rig = scenario.rig.downcast_ref::<OrbitRig>().unwrap();
-        assert_eq!((rig.metrics(), rig.certificates().len()), (&["estimate_error_du_s"][..], 0));
+        assert_eq!((rig.metrics(), rig.certificates().len()), (vec!["estimate_error_du_s"], 0));
         let (mut body, mut observer, mut guard) = (rig.body(0), rig.estimator(), rig.measurement_guard(0, false));
         let (mut measurement, mut truth, mut estimate) = Default::default();
         let mut errors = [0.0];

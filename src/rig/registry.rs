@@ -7,10 +7,10 @@ use crate::config::{Checks, ConfigError, Document, nearest};
 use std::sync::OnceLock;
 
 /// A rig that scenarios may name.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 pub struct RigKind {
     names: &'static [&'static str],
-    tables: &'static [&'static str],
+    tables: Vec<&'static str>,
     lists: &'static [&'static str],
     resolve: fn(&str, &Document, Context, &mut Checks<'_>) -> Resolved,
 }
@@ -25,7 +25,7 @@ impl RigKind {
             let (rig, table) = R::resolve(name, sections, context, checks)?;
             Ok((rig.map(AnyRig::new), table))
         };
-        Self { names: R::NAMES, tables: R::TABLES, lists: R::LISTS, resolve }
+        Self { names: R::NAMES, tables: R::tables(), lists: R::LISTS, resolve }
     }
 }
 
@@ -36,14 +36,19 @@ pub fn register(kinds: Vec<RigKind>) -> bool {
     KINDS.set(kinds).is_ok()
 }
 
+/// The rigs of this crate, compiled with it: a program that names them so does not compile them once more.
+pub fn shipped() -> Vec<RigKind> {
+    vec![RigKind::of::<RigidBodyRig>(), RigKind::of::<OrbitRig>()]
+}
+
 /// The rigs of this program: those of this crate where none were registered.
 fn kinds() -> &'static [RigKind] {
-    KINDS.get_or_init(|| vec![RigKind::of::<RigidBodyRig>(), RigKind::of::<OrbitRig>()])
+    KINDS.get_or_init(shipped)
 }
 
 /// The keys of tables that belong to a rig, whichever it is: those that hold one table.
 pub(crate) fn tables() -> Vec<&'static str> {
-    kinds().iter().flat_map(|kind| kind.tables).copied().collect()
+    kinds().iter().flat_map(|kind| &kind.tables).copied().collect()
 }
 
 /// The same, and those that hold a list of tables.

@@ -14,14 +14,16 @@ pub trait Estimator {
     type Estimate: Sample;
 
     /// Whether a measurement has every component the estimator needs, all finite.
-    fn usable(&self, measurement: &Self::Measurement) -> bool;
+    fn usable(&self, measurement: &Self::Measurement) -> bool {
+        measurement.finite()
+    }
     /// Forgets the past and starts at the configured guess, with `measurement` as the first.
     fn start(&mut self, measurement: &Self::Measurement);
     /// Learns from a measurement `dt_s` seconds after the last one learned from. `dt_s` is positive.
     fn update(&mut self, measurement: &Self::Measurement, dt_s: f64);
     /// Goes on by the model alone for `dt_s` seconds, or stays where there is none. The next update is still one from the
     /// last measurement learned from.
-    fn coast(&mut self, dt_s: f64);
+    fn coast(&mut self, _dt_s: f64) {}
     /// Writes the estimate, with the given further status bits, everything but the stamp.
     fn write(&self, status: u64, out: &mut Self::Estimate);
 
@@ -34,6 +36,40 @@ pub trait Estimator {
 }
 
 /// An estimator with its memory of which measurement it learned from last.
+///
+/// A role is a plain state machine: samples in, samples out, the time in their stamps.
+///
+/// ```
+/// use corotate::nalgebra::Vector1;
+/// use corotate::observe::Increment;
+/// use corotate::role::{InvariantRelation, Observer, RelationObserver};
+///
+/// corotate::sample! { Position = "doc/Position/v1" { position_m: f64, } }
+/// corotate::sample! { Velocity = "doc/Velocity/v1" { velocity_m_s: f64, status: u64, } }
+///
+/// /// ∫v dt = Δx: a velocity that is not measured.
+/// struct Uniform;
+/// impl InvariantRelation<1> for Uniform {
+///     type Measurement = Position;
+///     type Estimate = Velocity;
+///     fn increment(&self, last: &Position, now: &Position, dt_s: f64) -> Increment<1> {
+///         let way = Vector1::new(now.position_m - last.position_m);
+///         Increment::exact(way, dt_s, Vector1::zeros(), Vector1::zeros())
+///     }
+///     fn write(&self, _: &Position, velocity: &Vector1<f64>, status: u64, out: &mut Velocity) {
+///         (out.velocity_m_s, out.status) = (velocity.x, status);
+///     }
+/// }
+///
+/// let mut observer = Observer::new(RelationObserver::new(Uniform, [5.0], [0.0]), 0.01);
+/// let (mut measurement, mut estimate) = (Position::default(), Velocity::default());
+/// for tick in (0..1000).filter(|tick| tick % 7 != 3) {
+///     measurement.stamp.tick = tick; // every seventh is missing, and only a longer step
+///     measurement.position_m = 2.0 * tick as f64 * 0.01;
+///     observer.step(&measurement, &mut estimate);
+/// }
+/// assert!((estimate.velocity_m_s - 2.0).abs() < 1e-12);
+/// ```
 #[derive(Debug)]
 pub struct Observer<E> {
     estimator: E,

@@ -434,7 +434,10 @@ pub fn report(
         ticks: ticks.report(),
         written,
         read,
-        watchdog: watchdog.and_then(|watchdog| WatchReport::of(&watchdog)),
+        watchdog: watchdog.and_then(|watchdog| {
+            let names: Vec<&str> = scenario.rig.monitors().into_iter().map(|(name, _)| name).collect();
+            WatchReport::of(&watchdog, &names)
+        }),
         stages,
         grants,
         line: None,

@@ -120,6 +120,16 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     /// The fields after the stamp, in order.
     const FIELDS: &'static [Field];
 
+    /// Whether all of its numbers are numbers, and finite.
+    fn finite(&self) -> bool {
+        let words = self.words();
+        let mut numbers = Self::FIELDS.iter().filter(|field| field.kind == FieldKind::F64);
+        let finite = |field: &Field| {
+            words[field.offset / 8..].iter().take(field.count).all(|word| f64::from_bits(*word).is_finite())
+        };
+        numbers.all(finite)
+    }
+
     /// Takes over everything but the stamp from the bytes that [`content`](Message::content) gave elsewhere; false, and
     /// nothing changed, if they are not as many.
     fn set_content(&mut self, content: &[u8]) -> bool {
@@ -149,12 +159,33 @@ pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
     }
 }
 
-/// Defines a sample. `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8.
+/// Defines a sample: its name, its type name with a version, and its fields, of `f64`, `u64` or arrays of them.
+///
+/// `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8. A field's unit is the last
+/// part of its name.
+///
+/// ```
+/// corotate::sample! {
+///     /// What a motor's sensors report.
+///     MotorMeasurement = "motor/Measurement/v1" {
+///         /// Angular velocity, rad/s.
+///         speed_rad_s: f64,
+///         /// The bits of [`corotate::sample::status`].
+///         status: u64,
+///     }
+/// }
+///
+/// use corotate::sample::Sample;
+/// assert_eq!(MotorMeasurement::FIELDS[0].name, "speed_rad_s");
+/// assert_eq!(size_of::<MotorMeasurement>(), 32 + 16);
+/// ```
+#[macro_export]
 macro_rules! sample {
     ($(#[$doc:meta])* $name:ident = $type_name:literal { $($(#[$field_doc:meta])* $field:ident: $ty:ty,)+ }) => {
         $(#[$doc])*
         #[repr(C)]
-        #[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+        #[derive(Debug, Clone, Copy, Default, PartialEq, $crate::bytemuck::Pod, $crate::bytemuck::Zeroable)]
+        #[bytemuck(crate = "corotate::bytemuck")]
         pub struct $name {
             /// When, in which life of the sender, and for which tick.
             pub stamp: $crate::sample::Stamp,
@@ -171,6 +202,13 @@ macro_rules! sample {
             },)+];
         }
 
+        impl $crate::state::Persist for $name {
+            #[inline]
+            fn persist<W: $crate::state::Words>(&mut self, words: &mut W) {
+                $crate::sample::Message::words_mut(self).iter_mut().for_each(|word| words.word(word));
+            }
+        }
+
         impl $crate::sample::Message for $name {
             #[inline]
             fn stamp(&self) -> &$crate::sample::Stamp {
@@ -184,12 +222,12 @@ macro_rules! sample {
 
             #[inline]
             fn words(&self) -> &[u64] {
-                bytemuck::cast_slice(core::slice::from_ref(self))
+                $crate::bytemuck::cast_slice(core::slice::from_ref(self))
             }
 
             #[inline]
             fn words_mut(&mut self) -> &mut [u64] {
-                bytemuck::cast_slice_mut(core::slice::from_mut(self))
+                $crate::bytemuck::cast_slice_mut(core::slice::from_mut(self))
             }
         }
 
@@ -200,7 +238,7 @@ macro_rules! sample {
         };
     };
 }
-pub(crate) use sample;
+pub use crate::sample;
 
 /// Bits of a sample's status word.
 pub mod status {

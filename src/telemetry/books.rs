@@ -4,7 +4,7 @@
 
 use super::ledger::Ledger;
 use super::{LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
-use crate::control::{Breaches, WatchBounds, Watchdog, Watched};
+use crate::control::{Breaches, Watchdog};
 use crate::state::persist_fields;
 
 /// The counters of a role's ticks.
@@ -241,17 +241,16 @@ impl ReadBook {
 }
 
 impl WatchReport {
-    /// What a watchdog has seen; nothing where nothing is watched.
-    pub fn of(watchdog: &Watchdog) -> Option<Self> {
-        let bounds: &WatchBounds = watchdog.bounds();
-        let one = |watched: Watched| {
-            let Breaches { judged, count, first_tick, largest } = watchdog.breaches()[watched as usize];
-            let (quantity, max) = (watched.name().to_owned(), bounds.max[watched as usize]);
+    /// What a watchdog has seen of its quantities, by their names; nothing where nothing is watched.
+    pub fn of(watchdog: &Watchdog, names: &[&str]) -> Option<Self> {
+        let quantities = names.iter().zip(watchdog.bounds().max).zip(watchdog.breaches());
+        let one = |((name, max), breaches): ((&&str, f64), &Breaches)| {
+            let Breaches { judged, count, first_tick, largest } = *breaches;
             let largest = Some(largest).filter(|largest| largest.is_finite());
+            let quantity = (*name).to_owned();
             WatchedReport { quantity, max, judged, breaches: count, first_tick, largest }
         };
-        let watched = |watched: &Watched| bounds.max[*watched as usize] < f64::INFINITY;
-        let reports: Vec<WatchedReport> = Watched::ALL.into_iter().filter(watched).map(one).collect();
-        (!reports.is_empty()).then(|| Self { watched: reports, latched_at_tick: watchdog.latched_at() })
+        let watched: Vec<_> = quantities.filter(|((_, max), _)| *max < f64::INFINITY).map(one).collect();
+        (!watched.is_empty()).then(|| Self { watched, latched_at_tick: watchdog.latched_at() })
     }
 }

@@ -18,6 +18,8 @@ pub const WATCHDOG: Duration = Duration::from_secs(300);
 pub struct Bench {
     directory: tempfile::TempDir,
     runtime: tempfile::TempDir,
+    /// The program that it runs.
+    program: PathBuf,
     /// The user to run as, if not this one.
     user: Option<u32>,
 }
@@ -40,9 +42,14 @@ pub struct Done {
 
 impl Bench {
     pub fn new() -> Self {
+        Self::of(Path::new(env!("CARGO_BIN_EXE_corotate")))
+    }
+
+    /// A bench of another program that is corotate with other rigs.
+    pub fn of(program: &Path) -> Self {
         // Socket names limit the length of the runtime directory's path.
         let runtime = tempfile::Builder::new().prefix("ct").rand_bytes(6).tempdir_in("/tmp").unwrap();
-        Self { directory: tempfile::tempdir().unwrap(), runtime, user: None }
+        Self { directory: tempfile::tempdir().unwrap(), runtime, program: program.to_owned(), user: None }
     }
 
     /// A bench whose programs run as `nobody` where this process is root.
@@ -54,7 +61,8 @@ impl Bench {
                 std::os::unix::fs::chown(directory.path(), Some(NOBODY), Some(NOBODY)).unwrap();
             }
             // The build's own directory may be closed to others.
-            std::fs::copy(env!("CARGO_BIN_EXE_corotate"), bench.path("corotate")).unwrap();
+            std::fs::copy(&bench.program, bench.path("corotate")).unwrap();
+            bench.program = bench.path("corotate");
             bench.user = Some(NOBODY);
         }
         bench
@@ -70,10 +78,7 @@ impl Bench {
     }
 
     pub fn command(&self) -> Command {
-        self.command_of(&match self.user {
-            Some(_) => self.path("corotate"),
-            None => env!("CARGO_BIN_EXE_corotate").into(),
-        })
+        self.command_of(&self.program)
     }
 
     /// A command in this bench by another program than ours.
@@ -280,11 +285,17 @@ pub fn python() -> PathBuf {
     PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
 }
 
+/// A writer of chunks of the kind that the program writes.
+fn rewriter(to: &Path) -> mcap::Writer<std::io::BufWriter<std::fs::File>> {
+    let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Lz4));
+    options.create(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap()
+}
+
 /// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick.
 pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
     let bytes = std::fs::read(from).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
-    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    let mut writer = rewriter(to);
     for index in &summary.metadata_indexes {
         writer.write_metadata(&mcap::read::metadata(&bytes, index).unwrap()).unwrap();
     }
@@ -307,7 +318,7 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
 pub fn rewrite_metadata(from: &Path, to: &Path, change: impl Fn(&str, &mut BTreeMap<String, String>)) {
     let bytes = std::fs::read(from).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
-    let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap();
+    let mut writer = rewriter(to);
     for index in &summary.metadata_indexes {
         let mut metadata = mcap::read::metadata(&bytes, index).unwrap();
         metadata.metadata.remove("checksum");

@@ -179,6 +179,8 @@ class Reader:
 class Body:
     """A rigid body under a held acceleration: Euler's equations in principal axes."""
 
+    RIG = "rigid-body"
+
     def __init__(self, scenario, name):
         own = next(follower for follower in scenario["follower"] if follower["name"] == name)
         self.factor = own["inertia_factor"]
@@ -187,6 +189,22 @@ class Body:
         self.rate = tuple(own["initial_rate_rad_s"])
         #: What the last command asked for, rad/s²: torque over the nominal inertia.
         self.asked = (0.0, 0.0, 0.0)
+
+    def apply(self, command):
+        """Takes what a command asks for; False, and nothing changed, if that is no number."""
+        usable = all(map(math.isfinite, command.acceleration_rad_s2))
+        if usable:
+            self.asked = tuple(command.acceleration_rad_s2)
+        return usable
+
+    def apply_safe(self):
+        self.asked = (0.0, 0.0, 0.0)
+
+    def measured(self):
+        return {"omega_rad_s": self.rate, "applied_rad_s2": self.asked, "valid": 0b111}
+
+    def truth(self):
+        return {"omega_rad_s": self.rate, "applied_rad_s2": self.acceleration()}
 
     def acceleration(self):
         return tuple(asked / factor for asked, factor in zip(self.asked, self.factor))
@@ -228,14 +246,16 @@ class Actuator:
 
     def take(self, command):
         """Decides the input of a tick: its command, or none. True if one was due and did not come, or is not believed."""
-        self.rejected = command is not None and not all(map(math.isfinite, command.acceleration_rad_s2))
+        latched = self.safe and self.latches
+        self.rejected = command is not None and not latched and not self.body.apply(command)
         if command is None or self.rejected:
             self.silent_ticks += 1
             if not self.safe and self.silent_ticks >= self.timeout_ticks:
-                self.safe, self.body.asked = True, (0.0, 0.0, 0.0)
+                self.safe = True
+                self.body.apply_safe()
             return True
-        if not (self.safe and self.latches):
-            self.body.asked, self.silent_ticks, self.safe = tuple(command.acceleration_rad_s2), 0, False
+        if not latched:
+            self.silent_ticks, self.safe = 0, False
         return False
 
     def status(self):
@@ -248,20 +268,20 @@ class Actuator:
 class Follower:
     """The role: its links, its ticks, its books."""
 
-    def __init__(self, path, terminated, silent):
+    def __init__(self, path, terminated, silent, body):
         with open(path, encoding="utf-8") as file:
             self.seat = seat = json.load(file)
         self.path, self.terminated, self.silent = path, terminated, silent
         if seat["schema"] != "corotate/seat/v1" or seat["kind"] != "plant" or not seat["reads"]:
             raise SeatError(f"{seat['role']} is no driven body described by corotate/seat/v1")
-        if seat["scenario"]["rig"] != "rigid-body":
-            raise SeatError(f"this program is a rigid body, and the rig is {seat['scenario']['rig']}")
+        if seat["scenario"]["rig"] != body.RIG:
+            raise SeatError(f"this program is of the rig {body.RIG}, and the run's is {seat['scenario']['rig']}")
         self.transport = Transport(seat["transport"], seat["role"])
         try:
             self.open_links()
         except Exception as error:  # iceoryx2's errors have no ancestor of their own
             raise SeatError(f"cannot open the links of {seat['role']}: {error!r}; is the seat taken?") from error
-        self.body = Body(seat["scenario"], seat["role"])
+        self.body = body(seat["scenario"], seat["role"])
         self.actuator = Actuator(self.body, seat)
         self.period_ns, self.last_tick = seat["period_ns"], seat["last_tick"]
         self.timed = seat["clock"] == "realtime"
@@ -372,17 +392,16 @@ class Follower:
                 self.ticks["starved"] += 1
                 self.disturbed(tick)
         self.ticks["safe"] += self.actuator.safe
-        self.publish(self.measurement, applied_rad_s2=self.body.asked, valid=0b111)
-        self.publish(self.truth, applied_rad_s2=self.body.acceleration())
+        self.publish(self.measurement, self.body.measured())
+        self.publish(self.truth, self.body.truth())
         self.body.flow(self.period_ns / 1e9)
         self.ticks["executed"] += 1
         self.next_tick += 1
 
-    def publish(self, writer, **values):
+    def publish(self, writer, values):
         sample = writer.sample
         sample.tick, sample.generation = self.next_tick, 1
         sample.origin_ns = self.epoch_ns + self.next_tick * self.period_ns
-        sample.omega_rad_s = self.body.rate
         sample.status = self.actuator.status()
         for name, value in values.items():
             setattr(sample, name, value)
@@ -481,7 +500,7 @@ def forget(transport):
         pass  # Other runs live there.
 
 
-def main():
+def main(body=Body):
     parser = argparse.ArgumentParser(description="A follower in a seat of a corotate run.")
     parser.add_argument("seat", help="the seat's description, as the waiting run prints its path")
     parser.add_argument("--record", metavar="DIR", help="leave every sample published and received there")
@@ -491,7 +510,7 @@ def main():
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _frame: terminated.append(number))
     try:
-        follower = Follower(arguments.seat, terminated, arguments.silent)
+        follower = Follower(arguments.seat, terminated, arguments.silent, body)
         if arguments.record:
             follower.record()
         # What is made from now on is freed by reference counts; a collection would cost ticks.

@@ -3,7 +3,7 @@
 //! Must not refuse what the model itself holds possible: the region between central body and escape.
 
 use super::roles::{POSITION, VELOCITY};
-use crate::config::{Checks, finite_positive};
+use crate::config::Checks;
 use crate::model::{CentralField, OrbitState};
 use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible};
@@ -67,7 +67,7 @@ impl Limits {
         let circle = target.map_or(0.0, |radius| field.circular_velocity(radius));
         let initial = states.iter().map(speed).fold(0.0, f64::max);
         if let Some(limit) = raw.speed_du_s {
-            finite_positive(checks, "limits.speed_du_s", limit);
+            checks.positive("limits.speed_du_s", limit);
             checks.require(limit > initial.max(circle), "limits.speed_du_s", || {
                 format!(
                     "{limit} is not above the {:.3} du/s that a body has or is to have; raise it",

@@ -176,7 +176,7 @@ pub(super) fn hold(
     let initial = vec![OrbitState::from(&raw.spacecraft)];
     let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
     let rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "spacecraft".to_owned(), driven: true, fleet: None }],
+        bodies: vec![BodyInfo { name: "spacecraft".into(), driven: true, fleet: None }],
         field,
         initial,
         limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, context),
@@ -216,7 +216,7 @@ pub(super) fn rendezvous(
     initial.extend(raw.follower.iter().map(OrbitState::from));
     let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
     let mut rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
+        bodies: vec![BodyInfo { name: "leader".into(), driven: false, fleet: None }],
         field,
         initial,
         limits: limits(field, speed, &raw.observer, &sensors[0], thrust_max, &raw.limits, context),
@@ -228,7 +228,7 @@ pub(super) fn rendezvous(
         tick_s: context.tick_s,
     };
     for follower in &raw.follower {
-        rig.bodies.push(BodyInfo { name: follower.name.clone(), driven: true, fleet: None });
+        rig.bodies.push(BodyInfo { name: follower.name.clone().into(), driven: true, fleet: None });
         rig.sensors.push(sensor(context, rig.sensors.len() as u64, &follower.noise, &follower.bias));
     }
     if sound {

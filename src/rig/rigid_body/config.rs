@@ -1,7 +1,7 @@
 //! The sections of a scenario that belong to this rig: as typed, with their checks.
 
 use super::limits::RawLimits;
-use crate::config::{Checks, finite_positive};
+use crate::config::Checks;
 use crate::rig::check_name;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -175,7 +175,7 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
         (Some(_), true) => checks.refuse("controller", "has no follower to drive; add a [[follower]] or remove it"),
         (Some(controller), false) => {
             for (axis, gain) in controller.gain_per_s.into_iter().enumerate() {
-                finite_positive(checks, &format!("controller.gain_per_s[{axis}]"), gain);
+                checks.positive(&format!("controller.gain_per_s[{axis}]"), gain);
             }
             checks.require(controller.adaptation_gain >= 0.0, "controller.adaptation_gain", || {
                 format!("{} is below zero and would unlearn; give 0 or more", controller.adaptation_gain)
@@ -186,7 +186,7 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
 }
 
 fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
-    finite_positive(checks, "observer.observability_floor_rad_s", observer.observability_floor_rad_s);
+    checks.positive("observer.observability_floor_rad_s", observer.observability_floor_rad_s);
     let (learns, symmetric) = (observer.kind != Kind::HiddenRate, observer.kind == Kind::AxisymmetricInertia);
     let identifier = observer.identifier_decay.is_some() || observer.identifier_bandwidth.is_some();
     for (key, given, needed) in [
@@ -200,10 +200,10 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
         }
     }
     if let Some(IdentifierDecay::Rates(rates)) = &observer.identifier_decay {
-        rates.iter().for_each(|rate| finite_positive(checks, "observer.identifier_decay", *rate));
+        rates.iter().for_each(|rate| checks.positive("observer.identifier_decay", *rate));
     }
     if let Some(bandwidth) = &observer.identifier_bandwidth {
-        bandwidth.iter().for_each(|value| finite_positive(checks, "observer.identifier_bandwidth", *value));
+        bandwidth.iter().for_each(|value| checks.positive("observer.identifier_bandwidth", *value));
         checks.require(observer.identifier_decay.is_none(), "observer.identifier_bandwidth", || {
             "is of second order, and observer.identifier_decay of first; give one of them".to_owned()
         });
@@ -226,7 +226,7 @@ fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
         check_name(checks, &key, name, followers[..index].iter().map(|other| other.name.as_str()));
         check_noise(checks, &format!("follower[{index}]"), &follower.noise_rad_s);
         for factor in follower.inertia_factor {
-            finite_positive(checks, &format!("follower[{index}].inertia_factor"), factor);
+            checks.positive(&format!("follower[{index}].inertia_factor"), factor);
         }
     }
 }

@@ -4,7 +4,7 @@
 
 use super::MAX_TURN_RAD;
 use super::observer::ALL;
-use crate::config::{Checks, finite_positive};
+use crate::config::Checks;
 use crate::model::RigidBody;
 use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible, Pursuit};
@@ -70,7 +70,7 @@ impl Limits {
         for (key, value) in
             [("limits.rate_rad_s", raw.rate_rad_s), ("limits.acceleration_rad_s2", raw.acceleration_rad_s2)]
         {
-            value.iter().for_each(|value| finite_positive(checks, key, *value));
+            value.iter().for_each(|value| checks.positive(key, *value));
         }
         let fastest_rad_s = about.leader_rad_s.max(about.follower_rad_s);
         if let Some(rate_rad_s) = raw.rate_rad_s {

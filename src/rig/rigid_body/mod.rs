@@ -21,10 +21,11 @@ pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Rig, Start, UNKNOWN_DEVIATION, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, Inputs, Lyapunov, Monitor,
+    Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
 };
 use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer, Watched};
+use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{HiddenRate, RateNoise};
 use crate::sample::{FleetTruth, RateCommand, RateEstimate, RateTruth, status};
@@ -192,6 +193,52 @@ impl RigidBodyRig {
     }
 }
 
+impl RigidBodyRig {
+    /// Why nothing can be watched, if so.
+    fn uncontrolled(&self) -> Option<&'static str> {
+        self.controller.is_none().then_some("is watched by the controller, and this scenario has none")
+    }
+}
+
+/// What the controller can watch. Energy and momentum are per I1, which is what a free motion tells of the inertia.
+const MONITORS: [Monitor<RigidBodyRig>; 4] = [
+    Monitor {
+        name: "energy_drift",
+        of: Watched::Constant(|_, estimate: &RateEstimate| {
+            0.5 * Vector3::from(estimate.omega_rad_s).dot(&momentum(estimate))
+        }),
+        absent: RigidBodyRig::uncontrolled,
+    },
+    Monitor {
+        name: "momentum_drift",
+        of: Watched::Constant(|_, estimate| momentum(estimate).norm()),
+        absent: RigidBodyRig::uncontrolled,
+    },
+    Monitor {
+        name: "innovation_rad_s",
+        of: Watched::Small(|_, estimate: &RateEstimate| estimate.innovation_rad_s),
+        absent: |rig| {
+            let kalman = matches!(rig.observer, ObserverDesign::Hidden { filter: FilterDesign::Kalman(_), .. });
+            rig.uncontrolled().or(kalman.then_some("is not published by the Kalman filter"))
+        },
+    },
+    Monitor {
+        name: "lyapunov_rad2_s2",
+        of: Watched::Commanded(|command| RigidBodyRig::lyapunov(command).map(|(v, _)| v)),
+        absent: |rig| {
+            let fleets = rig.bodies[1..].iter().all(|body| body.fleet.is_some());
+            let second = rig.certificate.is_none().then_some("is published with the first-order filter only");
+            rig.uncontrolled().or(second).or(fleets.then_some("is not published for a fleet"))
+        },
+    },
+];
+
+/// The angular momentum per I1 in the body's axes, as estimated.
+fn momentum(estimate: &RateEstimate) -> Vector3<f64> {
+    let [second, third] = estimate.inertia_ratios;
+    Vector3::from(estimate.omega_rad_s).component_mul(&Vector3::new(1.0, second, third))
+}
+
 impl Rig for RigidBodyRig {
     type Body = RatePlant;
     type Estimator = RateObserver;
@@ -202,9 +249,12 @@ impl Rig for RigidBodyRig {
     type Fleet = RateFleet;
     const AXES: usize = 3;
     const NAMES: &'static [&'static str] = &["rigid-body"];
-    const TABLES: &'static [&'static str] = &["leader", "observer", "controller", "limits"];
     const LISTS: &'static [&'static str] = &["follower"];
     const CONTROLLED: &'static [&'static str] = &["omega_rad_s", "coefficients"];
+
+    fn tables() -> Vec<&'static str> {
+        vec!["leader", "observer", "controller", "limits"]
+    }
 
     fn resolve(
         _name: &str,
@@ -291,40 +341,15 @@ impl Rig for RigidBodyRig {
         self.limits.figures()
     }
 
-    /// Both per I1, which is what a free motion tells of the inertia: [kinetic energy, rad²/s²; momentum, rad/s].
-    fn invariants(&self, estimate: &RateEstimate) -> Option<[f64; 2]> {
-        let ([second, third], rate) = (estimate.inertia_ratios, Vector3::from(estimate.omega_rad_s));
-        let momentum = rate.component_mul(&Vector3::new(1.0, second, third));
-        Some([0.5 * rate.dot(&momentum), momentum.norm()])
+    fn monitors() -> &'static [Monitor<Self>] {
+        &MONITORS
     }
 
-    fn innovation(estimate: &RateEstimate) -> f64 {
-        estimate.innovation_rad_s
-    }
-
-    fn unwatched(&self, watched: Watched) -> Option<&'static str> {
-        let silent = match &self.observer {
-            ObserverDesign::Hidden { filter: FilterDesign::Kalman(_), .. } => watched == Watched::Innovation,
-            _ => false,
-        };
-        if self.controller.is_none() {
-            Some("is watched by the controller, and this scenario has none")
-        } else if silent {
-            Some("is not published by the Kalman filter")
-        } else if watched == Watched::Lyapunov && self.certificate.is_none() {
-            Some("is published with the first-order filter only")
-        } else if watched == Watched::Lyapunov && self.bodies[1..].iter().all(|body| body.fleet.is_some()) {
-            Some("is not published for a fleet")
-        } else {
-            None
-        }
-    }
-
-    fn metrics(&self) -> &'static [&'static str] {
+    fn metrics(&self) -> Vec<&'static str> {
         match (&self.observer, self.controller) {
-            (ObserverDesign::Hidden { .. }, _) => &["sync_error_rad_s", "estimate_error_rad_s"],
-            (_, Some(_)) => &["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"],
-            (_, None) => &["coefficient_error"],
+            (ObserverDesign::Hidden { .. }, _) => vec!["sync_error_rad_s", "estimate_error_rad_s"],
+            (_, Some(_)) => vec!["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"],
+            (_, None) => vec!["coefficient_error"],
         }
     }
 
@@ -353,7 +378,7 @@ impl Rig for RigidBodyRig {
         let estimate_error = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);
         let coefficients = estimate.map(|estimate| Vector3::from(estimate.coefficients));
         for (value, metric) in out.iter_mut().zip(self.metrics()) {
-            *value = match *metric {
+            *value = match metric {
                 "sync_error_rad_s" => worst,
                 "estimate_error_rad_s" => estimate_error,
                 _ => distance(coefficients, Some(self.inertia.coefficients())),
@@ -391,6 +416,42 @@ impl Rig for RigidBodyRig {
             }
         }
         Some(rig)
+    }
+
+    fn pictures() -> Vec<Picture> {
+        let plane = |title, axes, point| {
+            let caption = "Angular velocity in a plane. A dot is where a path begins.";
+            Picture::Plane(Plane { title, axes, caption, point, centred: false, compared: None })
+        };
+        let graph = |axis: usize| {
+            Picture::Graph(Graph {
+                title: format!("angular velocity about axis {axis} over time"),
+                field: "omega_rad_s",
+                element: axis - 1,
+                axis: format!("ω{axis}, rad/s"),
+                caption: format!("Angular velocity ω{axis} in the body's axes."),
+            })
+        };
+        let inputs =
+            Inputs { field: "applied_rad_s2", axis: "control acceleration, rad/s²", components: &["u1", "u2", "u3"] };
+        vec![
+            plane("angular velocities in the plane ω1 ω2", ["ω1, rad/s", "ω2, rad/s"], |of| {
+                Some([of("omega_rad_s", 0)?, of("omega_rad_s", 1)?])
+            }),
+            plane("angular velocities in the plane ω2 ω3", ["ω2, rad/s", "ω3, rad/s"], |of| {
+                Some([of("omega_rad_s", 1)?, of("omega_rad_s", 2)?])
+            }),
+            graph(1),
+            graph(2),
+            graph(3),
+            Picture::Inputs(inputs),
+            Picture::Lyapunov(Lyapunov {
+                field: "lyapunov_rad2_s2",
+                axes: ["V, rad²/s²", "−dV/dt, rad²/s³"],
+                function: "V = ½(|e|² + ε²) of [D](15)",
+                bound: "the bound of [D](18)",
+            }),
+        ]
     }
 
     fn notes(&self) -> Vec<String> {
@@ -444,7 +505,7 @@ impl Rig for RigidBodyRig {
             );
         }
         let report = |body: &BodyInfo| CertificateReport {
-            body: body.name.clone(),
+            body: body.name.to_string(),
             conditions: conditions.clone(),
             continuous_rate_per_s: Some(certificate.rate_per_s),
             bounds: vec![Figure { name: "M >= |omega|, rad/s".to_owned(), value: certificate.rate_bound_rad_s }],

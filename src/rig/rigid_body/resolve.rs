@@ -34,7 +34,7 @@ pub(super) fn resolve(
     let observer = design_observer(&raw, &inertia, supplied_axis, context.tick_s, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
-        bodies: vec![BodyInfo { name: "leader".to_owned(), driven: false, fleet: None }],
+        bodies: vec![BodyInfo { name: "leader".into(), driven: false, fleet: None }],
         inertia,
         spreads: vec![Vector3::zeros()],
         seed: context.seed,
@@ -60,7 +60,7 @@ pub(super) fn resolve(
         checks.accept(&format!("follower[{index}].inertia_factor"), Inertia::new(own.into()));
         rig.initial_rates.push(follower.initial_rate_rad_s.into());
         rig.spreads.push(follower.spread_rad_s().into());
-        rig.bodies.push(BodyInfo { fleet: follower.fleet(), name: follower.name, driven: true });
+        rig.bodies.push(BodyInfo { fleet: follower.fleet(), name: follower.name.into(), driven: true });
         rig.inertia_factors.push(factor);
         rig.noise.push(noise(context, index as u64 + 1, follower.noise_rad_s, follower.bias_rad_s));
         rig.deviations_rad_s.push(follower.noise_rad_s.into());

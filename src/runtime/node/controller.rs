@@ -4,8 +4,8 @@ use super::ports::driven;
 use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
-use crate::control::{Watchdog, Watched};
-use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig};
+use crate::control::Watchdog;
+use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{Horizon, Input, Output, Seek};
@@ -264,10 +264,30 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     fn watch(&mut self) {
         let Some(estimate) = self.estimate.sample() else { return };
         let tick = estimate.stamp().tick;
-        if let Some(values) = self.rig.invariants(estimate) {
-            self.watchdog.invariants(tick, values);
+        for (quantity, monitor) in R::monitors().iter().enumerate() {
+            match monitor.of {
+                Watched::Constant(of) if self.watchdog.watches(quantity, tick) => {
+                    self.watchdog.constant(quantity, tick, of(&self.rig, estimate));
+                }
+                Watched::Small(of) if self.watchdog.watches(quantity, tick) => {
+                    self.watchdog.magnitude(quantity, tick, of(&self.rig, estimate));
+                }
+                _ => {}
+            }
         }
-        self.watchdog.magnitude(Watched::Innovation, tick, R::innovation(estimate));
+    }
+
+    /// Holds the command of a channel against the physics.
+    #[inline]
+    fn watch_command(watchdog: &mut Watchdog, tick: u64, command: &Command<R>) {
+        for (quantity, monitor) in R::monitors().iter().enumerate() {
+            if let Watched::Commanded(of) = monitor.of
+                && watchdog.watches(quantity, tick)
+                && let Some(value) = of(command)
+            {
+                watchdog.magnitude(quantity, tick, value);
+            }
+        }
     }
 
     #[inline]
@@ -284,9 +304,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let mut starved = false;
         for channel in &mut self.channels {
             began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved)?;
-            let watched = self.watchdog.active() && channel.ready;
-            if let (true, Some((v, _))) = (watched, R::lyapunov(channel.command.last())) {
-                self.watchdog.magnitude(Watched::Lyapunov, stamp.tick, v);
+            if self.watchdog.active() && channel.ready {
+                Self::watch_command(&mut self.watchdog, stamp.tick, channel.command.last());
             }
         }
         for fleet in &mut self.fleets {

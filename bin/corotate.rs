@@ -1,0 +1,9 @@
+//! `corotate`: the program of this crate's rigs and scenarios. A program of your own names yours instead.
+
+use corotate::Program;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let program = Program::new().rigs(corotate::rig::shipped());
+    corotate::config::SHIPPED.into_iter().fold(program, |program, (name, text)| program.scenario(name, text)).main()
+}

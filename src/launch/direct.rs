@@ -1,0 +1,232 @@
+//! A run in one thread, as short as it can be: the roles are called one after the other on samples that stay in place.
+//!
+//! It holds as long as every sample is there and is believed, which makes all counters known. At the first that is not, the
+//! run is begun anew by the nodes, which know what to do then: the same bits up to there, by the same roles. Must not do
+//! anything that a node would not have done, nor go on where one would have had a choice.
+
+use super::in_process::proceed;
+use super::score::Scoring;
+use super::{Launch, Outcome};
+use crate::bus::Signal;
+use crate::clock::Grid;
+use crate::config::Scenario;
+use crate::control::WatchBounds;
+use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
+use crate::role::{CommandEvent, Controller, Guard, Observer, Plant};
+use crate::runtime::{RoleId, ports};
+use crate::sample::{Message, Stamp};
+use crate::telemetry::{Checkpoints, Ledger, LinkRead, LinkWritten, RoleReport, StateHash, Ticks};
+
+/// One body with what it sends, and what the controller makes of that.
+struct Driven<R: Rig> {
+    plant: Plant<R::Body>,
+    measurement: Measurement<R>,
+    truth: Truth<R>,
+    command: Option<Controlled<R>>,
+    hashes: [StateHash; 2],
+}
+
+/// A body's law with its command and the guards on the way.
+struct Controlled<R: Rig> {
+    controller: Controller<R::Law>,
+    measurement_guard: R::MeasurementGuard,
+    command_guard: R::CommandGuard,
+    command: Command<R>,
+    hash: StateHash,
+}
+
+/// Whether a run of this scenario may be a direct one.
+fn is_plain(scenario: &Scenario, launch: &Launch<'_>) -> bool {
+    let watch = WatchBounds { from_tick: scenario.watch.from_tick, ..WatchBounds::NONE };
+    let single = scenario.rig.bodies().iter().all(|body| body.fleet.is_none());
+    single && scenario.faults.is_empty() && launch.record.is_none() && scenario.watch.max == watch.max
+}
+
+/// Runs a scenario; none if it has to be run by the nodes.
+pub(crate) fn run_rig<R: Rig>(rig: &R, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
+    is_plain(scenario, launch).then(|| Run::new(rig, scenario).run(launch)).flatten()
+}
+
+/// The hash of a signal of this run.
+fn hash(scenario: &Scenario) -> StateHash {
+    StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick)
+}
+
+struct Run<'a, R: Rig> {
+    scenario: &'a Scenario,
+    grid: Grid,
+    bodies: Vec<Driven<R>>,
+    observer: Observer<R::Estimator>,
+    measurement_guard: R::MeasurementGuard,
+    estimate: Estimate<R>,
+    estimate_hash: StateHash,
+    /// The controller's, and the scorer's.
+    estimate_guards: [R::EstimateGuard; 2],
+    scoring: Scoring<R>,
+    controlled: bool,
+}
+
+impl<'a, R: Rig> Run<'a, R> {
+    fn new(rig: &R, scenario: &'a Scenario) -> Self {
+        let body = |(index, info): (usize, &crate::rig::BodyInfo)| Driven {
+            plant: Plant::new(rig.body(index), scenario.actuation(info.driven), scenario.tick_s()),
+            measurement: Measurement::<R>::default(),
+            truth: Truth::<R>::default(),
+            command: info.driven.then(|| Controlled {
+                controller: Controller::new(rig.law(index)),
+                measurement_guard: rig.measurement_guard(index, true),
+                command_guard: rig.command_guard(index),
+                command: Command::<R>::default(),
+                hash: hash(scenario),
+            }),
+            hashes: [hash(scenario), hash(scenario)],
+        };
+        let bodies: Vec<Driven<R>> = rig.bodies().iter().enumerate().map(body).collect();
+        Self {
+            scenario,
+            grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
+            controlled: bodies.iter().any(|body| body.command.is_some()),
+            bodies,
+            observer: Observer::new(rig.estimator(), scenario.tick_s()),
+            measurement_guard: rig.measurement_guard(0, false),
+            estimate: Estimate::<R>::default(),
+            estimate_hash: hash(scenario),
+            estimate_guards: [rig.estimate_guard(), rig.estimate_guard()],
+            scoring: Scoring::new(rig, scenario),
+        }
+    }
+
+    fn run(mut self, launch: &mut Launch<'_>) -> Option<Outcome> {
+        let (mut ticks, mut signal) = (0, 0);
+        for tick in 0..=self.scenario.last_tick {
+            if !self.tick(tick) {
+                return None;
+            }
+            ticks = tick + 1;
+            if !proceed(|| self.scoring.latest(), self.scenario, launch, tick) {
+                signal = launch.signal.load(std::sync::atomic::Ordering::Relaxed);
+                break;
+            }
+        }
+        Some(self.outcome(ticks, signal))
+    }
+
+    /// One tick through all roles; false if one of them has a choice.
+    #[inline]
+    fn tick(&mut self, tick: u64) -> bool {
+        let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
+        for body in &mut self.bodies {
+            let applied = match &mut body.command {
+                Some(controlled) if tick > 0 => {
+                    controlled.command_guard.accepts(&controlled.command)
+                        && body.plant.command(tick, Some(&controlled.command)) == CommandEvent::Applied
+                }
+                _ => body.plant.command(tick, None) == CommandEvent::NotDue,
+            };
+            if !applied {
+                return false;
+            }
+            body.plant.measure(&stamp, &mut body.measurement);
+            body.measurement.stamp_mut().generation = 1;
+            body.plant.truth(&stamp, &mut body.truth);
+            body.truth.stamp_mut().generation = 1;
+            body.plant.advance(1);
+            body.hashes[0].absorb(tick, body.measurement.content());
+            body.hashes[1].absorb(tick, body.truth.content());
+        }
+        let observed = &self.bodies[0].measurement;
+        if !self.measurement_guard.accepts(observed) {
+            return false;
+        }
+        self.observer.step(observed, &mut self.estimate);
+        (self.estimate.stamp_mut().generation, self.estimate.stamp_mut().sent_ns) = (1, 0);
+        self.estimate_hash.absorb(tick, self.estimate.content());
+        let [controller_s, scorer_s] = &mut self.estimate_guards;
+        if self.controlled && !controller_s.accepts(&self.estimate) {
+            return false;
+        }
+        for Driven { measurement, command, .. } in &mut self.bodies {
+            let Some(controlled) = command else { continue };
+            if !controlled.measurement_guard.accepts(measurement) {
+                return false;
+            }
+            controlled.controller.step(&self.estimate, measurement, &mut controlled.command);
+            let stamp = controlled.command.stamp_mut();
+            (stamp.generation, stamp.sent_ns) = (1, 0);
+            controlled.hash.absorb(tick, controlled.command.content());
+        }
+        if !scorer_s.accepts(&self.estimate) {
+            return false;
+        }
+        let bodies = &self.bodies;
+        self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);
+        true
+    }
+
+    fn outcome(mut self, ticks: u64, signal: usize) -> Outcome {
+        let score = self.scoring.finish();
+        let reports = RoleId::all(self.scenario).into_iter().map(|role| self.report(role, ticks)).collect();
+        Outcome {
+            reports,
+            recording: None,
+            unbooked: Vec::new(),
+            problems: Vec::new(),
+            score,
+            incidents: Vec::new(),
+            grants: Vec::new(),
+            domain: None,
+            remains: None,
+            signal,
+        }
+    }
+
+    /// The account of a role that executed every tick on every input.
+    fn report(&self, role: RoleId, ticks: u64) -> RoleReport {
+        let ports = ports(self.scenario, role);
+        let written = ports.writes.iter().map(|port| LinkWritten {
+            service: port.topic.to_string(),
+            published: ticks,
+            skipped: 0,
+            void: 0,
+            extra: 0,
+            injected: 0,
+            last_tick: ticks.checked_sub(1),
+            hash: Some(self.checkpoints(&port.topic.body, port.topic.signal)),
+        });
+        let read = ports.reads.iter().map(|port| {
+            // The last command waits for a tick that does not come.
+            let received = if port.topic.signal == Signal::Command { ticks.saturating_sub(1) } else { ticks };
+            LinkRead {
+                service: port.topic.to_string(),
+                received,
+                gaps: 0,
+                stale: 0,
+                void: 0,
+                rejected: 0,
+                last_tick: received.checked_sub(1),
+            }
+        });
+        RoleReport {
+            role: role.name(self.scenario).to_owned(),
+            ticks: Ticks { elapsed: ticks, executed: ticks, ..Ticks::default() },
+            written: written.collect(),
+            read: read.collect(),
+            watchdog: None,
+            stages: Vec::new(),
+            grants: Vec::new(),
+            line: None,
+        }
+    }
+
+    fn checkpoints(&self, name: &str, signal: Signal) -> Checkpoints {
+        let index = self.scenario.rig.bodies().iter().position(|body| body.name == name).unwrap_or(0);
+        let body = &self.bodies[index];
+        let hash = match (signal, &body.command) {
+            (Signal::Measurement, _) => &body.hashes[0],
+            (Signal::Estimate, _) => &self.estimate_hash,
+            (Signal::Command, Some(controlled)) => &controlled.hash,
+            _ => &body.hashes[1],
+        };
+        hash.checkpoints()
+    }
+}

@@ -1,0 +1,117 @@
+//! `corotate bench`: the benchmark suite, from the rows asked for to a table, JSON and histograms.
+
+use super::role::die_with;
+use super::run::{catch_signals, make_directory};
+use super::{Exit, fail, print};
+use crate::bench::{Bench, BenchError, PeerSeat, Results, Row, run, serve_peer, table, write_results};
+use indicatif::ProgressBar;
+use std::cell::RefCell;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Options of `corotate bench`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll, processor [default: all]
+    #[arg(value_name = "ROW", value_parser = row)]
+    rows: Vec<Row>,
+    /// A smoke run of a few seconds, whose figures mean nothing
+    #[arg(long)]
+    quick: bool,
+    /// Exit code 3 if a target is not met
+    #[arg(long)]
+    check: bool,
+    /// Directory for the results [default: runs/<utc>-bench]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Print the results as one JSON object on stdout, everything else on stderr
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate bench                            every row, about five minutes
+  corotate bench step hop --quick           two rows, as a smoke test
+  corotate bench step --check               exit code 3 if a target is missed";
+
+fn row(name: &str) -> Result<Row, String> {
+    let known = || Row::ALL.map(|(_, name, _)| name).join(", ");
+    Row::named(name).ok_or_else(|| format!("there is no such row; there are {}", known()))
+}
+
+/// Options of the hidden command by which the suite starts the other end of a hop.
+#[derive(clap::Args)]
+pub struct PeerArguments {
+    /// The suite's domain
+    #[arg(long)]
+    domain: PathBuf,
+    /// Die with this process
+    #[arg(long)]
+    parent: i32,
+    /// Take the observer's place, not the controller's
+    #[arg(long)]
+    observer: bool,
+}
+
+/// Measures what was asked for.
+pub fn bench(arguments: &Arguments) -> Exit {
+    match attempt(arguments) {
+        Ok(results) if arguments.check && !results.met() => Exit::NotAccepted,
+        Ok(_) => Exit::Ok,
+        Err((exit, reason)) => fail(exit, &reason),
+    }
+}
+
+fn attempt(arguments: &Arguments) -> Result<Results, (Exit, String)> {
+    let broken = |reason: String| (Exit::Failure, reason);
+    let started = jiff::Timestamp::now();
+    let directory = make_directory(arguments.out.as_deref(), "bench", started)
+        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
+    let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
+    let rows = if arguments.rows.is_empty() { Row::ALL.map(|(row, ..)| row).to_vec() } else { arguments.rows.clone() };
+    // Drawn on stderr, and only if that is a terminal.
+    let spinner = ProgressBar::new_spinner();
+    spinner.enable_steady_tick(Duration::from_millis(200));
+    let last = RefCell::new(String::new());
+    let mut bench = Bench {
+        rows,
+        quick: arguments.quick,
+        program,
+        signal: &signal,
+        progress: &mut |what| {
+            spinner.set_message(what.to_owned());
+            last.replace(what.to_owned());
+        },
+    };
+    let measured = run(&mut bench);
+    spinner.finish_and_clear();
+    let (board, privileges) = measured.map_err(|error| match error {
+        BenchError::Interrupted(signal) => (Exit::Signal(signal), error.to_string()),
+        error => broken(format!("{}: {error}", last.borrow())),
+    })?;
+    let results = Results::new(&bench, board, privileges, started);
+    write_results(&directory, &results).map_err(|error| broken(format!("cannot write the results: {error}")))?;
+    let text = format!("{}results in {}\n", table(&results), directory.display());
+    let printed = if arguments.json {
+        crate::system::tell(text.trim_end());
+        print(&format!("{}\n", serde_json::to_string(&results).expect("results of plain values are JSON")))
+    } else {
+        print(&text)
+    };
+    printed.map_err(broken)?;
+    Ok(results)
+}
+
+/// Serves as the other end of a hop.
+pub fn peer(arguments: &PeerArguments) -> Exit {
+    if let Err(exit) = die_with(arguments.parent) {
+        return exit;
+    }
+    match serve_peer(&PeerSeat { domain: arguments.domain.clone(), observer: arguments.observer }) {
+        Ok(()) => Exit::Ok,
+        Err(reason) => fail(Exit::Failure, &reason),
+    }
+}

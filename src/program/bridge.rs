@@ -1,0 +1,78 @@
+//! `corotate bridge`: a device behind a serial line, in a follower's seat.
+
+use super::role::{die_with, terminated_by_signals};
+use super::{Exit, fail};
+use crate::launch::line_words;
+use crate::runtime::{DeviceError, DeviceSeat, RoleError, run_bridge};
+use crate::system::tell;
+use std::path::PathBuf;
+
+/// Options of `corotate bridge`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
+    #[arg(long, value_name = "PATH")]
+    serial: PathBuf,
+    /// Its speed, bit/s [default: as it is]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
+    baud: Option<u32>,
+    /// The driven body whose seat the device takes
+    #[arg(long, value_name = "NAME")]
+    body: String,
+    /// The run's domain, as `corotate run --external NAME` prints it
+    #[arg(long, value_name = "DIR")]
+    domain: PathBuf,
+    /// How long a device that is silent or gone is waited for, s
+    #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
+    patience: f64,
+    /// Die with this process
+    #[arg(long, value_name = "PID", hide = true)]
+    parent: Option<i32>,
+}
+
+const EXAMPLES: &str = "\
+Example:
+  corotate run pair.toml --external follower
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR      with the DIR that the run prints";
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;
+    let sensible = (0.001..=86_400.0).contains(&value);
+    sensible.then_some(value).ok_or_else(|| "give 0.001 to 86400 s".to_owned())
+}
+
+/// Serves the seat to the end of the run.
+pub fn bridge(arguments: &Arguments) -> Exit {
+    attempt(arguments).unwrap_or_else(|exit| exit)
+}
+
+fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
+    arguments.parent.map_or(Ok(()), die_with)?;
+    let terminated = terminated_by_signals()?;
+    let seat = DeviceSeat {
+        domain: arguments.domain.clone(),
+        body: arguments.body.clone(),
+        path: arguments.serial.clone(),
+        baud: arguments.baud,
+        patience_s: arguments.patience,
+    };
+    let welcomed = |device: &str| tell(format_args!("{} on {}: {device}", seat.body, seat.path.display()));
+    let book = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
+    if let Some(book) = book {
+        tell(line_words(&seat.body, &book));
+    }
+    Ok(Exit::Ok)
+}
+
+fn exit_of(error: &RoleError) -> Exit {
+    match error {
+        RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::NotDriven { .. } => {
+            Exit::Usage
+        }
+        // A device that should be there and does not answer is a failure; one that is not what was asked for is usage.
+        RoleError::Device(DeviceError::Silent { .. }) => Exit::Failure,
+        RoleError::Device(_) => Exit::Usage,
+        _ => Exit::Failure,
+    }
+}

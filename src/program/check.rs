@@ -1,0 +1,115 @@
+//! `corotate check`: validate scenarios and tell what may be claimed of their loops.
+
+use super::{Exit, fail, say};
+use crate::analysis::{Claim, apart, claims, digits};
+use crate::config::Scenario;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Options of `corotate check`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// Scenario files
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Override any key of the scenarios
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Print what is claimed of each scenario as one line of JSON (corotate/check/v1)
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate check pair.toml                  the scenario with every default, and what may be claimed of its loop
+  corotate check --json pair.toml           those claims for programs
+  corotate check config/*.toml > /dev/null  are they all valid? exit code 2 if one is not";
+
+/// Checks scenarios; all of them, even if one fails.
+pub fn check(arguments: &Arguments) -> Exit {
+    let mut exit = Exit::Ok;
+    for path in &arguments.files {
+        match Scenario::load(path, &arguments.set) {
+            Ok(scenario) => {
+                let text = if arguments.json { json(path, &scenario) } else { tell(path, &scenario) };
+                if let Err(gone) = say(&text) {
+                    return gone;
+                }
+            }
+            Err(error) => exit = fail(Exit::Usage, &error),
+        }
+    }
+    exit
+}
+
+/// What is claimed of a scenario, for programs.
+fn json(path: &Path, scenario: &Scenario) -> String {
+    let value = serde_json::json!({
+        "schema": "corotate/check/v1",
+        "file": path.display().to_string(),
+        "scenario": scenario.name,
+        "clock": scenario.clock.name(),
+        "tick_hz": 1.0 / scenario.tick_s(),
+        "notes": scenario.rig.notes(),
+        "limits": scenario.rig.limits(),
+        "followers": claims(scenario),
+    });
+    format!("{value}\n")
+}
+
+/// The scenario as resolved, and what is claimed of it as comments, so that the whole is a scenario file.
+fn tell(path: &Path, scenario: &Scenario) -> String {
+    let mut text = format!("# {}: valid\n{}\n", path.display(), scenario.to_toml());
+    tell_claims(scenario, &mut text).expect("a string takes every text");
+    text
+}
+
+fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
+    scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
+    for limit in scenario.rig.limits() {
+        writeln!(text, "# limit: {}: {}", limit.name, digits(limit.value))?;
+    }
+    let claims = claims(scenario);
+    if claims.is_empty() {
+        writeln!(text, "# no body is driven, so there is no loop to claim anything of")?;
+    }
+    claims.iter().try_for_each(|claim| tell_claim(claim, text))
+}
+
+fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "# {}, the law in continuous time", claim.body)?;
+    for bound in &claim.bounds {
+        writeln!(text, "#   {}: {}", bound.name, digits(bound.value))?;
+    }
+    for condition in &claim.conditions {
+        let verdict = if condition.holds { "holds" } else { "does not hold" };
+        let [value, required] = apart(condition.value, condition.required);
+        let margin = digits(condition.value - condition.required);
+        writeln!(text, "#   {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
+    }
+    match claim.continuous_rate_per_s {
+        Some(rate) => writeln!(text, "#   its error falls at least as exp(-{} t)", digits(rate))?,
+        None if claim.conditions.is_empty() => writeln!(text, "#   this rig proves nothing of it")?,
+        None => writeln!(text, "#   no constant rate: the observer's gain varies")?,
+    }
+    writeln!(text, "# {}, the loop that runs: sampled, held, one tick late", claim.body)?;
+    match (claim.loop_rate_per_s, &claim.reason) {
+        (Some(rate), _) => writeln!(text, "#   once it is small, the error falls as exp(-{} t)", digits(rate))?,
+        (None, reason) => writeln!(text, "#   no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
+    }
+    for floor in &claim.floors {
+        writeln!(text, "#   floor to expect: {} {}", floor.name, digits(floor.value))?;
+    }
+    for reach in &claim.reaches {
+        let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
+        match reach.after_s {
+            Some(after_s) => writeln!(text, "#   {metric} from {from} to {limit}: {} s at that rate", digits(after_s))?,
+            None => writeln!(text, "#   {metric} from {from} to {limit}: never, it is below the floor")?,
+        }
+    }
+    // The reason why no rate is claimed is a warning too, and is told above.
+    let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
+    others.try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
+}

@@ -1,0 +1,96 @@
+//! `corotate diff`: two recordings beside each other.
+
+use super::record::{exit_of, exit_with, open};
+use super::{Exit, fail, harmless, say};
+use crate::record::{Comparison, Tolerances, diff as compare};
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Options of `corotate diff`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// A recording
+    a: PathBuf,
+    /// Another
+    b: PathBuf,
+    /// So much may numbers differ, in the field's own unit
+    #[arg(long, value_name = "X", default_value_t = 0.0)]
+    absolute: f64,
+    /// So much may numbers differ, as a part of the larger one
+    #[arg(long, value_name = "X", default_value_t = 0.0)]
+    relative: f64,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
+}
+
+const EXAMPLES: &str = "\
+Values are compared at ticks that both recordings have; times and generations are not. Exit code 3 if they differ.
+
+Examples:
+  corotate diff before/run.mcap after/run.mcap      bit for bit
+  corotate diff a.mcap b.mcap --absolute 1e-9       numbers within 1e-9 rad/s, rad/s2, ...";
+
+/// Compares.
+pub fn diff(arguments: &Arguments) -> Exit {
+    let tolerances = Tolerances { absolute: arguments.absolute, relative: arguments.relative };
+    let bad = [("absolute", arguments.absolute), ("relative", arguments.relative)]
+        .into_iter()
+        .find(|(_, x)| !(0.0..).contains(x));
+    if let Some((name, value)) = bad {
+        return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
+    }
+    let open = |file| open(file, arguments.accept_incomplete);
+    let both = open(&arguments.a).and_then(|a| Ok((a, open(&arguments.b)?)));
+    let (a, b) = match both {
+        Ok(both) => both,
+        Err(error) => return fail(exit_of(&error), &error),
+    };
+    match compare(&a, &b, tolerances) {
+        Ok(comparison) => match say(&harmless(&table(&comparison))) {
+            Ok(()) => {
+                let exit = if comparison.same() { Exit::Ok } else { Exit::NotAccepted };
+                exit_with(&a, exit_with(&b, exit))
+            }
+            Err(exit) => exit,
+        },
+        Err(error) => fail(exit_of(&error), &error),
+    }
+}
+
+fn table(comparison: &Comparison) -> String {
+    let mut text = String::new();
+    // Writing to a string does not fail.
+    let _ = match comparison.first() {
+        Some((signal, first)) => writeln!(
+            text,
+            "first difference: tick {}, {} {}: {:e} and {:e}",
+            first.tick, signal.name, first.field, first.values[0], first.values[1]
+        ),
+        None => writeln!(text, "no value differs"),
+    };
+    let _ = writeln!(
+        text,
+        "{:<28} {:>9} {:>7} {:>7} {:>9} {:>10} {:>10}  largest at",
+        "signal", "compared", "only a", "only b", "beyond", "max", "rms"
+    );
+    for signal in &comparison.signals {
+        let (max, at) = signal
+            .max
+            .as_ref()
+            .map_or((0.0, String::new()), |(max, field, tick)| (*max, format!("tick {tick}, {field}")));
+        let [a, b] = signal.only;
+        let _ = writeln!(
+            text,
+            "{:<28} {:>9} {a:>7} {b:>7} {:>9} {max:>10.2e} {:>10.2e}  {at}",
+            signal.name, signal.compared, signal.beyond, signal.rms
+        );
+    }
+    for (which, names) in ["a", "b"].iter().zip(&comparison.only) {
+        for name in names {
+            let _ = writeln!(text, "{name}: only in {which}");
+        }
+    }
+    text
+}

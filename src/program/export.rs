@@ -1,0 +1,73 @@
+//! `corotate export`: a recording as tables.
+
+use super::{Exit, fail, record, say};
+use crate::record::{ExportError, Recording, export_csv};
+use std::path::PathBuf;
+
+/// Options of `corotate export`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES, group = clap::ArgGroup::new("forms").required(true).multiple(true))]
+pub struct Arguments {
+    /// The recording
+    file: PathBuf,
+    /// Write one CSV file per signal into this directory
+    #[arg(long, value_name = "DIR", group = "forms")]
+    csv: Option<PathBuf>,
+    /// Write one Parquet file per signal into this directory
+    #[arg(long, value_name = "DIR", group = "forms")]
+    parquet: Option<PathBuf>,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
+}
+
+const EXAMPLES: &str = "\
+Every sample is a row: time in the run in s, when it was received in ns, and every element of every field. Numbers read back
+to the same bits.
+
+Examples:
+  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --csv tables
+  head -2 tables/leader.estimate.csv
+  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --parquet tables";
+
+/// What there is to say to whoever asks a program for Parquet that was built without.
+const REFUSAL: &str =
+    "--parquet: this program was built without Parquet; build it with `cargo build --release --features parquet`";
+
+/// Exports.
+pub fn export(arguments: &Arguments) -> Exit {
+    if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
+        return fail(Exit::Usage, &REFUSAL);
+    }
+    let recording = match record::open(&arguments.file, arguments.accept_incomplete) {
+        Ok(recording) => recording,
+        Err(error) => return fail(record::exit_of(&error), &error),
+    };
+    match write(arguments, &recording) {
+        Ok(files) => {
+            let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
+            say(&lines).err().unwrap_or(record::exit_with(&recording, Exit::Ok))
+        }
+        Err(error) => fail(exit_of(&error), &error),
+    }
+}
+
+fn write(arguments: &Arguments, recording: &Recording) -> Result<Vec<PathBuf>, ExportError> {
+    let mut files = Vec::new();
+    if let Some(directory) = &arguments.csv {
+        files.extend(export_csv(recording, directory)?);
+    }
+    #[cfg(feature = "parquet")]
+    if let Some(directory) = &arguments.parquet {
+        files.extend(crate::record::export_parquet(recording, directory)?);
+    }
+    Ok(files)
+}
+
+fn exit_of(error: &ExportError) -> Exit {
+    match error {
+        ExportError::Recording(error) => record::exit_of(error),
+        ExportError::Write { .. } => Exit::Failure,
+        ExportError::Wide { .. } => Exit::Usage,
+    }
+}

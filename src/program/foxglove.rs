@@ -1,0 +1,73 @@
+//! `corotate foxglove`: a running loop on a Foxglove WebSocket, as `corotate run --foxglove` starts it or by hand.
+
+use super::{Exit, fail};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// Where it listens unless told otherwise: on this machine only, at Foxglove's own port.
+pub const ADDRESS: &str = "127.0.0.1:8765";
+
+/// Options of `corotate foxglove`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The run's domain [default: the newest run of this user]
+    #[arg(value_name = "DIR")]
+    domain: Option<PathBuf>,
+    /// Where to listen, as IP:PORT; at port 0 the system chooses one, and it is printed
+    #[arg(long, value_name = "ADDR", default_value = ADDRESS, value_parser = address)]
+    address: SocketAddr,
+    /// Where to tell the address (the launcher gives a file)
+    #[arg(long, value_name = "FILE", hide = true)]
+    tell: Option<PathBuf>,
+    /// Die with this process (the launcher gives its own id)
+    #[arg(long, value_name = "PID", hide = true)]
+    parent: Option<i32>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate run rigid-pair.toml --foxglove        from the first tick on; in Foxglove open the connection
+                                                 \"Foxglove WebSocket\", ws://localhost:8765
+  corotate run & corotate foxglove               the newest run of this user, from now on; Ctrl-C ends it in order
+  corotate foxglove --address 0.0.0.0:9000       for other machines too: whoever reaches that port sees everything";
+
+/// Where to listen, as it is typed.
+pub fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| format!("it is not IP:PORT, as {ADDRESS}; the scenario's file goes before this option"))
+}
+
+/// What there is to say to whoever asks a program for it that was built without.
+pub fn refusal() -> Option<&'static str> {
+    let remedy = "this program was built without Foxglove; build it with `cargo build --release --features foxglove`";
+    (!cfg!(feature = "foxglove")).then_some(remedy)
+}
+
+/// Shows a run to its end.
+pub fn foxglove(arguments: &Arguments) -> Exit {
+    refusal().map_or_else(|| serve(arguments), |reason| fail(Exit::Usage, &reason))
+}
+
+#[cfg(not(feature = "foxglove"))]
+fn serve(_: &Arguments) -> Exit {
+    Exit::Usage
+}
+
+#[cfg(feature = "foxglove")]
+fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
+    use super::role::{die_with, terminated_by_signals};
+    use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
+    if let Some(Err(exit)) = parent.map(die_with) {
+        return exit;
+    }
+    let terminated = match terminated_by_signals() {
+        Ok(terminated) => terminated,
+        Err(exit) => return exit,
+    };
+    let seat = FoxgloveSeat { domain: domain.clone(), address: *address, tell: tell.clone() };
+    match run_foxglove(&seat, &terminated) {
+        Ok(()) => Exit::Ok,
+        Err(error @ (FoxgloveError::NoRun | FoxgloveError::Run(_))) => fail(Exit::Usage, &error),
+        Err(error) => fail(Exit::Failure, &error),
+    }
+}

@@ -1,0 +1,342 @@
+//! The command line: parse, validate, call the library, map errors to exit codes. No logic of its own.
+//!
+//! [`Program`] is the door for whoever has a rig: his `main` names it, and is launcher, roles and tools at once, because roles
+//! are started from the program's own file.
+
+// The comments on arguments are what `--help` prints: no Markdown.
+#![allow(rustdoc::broken_intra_doc_links, rustdoc::invalid_html_tags)]
+
+mod bench;
+mod bridge;
+mod check;
+mod diff;
+mod doctor;
+mod export;
+mod foxglove;
+mod init;
+mod new;
+mod record;
+mod replay;
+mod report;
+mod role;
+mod run;
+mod seat;
+mod watch;
+
+use crate::bus::domain::Domain;
+use crate::config::Scenario;
+use crate::rig::{Rig, RigKind, register};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use std::backtrace::{Backtrace, BacktraceStatus};
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+/// Bodies move together although not everything about them can be measured.
+///
+/// Without a command: runs the first scenario that ships with the program.
+#[derive(Parser)]
+#[command(version, max_term_width = 100, after_help = EXIT_CODES)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Option<Command>,
+}
+
+const EXIT_CODES: &str = "\
+Exit codes: 0 ok, 1 failure while running, 2 usage or configuration, 3 acceptance criteria not met,
+            4 a process died or hung, 5 required privilege not granted, 128+n ended in order by signal n
+
+Examples:
+  corotate                                       the shipped scenario rigid-pair
+  corotate init rigid-trio > trio.toml           a commented scenario to start from
+  corotate new thermostat                        a crate with a rig of your own, that runs
+  corotate check trio.toml                       validate it, print what may be claimed of its loop
+  corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
+  corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
+  corotate seat trio.toml follower-a             what that program must know, as JSON
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
+                                                 a device as the follower of a run --external follower
+  corotate report runs/20261121T150000Z-rigid-pair
+                                                 the run as one page, report.html
+  corotate watch                                 a screen on the newest run
+  corotate run trio.toml --foxglove              live in Foxglove too, at ws://localhost:8765
+  corotate doctor                                is this machine fit for real time, and what to do about it
+  corotate bench step hop                        what the step and a hop cost here, beside their floors";
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run a scenario to its end and tell how it went
+    Run(run::Arguments),
+    /// Validate scenarios; print each as resolved, with what may be claimed of its loop
+    Check(check::Arguments),
+    /// Print a commented scenario to start from
+    Init(init::Arguments),
+    /// Write a crate with a rig of your own to start from
+    New(new::Arguments),
+    /// Print what a program of your own needs to take a role's seat, as JSON
+    Seat(seat::Arguments),
+    /// Take the seat of a body in a run (the launcher starts it; so can you)
+    Plant(role::PlantArguments),
+    /// Take the observer's seat in a run
+    Observer(role::Arguments),
+    /// Take the controller's seat in a run
+    Controller(role::Arguments),
+    /// Put a device behind a serial line into a driven body's seat in a run
+    Bridge(bridge::Arguments),
+    /// Record every sample of a running loop to a file
+    Record(record::Arguments),
+    /// Feed a recording to the live roles and compare what they say, bit for bit
+    Replay(replay::Arguments),
+    /// Compare two recordings
+    Diff(diff::Arguments),
+    /// Write a recording as tables
+    Export(export::Arguments),
+    /// Show a run, or a recording, as one page
+    Report(report::Arguments),
+    /// Watch a running loop on the terminal
+    Watch(watch::Arguments),
+    /// Show a running loop on a Foxglove WebSocket
+    Foxglove(foxglove::Arguments),
+    /// Tell whether this machine is fit for real time, and what to do about it
+    Doctor(doctor::Arguments),
+    /// Measure what everything costs beside its floors, on this machine
+    Bench(bench::Arguments),
+    /// Take the other end of a hop that is measured
+    #[command(hide = true)]
+    BenchPeer(bench::PeerArguments),
+    /// Clean up after processes of a run that were killed, and after its launcher
+    #[command(hide = true)]
+    Janitor(JanitorArguments),
+}
+
+/// Whom the launcher's janitor cleans up after.
+#[derive(clap::Args)]
+struct JanitorArguments {
+    /// The run's domain
+    #[arg(long)]
+    domain: PathBuf,
+    /// For how long somebody may stand still while he makes a file, s
+    #[arg(long)]
+    limit_s: f64,
+}
+
+/// What the process says to its parent.
+#[derive(Clone, Copy)]
+enum Exit {
+    Ok,
+    Failure,
+    Usage,
+    NotAccepted,
+    ProcessLost,
+    PrivilegeMissing,
+    Signal(usize),
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(match exit {
+            Exit::Ok => 0,
+            Exit::Failure => 1,
+            Exit::Usage => 2,
+            Exit::NotAccepted => 3,
+            Exit::ProcessLost => 4,
+            Exit::PrivilegeMissing => 5,
+            Exit::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
+        })
+    }
+}
+
+/// Prints an error, one paragraph per line of it, and gives the exit code.
+fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
+    remark(error);
+    exit
+}
+
+/// Prints what there is to be said beside the results.
+fn remark(text: &dyn std::fmt::Display) {
+    for line in harmless(&text.to_string()).lines() {
+        // Without a stderr the exit code is all there is to say.
+        let _ = writeln!(io::stderr(), "corotate: {line}");
+    }
+}
+
+/// A text that may come from a file, as it may stand on a terminal: what would command it, or turn the order of letters, is
+/// shown by its number.
+fn harmless(text: &str) -> String {
+    let shown = |letter: char| match letter {
+        '\n' => letter.to_string(),
+        '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+            letter.escape_unicode().to_string()
+        }
+        _ if letter.is_control() => letter.escape_unicode().to_string(),
+        _ => letter.to_string(),
+    };
+    text.chars().map(shown).collect()
+}
+
+/// Prints to stdout, or says why not; a reader that has gone is an error, where `print!` would panic.
+fn print(text: &str) -> Result<(), String> {
+    let mut stdout = io::stdout().lock();
+    stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush())
+        .map_err(|error| format!("cannot write to stdout: {error}; give it a reader"))
+}
+
+/// Prints to stdout; where that fails, says so and gives the exit code.
+fn say(text: &str) -> Result<(), Exit> {
+    print(text).map_err(|reason| fail(Exit::Failure, &reason))
+}
+
+/// A program that runs rigs: its launcher, its roles and its tools.
+///
+/// ```no_run
+/// use corotate::Program;
+/// use corotate::rig::RigidBodyRig;
+/// use std::process::ExitCode;
+///
+/// fn main() -> ExitCode {
+///     Program::new().rig::<RigidBodyRig>().main()
+/// }
+/// ```
+#[derive(Default)]
+pub struct Program {
+    rigs: Vec<RigKind>,
+    scenarios: Vec<(&'static str, &'static str)>,
+}
+
+impl Program {
+    /// A program without rigs.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds a rig: scenarios may name it.
+    #[must_use]
+    pub fn rig<R: Rig>(mut self) -> Self {
+        self.rigs.push(RigKind::of::<R>());
+        self
+    }
+
+    /// Adds rigs that another crate has compiled.
+    #[must_use]
+    pub fn rigs(mut self, kinds: impl IntoIterator<Item = RigKind>) -> Self {
+        self.rigs.extend(kinds);
+        self
+    }
+
+    /// Adds a scenario that ships with the program, by its name and its text: `init` prints it, and the first one runs where
+    /// no file is named.
+    #[must_use]
+    pub fn scenario(mut self, name: &'static str, text: &'static str) -> Self {
+        self.scenarios.push((name, text));
+        self
+    }
+
+    /// Does what the command line asks for; the exit code is the process's.
+    ///
+    /// # Panics
+    /// If a scenario was read before: the rigs are known from then on.
+    pub fn main(self) -> ExitCode {
+        assert!(register(self.rigs), "Program::main comes before any scenario is read");
+        let _ = SCENARIOS.set(self.scenarios);
+        // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
+        let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
+        let version = concat!("with corotate ", env!("CARGO_PKG_VERSION"));
+        let line = Arguments::command().name(name());
+        let mut line = if name() == env!("CARGO_PKG_NAME") { line } else { line.version(version) };
+        let command = Arguments::from_arg_matches_mut(&mut line.get_matches_mut());
+        let command = command.unwrap_or_else(|error| error.exit()).command;
+        tell_defects();
+        // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
+        let exit = std::panic::catch_unwind(|| obey(command))
+            .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
+        exit.into()
+    }
+}
+
+static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
+
+/// The scenarios that ship with this program.
+fn scenarios() -> &'static [(&'static str, &'static str)] {
+    SCENARIOS.get().map_or(&[], Vec::as_slice)
+}
+
+/// A scenario from its file, or the program's first.
+fn load(file: Option<&Path>, overrides: &[String]) -> Result<Scenario, String> {
+    let loaded = match (file, scenarios().first()) {
+        (Some(path), _) => Scenario::load(path, overrides),
+        (None, Some((name, text))) => Scenario::parse(text, &format!("{name}.toml"), overrides),
+        (None, None) => return Err("this program has no scenario of its own; name a scenario file".to_owned()),
+    };
+    loaded.map_err(|error| error.to_string())
+}
+
+/// How this program is called: by the name of its file.
+fn name() -> &'static str {
+    static NAME: OnceLock<String> = OnceLock::new();
+    NAME.get_or_init(|| {
+        let file = std::env::current_exe().ok();
+        file.as_deref().and_then(Path::file_name).map_or("corotate".into(), |name| name.to_string_lossy().into_owned())
+    })
+}
+
+/// Tells a panic as any error is told, and with RUST_BACKTRACE where it came from.
+fn tell_defects() {
+    std::panic::set_hook(Box::new(|panic| {
+        let place = panic.location().map_or(String::new(), |at| format!(" at {}:{}", at.file(), at.line()));
+        let payload = panic.payload();
+        let words = payload.downcast_ref::<String>().map(String::as_str).or(payload.downcast_ref().copied());
+        let words = words.unwrap_or("no reason given").trim();
+        remark(&format!("a defect of this program or of iceoryx2{place}: {words}"));
+        let trace = Backtrace::capture();
+        if trace.status() == BacktraceStatus::Captured {
+            remark(&trace);
+        }
+    }));
+}
+
+/// Does what the command line asks for.
+fn obey(command: Option<Command>) -> Exit {
+    match command {
+        None => run::run(&run::Arguments::default()),
+        Some(Command::Run(arguments)) => run::run(&arguments),
+        Some(Command::Check(arguments)) => check::check(&arguments),
+        Some(Command::Init(arguments)) => init::init(&arguments),
+        Some(Command::New(arguments)) => new::new(&arguments),
+        Some(Command::Seat(arguments)) => seat::seat(&arguments),
+        Some(Command::Plant(arguments)) => role::role(&arguments.body, &arguments.seat),
+        Some(Command::Observer(arguments)) => role::role("observer", &arguments),
+        Some(Command::Controller(arguments)) => role::role("controller", &arguments),
+        Some(Command::Bridge(arguments)) => bridge::bridge(&arguments),
+        Some(Command::Record(arguments)) => record::record(&arguments),
+        Some(Command::Replay(arguments)) => replay::replay(&arguments),
+        Some(Command::Diff(arguments)) => diff::diff(&arguments),
+        Some(Command::Export(arguments)) => export::export(&arguments),
+        Some(Command::Report(arguments)) => report::report(&arguments),
+        Some(Command::Watch(arguments)) => watch::watch(&arguments),
+        Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
+        Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
+        Some(Command::Bench(arguments)) => bench::bench(&arguments),
+        Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
+        Some(Command::Janitor(arguments)) => janitor(&arguments),
+    }
+}
+
+fn janitor(arguments: &JanitorArguments) -> Exit {
+    let limit = Duration::try_from_secs_f64(arguments.limit_s).map_err(|error| error.to_string());
+    let domain = Domain::join(&arguments.domain).map_err(|error| error.to_string());
+    // Without the buffers of the standard streams: what is in one is not seen by whoever waits for input.
+    let line = io::stdin().as_fd().try_clone_to_owned().map(File::from).map_err(|error| error.to_string());
+    match (limit, domain, line) {
+        (Ok(limit), Ok(domain), Ok(line)) => match crate::launch::janitor(&domain, limit, line, io::stdout()) {
+            Ok(()) => Exit::Ok,
+            Err(error) => fail(Exit::Failure, &error),
+        },
+        (Err(error), ..) | (_, Err(error), _) | (.., Err(error)) => fail(Exit::Usage, &error),
+    }
+}

@@ -1,0 +1,1 @@
+../../../examples/motor-pair/tests/clocks.rs

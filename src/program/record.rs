@@ -1,0 +1,89 @@
+//! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
+
+use super::role::{die_with, terminated_by_signals};
+use super::{Exit, fail, remark, say};
+use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+/// Options of `corotate record`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The run's domain, a directory: `corotate run --external ROLE` prints it while it waits for that role
+    #[arg(long, value_name = "DIR")]
+    domain: PathBuf,
+    /// The file to write
+    #[arg(long, value_name = "FILE", default_value = "run.mcap")]
+    out: PathBuf,
+    /// Die with this process (the launcher gives its own id)
+    #[arg(long, value_name = "PID", hide = true)]
+    parent: Option<i32>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate run --record                             record a run from its first tick to its last
+  corotate record --domain $XDG_RUNTIME_DIR/corotate/<id> --out part.mcap
+                                                    record a run that is under way, from now on; Ctrl-C ends it in order";
+
+/// Records to the end of the run.
+pub fn record(arguments: &Arguments) -> Exit {
+    if let Some(Err(exit)) = arguments.parent.map(die_with) {
+        return exit;
+    }
+    let terminated = match terminated_by_signals() {
+        Ok(terminated) => terminated,
+        Err(exit) => return exit,
+    };
+    let seat = RecorderSeat { domain: arguments.domain.clone(), file: arguments.out.clone() };
+    match run_recorder(&seat, &terminated) {
+        Ok(report) => told(&report, arguments.parent.is_some()),
+        Err(error) => fail(exit_of(&error), &error),
+    }
+}
+
+fn told(report: &RecordingReport, child: bool) -> Exit {
+    let part = if report.whole { "" } else { ", from the midst of the run on" };
+    let text = format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes);
+    if let (false, Err(exit)) = (child, say(&text)) {
+        return exit;
+    }
+    report.problem.as_ref().map_or(Exit::Ok, |problem| fail(Exit::Failure, problem))
+}
+
+/// Opens a recording that is all there; another one too where the user says so, with a remark.
+pub fn open(file: &Path, accept_incomplete: bool) -> Result<Recording, RecordError> {
+    let recording = Recording::open(file)?;
+    match recording.require_whole() {
+        Err(error) if !accept_incomplete => return Err(error),
+        Err(RecordError::Damaged { reason, .. }) => {
+            remark(&format!("{} is damaged, and read as far as it can be believed: {reason}", file.display()));
+        }
+        Err(RecordError::Incomplete { missing, .. }) => {
+            remark(&format!("{} is not complete, and read as far as it goes: {missing}", file.display()));
+        }
+        _ => {}
+    }
+    Ok(recording)
+}
+
+/// The exit code of what was done with a recording: a damaged one is a failure, however much of it could be read.
+pub fn exit_with(recording: &Recording, exit: Exit) -> Exit {
+    if recording.damage().is_some() { Exit::Failure } else { exit }
+}
+
+/// Whether it lies with the file, or with what was asked.
+pub fn exit_of(error: &RecordError) -> Exit {
+    match error {
+        RecordError::Run(_) | RecordError::Domain(_) | RecordError::NotOurs { .. } | RecordError::Scenario { .. } => {
+            Exit::Usage
+        }
+        RecordError::Layout { .. } | RecordError::Missing { .. } => Exit::Usage,
+        RecordError::Read { source, .. } if source.kind() == ErrorKind::NotFound => Exit::Usage,
+        RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,
+        RecordError::Bus(_) | RecordError::Full { .. } | RecordError::Write { .. } | RecordError::Read { .. } => {
+            Exit::Failure
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! `corotate replay`: a recording through the live roles.
+
+use super::record::{exit_of, exit_with, open};
+use super::{Exit, fail, harmless, say};
+use crate::config::Scenario;
+use crate::launch::{LaunchError, replay_as_process};
+use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
+use crate::runtime::RoleId;
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+/// Options of `corotate replay`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The recording
+    file: PathBuf,
+    /// observer, controller, a body's name, or all
+    #[arg(long, value_name = "ROLE", default_value = "all")]
+    role: String,
+    /// Replay each role as a process of its own, as it takes part in runs, instead of in one thread
+    #[arg(long)]
+    processes: bool,
+    /// Go on with what there is of a recording that is not complete
+    #[arg(long)]
+    accept_incomplete: bool,
+}
+
+const EXAMPLES: &str = "\
+Each role gets the inputs that it had, and misses what it missed; everything that it publishes but the time of sending is
+compared with what was recorded. Exit code 3 if anything differs. What cannot be told is said.
+
+Examples:
+  corotate replay runs/20261121T150000Z-rigid-pair/run.mcap
+  corotate replay run.mcap --role observer --processes";
+
+/// Replays.
+pub fn replay(arguments: &Arguments) -> Exit {
+    let recording = match open(&arguments.file, arguments.accept_incomplete) {
+        Ok(recording) => recording,
+        Err(error) => return fail(exit_of(&error), &error),
+    };
+    match attempt(arguments, &recording) {
+        Ok(replays) => {
+            let text: String = replays.iter().map(words).collect();
+            let differs = replays.iter().any(|replay| replay.difference.is_some());
+            match say(&harmless(&text)) {
+                Err(exit) => exit,
+                Ok(()) => exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }),
+            }
+        }
+        Err(LaunchError::Record(error)) => fail(exit_of(&error), &error),
+        Err(error) => fail(super::run::exit_of(&error), &error),
+    }
+}
+
+fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleReplay>, LaunchError> {
+    let scenario = recording.scenario_for_replay()?;
+    recording.check_layouts(&scenario)?;
+    let roles = roles(&arguments.role, &scenario)?;
+    if !arguments.processes {
+        return Ok(roles
+            .into_iter()
+            .map(|role| replay_in_process(recording, &scenario, role))
+            .collect::<Result<_, _>>()?);
+    }
+    let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
+    let program = std::env::current_exe().map_err(spawn)?;
+    let signal = super::run::catch_signals().map_err(spawn)?;
+    let mut replays = Vec::new();
+    for role in roles {
+        replays.push(replay_as_process(recording, &scenario, role, &program, &signal)?);
+        if signal.load(Ordering::Relaxed) != 0 {
+            return Err(RecordError::Missing { reason: "ended by a signal before all was replayed".to_owned() }.into());
+        }
+    }
+    Ok(replays)
+}
+
+fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {
+    if name == "all" {
+        return Ok(RoleId::all(scenario));
+    }
+    RoleId::named(scenario, name).map(|role| vec![role]).ok_or_else(|| {
+        let known = scenario.rig.roles().join(", ");
+        RecordError::Missing {
+            reason: format!("--role {name}: there is no such role; this recording has: {known}, all"),
+        }
+    })
+}
+
+/// One role's replay for people.
+fn words(replay: &RoleReplay) -> String {
+    let RoleReplay { role, ticks, lives, samples, difference, limit } = replay;
+    let lives = if *lives > 1 { format!(" in {lives} lives") } else { String::new() };
+    let verdict = match difference {
+        None => "the same to the last bit".to_owned(),
+        Some(first) => {
+            let field = first.field.as_ref().map_or(String::new(), |field| format!(" {field}"));
+            format!(
+                "first difference at tick {}, {}{field}:\n  recorded {}\n  replayed {}",
+                first.tick, first.service, first.recorded, first.replayed
+            )
+        }
+    };
+    let limit = limit.as_ref().map_or(String::new(), |limit| {
+        format!("  from tick {} on nothing can be compared: {}\n", limit.tick, limit.reason)
+    });
+    format!("{role}: {ticks} ticks{lives}, {samples} samples: {verdict}\n{limit}")
+}

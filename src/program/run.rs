@@ -1,0 +1,334 @@
+//! `corotate run`: one scenario from file to verdict.
+
+use super::{Exit, fail, foxglove, load, name, print, scenarios};
+use crate::config::{ClockKind, RunId, Scenario};
+use crate::files;
+use crate::launch::{
+    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
+};
+use crate::runtime::seat_path;
+use crate::system::{remedy, tell};
+use indicatif::{ProgressBar, ProgressStyle};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
+
+/// Options of `corotate run`.
+#[derive(clap::Args, Default)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// Scenario file; without one, the first that ships with the program
+    file: Option<PathBuf>,
+    /// What drives the ticks: realtime, lockstep or in-process
+    #[arg(long, value_name = "CLOCK")]
+    clock: Option<String>,
+    /// Length of the run, s
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    duration: Option<String>,
+    /// Ticks per second, Hz
+    #[arg(long, value_name = "HZ", allow_negative_numbers = true)]
+    tick_hz: Option<String>,
+    /// Override any key of the scenario, as leader.measured_axes=[1,3] or follower.0.name=chaser
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Directory for the results [default: runs/<utc>-<name>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Do not run without every privilege that the scenario asks for
+    #[arg(long)]
+    require_rt: bool,
+    /// Do not start this role; somebody else will, in the domain that is printed
+    #[arg(long, value_name = "ROLE")]
+    external: Vec<String>,
+    /// Write the verdict to this file as JUnit XML, one test case per criterion
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    /// Record every sample to run.mcap in the directory for the results
+    #[arg(long)]
+    record: bool,
+    /// Show every signal live on a Foxglove WebSocket, at IP:PORT; without ADDR at 127.0.0.1:8765
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
+    foxglove: Option<SocketAddr>,
+    /// Print the summary as one JSON object on stdout, everything else on stderr
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  corotate run pair.toml                             four processes in real time; a table, and runs/<utc>-<name>/
+  corotate run pair.toml --clock lockstep            as fast as the machine goes, the same bits
+  corotate run pair.toml --record --set follower.0.initial_rate_rad_s=[1,0,0]
+                                                     every sample to run.mcap, with another start
+  corotate run pair.toml --external follower         wait for hardware in the follower's seat
+  corotate run pair.toml --junit verdict.xml --require-rt
+                                                     as a test, on a machine that grants real time";
+
+impl Arguments {
+    fn overrides(&self) -> Vec<String> {
+        let named = [("clock", &self.clock), ("duration_s", &self.duration), ("tick_hz", &self.tick_hz)];
+        let named = named.into_iter().filter_map(|(key, value)| value.as_ref().map(|value| format!("{key}={value}")));
+        let record = self.record.then(|| "record=true".to_owned());
+        self.set.iter().cloned().chain(named).chain(record).collect()
+    }
+
+    /// What to call the run where the scenario's name is not known.
+    fn stem(&self) -> String {
+        let stem = self.file.as_deref().and_then(Path::file_stem);
+        let shipped = || scenarios().first().map_or(name(), |(name, _)| name).to_owned();
+        stem.map_or_else(shipped, |stem| stem.to_string_lossy().into_owned())
+    }
+
+    fn scenario(&self) -> Result<Scenario, Failure> {
+        let loaded = load(self.file.as_deref(), &self.overrides());
+        let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
+        self.check_external(&scenario)
+            .and_then(|()| self.check_foxglove(&scenario))
+            .map_err(|reason| Failure { exit: Exit::Usage, reason })?;
+        Ok(scenario)
+    }
+
+    fn check_foxglove(&self, scenario: &Scenario) -> Result<(), String> {
+        let in_thread = "a run in one thread has nothing that another process could show; take --clock lockstep";
+        let reason = foxglove::refusal().or((scenario.clock == ClockKind::InProcess).then_some(in_thread));
+        reason.filter(|_| self.foxglove.is_some()).map_or(Ok(()), |reason| Err(format!("--foxglove: {reason}")))
+    }
+
+    fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
+        let check =
+            |role: &String| scenario.check_external(role).map_err(|reason| format!("--external {role}: {reason}"));
+        self.external.iter().try_for_each(check)
+    }
+}
+
+/// Why a run has no verdict.
+struct Failure {
+    exit: Exit,
+    reason: String,
+}
+
+impl Failure {
+    fn new(exit: Exit, reason: impl ToString) -> Self {
+        Self { exit, reason: reason.to_string() }
+    }
+}
+
+/// Runs a scenario.
+pub fn run(arguments: &Arguments) -> Exit {
+    let run = match new_run() {
+        Ok(run) => run,
+        Err(error) => {
+            let reason = "a sandbox may forbid getrandom: allow it";
+            return fail(Exit::Failure, &format!("the run gets no identifier: no random numbers: {error}; {reason}"));
+        }
+    };
+    let loaded = arguments.scenario().map(|scenario| Scenario { run: Some(run), ..scenario });
+    let name = loaded.as_ref().map_or_else(|_| arguments.stem(), |scenario| scenario.name.clone());
+    let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, ended));
+    // Whoever reads the file finds no older verdict, however this run ends.
+    if let Err(exit) = write_verdict(Err("the run did not come to an end")) {
+        return exit;
+    }
+    let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
+    let told = ended.as_ref().map(|(summary, _)| summary);
+    let written = write_verdict(told.map_err(|failure| failure.reason.as_str()));
+    let exit = match told {
+        Ok(summary) => verdict(summary),
+        Err(failure) => fail(failure.exit, &failure.reason),
+    };
+    match (written, exit) {
+        (Err(failed), Exit::Ok) => failed,
+        _ => exit,
+    }
+}
+
+fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str>) -> Result<(), Exit> {
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let made = directory.map_or(Ok(()), files::create_directories);
+    made.and_then(|()| files::write(path, junit(name, run, ended).as_bytes()))
+        .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
+}
+
+/// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failure> {
+    let broken = |reason: String| Failure { exit: Exit::Failure, reason };
+    let started = jiff::Timestamp::now();
+    let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
+        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    if arguments.out.is_some() {
+        claim(&directory).map_err(|error| match error {
+            ResultsError::Foreign { .. } => Failure::new(Exit::Usage, error),
+            ResultsError::Directory { .. } => Failure::new(Exit::Failure, error),
+        })?;
+    }
+    let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
+    let program = std::env::current_exe()
+        .map_err(|error| broken(format!("cannot find this program's own file: {error}; {}", remedy(&error))))?;
+    let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
+    let fleets = fleets.map(|body| body.name.to_string()).collect();
+    let mut screen = Screen { bar: None, asked: false, fleets };
+    let outcome = crate::launch::run(
+        scenario,
+        &mut Launch {
+            program,
+            external: arguments.external.clone(),
+            record: scenario.record.then(|| directory.join("run.mcap")),
+            foxglove: arguments.foxglove,
+            require_realtime: arguments.require_rt,
+            signal: &signal,
+            progress: &mut |progress| screen.show(progress),
+        },
+    );
+    screen.clear();
+    let outcome = outcome.map_err(|error| Failure::new(exit_of(&error), error))?;
+    let summary = Summary::new(scenario, &outcome, started);
+    let written = write_run(&directory, scenario, &summary);
+    let reported = report(arguments, &summary, &directory);
+    written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
+    reported.map_err(broken)?;
+    Ok((summary, outcome))
+}
+
+fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
+    let text = format!("{}results in {}\n", table(summary), directory.display());
+    if arguments.json {
+        tell(text.trim_end());
+        print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
+    } else {
+        print(&text)
+    }
+}
+
+fn verdict(summary: &Summary) -> Exit {
+    if !summary.books.balanced {
+        return fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
+    }
+    if summary.incidents.iter().any(|incident| incident.action == Action::Stopped) {
+        return Exit::ProcessLost;
+    }
+    if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
+        return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+    }
+    if summary.signal != 0 {
+        tell(format_args!("corotate: ended in order by signal {}", summary.signal));
+        return Exit::Signal(summary.signal);
+    }
+    for criterion in summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)) {
+        let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
+        fail(Exit::NotAccepted, &format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
+    }
+    if summary.accepted == Some(false) { Exit::NotAccepted } else { Exit::Ok }
+}
+
+/// The exit code of a run, or a replay, that failed.
+pub fn exit_of(error: &LaunchError) -> Exit {
+    match error {
+        LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
+        LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
+        LaunchError::Domain(_)
+        | LaunchError::Descriptors { .. }
+        | LaunchError::Bus(_)
+        | LaunchError::Ledger(_)
+        | LaunchError::Write { .. }
+        | LaunchError::Record(_)
+        | LaunchError::Spawn { .. } => Exit::Failure,
+    }
+}
+
+/// A signal cannot be caught: the system's error with what to do.
+pub fn not_caught(error: io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("cannot catch signals: {error}; {}", remedy(&error)))
+}
+
+/// The number of the signal that asked for the end, once one has.
+pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
+    let signal = Arc::new(AtomicUsize::new(0));
+    for number in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
+    }
+    Ok(signal)
+}
+
+/// The most runs of one scenario that begin in one second.
+const DIRECTORIES: u32 = 10_000;
+
+/// The directory for the results: as given, or a new one under `runs/`.
+pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
+    let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
+    if let Some(path) = given {
+        return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
+    }
+    let runs = Path::new("runs");
+    files::create_directories(runs).map_err(|error| named(runs, error))?;
+    let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
+    for attempt in 1..=DIRECTORIES {
+        let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
+        match files::create_directory(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
+        }
+    }
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
+}
+
+/// Progress on a terminal; silence elsewhere, but for what a person must do.
+struct Screen {
+    bar: Option<ProgressBar>,
+    asked: bool,
+    /// The bodies that are many, and that no device can be.
+    fleets: Vec<String>,
+}
+
+impl Screen {
+    fn show(&mut self, progress: &Progress<'_>) {
+        match progress {
+            Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
+                self.asked = true;
+                for role in external {
+                    tell(format_args!("waiting for {role}: start it with\n  {}", self.by_hand(role, domain)));
+                    let seat = seat_path(domain, role);
+                    tell(format_args!("or give a program of your own the seat\n  {}", seat.display()));
+                }
+            }
+            Progress::Waiting { .. } => {}
+            Progress::External(words) => match &self.bar {
+                Some(bar) => bar.suspend(|| tell(words)),
+                None => tell(words),
+            },
+            Progress::Running { tick, last_tick, metric } => {
+                let bar = self.bar.get_or_insert_with(|| bar(*last_tick));
+                bar.set_position(*tick);
+                bar.set_message(if metric.is_nan() { "-".to_owned() } else { format!("{metric:.2e}") });
+            }
+        }
+    }
+
+    fn by_hand(&self, role: &str, domain: &Path) -> String {
+        let (name, domain) = (name(), domain.display());
+        match role {
+            "observer" | "controller" => format!("{name} {role} --domain {domain}"),
+            body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
+                format!("{name} plant --body {body} --domain {domain}")
+            }
+            body => format!(
+                "{name} plant --body {body} --domain {domain}\nor put a device there with\n  \
+                 {name} bridge --serial PATH --body {body} --domain {domain}"
+            ),
+        }
+    }
+
+    fn clear(&mut self) {
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn bar(last_tick: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40} tick {pos}/{len} {eta} left, error {msg}");
+    // Drawn on stderr, and only if that is a terminal.
+    ProgressBar::new(last_tick).with_style(style.expect("the template is a constant that parses"))
+}

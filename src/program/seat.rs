@@ -1,0 +1,58 @@
+//! `corotate seat`: what a foreign program must know to take a role's seat.
+
+use super::{Exit, fail, say};
+use crate::config::{ClockKind, Scenario};
+use crate::runtime::{RoleError, RoleId, describe_seat, join_run};
+use crate::system::tell;
+use std::path::PathBuf;
+
+/// Options of `corotate seat`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// Scenario file
+    file: PathBuf,
+    /// The role: a body's name, observer or controller
+    role: String,
+    /// What drives the ticks: realtime or lockstep
+    #[arg(long, value_name = "CLOCK")]
+    clock: Option<String>,
+    /// Override any key of the scenario
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// The domain of a run that waits for the role; FILE is then DIR/scenario.toml
+    #[arg(long, value_name = "DIR")]
+    domain: Option<PathBuf>,
+}
+
+const EXAMPLES: &str = "\
+Example:
+  corotate seat pair.toml follower          services, samples and fields of the follower's seat";
+
+/// Prints a seat.
+pub fn seat(arguments: &Arguments) -> Exit {
+    describe(arguments).map_or_else(|exit| exit, |()| Exit::Ok)
+}
+
+fn describe(arguments: &Arguments) -> Result<(), Exit> {
+    let clock = arguments.clock.iter().map(|clock| format!("clock={clock}"));
+    let overrides: Vec<String> = arguments.set.iter().cloned().chain(clock).collect();
+    let scenario = Scenario::load(&arguments.file, &overrides).map_err(|error| fail(Exit::Usage, &error))?;
+    if scenario.clock == ClockKind::InProcess {
+        return Err(fail(Exit::Usage, &"one process has no seats for others; give --clock realtime or lockstep"));
+    }
+    let role = RoleId::named(&scenario, &arguments.role).ok_or_else(|| {
+        let (role, known) = (arguments.role.clone(), scenario.rig.roles().join(", "));
+        fail(Exit::Usage, &RoleError::NoSuchRole { role, known })
+    })?;
+    scenario.check_external(&arguments.role).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let domain = arguments.domain.as_deref().map(|root| join_run(&scenario, root)).transpose();
+    let domain = domain.map_err(|error| fail(Exit::Usage, &error))?;
+    if domain.is_none() {
+        let name = &arguments.role;
+        tell(format_args!(
+            "corotate: a domain exists while a run does; `run --external {name}` writes this with its domain, or give --domain"
+        ));
+    }
+    say(&describe_seat(&scenario, role, domain.as_ref()).to_json())
+}

@@ -1,0 +1,44 @@
+"""The follower of examples/motor-pair, by the links of follower.py: a seat is the same whatever the rig.
+
+Must not know more of the motor than the scenario in the seat says.
+"""
+
+import math
+import sys
+
+import follower
+
+
+class Motor:
+    """J dw/dt = k i - b w, under a held current."""
+
+    RIG = "motor-pair"
+
+    def __init__(self, scenario, _name):
+        motor = scenario["motor"]
+        self.end = motor["torque_n_m_per_a"] / motor["friction_n_m_s"]
+        self.rate = motor["friction_n_m_s"] / motor["inertia_kg_m2"]
+        self.speed, self.current = 0.0, 0.0
+
+    def apply(self, command):
+        usable = math.isfinite(command.current_a)
+        if usable:
+            self.current = command.current_a
+        return usable
+
+    def apply_safe(self):
+        self.current = 0.0
+
+    def measured(self):
+        return {"speed_rad_s": self.speed, "current_a": self.current}
+
+    def truth(self):
+        return {**self.measured(), "load_n_m": 0.0}
+
+    def flow(self, dt_s):
+        end = self.end * self.current
+        self.speed = end + (self.speed - end) * math.exp(-self.rate * dt_s)
+
+
+if __name__ == "__main__":
+    sys.exit(follower.main(Motor))

@@ -1,0 +1,190 @@
+//! A program of somebody else's, `examples/motor-pair`: with a rig that this crate does not know, everything works.
+
+mod common;
+
+use common::{Bench, await_some};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+const TICKS: u64 = 10_001;
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The program, built from outside as its author would, but into the same place, where its dependencies are built already.
+fn program() -> &'static Path {
+    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
+        let manifest = root().join("examples/motor-pair/Cargo.toml");
+        let mut command = Command::new(env!("CARGO"));
+        command.args(["build", "--locked", "--manifest-path", manifest.to_str().unwrap()]);
+        command.args(["--target-dir", profile.parent().unwrap().to_str().unwrap()]);
+        command.args((!cfg!(debug_assertions)).then_some("--release"));
+        let built = command.output().unwrap();
+        assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+        profile.join("motor-pair")
+    })
+}
+
+fn summary(bench: &Bench, out: &str) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(bench.path(out).join("summary.json")).unwrap()).unwrap()
+}
+
+/// Hash and number of the ticks before the first that was missed.
+fn clean(bench: &Bench, out: &str) -> (Vec<String>, usize) {
+    let text = std::fs::read_to_string(bench.path(out).join("hashes.txt")).unwrap();
+    let clean = summary(bench, out)["state"]["clean_ticks"].as_u64().unwrap();
+    let hashes = text.lines().filter(|line| !line.starts_with('#')).map(str::to_owned);
+    (hashes.collect(), clean as usize)
+}
+
+#[test]
+fn three_clocks_give_one_hash() {
+    let bench = Bench::of(program());
+    for clock in ["in-process", "lockstep", "realtime"] {
+        // A loaded machine may miss ticks in real time, and with them the criteria.
+        let relaxed = if clock == "realtime" { "accept={}" } else { "seed=1" };
+        let done = bench.run(&["run", "--clock", clock, "--out", clock, "--set", relaxed]);
+        assert_eq!(done.code, Some(0), "{clock}: {done:?}");
+        assert_eq!(summary(&bench, clock)["state"]["elapsed_ticks"], TICKS, "{clock}");
+        assert_eq!(summary(&bench, clock)["books"]["balanced"], true, "{clock}");
+    }
+    let (one, clean_one) = clean(&bench, "in-process");
+    assert_eq!(clean_one as u64, TICKS);
+    assert_eq!(clean(&bench, "lockstep"), (one.clone(), clean_one));
+    let (live, clean_live) = clean(&bench, "realtime");
+    let common = one.iter().zip(&live).take_while(|(one, live)| one == live).count();
+    assert!(common >= clean_live.min(live.len()), "{common} hashes are the same, {clean_live} ticks were clean");
+}
+
+#[test]
+fn what_a_scenario_gets_wrong_is_told_as_for_any_rig() {
+    let bench = Bench::of(program());
+    let shipped = bench.run(&["init", "motor-pair"]);
+    assert_eq!(shipped.code, Some(0), "{shipped:?}");
+    let line = |key: &str| 1 + shipped.stdout.lines().position(|line| line.starts_with(key)).unwrap();
+    for (from, to, expected) in [
+        ("inertia_kg_m2 = 1e-3", "inertia_kg_m2 = -1", "motor.inertia_kg_m2: -1 is not above zero"),
+        ("inertia_kg_m2 = 1e-3", "inertia_kg_m2 = \"a\"", "motor.inertia_kg_m2: "),
+        ("gain_per_s", "gian_per_s", "gain_per_s"),
+        ("speed_error_rad_s_max", "sped_error_rad_s_max", "speed_error_rad_s_max"),
+    ] {
+        let file = bench.path("wrong.toml");
+        std::fs::write(&file, shipped.stdout.replace(from, to)).unwrap();
+        let refused = bench.run(&["check", file.to_str().unwrap()]);
+        let place = format!("wrong.toml:{}", line(from.split(' ').next().unwrap()));
+        assert_eq!(refused.code, Some(2), "{to}: {refused:?}");
+        assert!(refused.stderr.contains(&place) && refused.stderr.contains(expected), "{to}: {refused:?}");
+    }
+    std::fs::write(bench.path("other.toml"), shipped.stdout.replace("rig = \"motor-pair\"", "rig = \"rigid-body\""))
+        .unwrap();
+    let refused = bench.run(&["check", "other.toml"]);
+    assert!(refused.code == Some(2) && refused.stderr.contains("motor-pair"), "{refused:?}");
+}
+
+/// Recorded, replayed, compared, exported, drawn: with its faults, and judged.
+#[test]
+fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
+    let bench = Bench::of(program());
+    let fault = "fault=[{kind=\"not-a-number\",role=\"leader\",field=\"speed_rad_s\",from_tick=100,ticks=5},\
+                 {kind=\"drop\",role=\"controller\",from_tick=300,ticks=30},{kind=\"kill\",role=\"observer\",from_tick=500}]";
+    let run = |out: &str, clock: &str, fault: &str| {
+        let junit = format!("{out}.xml");
+        let options = ["--clock", clock, "--record", "--out", out, "--junit", &junit, "--set", fault];
+        let done = bench.run(&[&["run"], &options[..]].concat());
+        assert_eq!(done.code, Some(0), "{done:?}");
+        assert!(std::fs::read_to_string(bench.path(&junit)).unwrap().contains("load_error_n_m"));
+        bench.path(out).join("run.mcap").display().to_string()
+    };
+    let (one, other) = (run("one", "in-process", fault), run("other", "lockstep", fault));
+    let quiet = run("quiet", "in-process", "fault=[]");
+    let told = summary(&bench, "one");
+    assert_eq!(told["books"]["rejected_samples"], 5, "{:#}", told["books"]);
+    assert!(told["score"]["statuses"].to_string().contains("holding"), "{:#}", told["score"]["statuses"]);
+    assert_eq!(bench.run(&["replay", &one]).code, Some(0));
+    assert_eq!(bench.run(&["replay", &other, "--role", "controller"]).code, Some(0));
+    assert_eq!(bench.run(&["diff", &one, &other]).code, Some(0));
+    let differs = bench.run(&["diff", &one, &quiet]);
+    assert!(differs.code == Some(3) && differs.stdout.contains("speed_rad_s"), "{differs:?}");
+    let exported = bench.run(&["export", &quiet, "--csv", "tables"]);
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let tables = std::fs::read_dir(bench.path("tables")).unwrap().map(|entry| entry.unwrap().path());
+    let tables: Vec<String> = tables.map(|path| std::fs::read_to_string(path).unwrap()).collect();
+    assert!(tables.iter().any(|table| table.contains("rise_rad_s2")), "{}", tables.len());
+    let page = bench.run(&["report", bench.path("one").to_str().unwrap(), "--out", "page.html"]);
+    assert_eq!(page.code, Some(0), "{page:?}");
+    let html = std::fs::read_to_string(bench.path("page.html")).unwrap();
+    for drawn in ["speed, rad/s", "load, N m", "current, A", "speed_error_rad_s"] {
+        assert!(html.contains(drawn), "{drawn}");
+    }
+}
+
+/// A role is killed and started anew, watched and seen in its seat; the same bits.
+#[test]
+fn a_killed_role_is_started_anew_and_the_run_is_watched() {
+    let bench = Bench::of(program());
+    let whole = bench.run(&["run", "--clock", "in-process", "--duration", "300", "--out", "whole"]);
+    assert_eq!(whole.code, Some(0), "{whole:?}");
+    let running = bench.start(&["run", "--clock", "lockstep", "--duration", "300", "--out", "killed"]);
+    // The tick that the screen shows, once there is one.
+    let screen = await_some(|| {
+        let screen = bench.run(&["watch", "--once", "0.2"]);
+        let tick =
+            screen.stdout.split("tick ").nth(1).and_then(|rest| rest.split('/').next()?.trim().parse::<u64>().ok());
+        tick.is_some_and(|tick| tick > 0).then_some(screen)
+    });
+    for role in ["observer", "follower", "controller"] {
+        if let Some(pid) = bench.role(role) {
+            common::send_signal(pid, 9);
+        }
+    }
+    let done = running.wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert!(screen.code == Some(0) && screen.stdout.contains("speed_error_rad_s"), "{screen:?}");
+    assert!(!summary(&bench, "killed")["incidents"].as_array().unwrap().is_empty());
+    assert_eq!(clean(&bench, "killed"), clean(&bench, "whole"));
+}
+
+/// A program in Python that knows of the rig only what its seat says.
+#[test]
+fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
+    let bench = Bench::of(program());
+    let described = bench.run(&["seat", "motor-pair.toml", "follower"]);
+    assert_eq!(described.code, Some(2), "there is no such file here: {described:?}");
+    let running = bench.start(&["run", "--clock", "lockstep", "--external", "follower", "--out", "out", "--json"]);
+    let seat = || bench.domains().first().map(|domain| domain.join("follower.seat.json")).filter(|seat| seat.is_file());
+    let (seat, motor) = (await_some(seat), root().join("tests/hil/motor.py"));
+    let venv = Command::new(root().join("tests/hil/venv")).output().unwrap();
+    assert!(venv.status.success(), "{}", String::from_utf8_lossy(&venv.stderr));
+    let interpreter = PathBuf::from(String::from_utf8(venv.stdout).unwrap().trim());
+    let follower = bench.start_program(&interpreter, &[motor.to_str().unwrap(), seat.to_str().unwrap()]);
+    let (done, follower) = (running.wait(), follower.wait());
+    assert_eq!((done.code, follower.code), (Some(0), Some(0)), "{done:?} {follower:?}");
+    assert_eq!(summary(&bench, "out")["books"]["balanced"], true);
+}
+
+/// What `corotate new` writes is this example under another name.
+#[test]
+fn a_new_crate_is_the_example_under_its_name() {
+    let bench = Bench::new();
+    let done = bench.run(&["new", "two-motors"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    for (file, original) in
+        [("src/main.rs", "src/main.rs"), ("two-motors.toml", "motor-pair.toml"), ("tests/clocks.rs", "tests/clocks.rs")]
+    {
+        let written = std::fs::read_to_string(bench.path("two-motors").join(file)).unwrap();
+        let example = std::fs::read_to_string(root().join("examples/motor-pair").join(original)).unwrap();
+        assert_eq!(written, example.replace("motor-pair", "two-motors"), "{file}");
+    }
+    let manifest = std::fs::read_to_string(bench.path("two-motors/Cargo.toml")).unwrap();
+    assert!(manifest.contains("name = \"two-motors\"") && manifest.contains("corotate = {"), "{manifest}");
+    assert_eq!(bench.run(&["new", "two-motors"]).code, Some(2), "it is there already");
+    for name in ["Two", "1st", "a_b", "corotate", "x", "../x", "a-"] {
+        let refused = bench.run(&["new", name]);
+        assert!(refused.code == Some(2) && refused.stderr.contains("cannot name"), "{name}: {refused:?}");
+    }
+}
