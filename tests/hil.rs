@@ -8,7 +8,8 @@ use corotate::bus::domain::{Domain, OwnedDomain};
 use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
-use corotate::config::Scenario;
+use corotate::clock::monotonic_ns;
+use corotate::config::{ClockKind, Scenario};
 use corotate::runtime::{
     Gate, Input, Poll, RoleId, Seek, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
 };
@@ -369,8 +370,7 @@ fn a_follower_that_says_nothing_of_itself_is_seen_by_its_samples() {
 #[test]
 fn a_silent_follower_that_misses_its_last_ticks_is_done() {
     let bench = Bench::new();
-    let limit = "supervision.heartbeat_timeout_s=0.5";
-    let brief = ["--duration", "1", "--set", "accept={}", "--set", limit];
+    let brief = ["--duration", "1", "--set", "accept={}"];
     let (running, _) = start_waiting(&bench, &[&["--clock", "realtime"], &brief[..]].concat());
     let domains = bench.domains();
     let partner = Partner::new(&domains[0], |tick, _| (tick < 990, tick < 990));
@@ -441,12 +441,16 @@ impl Partner {
         let mut schedule = bus.reader::<Schedule>(&topic(&scenario, "run", Signal::Schedule), Reader::Role).unwrap();
         let mut measurement = bus.writer::<RateMeasurement>(&signal(Signal::Measurement), 1).unwrap();
         let mut truth = bus.writer::<RateTruth>(&signal(Signal::Truth), 1).unwrap();
-        let (mut next, mut phase) = (0, Phase::Gather);
+        let (mut next, mut phase, mut epoch_ns) = (0, Phase::Gather, 0);
         while on.load(Ordering::Relaxed) {
             while schedule.advance().unwrap() {
-                phase = Phase::from_number(schedule.current().unwrap().phase);
+                let word = schedule.current().unwrap();
+                (phase, epoch_ns) = (Phase::from_number(word.phase), word.epoch_ns);
             }
-            let ready = next == 0 || command.seek(next - 1).unwrap() != Seek::NotYet;
+            let ready = match scenario.clock {
+                ClockKind::Realtime => monotonic_ns() >= epoch_ns + next * scenario.period_ns,
+                _ => next == 0 || command.seek(next - 1).unwrap() != Seek::NotYet,
+            };
             if phase != Phase::Run || !ready || next > scenario.last_tick {
                 std::thread::sleep(Duration::from_micros(50));
                 continue;

@@ -68,7 +68,7 @@ impl StateHash {
     }
 
     /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
-    #[cold]
+    #[inline]
     fn checkpoint(&mut self, ticks: u64) {
         while self.count < self.capacity && self.due <= ticks {
             self.checkpoints.set(self.count as usize, self.value);

@@ -190,12 +190,11 @@ class Body:
         #: What the last command asked for, rad/s²: torque over the nominal inertia.
         self.asked = (0.0, 0.0, 0.0)
 
+    def believes(self, command):
+        return all(map(math.isfinite, command.acceleration_rad_s2))
+
     def apply(self, command):
-        """Takes what a command asks for; False, and nothing changed, if that is no number."""
-        usable = all(map(math.isfinite, command.acceleration_rad_s2))
-        if usable:
-            self.asked = tuple(command.acceleration_rad_s2)
-        return usable
+        self.asked = tuple(command.acceleration_rad_s2)
 
     def apply_safe(self):
         self.asked = (0.0, 0.0, 0.0)
@@ -246,15 +245,15 @@ class Actuator:
 
     def take(self, command):
         """Decides the input of a tick: its command, or none. True if one was due and did not come, or is not believed."""
-        latched = self.safe and self.latches
-        self.rejected = command is not None and not latched and not self.body.apply(command)
+        self.rejected = command is not None and not self.body.believes(command)
         if command is None or self.rejected:
             self.silent_ticks += 1
             if not self.safe and self.silent_ticks >= self.timeout_ticks:
                 self.safe = True
                 self.body.apply_safe()
             return True
-        if not latched:
+        if not (self.safe and self.latches):
+            self.body.apply(command)
             self.silent_ticks, self.safe = 0, False
         return False
 

@@ -20,11 +20,11 @@ class Motor:
         self.rate = motor["friction_n_m_s"] / motor["inertia_kg_m2"]
         self.speed, self.current = 0.0, 0.0
 
+    def believes(self, command):
+        return math.isfinite(command.current_a)
+
     def apply(self, command):
-        usable = math.isfinite(command.current_a)
-        if usable:
-            self.current = command.current_a
-        return usable
+        self.current = command.current_a
 
     def apply_safe(self):
         self.current = 0.0

@@ -194,6 +194,15 @@ impl RigidBodyRig {
 }
 
 impl RigidBodyRig {
+    /// Which of all metrics there are, the first and the one after the last: without a follower there is only the inertia.
+    fn scored(&self) -> (usize, usize) {
+        match (&self.observer, self.controller) {
+            (ObserverDesign::Hidden { .. }, _) => (0, 2),
+            (_, Some(_)) => (0, 3),
+            (_, None) => (2, 3),
+        }
+    }
+
     /// Why nothing can be watched, if so.
     fn uncontrolled(&self) -> Option<&'static str> {
         self.controller.is_none().then_some("is watched by the controller, and this scenario has none")
@@ -346,11 +355,8 @@ impl Rig for RigidBodyRig {
     }
 
     fn metrics(&self) -> Vec<&'static str> {
-        match (&self.observer, self.controller) {
-            (ObserverDesign::Hidden { .. }, _) => vec!["sync_error_rad_s", "estimate_error_rad_s"],
-            (_, Some(_)) => vec!["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"],
-            (_, None) => vec!["coefficient_error"],
-        }
+        let (first, end) = self.scored();
+        ["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"][first..end].to_vec()
     }
 
     /// |p − ω| of the worst follower, of all bodies of fleets too, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
@@ -377,13 +383,10 @@ impl Rig for RigidBodyRig {
             followers.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst });
         let estimate_error = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);
         let coefficients = estimate.map(|estimate| Vector3::from(estimate.coefficients));
-        for (value, metric) in out.iter_mut().zip(self.metrics()) {
-            *value = match metric {
-                "sync_error_rad_s" => worst,
-                "estimate_error_rad_s" => estimate_error,
-                _ => distance(coefficients, Some(self.inertia.coefficients())),
-            };
-        }
+        let coefficient_error = distance(coefficients, Some(self.inertia.coefficients()));
+        let values = [worst, estimate_error, coefficient_error];
+        let (first, _) = self.scored();
+        out.iter_mut().zip(&values[first..]).for_each(|(out, value)| *out = *value);
     }
 
     fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
