@@ -127,12 +127,12 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
 #[test]
 fn a_killed_role_is_started_anew_and_the_run_is_watched() {
     let bench = Bench::of(program());
-    let whole = bench.run(&["run", "--clock", "in-process", "--duration", "300", "--out", "whole"]);
+    let whole = bench.run(&["run", "--clock", "in-process", "--duration", "1000", "--out", "whole"]);
     assert_eq!(whole.code, Some(0), "{whole:?}");
-    let running = bench.start(&["run", "--clock", "lockstep", "--duration", "300", "--out", "killed"]);
+    let running = bench.start(&["run", "--clock", "lockstep", "--duration", "1000", "--out", "killed"]);
     // The tick that the screen shows, once there is one.
     let screen = await_some(|| {
-        let screen = bench.run(&["watch", "--once", "0.2"]);
+        let screen = bench.run(&["watch", "--once", "1"]);
         let tick =
             screen.stdout.split("tick ").nth(1).and_then(|rest| rest.split('/').next()?.trim().parse::<u64>().ok());
         tick.is_some_and(|tick| tick > 0).then_some(screen)
