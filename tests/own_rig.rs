@@ -137,11 +137,7 @@ fn a_killed_role_is_started_anew_and_the_run_is_watched() {
             screen.stdout.split("tick ").nth(1).and_then(|rest| rest.split('/').next()?.trim().parse::<u64>().ok());
         tick.is_some_and(|tick| tick > 0).then_some(screen)
     });
-    for role in ["observer", "follower", "controller"] {
-        if let Some(pid) = bench.role(role) {
-            common::send_signal(pid, 9);
-        }
-    }
+    common::send_signal(bench.await_role("controller"), 9);
     let done = running.wait();
     assert_eq!(done.code, Some(0), "{done:?}");
     assert!(screen.code == Some(0) && screen.stdout.contains("speed_error_rad_s"), "{screen:?}");
