@@ -1,5 +1,5 @@
-//! Roles killed at random: a random role of a random shipped scenario, at a random place of its life, at a random instant, or
-//! at a random system call. In lockstep nothing may be lost: hash, counters and metrics are those of an undisturbed run.
+//! Roles killed at random: a random role of a random shipped scenario, at a random place of its life, at a random instant,
+//! alone or together with others, or at a random system call. In lockstep nothing may be lost: hash, counters and metrics are those of an undisturbed run.
 //!
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
@@ -37,6 +37,8 @@ enum Kill {
 struct Case {
     scenario: &'static str,
     role: String,
+    /// Who is killed in the same instant.
+    others: Vec<String>,
     realtime: bool,
     kill: Kill,
 }
@@ -51,7 +53,8 @@ impl Case {
         let (scenario, text) = SHIPPED[below(&mut random, SHIPPED.len() as u64) as usize];
         let parsed = Scenario::parse(text, scenario, &[]).unwrap();
         let roles = RoleId::all(&parsed);
-        let role = roles[below(&mut random, roles.len() as u64) as usize].name(&parsed).to_owned();
+        let names: Vec<String> = roles.iter().map(|role| role.name(&parsed).to_owned()).collect();
+        let role = names[below(&mut random, names.len() as u64) as usize].clone();
         let realtime = below(&mut random, 10) == 0;
         let kill = match below(&mut random, 10) {
             0..5 => {
@@ -71,7 +74,9 @@ impl Case {
             }
             _ => Kill::Instant(below(&mut random, if realtime { 1_000_000 } else { 250_000 })),
         };
-        Self { scenario, role, realtime, kill }
+        let together = matches!(kill, Kill::Instant(_)) && below(&mut random, 2) == 0;
+        let others = names.into_iter().filter(|name| together && *name != role && below(&mut random, 2) == 0).collect();
+        Self { scenario, role, others, realtime, kill }
     }
 
     fn arguments(&self) -> Vec<String> {
@@ -100,9 +105,10 @@ impl Case {
         match self.kill {
             Kill::Place(..) => {}
             Kill::Instant(after_us) => {
-                let pid = running.await_role_or_end(&bench, &self.role);
+                let roles = self.others.iter().chain([&self.role]);
+                let pids: Vec<_> = roles.map(|role| running.await_role_or_end(&bench, role)).collect();
                 std::thread::sleep(Duration::from_micros(after_us));
-                pid.iter().for_each(|pid| send_signal(*pid, libc_kill()));
+                pids.iter().flatten().for_each(|pid| send_signal(*pid, libc_kill()));
             }
             Kill::Call(call, count) => {
                 if let Some(pid) = running.await_role_or_end(&bench, &self.role) {
@@ -176,7 +182,8 @@ fn undisturbed(scenario: &'static str) -> Value {
     static KNOWN: LazyLock<Mutex<BTreeMap<&'static str, Value>>> = LazyLock::new(Mutex::default);
     let mut known = KNOWN.lock().unwrap();
     let run = || {
-        let arguments = Case { scenario, role: String::new(), realtime: false, kill: Kill::Instant(0) }.arguments();
+        let case = Case { scenario, role: String::new(), others: Vec::new(), realtime: false, kill: Kill::Instant(0) };
+        let arguments = case.arguments();
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let done = bench(scenario).run(&arguments);
         serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("{done:?}"))

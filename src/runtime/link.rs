@@ -1,11 +1,13 @@
 //! The two ends of a link: what was sent, received, lost, not believed, and its hash.
 
 mod input;
+mod kept;
 mod output;
 
 pub use input::{Horizon, Input, Seek};
-pub use output::Output;
+pub use kept::Kept;
 pub(super) use output::written;
+pub use output::{Extent, Output};
 
 #[cfg(test)]
 mod tests {
@@ -32,14 +34,15 @@ mod tests {
         }
     }
 
-    const LAST: u64 = 100;
+    const EXTENT: Extent = Extent { last_tick: 100, kept_ticks: 4 };
+    const WORDS: usize = size_of::<RateCommand>() / size_of::<u64>();
 
     fn topic() -> Topic {
         Topic { scenario: "s".to_owned(), body: "b".to_owned(), signal: Signal::Command }
     }
 
     fn output(bus: &MemoryBus, ledger: &Ledger, generation: u64) -> Output<MemoryBus, RateCommand> {
-        Output::open(bus, &topic(), 1, generation, &ledger.reopened(), LAST).unwrap()
+        Output::open(bus, &topic(), 1, generation, &ledger.reopened(), EXTENT).unwrap()
     }
 
     fn ends_with(ledger: Ledger, depth: usize) -> Ends {
@@ -50,7 +53,7 @@ mod tests {
     }
 
     fn ends(depth: usize) -> Ends {
-        ends_with(Ledger::private(Output::<MemoryBus, RateCommand>::words(LAST)), depth)
+        ends_with(Ledger::private(EXTENT.words(WORDS)), depth)
     }
 
     impl Ends {
@@ -115,7 +118,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         for (case, sent) in [("staged", false), ("sent", true)] {
             let path = directory.path().join(format!("{case}.books"));
-            let ledger = Ledger::shared(&path, Output::<MemoryBus, RateCommand>::words(LAST)).unwrap();
+            let ledger = Ledger::shared(&path, EXTENT.words(WORDS)).unwrap();
             let mut ends = ends_with(ledger, 8);
             ends.send(&[0, 1]);
             ends.output.stage(|sample| (sample.stamp.tick, sample.acceleration_rad_s2[0]) = (2, 0.5)).unwrap();
@@ -124,13 +127,7 @@ mod tests {
             if sent {
                 ends.output.dispatch().unwrap();
             }
-            let as_told = written(
-                &mut Restore(&committed.0),
-                "",
-                size_of::<RateCommand>() / 8,
-                true,
-                (&ends.ledger.reopened(), LAST),
-            );
+            let as_told = written(&mut Restore(&committed.0), "", WORDS, true, (&ends.ledger.reopened(), EXTENT));
             let mut successor = ends.successor(&committed);
             successor.dispatch().unwrap();
             successor.finish().unwrap();
@@ -178,5 +175,48 @@ mod tests {
         assert_eq!((input.seek(2).unwrap(), input.seek(5).unwrap()), (Seek::Passed, Seek::Found));
         let read = input.counters().report("");
         assert_eq!((read.received, read.gaps, read.stale, read.last_tick), (4, 2, 2, Some(5)));
+    }
+
+    /// Reader and writer die, and what was between them with them: their successors go on as if nothing had happened.
+    #[test]
+    fn what_was_under_way_when_both_ends_died_is_found_in_the_ledger() {
+        let directory = tempfile::tempdir().unwrap();
+        let ledger = Ledger::shared(&directory.path().join("x.books"), EXTENT.words(WORDS)).unwrap();
+        let mut ends = ends_with(ledger, 8);
+        ends.output = ends.output.with_voids(true);
+        ends.send(&[0, 1]);
+        assert_eq!(ends.input.seek(1).unwrap(), Seek::Found);
+        ends.send(&[2]);
+        ends.output.stage_void(3);
+        ends.output.dispatch().unwrap();
+        ends.output.finish().unwrap();
+        ends.output.stage(|sample| (sample.stamp.tick, sample.acceleration_rad_s2[0]) = (4, 0.5)).unwrap();
+        let (mut committed, mut counters, mut state) = (Store(Vec::new()), Store(Vec::new()), Store(Vec::new()));
+        ends.output.persist(&mut committed);
+        ends.output.dispatch().unwrap();
+        ends.input.counters().persist(&mut counters);
+        ends.input.persist(&mut state);
+
+        ends.bus = MemoryBus::new(Depths { role: 8, scorer: 1, history: 0 });
+        let mut output = ends.successor(&committed).with_voids(true);
+        let shared = ends.ledger.reopened();
+        shared.take(EXTENT.words(WORDS) - Kept::words(EXTENT.kept_ticks, WORDS));
+        let mut input = Input::<_, RateCommand>::watch(&ends.bus, &topic(), Reader::Role)
+            .unwrap()
+            .inheriting(Kept::open(&shared, EXTENT.kept_ticks, WORDS), 1);
+        input.counters().persist(&mut Restore(&counters.0));
+        input.persist(&mut Restore(&state.0));
+        output.dispatch().unwrap();
+        output.finish().unwrap();
+        output.send(|sample| sample.stamp.tick = 5).unwrap();
+        let mut seen = Vec::new();
+        for tick in 2..=5 {
+            let sought = input.seek(tick).unwrap();
+            seen.push((sought, input.sample().map(|sample| (sample.stamp.tick, sample.acceleration_rad_s2[0]))));
+        }
+        let found = |tick, value| (Seek::Found, Some((tick, value)));
+        assert_eq!(seen, [found(2, 0.0), (Seek::Passed, None), found(4, 0.5), found(5, 0.0)]);
+        let read = input.counters().report("");
+        assert_eq!((read.received, read.void, read.gaps, read.stale, read.rejected), (5, 1, 0, 0, 0));
     }
 }

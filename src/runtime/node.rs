@@ -15,16 +15,14 @@ pub use ports::{Port, Ports, ports};
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
 use super::hooks::{self, Place};
-use super::link::{self, Horizon, Input, Output};
+use super::link::{self, Extent, Horizon, Input, Kept, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
-use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
 use crate::config::{ClockKind, Scenario};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Fleet, Rig};
 use crate::role::Guard;
-use crate::sample::RateTruth;
 use crate::serial::LineBook;
 use crate::state::{Count, Persist, Restore, Words};
 use crate::telemetry::{Grant, Ledger, LedgerError, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchReport};
@@ -322,15 +320,34 @@ impl<B: Bus> Seat<'_, B> {
         S: Carried + ?Sized,
     {
         let topic = topic(self.scenario, &body.name, signal);
-        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?.guarded(guard);
+        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?
+            .inheriting(self.kept(&topic), body.bodies())
+            .guarded(guard);
         input.expect(horizon(self.scenario, None));
         Ok(input)
     }
 
+    /// What the writer of a signal has kept for the successor of a reader.
+    fn kept(&self, topic: &Topic) -> Option<Kept> {
+        if self.generation == 1 {
+            return None;
+        }
+        let (scenario, extent) = (self.scenario, extent(self.scenario));
+        RoleId::all(scenario).into_iter().find_map(|writer| {
+            let written = ports(scenario, writer).writes;
+            let index = written.iter().position(|port| port.topic == *topic)?;
+            let path = self.ledger.path()?.with_file_name(ledger_file(scenario, writer));
+            let ledger = Ledger::existing(&path, ledger_words(scenario, writer))?;
+            let length = words(&written[index]);
+            ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_ticks, length));
+            Kept::open(&ledger, extent.kept_ticks, length)
+        })
+    }
+
     fn output<S: Carried + ?Sized>(&self, body: &BodyInfo, signal: Signal) -> Result<Output<B, S>, BusError> {
         let topic = topic(self.scenario, &body.name, signal);
-        let (bodies, last_tick) = (body.bodies(), self.scenario.last_tick);
-        let output = Output::open(self.bus, &topic, bodies, self.generation, self.ledger, last_tick)?;
+        let (bodies, extent) = (body.bodies(), extent(self.scenario));
+        let output = Output::open(self.bus, &topic, bodies, self.generation, self.ledger, extent)?;
         // Nobody in the loop reads the truth, and the score is to tell what really happened.
         let disturbance = match signal {
             Signal::Truth => None,
@@ -355,7 +372,29 @@ pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
 
 /// How many words of a role's ledger lie beside its record.
 pub(crate) fn ledger_words(scenario: &Scenario, role: RoleId) -> usize {
-    ports(scenario, role).writes.len() * Output::<MemoryBus, RateTruth>::words(scenario.last_tick)
+    words_of(&ports(scenario, role).writes, extent(scenario))
+}
+
+fn words_of(written: &[Port], extent: Extent) -> usize {
+    written.iter().map(|port| extent.words(words(port))).sum()
+}
+
+/// The length of a sample, words.
+fn words(port: &Port) -> usize {
+    port.size / size_of::<u64>()
+}
+
+/// The name of the file that has a role's ledger.
+pub(super) fn ledger_file(scenario: &Scenario, role: RoleId) -> String {
+    format!("{}.books", role.name(scenario))
+}
+
+/// What the writing ends of a scenario keep. Where every sample is waited for, one may be under way for as long as the fastest
+/// role may be ahead.
+fn extent(scenario: &Scenario) -> Extent {
+    let lockstep = scenario.clock == ClockKind::Lockstep;
+    let kept_ticks = if lockstep { super::window_ticks(scenario) } else { 0 };
+    Extent { last_tick: scenario.last_tick, kept_ticks }
 }
 
 /// An upper bound on the shared memory that a role's record takes, bytes: two copies of what it writes, and of what bodies,
@@ -410,23 +449,22 @@ pub fn report(
     let (ports, ledger) = (ports(scenario, role), &ledger.reopened());
     // Of a role that has committed nothing there are zeros.
     let record = ledger.record().unwrap_or_default();
-    let words = &mut Restore(&record);
+    let record_words = &mut Restore(&record);
     let (mut ticks, voids) = (TickBook::default(), scenario.clock != ClockKind::Realtime);
-    ticks.persist(words);
+    ticks.persist(record_words);
     let written = |port: &Port| {
-        let length = port.size / size_of::<u64>();
-        link::written(words, &port.topic.to_string(), length, voids, (ledger, scenario.last_tick))
+        link::written(record_words, &port.topic.to_string(), words(port), voids, (ledger, extent(scenario)))
     };
     let written = ports.writes.iter().map(written).collect();
     let read = |port: &Port| {
         let mut read = ReadBook::default();
-        read.persist(words);
+        read.persist(record_words);
         read.report(&port.topic.to_string())
     };
     let read = ports.reads.iter().map(read).collect();
     let watchdog = (role == RoleId::Controller).then(|| {
         let mut watchdog = Watchdog::new(scenario.watch);
-        watchdog.persist(words);
+        watchdog.persist(record_words);
         watchdog
     });
     RoleReport {

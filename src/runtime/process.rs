@@ -5,7 +5,7 @@
 use super::bridge::DeviceError;
 use super::drive::{Control, Drive, Ended, Voice, Waiting};
 use super::hooks::{self, Place};
-use super::node::{self, Occupant, ReadyNode, RoleId, ledger_words, report, topic};
+use super::node::{self, Occupant, ReadyNode, RoleId, ledger_file, ledger_words, report, topic};
 use super::privileges::Privileges;
 use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError};
@@ -191,7 +191,7 @@ fn take_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Led
 }
 
 fn ledger_path(domain: &Domain, scenario: &Scenario, role: RoleId) -> PathBuf {
-    domain.shared(&format!("{}.books", role.name(scenario)))
+    domain.shared(&ledger_file(scenario, role))
 }
 
 fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {

@@ -115,6 +115,13 @@ impl Ledger {
         Ok(Self::over(Storage::shared(path, Self::FIRST + words)?, Some(path.to_owned())))
     }
 
+    /// The ledger of so many words in a file that must be there, to be read.
+    pub fn existing(path: &Path, words: usize) -> Option<Self> {
+        let shared = SharedWords::existing(path).ok()?;
+        let whole = shared.words().len() == Self::FIRST + words;
+        whole.then(|| Self::over(Storage::Shared(shared), Some(path.to_owned())))
+    }
+
     /// The same, to be written: there is one writer at a time.
     ///
     /// # Errors
@@ -174,6 +181,11 @@ impl Ledger {
         let words =
             self.memory.words.words().get(begin..begin + count).expect("the ledger is sized for all that it has");
         Slots { words: words.into(), _memory: self.memory.clone() }
+    }
+
+    /// Where it is, unless it dies with this process.
+    pub fn path(&self) -> Option<&Path> {
+        self.memory.path.as_deref()
     }
 
     /// Whether another process may have to continue from here: whoever writes commits every tick.

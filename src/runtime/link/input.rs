@@ -3,12 +3,14 @@
 //! Samples of generation 0 are warm-up: they pass through the link and go no further. Must not let a sample that its guard
 //! does not believe be seen.
 
+use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
 use crate::role::{Guard, Unguarded};
 use crate::sample::{Stamp, VOID};
 use crate::state::{Persist, Words};
 use crate::telemetry::ReadBook;
+use std::borrow::{Borrow, BorrowMut};
 
 /// What a reading end has for a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,7 +60,14 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
     doubted: Option<u64>,
     /// Whether what arrives may be what a predecessor of this end has counted already.
     pub(super) repeated: bool,
+    inheritance: Option<Inheritance<S>>,
     book: ReadBook,
+}
+
+/// What was on its way to a predecessor: it may have died together with the writer.
+struct Inheritance<S: Carried + ?Sized> {
+    kept: Kept,
+    sample: S::Owned,
 }
 
 impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
@@ -83,14 +92,20 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
             newest: Newest::None,
             doubted: None,
             repeated: false,
+            inheritance: None,
             book: ReadBook::default(),
         })
     }
 
     /// The same with a guard.
     pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
-        let Self { port, horizon, last, newest, doubted, repeated, book, .. } = self;
-        Input { port, guard, horizon, last, newest, doubted, repeated, book }
+        let Self { port, horizon, last, newest, doubted, repeated, inheritance, book, .. } = self;
+        Input { port, guard, horizon, last, newest, doubted, repeated, inheritance, book }
+    }
+
+    /// The same for a successor, with what the writer of a signal of so many bodies has kept.
+    pub fn inheriting(self, kept: Option<Kept>, bodies: usize) -> Self {
+        Self { inheritance: kept.map(|kept| Inheritance { kept, sample: S::blank(bodies) }), ..self }
     }
 }
 
@@ -136,12 +151,29 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// Takes one sample off the link, whatever it is worth; false if there is none.
     #[inline]
     fn take(&mut self) -> Result<bool, BusError> {
-        if !self.port.advance()? {
+        if !self.inherits() && !self.port.advance()? {
             return Ok(false);
         }
-        let stamp = self.port.current().map(|sample| *sample.stamp());
+        let stamp = self.current().map(|sample| *sample.stamp());
         self.newest = stamp.map_or(Newest::None, |stamp| self.account(&stamp));
         Ok(true)
+    }
+
+    /// Moves on to the next sample of what was on its way to a predecessor. Behind the last the link goes on.
+    #[inline]
+    fn inherits(&mut self) -> bool {
+        let Some(Inheritance { kept, sample }) = &mut self.inheritance else { return false };
+        let found = kept.find(self.book.covered(), sample.borrow_mut().words_mut());
+        if !found {
+            (self.inheritance, self.newest) = (None, Newest::None);
+        }
+        found
+    }
+
+    /// The sample that was taken last.
+    #[inline]
+    fn current(&self) -> Option<&S> {
+        self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()))
     }
 
     /// Enters a sample into the books.
@@ -166,7 +198,8 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             }
             return Newest::None;
         }
-        self.repeated = false;
+        // What is inherited may come once more, by the link.
+        self.repeated = self.inheritance.is_some();
         if !self.possible(stamp.tick) {
             self.book.stray();
             return Newest::None;
@@ -182,7 +215,9 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             self.book.void(stamp.tick);
             return Newest::None;
         }
-        if self.port.current().is_some_and(|sample| self.guard.accepts(sample)) {
+        // Not by `current`: the guard is another part of this end.
+        let sample = self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()));
+        if sample.is_some_and(|sample| self.guard.accepts(sample)) {
             self.book.received(stamp.tick);
             return Newest::AtHand;
         }
@@ -224,13 +259,13 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// The sample at hand, if there is one that can be used.
     #[inline]
     pub fn sample(&self) -> Option<&S> {
-        self.port.current().filter(|_| self.newest == Newest::AtHand)
+        self.current().filter(|_| self.newest == Newest::AtHand)
     }
 
     /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
     #[inline]
     pub fn rejected(&self) -> Option<&Stamp> {
-        self.port.current().filter(|_| self.newest == Newest::Rejected).map(S::stamp)
+        self.current().filter(|_| self.newest == Newest::Rejected).map(S::stamp)
     }
 
     /// Takes what waits and forgets it, to exercise the link. Before the first tick only.

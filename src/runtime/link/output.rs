@@ -4,6 +4,7 @@
 //! sent that is not committed, and what is committed and was perhaps not sent is sent by a successor: readers tell a repeated
 //! sample by its tick. A void stands for a sample that does not exist, where everybody waits for inputs. Must not commit.
 
+use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
 use crate::fault::Transport;
 use crate::runtime::disturb::Disturbance;
@@ -13,6 +14,9 @@ use crate::state::{Persist, Words, persist_fields};
 use crate::telemetry::{Ledger, LinkWritten, Slots, WriteBook};
 use std::borrow::{Borrow, BorrowMut};
 
+/// Words of a stamp.
+const STAMP_WORDS: usize = size_of::<Stamp>() / size_of::<u64>();
+
 /// The writing end of a signal.
 pub struct Output<B: Bus, S: Carried + ?Sized> {
     port: S::Writer<B>,
@@ -20,8 +24,6 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     /// What is committed and not yet counted, and the sample that it is about, under the stamp that it was made with.
     staged: Staged,
     sample: S::Owned,
-    /// The tick of the last sample that was made and went out, or goes out, as that of its tick.
-    last_sample: Option<u64>,
     /// Whether the port holds that sample already.
     filled: bool,
     /// Whether a void takes the place of a sample that does not go out.
@@ -34,6 +36,7 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     book: WriteBook,
     /// How much of a tick has been sent, for a successor: the tick + 1, and 16 bits for the number of samples.
     progress: Option<Slots>,
+    kept: Option<Kept>,
 }
 
 /// What a writing end is about to send for a tick.
@@ -43,7 +46,7 @@ struct Staged {
     /// One of the constants.
     kind: u64,
     /// The stamp as it goes out: a scripted fault may have broken it.
-    stamp: [u64; 4],
+    stamp: [u64; STAMP_WORDS],
     /// Samples of earlier ticks, held back by scripted faults, that go out before this tick's.
     late: u64,
     /// How often this tick's sample goes out.
@@ -73,13 +76,24 @@ impl Staged {
     }
 }
 
-impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
-    /// Words of the ledger beside the record, for a run that ends with `last_tick`.
-    pub fn words(last_tick: u64) -> usize {
-        1 + WriteBook::words(last_tick)
-    }
+/// How far a run goes, and of how many ticks samples are [kept](Kept): what decides how much a writing end keeps in a ledger.
+#[derive(Debug, Clone, Copy)]
+pub struct Extent {
+    /// The last tick.
+    pub last_tick: u64,
+    /// The ticks whose samples are kept.
+    pub kept_ticks: u64,
+}
 
-    /// Opens a signal of so many bodies for a run that ends with `last_tick`.
+impl Extent {
+    /// Words of the ledger beside the record, for samples of so many words.
+    pub fn words(self, length: usize) -> usize {
+        1 + WriteBook::words(self.last_tick) + Kept::words(self.kept_ticks, length)
+    }
+}
+
+impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
+    /// Opens a signal of so many bodies.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -89,22 +103,24 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         bodies: usize,
         generation: u64,
         ledger: &Ledger,
-        last_tick: u64,
+        extent: Extent,
     ) -> Result<Self, BusError> {
         let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
+        let book = WriteBook::open(ledger, extent.last_tick);
+        let kept = Kept::open(ledger, extent.kept_ticks, S::length(bodies));
         Ok(Self {
             port: S::writer(bus, topic, bodies, generation)?,
             generation,
             staged: Staged::default(),
             sample: S::blank(bodies),
-            last_sample: None,
             filled: false,
             voids: false,
             shows: false,
             shown: false,
             disturbance: None,
-            book: WriteBook::open(ledger, last_tick),
+            book,
             progress,
+            kept,
         })
     }
 
@@ -143,7 +159,6 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let stamp = *kept.stamp();
         self.staged =
             Staged { tick: stamp.tick, kind: Staged::SAMPLE, stamp: bytemuck::cast(stamp), late: 0, copies: 1 };
-        self.last_sample = Some(stamp.tick);
         hooks::at(Place::Staged);
         Ok(())
     }
@@ -178,7 +193,6 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         self.book.extra(late + copies - u64::from(delivered));
         let kind = if delivered { Staged::SAMPLE } else { Staged::WITHHELD };
         self.staged = Staged { tick: stamp.tick, kind, stamp: bytemuck::cast(*sample.stamp()), late, copies };
-        self.last_sample = if delivered { Some(stamp.tick) } else { self.last_sample };
         let kept = self.sample.borrow_mut();
         kept.assign(sample);
         *kept.stamp_mut() = stamp;
@@ -200,6 +214,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if !std::mem::take(&mut self.filled) {
             return self.dispatch_rest();
         }
+        self.keep();
         if self.shows {
             self.port.show()?;
             self.shown = true;
@@ -209,6 +224,28 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.sent(1);
         }
         Ok(())
+    }
+
+    /// Keeps what stands for the tick, before anybody sees it.
+    #[inline]
+    fn keep(&self) {
+        let Some(kept) = &self.kept else { return };
+        let sample: &S = self.sample.borrow();
+        if self.staged.kind == Staged::SAMPLE {
+            let content = &sample.words()[STAMP_WORDS..];
+            kept.keep(self.staged.tick, self.staged.stamp.iter().chain(content).copied());
+        } else {
+            let stamp: [u64; STAMP_WORDS] = bytemuck::cast(self.void());
+            kept.keep(self.staged.tick, stamp.into_iter().chain(std::iter::repeat(0)));
+        }
+    }
+
+    /// The stamp of the void that takes the place of what is staged.
+    fn void(&self) -> Stamp {
+        let made = *self.sample.borrow().stamp();
+        let Staged { tick, kind, .. } = self.staged;
+        let stamp = if kind == Staged::WITHHELD { made } else { Stamp { tick, ..Stamp::default() } };
+        Stamp { generation: self.generation | VOID, ..stamp }
     }
 
     /// Leaves word that so many samples of the tick have been sent.
@@ -236,6 +273,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if kind == Staged::NOTHING {
             return Ok(());
         }
+        self.keep();
         let own = late + copies;
         let void = self.voids && kind != Staged::SAMPLE;
         for index in self.already_sent()..own + u64::from(void) {
@@ -254,41 +292,15 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                     })?;
                 }
                 None => {
-                    let made = *self.sample.borrow().stamp();
-                    let Staged { tick, kind, .. } = self.staged;
-                    self.send_void(if kind == Staged::WITHHELD { made } else { Stamp { tick, ..Stamp::default() } })?;
+                    let void = self.void();
+                    self.port.send(|slot| {
+                        slot.words_mut().fill(0);
+                        *slot.stamp_mut() = void;
+                    })?;
                 }
             }
             hooks::at(Place::Sent);
             self.sent(index + 1);
-        }
-        Ok(())
-    }
-
-    fn send_void(&mut self, stamp: Stamp) -> Result<(), BusError> {
-        self.port.send(|slot| {
-            slot.words_mut().fill(0);
-            *slot.stamp_mut() = Stamp { generation: self.generation | VOID, ..stamp };
-        })
-    }
-
-    /// Sends again what was sent for a tick, the sample or the void: who had it died with the writer.
-    ///
-    /// # Errors
-    /// [`BusError::Send`].
-    pub fn repeat(&mut self, tick: u64) -> Result<(), BusError> {
-        self.port.prepare()?;
-        if self.last_sample == Some(tick) {
-            let (kept, generation): (&S, u64) = (self.sample.borrow(), self.generation);
-            self.port.send(|slot| {
-                slot.assign(kept);
-                slot.stamp_mut().generation = generation;
-            })?;
-        } else {
-            self.send_void(Stamp { tick, ..Stamp::default() })?;
-        }
-        if self.staged.tick == tick {
-            self.sent(self.staged.late + self.staged.copies + 1);
         }
         Ok(())
     }
@@ -367,7 +379,6 @@ impl<B: Bus, S: Carried + ?Sized> Persist for Output<B, S> {
         self.book.persist(words);
         self.staged.persist(words);
         self.sample.borrow_mut().words_mut().persist(words);
-        self.last_sample.persist(words);
     }
 }
 
@@ -384,15 +395,15 @@ pub fn written(
     service: &str,
     length: usize,
     voids: bool,
-    (ledger, last_tick): (&Ledger, u64),
+    (ledger, extent): (&Ledger, Extent),
 ) -> LinkWritten {
     ledger.take(1);
-    let (mut book, mut staged) = (WriteBook::open(ledger, last_tick), Staged::default());
+    let (mut book, mut staged) = (WriteBook::open(ledger, extent.last_tick), Staged::default());
+    ledger.take(Kept::words(extent.kept_ticks, length));
     let mut sample = vec![0_u64; length];
     book.persist(words);
     staged.persist(words);
     sample.persist(words);
-    None::<u64>.persist(words);
     staged.count(&mut book, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], voids);
     book.report(service)
 }

@@ -8,16 +8,14 @@ use super::controller::ControllerNode;
 use super::observer::ObserverNode;
 use super::{Gate, Node, Poll, RoleId, Seat};
 use crate::bus::{Bus, BusError};
-use crate::clock::{Clock, Grid};
+use crate::clock::Grid;
 use crate::rig::Rig;
 use crate::telemetry::{LedgerError, StageReport, Ticks};
 
-/// Both nodes. What the observer had sent and the controller not used died with both: in lockstep a successor sends it again.
+/// Both nodes.
 pub struct FusedNode<R: Rig, B: Bus> {
     observer: ObserverNode<R, B>,
     controller: ControllerNode<R, B>,
-    /// Whether no sample may be lost.
-    lossless: bool,
     /// The tick of the estimate that the observer has sent and not settled.
     estimated: Option<u64>,
 }
@@ -26,7 +24,7 @@ impl<R: Rig, B: Bus> FusedNode<R, B> {
     pub fn open(rig: &R, observer: &Seat<'_, B>, controller: &Seat<'_, B>) -> Result<Self, BusError> {
         let made = ObserverNode::open(rig, observer)?.shown_first();
         let used = ControllerNode::open(rig, controller)?;
-        Ok(Self { observer: made, controller: used, lossless: controller.clock == Clock::None, estimated: None })
+        Ok(Self { observer: made, controller: used, estimated: None })
     }
 
     /// Whether it is the observer's input that the next tick lacks: nothing else could bring the estimate.
@@ -59,9 +57,6 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
     }
 
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
-        if self.lossless {
-            self.observer.repeat(self.controller.next_tick())?;
-        }
         self.observer.start(grid, first_tick)?;
         self.controller.start(grid, first_tick)
     }
@@ -156,12 +151,13 @@ impl<R: Rig, B: Bus> Node for FusedNode<R, B> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::commit_last;
+    use super::super::{commit_last, ledger_file};
     use super::*;
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
+    use crate::clock::Clock;
     use crate::config::{SHIPPED, Scenario};
-    use crate::runtime::{ReadyNode, build, depths, private_ledger, report};
+    use crate::runtime::{ReadyNode, build, depths, private_ledger, report, shared_ledger};
     use crate::telemetry::Ledger;
     use crate::with_shipped_rig;
 
@@ -197,7 +193,9 @@ mod tests {
         let plant_books = roles.map(|role| private_ledger(scenario, role));
         let plant = |(role, books): (&RoleId, &Ledger)| build(scenario, *role, &bus, books).unwrap();
         let mut plants: Vec<ReadyNode> = roles.iter().zip(&plant_books).map(plant).collect();
-        let books = [RoleId::Observer, RoleId::Controller].map(|role| private_ledger(scenario, role));
+        let directory = tempfile::tempdir().unwrap();
+        let books = [RoleId::Observer, RoleId::Controller]
+            .map(|role| shared_ledger(scenario, role, &directory.path().join(ledger_file(scenario, role))).unwrap());
 
         let first_bus = enter(&domain, scenario);
         let mut fused = open(rig, scenario, &first_bus, &books);

@@ -65,11 +65,6 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         self.estimate.publish()
     }
 
-    /// Sends again what was sent for the ticks from this one on: nobody has it any more.
-    pub fn repeat(&mut self, from: u64) -> Result<(), BusError> {
-        (from..self.book.next()).try_for_each(|tick| self.estimate.repeat(tick))
-    }
-
     #[inline]
     fn execute(&mut self) -> Result<Poll, BusError> {
         let received = self.clock.now_ns();
