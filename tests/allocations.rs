@@ -218,10 +218,12 @@ fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
     Occupant::Device(index, Box::new(link))
 }
 
-fn counts(text: &str, with_device: bool, fused: bool) -> Vec<(RoleReport, Count)> {
-    let fused = format!("launch.fused={fused}");
-    let overrides =
-        ["clock=realtime", "duration_s=1", "accept={}", "fault=[]", "watchdog={}", &fused].map(str::to_owned);
+fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Count)> {
+    let processes = format!("launch.processes={processes}");
+    // So slow that a device is heard on any machine.
+    let (tick, duration) = if with_device { ("tick_hz=200", "duration_s=4") } else { ("tick_hz=1000", "duration_s=1") };
+    let overrides = ["clock=realtime", tick, duration, "accept={}", "fault=[]", "watchdog={}", &processes];
+    let overrides = overrides.map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
     let domain = OwnedDomain::create(0).unwrap();
     let hosts = RoleId::all(&scenario).into_iter().filter(|role| role.host(&scenario) == *role);
@@ -236,11 +238,11 @@ fn counts(text: &str, with_device: bool, fused: bool) -> Vec<(RoleReport, Count)
                     by_device = Some(scope.spawn(|| device(scenario, *index, &far)));
                     scope.spawn(move || count_role(scenario, linked(scenario, *index, path), domain))
                 }
-                RoleId::Controller if scenario.fused => scope.spawn(move || {
-                    let observer = Occupant::Fused(private_ledger(scenario, RoleId::Observer));
-                    count_role(scenario, observer, domain)
+                role => scope.spawn(move || {
+                    let others = role.hosted(scenario).into_iter().filter(|other| other != role);
+                    let others = others.map(|other| (other, private_ledger(scenario, other))).collect();
+                    count_role(scenario, Occupant::Role(*role, others), domain)
                 }),
-                role => scope.spawn(move || count_role(scenario, *role, domain)),
             })
             .collect();
         conduct(scenario, domain);
@@ -268,22 +270,28 @@ fn assert_none(name: &str, counts: Vec<(RoleReport, Count)>) {
 #[test]
 fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
-        assert_none(name, counts(text, false, false));
+        assert_none(name, counts(text, false, "[]"));
     }
 }
 
 #[test]
-fn neither_does_an_observer_that_shares_the_controller_s_process() {
+fn neither_does_a_process_of_several_roles() {
     let (name, text) = corotate::config::SHIPPED[0];
-    let counts = counts(text, false, true);
-    assert!(counts.len() == 3 && counts.iter().all(|(report, _)| report.role != "observer"));
-    assert_none(name, counts);
+    for (processes, count) in [
+        ("[['observer', 'controller']]", 3),
+        ("[['leader', 'controller'], ['follower', 'observer']]", 2),
+        ("[['leader', 'follower', 'observer', 'controller']]", 1),
+    ] {
+        let counts = counts(text, false, processes);
+        assert_eq!(counts.len(), count, "{processes}");
+        assert_none(name, counts);
+    }
 }
 
 #[test]
 fn neither_does_a_bridge_to_a_device() {
     let (name, text) = corotate::config::SHIPPED[0];
-    let counts = counts(text, true, false);
+    let counts = counts(text, true, "[]");
     assert!(counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
     assert_none(name, counts);
 }

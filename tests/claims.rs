@@ -3,7 +3,7 @@
 //! A claim is false if the loop does not converge, if its error falls at another rate than the printed one, or if it ends at
 //! another floor. Converging loops of which nothing is claimed are counted: to promise nothing is easy.
 //!
-//! `tests/claims-campaign N SEED FIRST` draws N scenarios from number FIRST on; the short form in the suite is the first 200
+//! `tests/claims-campaign N SEED FIRST` draws N scenarios from number FIRST on; the short form in the suite is the first 60
 //! of seed 1.
 
 use corotate::analysis::{Claim, claims};
@@ -484,7 +484,7 @@ fn what_was_claimed_falsely_once_is_not_again() {
 #[test]
 fn what_is_claimed_holds() {
     let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
-    let (count, seed, first) = (of("COROTATE_CLAIMS", 200), of("COROTATE_SEED", 1), of("COROTATE_FIRST", 0));
+    let (count, seed, first) = (of("COROTATE_CLAIMS", 60), of("COROTATE_SEED", 1), of("COROTATE_FIRST", 0));
     let (next, refused) = (AtomicU64::new(first), AtomicU64::new(0));
     let counts = Mutex::new(BTreeMap::<&str, u64>::new());
     let unfitted = Mutex::new(BTreeMap::<&str, u64>::new());

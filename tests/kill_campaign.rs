@@ -133,7 +133,8 @@ impl Case {
     fn judge(&self, done: &Done) -> (bool, Option<String>) {
         // Before the ticks run a role that dies ends the run, and says so.
         if done.code == Some(4) && done.stdout.is_empty() {
-            let named = done.stderr.contains(&self.role) && done.stderr.contains("died");
+            let mut killed = self.others.iter().chain([&self.role]);
+            let named = killed.any(|role| done.stderr.contains(&format!("{role} died")));
             return (true, (!named).then(|| format!("its death is not told: {done:?}")));
         }
         let Ok(summary) = serde_json::from_str::<Value>(&done.stdout) else {

@@ -16,6 +16,10 @@ use crate::runtime::RoleId;
 const RATES_HZ: [u64; 4] = [1000, 5000, 10_000, 20_000];
 /// Words of the bare samples: 128 bytes, as much as a measurement takes, and an estimate nearly.
 const WORDS: usize = 16;
+/// `launch.processes`: each role in a process of its own, both of the performance-critical step in one, all in one.
+pub(super) const APART: &str = "[]";
+const ESTIMATE_AND_CONTROL: &str = "[['observer', 'controller']]";
+const ALL: &str = "[['leader', 'follower', 'observer', 'controller']]";
 /// Until the first sample of a round is due, ns.
 const START_NS: u64 = 20_000_000;
 
@@ -28,10 +32,12 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
             bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
             let (ours, floor) = (format!("ours, {hz} Hz"), format!("raw hops, {hz} Hz"));
-            let fused = run_pair(bench, *hz, seconds, true)?;
-            stages(&fused, "controller", "age")
-                .for_each(|latency| board.record(Row::Chain, &format!("fused, {hz} Hz"), Some(&ours), &latency));
-            let outcome = run_pair(bench, *hz, seconds, false)?;
+            for (name, processes) in [("observer with controller", ESTIMATE_AND_CONTROL), ("all in one process", ALL)] {
+                let outcome = run_pair(bench, *hz, seconds, processes)?;
+                stages(&outcome, "controller", "age")
+                    .for_each(|latency| board.record(Row::Chain, &format!("{name}, {hz} Hz"), Some(&ours), &latency));
+            }
+            let outcome = run_pair(bench, *hz, seconds, APART)?;
             for (name, role, stage, beside) in [
                 (ours.clone(), "controller", "age", Some(floor.as_str())),
                 (format!("ours until the estimate is sent, {hz} Hz"), "observer", "age", None),
@@ -61,15 +67,15 @@ pub(super) fn stages<'a>(
     of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
 }
 
-/// A real-time run of the pair of bodies, with observer and controller in one process or in two.
-pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64, fused: bool) -> Result<Outcome, BenchError> {
+/// A real-time run of the pair of bodies, with these roles in one process.
+pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64, processes: &str) -> Result<Outcome, BenchError> {
     let (name, text) = SHIPPED[0];
     let overrides = [
         format!("tick_hz={hz}.0"),
         format!("duration_s={seconds:?}"),
         "accept={}".into(),
         "clock=realtime".into(),
-        format!("launch.fused={fused}"),
+        format!("launch.processes={processes}"),
     ];
     let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
     let mut launch = Launch {

@@ -1,6 +1,6 @@
 //! How late a tick begins: in a run, bare, and by cyclictest, in turn, at the same priority and period on the same core.
 
-use super::chain::{run_pair, stages};
+use super::chain::{APART, run_pair, stages};
 use super::hop::in_the_leaders_place;
 use super::peer::pair;
 use super::watch::Watch;
@@ -21,7 +21,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let (rounds, ticks) = (bench.size(5, 1), bench.size(2000, 100));
     for round in 1..=rounds {
         bench.next(&format!("tick: round {round} of {rounds}"))?;
-        let outcome = run_pair(bench, 1000, ticks as f64 / 1e3, false)?;
+        let outcome = run_pair(bench, 1000, ticks as f64 / 1e3, APART)?;
         for latency in stages(&outcome, "leader", "lateness") {
             board.record(Row::Tick, "ours, in a run", Some("cyclictest"), &latency);
         }

@@ -164,14 +164,15 @@ pub(super) struct Launch {
     pub startup_timeout_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub external_timeout_s: Option<f64>,
-    pub fused: bool,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub processes: Vec<Vec<String>>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub external: Vec<String>,
 }
 
 impl Default for Launch {
     fn default() -> Self {
-        Self { startup_timeout_s: 30.0, external_timeout_s: None, fused: false, external: Vec::new() }
+        Self { startup_timeout_s: 30.0, external_timeout_s: None, processes: Vec::new(), external: Vec::new() }
     }
 }
 

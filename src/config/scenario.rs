@@ -16,8 +16,6 @@ const MIN_TICK_HZ: f64 = 0.1;
 const MAX_TICK_HZ: f64 = 1e5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
-/// The roles that `launch.fused` makes one process of.
-const FUSED: [&str; 2] = ["observer", "controller"];
 /// The keys that hold one table each, whatever the rig.
 const TABLES: [&str; 6] = ["actuator", "realtime", "launch", "supervision", "watchdog", "accept"];
 
@@ -53,8 +51,8 @@ pub struct Scenario {
     pub startup_timeout_s: f64,
     /// For how long an external role may keep the run waiting, s; if none, for ever until the ticks run, and then 30 s.
     pub external_timeout_s: Option<f64>,
-    /// Whether observer and controller share a process, where roles are processes.
-    pub fused: bool,
+    /// The roles that share a process, where roles are processes.
+    pub processes: Vec<Vec<String>>,
     /// Roles that somebody else starts: hardware, or a foreign program.
     pub external: Vec<String>,
     /// What the launcher does about roles that fail.
@@ -136,7 +134,7 @@ impl Scenario {
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
             external_timeout_s: raw.launch.external_timeout_s,
-            fused: raw.launch.fused,
+            processes: raw.launch.processes,
             external: raw.launch.external,
             supervision: raw.supervision,
             faults,
@@ -160,7 +158,8 @@ impl Scenario {
         if !roles.contains(&role) {
             return Err(format!("there is no such role; this scenario has: {}", roles.join(", ")));
         }
-        if self.fused && FUSED.contains(&role) { Err(fused_with_external(role)) } else { Ok(()) }
+        let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
+        if shared { Err(shared_with_external(role)) } else { Ok(()) }
     }
 
     /// The period h, s.
@@ -293,7 +292,7 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
             .to_owned()
     });
     let Some(roles) = roles else { return };
-    check_fused(&raw.launch, &roles, checks);
+    check_processes(&raw.launch, &roles, checks);
     for (index, role) in external.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
         let known = roles.join(", ");
         checks.refuse(
@@ -303,25 +302,32 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
     }
 }
 
-/// The observer can only be fused with a controller that there is, and neither of them with somebody else's program.
-fn check_fused(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
-    if !launch.fused {
-        return;
-    }
-    checks.require(roles.contains(&"controller"), "launch.fused", || {
-        "no body of this scenario is driven, so there is no controller to fuse the observer with; leave it false"
-            .to_owned()
-    });
-    for (index, role) in launch.external.iter().enumerate().filter(|(_, role)| FUSED.contains(&role.as_str())) {
-        checks.refuse(&format!("launch.external[{index}]"), fused_with_external(role));
+/// A process can only have roles that there are, each once, and none that is somebody else's program.
+fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
+    let mut taken = Vec::new();
+    for (process, names) in launch.processes.iter().enumerate() {
+        let key = format!("launch.processes[{process}]");
+        checks.require(names.len() > 1, &key, || {
+            "a role alone has a process in any case; name two roles or more, or leave it out".to_owned()
+        });
+        for (index, name) in names.iter().enumerate() {
+            let key = format!("{key}[{index}]");
+            if !roles.contains(&name.as_str()) {
+                let known = roles.join(", ");
+                checks.refuse(&key, format!("there is no role `{name}`; this scenario has: {known}"));
+            } else if taken.contains(&name) {
+                checks.refuse(&key, format!("the {name} cannot be in two places; name it once"));
+            } else if launch.external.contains(name) {
+                checks.refuse(&key, shared_with_external(name));
+            }
+            taken.push(name);
+        }
     }
 }
 
-/// Why a role that is fused with another cannot be somebody else's.
-fn fused_with_external(role: &str) -> String {
-    format!(
-        "launch.fused makes one process of ours of observer and controller, so nobody else can be the {role}; set it to false"
-    )
+/// Why a role that shares a process of ours cannot be somebody else's.
+fn shared_with_external(role: &str) -> String {
+    format!("launch.processes has the {role} in a process of ours, so nobody else can be it; take it out there")
 }
 
 /// Roles that a policy names must exist.

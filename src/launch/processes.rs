@@ -468,6 +468,10 @@ impl<'a> Crew<'a> {
                 dismissal.gather(self.scenario, self.domain, role, ledger);
             }
         }
+        // In the order of a tick, whoever shares a process with whom.
+        let order = RoleId::all(self.scenario);
+        let place = |name: &str| order.iter().position(|role| role.name(self.scenario) == name);
+        dismissal.reports.sort_by_key(|report| place(&report.role));
         dismissal
     }
 

@@ -88,7 +88,7 @@ fn cut(script: &mut Script) {
 fn without_interruptions(scenario: &Scenario) -> String {
     let mut table = scenario.resolved.clone();
     if let Some(launch) = table.get_mut("launch").and_then(toml::Value::as_table_mut) {
-        launch.insert("fused".to_owned(), false.into());
+        launch.remove("processes");
     }
     if let Some(faults) = table.get_mut("fault").and_then(toml::Value::as_array_mut) {
         let interrupts = |fault: &toml::Value| {

@@ -22,7 +22,7 @@ pub fn table(summary: &Summary) -> String {
         summary.last_tick + 1
     );
     for (role, host) in &summary.hosted {
-        let _ = writeln!(text, "fused: the {role} is in the {host}'s process");
+        let _ = writeln!(text, "one process: the {role} is in the {host}'s");
     }
     for note in &summary.notes {
         let _ = writeln!(text, "note: {note}");

@@ -51,7 +51,7 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
         Err(error) => {
             let usage = matches!(
                 error,
-                RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Fused { .. }
+                RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. }
             );
             fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
         }

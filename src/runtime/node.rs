@@ -4,7 +4,7 @@
 
 mod bridge;
 mod controller;
-mod fused;
+mod group;
 mod observer;
 mod plant;
 mod ports;
@@ -67,12 +67,15 @@ impl RoleId {
         Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
     }
 
-    /// The role in whose process it runs: its own, unless the scenario fuses it with another.
+    /// The role in whose process it runs: its own, unless the scenario gives it one together with others. Then it is the last of
+    /// them in the order of a tick.
     pub fn host(self, scenario: &Scenario) -> Self {
-        match self {
-            Self::Observer if scenario.fused && scenario.clock != ClockKind::InProcess => Self::Controller,
-            own => own,
-        }
+        let name = self.name(scenario);
+        let process = scenario.processes.iter().find(|roles| roles.iter().any(|role| role == name));
+        let Some(process) = process.filter(|_| scenario.clock != ClockKind::InProcess) else { return self };
+        let mut roles = Self::all(scenario);
+        roles.retain(|role| process.iter().any(|name| name == role.name(scenario)));
+        roles.pop().unwrap_or(self)
     }
 
     /// The roles that run in its process, in the order of a tick; none if it is in another's.
@@ -94,37 +97,35 @@ impl RoleId {
 
 /// Who takes a role's seat.
 pub enum Occupant {
-    /// This program.
-    Role(RoleId),
+    /// This program, with other roles in the same process: these, in the order of a tick, with their ledgers.
+    Role(RoleId, Vec<(RoleId, Ledger)>),
     /// A device, as the driven body with this index.
     Device(usize, Box<DeviceLink>),
-    /// This program, as the controller and as the observer too, whose books these are.
-    Fused(Ledger),
 }
 
 impl Occupant {
     /// The seat.
     pub fn role(&self) -> RoleId {
         match self {
-            Self::Role(role) => *role,
+            Self::Role(role, _) => *role,
             Self::Device(index, _) => RoleId::Plant(*index),
-            Self::Fused(_) => RoleId::Controller,
         }
     }
 
-    /// Its roles with their books, in the order of a tick; `ledger` has those of the seat.
+    /// Its roles with their ledgers, in the order of a tick; `ledger` is that of the seat.
     pub(super) fn books(&self, ledger: &Ledger) -> Vec<(RoleId, Ledger)> {
-        let observer = match self {
-            Self::Fused(observer) => Some((RoleId::Observer, observer.reopened())),
-            Self::Role(_) | Self::Device(..) => None,
+        let others = match self {
+            Self::Role(_, others) => &others[..],
+            Self::Device(..) => &[],
         };
-        observer.into_iter().chain([(self.role(), ledger.reopened())]).collect()
+        let others = others.iter().map(|(role, ledger)| (*role, ledger.reopened()));
+        others.chain([(self.role(), ledger.reopened())]).collect()
     }
 }
 
 impl From<RoleId> for Occupant {
     fn from(role: RoleId) -> Self {
-        Self::Role(role)
+        Self::Role(role, Vec::new())
     }
 }
 
@@ -310,7 +311,7 @@ pub struct Seat<'a, B> {
     scenario: &'a Scenario,
     role: RoleId,
     generation: u64,
-    ledger: &'a Ledger,
+    ledger: Ledger,
     clock: Clock,
 }
 
@@ -347,12 +348,15 @@ impl<B: Bus> Seat<'_, B> {
     fn output<S: Carried + ?Sized>(&self, body: &BodyInfo, signal: Signal) -> Result<Output<B, S>, BusError> {
         let topic = topic(self.scenario, &body.name, signal);
         let (bodies, extent) = (body.bodies(), extent(self.scenario));
-        let output = Output::open(self.bus, &topic, bodies, self.generation, self.ledger, extent)?;
+        let output = Output::open(self.bus, &topic, bodies, self.generation, &self.ledger, extent)?;
         // Nobody in the loop reads the truth, and the score is to tell what really happened.
         let disturbance = match signal {
             Signal::Truth => None,
             _ => Disturbance::of(self.scenario, self.role.name(self.scenario), &body.name, bodies),
         };
+        // In a process with others whoever has a short way is served at once, and all others when the tick is done.
+        let alone = self.role.host(self.scenario).hosted(self.scenario).len() == 1;
+        let output = if alone { output } else { output.shown_first() };
         Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
     }
 
@@ -390,10 +394,10 @@ pub(super) fn ledger_file(scenario: &Scenario, role: RoleId) -> String {
 }
 
 /// What the writing ends of a scenario keep. Where every sample is waited for, one may be under way for as long as the fastest
-/// role may be ahead.
+/// role may be ahead of what is scored, and a little longer: a tick is scored before its command is used. As links, twice that.
 fn extent(scenario: &Scenario) -> Extent {
     let lockstep = scenario.clock == ClockKind::Lockstep;
-    let kept_ticks = if lockstep { super::window_ticks(scenario) } else { 0 };
+    let kept_ticks = if lockstep { 2 * super::window_ticks(scenario) } else { 0 };
     Extent { last_tick: scenario.last_tick, kept_ticks }
 }
 
@@ -511,27 +515,37 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
     bus: &B,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
-    let generation = ledger.enter();
-    let ledger = &ledger.reopened();
-    let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
     let occupant = occupant.into();
-    let seat = Seat { bus, scenario, role: occupant.role(), generation, ledger, clock };
-    Ok(match occupant {
-        Occupant::Device(index, link) => Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?),
-        Occupant::Fused(books) => {
-            let (generation, ledger) = (books.enter(), &books.reopened());
-            let observer = Seat { bus, scenario, role: RoleId::Observer, generation, ledger, clock };
-            Box::new(fused::FusedNode::<R, B>::open(rig, &observer, &seat)?)
-        }
-        Occupant::Role(RoleId::Plant(index)) => {
+    let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
+    let mut roles = occupant.books(ledger);
+    let seat = |(role, ledger): &(RoleId, Ledger)| {
+        let generation = ledger.enter();
+        Seat { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
+    };
+    if let Occupant::Device(index, link) = occupant {
+        let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
+        return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
+    }
+    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &seat(of))?));
+    if let [only] = &mut roles[..] {
+        return open(only).map(|(_, node)| node);
+    }
+    let nodes = roles.iter().map(open).collect::<Result<_, BusError>>()?;
+    Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)))
+}
+
+/// The node of one role of this program.
+fn role_node<R: Rig, B: Bus + 'static>(rig: &R, seat: &Seat<'_, B>) -> Result<ReadyNode, BusError> {
+    Ok(match seat.role {
+        RoleId::Plant(index) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {
-                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, &seat)?),
-                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, &seat)?),
+                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat)?),
+                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, seat)?),
             }
         }
-        Occupant::Role(RoleId::Observer) => Box::new(observer::ObserverNode::<R, B>::open(rig, &seat)?),
-        Occupant::Role(RoleId::Controller) => Box::new(controller::ControllerNode::<R, B>::open(rig, &seat)?),
+        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat)?),
+        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat)?),
     })
 }
 

@@ -109,16 +109,14 @@ fn cores(settings: &Realtime, first_served: bool) -> Vec<usize> {
 }
 
 /// The core of a role's process: plants in turn, for all of them act when the tick is due; observer and controller on cores
-/// of their own if there are any, else beside the leader and beside the first follower, whose measurements they wait for.
-/// Fused, they need one core less, or are beside the leader, of which they want more than of a follower.
+/// of their own if there are any, else beside the leader and beside the first follower, whose measurements they wait for. A
+/// process of several roles is where the first of them would be.
 fn core_of(cores: &[usize], role: RoleId, scenario: &Scenario) -> Option<usize> {
     let bodies = scenario.rig.bodies().len();
-    let fused = RoleId::Observer.host(scenario) == RoleId::Controller;
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
-    let place = match role.host(scenario) {
-        RoleId::Plant(index) => index,
+    let place = match role.host(scenario).hosted(scenario).first()? {
+        RoleId::Plant(index) => *index,
         RoleId::Observer => own_or(bodies, 0),
-        RoleId::Controller if fused => own_or(bodies, 0),
         RoleId::Controller => own_or(bodies + 1, 1),
     };
     cores.get(place % cores.len().max(1)).copied()
@@ -188,19 +186,19 @@ mod tests {
     #[test]
     fn whoever_waits_for_a_body_is_beside_it_unless_there_are_cores_for_all() {
         let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer, RoleId::Controller];
-        let places = |cores: &[usize], fused: &str| {
-            let scenario = shipped("rigid-pair", &[fused]);
+        let places = |cores: &[usize], processes: &str| {
+            let scenario = shipped("rigid-pair", &[processes]);
             roles.map(|role| core_of(cores, role, &scenario).unwrap())
         };
-        let apart = |cores: &[usize]| places(cores, "launch.fused=false");
+        let apart = |cores: &[usize]| places(cores, "launch.processes=[]");
         assert_eq!(apart(&[7]), [7, 7, 7, 7]);
         assert_eq!(apart(&[4, 5]), [4, 5, 4, 5]);
         assert_eq!(apart(&[4, 5, 6]), [4, 5, 6, 5]);
         assert_eq!(apart(&[4, 5, 6, 7, 8]), [4, 5, 6, 7]);
-        let fused = |cores: &[usize]| places(cores, "launch.fused=true");
-        assert_eq!(fused(&[7]), [7, 7, 7, 7]);
-        assert_eq!(fused(&[4, 5]), [4, 5, 4, 4]);
-        assert_eq!(fused(&[4, 5, 6, 7]), [4, 5, 6, 6]);
+        let together = |cores: &[usize]| places(cores, "launch.processes=[['observer','controller']]");
+        assert_eq!(together(&[7]), [7, 7, 7, 7]);
+        assert_eq!(together(&[4, 5]), [4, 5, 4, 4]);
+        assert_eq!(together(&[4, 5, 6, 7]), [4, 5, 6, 6]);
         let trio = shipped("rigid-trio", &[]);
         assert_eq!(core_of(&[4, 5], RoleId::Plant(2), &trio), Some(4));
         assert_eq!(core_of(&[], RoleId::Plant(2), &trio), None);

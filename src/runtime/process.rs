@@ -60,8 +60,10 @@ pub enum RoleError {
         known: String,
     },
     /// The role is another process's too.
-    #[error("in this run the {role} is in the process of the {host} (launch.fused); start that, or run without")]
-    Fused {
+    #[error(
+        "in this run the {role} is in the process of the {host} (launch.processes); start that, or give each a process of its own"
+    )]
+    Hosted {
         /// As given.
         role: String,
         /// The role in whose process it is.
@@ -126,12 +128,9 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
     require_process(&scenario, role)?;
-    let occupant = match role {
-        RoleId::Controller if RoleId::Observer.host(&scenario) == role => {
-            Occupant::Fused(take_ledger(&domain, &scenario, RoleId::Observer)?)
-        }
-        role => role.into(),
-    };
+    let others = role.hosted(&scenario).into_iter().filter(|other| *other != role);
+    let others = others.map(|other| Ok((other, take_ledger(&domain, &scenario, other)?)));
+    let occupant = Occupant::Role(role, others.collect::<Result<_, LedgerError>>()?);
     in_domain(&domain, &scenario, occupant, terminated, |_| {})
 }
 
@@ -139,7 +138,7 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
 pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), RoleError> {
     let host = role.host(scenario);
     let name = |role: RoleId| role.name(scenario).to_owned();
-    if host == role { Ok(()) } else { Err(RoleError::Fused { role: name(role), host: name(host) }) }
+    if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
 }
 
 /// The domain of a run with its scenario.
@@ -252,7 +251,8 @@ pub fn serve<B: Bus + 'static>(
         terminated,
     );
     let mut stages = Vec::new();
-    let ended = match begin(scenario, role, &mut node, &mut control, &mut stages)? {
+    let leads = books.iter().any(|(role, _)| *role == RoleId::Plant(0));
+    let ended = match begin(scenario, leads, &mut node, &mut control, &mut stages)? {
         Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
@@ -261,10 +261,9 @@ pub fn serve<B: Bus + 'static>(
         privileges::release();
     }
     for (of, ledger) in &books {
-        // What was asked of the machine, and measured before the ticks, is the seat's own.
-        let seats = *of == role;
-        let (mut stages, grants) =
-            if seats { (std::mem::take(&mut stages), privileges.grants.clone()) } else { Default::default() };
+        // What was asked of the machine is the seat's own, and what was measured before the ticks the leader's.
+        let mut stages = if *of == RoleId::Plant(0) { std::mem::take(&mut stages) } else { Vec::new() };
+        let grants = if *of == role { privileges.grants.clone() } else { Vec::new() };
         let node = node.of(*of).unwrap_or(&*node);
         stages.extend(node.stages());
         deliver(&RoleReport { line: node.line(), ..report(scenario, *of, ledger, stages, grants) })?;
@@ -281,10 +280,11 @@ pub fn serve<B: Bus + 'static>(
     Ok(())
 }
 
-/// From open links to the word to run. The links of a successor carry samples already. `None` if the run was stopped before.
+/// From open links to the word to run. The links of a successor carry samples already. Whoever has the leader measures the
+/// machine. `None` if the run was stopped before.
 fn begin<B: Bus>(
     scenario: &Scenario,
-    role: RoleId,
+    leads: bool,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     stages: &mut Vec<StageReport>,
@@ -298,7 +298,7 @@ fn begin<B: Bus>(
             sleep_until(monotonic_ns() + WARM_UP_PAUSE_NS);
         }
     }
-    if scenario.clock == ClockKind::Realtime && role == RoleId::Plant(0) && control.first() {
+    if scenario.clock == ClockKind::Realtime && leads && control.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
     hooks::at(Place::Ready);

@@ -129,7 +129,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         Self { voids, ..self }
     }
 
-    /// Whose samples are shown to readers of the newest at first, and sent to the others by [`publish`](Self::publish).
+    /// Whose samples are shown to readers of the newest at first, and sent to the others by [`finish`](Self::finish).
     pub fn shown_first(self) -> Self {
         Self { shows: true, ..self }
     }
@@ -305,25 +305,16 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         Ok(())
     }
 
-    /// Sends what was only shown, if anything was.
-    ///
-    /// # Errors
-    /// [`BusError::Send`].
-    #[inline]
-    pub fn publish(&mut self) -> Result<(), BusError> {
-        self.port.publish()?;
-        if std::mem::take(&mut self.shown) {
-            self.sent(1);
-        }
-        Ok(())
-    }
-
-    /// Does what a dispatched sample leaves to be done: counters, hash, memory for the next. Off the critical path.
+    /// Does what a dispatched sample leaves to be done: all readers, counters, hash, memory for the next. Off the critical path.
     ///
     /// # Errors
     /// [`BusError::Send`].
     #[inline]
     pub fn finish(&mut self) -> Result<(), BusError> {
+        if std::mem::take(&mut self.shown) {
+            self.port.publish()?;
+            self.sent(1);
+        }
         if let Some(disturbance) = &mut self.disturbance {
             disturbance.forget(self.staged.late);
         }

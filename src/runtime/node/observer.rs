@@ -54,17 +54,6 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         })
     }
 
-    /// With estimates that are shown to readers of the newest at first; [`publish`](Self::publish) must follow a tick.
-    pub fn shown_first(self) -> Self {
-        Self { estimate: self.estimate.shown_first(), ..self }
-    }
-
-    /// Sends the estimate that was only shown, if one was.
-    #[inline]
-    pub fn publish(&mut self) -> Result<(), BusError> {
-        self.estimate.publish()
-    }
-
     #[inline]
     fn execute(&mut self) -> Result<Poll, BusError> {
         let received = self.clock.now_ns();

@@ -189,8 +189,11 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         }
     }
 
+    /// In lockstep. In real time a body waits for the tick alone.
     fn awaits(&self) -> Option<RoleId> {
-        None
+        let last = self.book.next().checked_sub(1)?;
+        let lacks = self.command.as_ref().is_some_and(|command| !command.knows(last));
+        lacks.then_some(RoleId::Controller)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {

@@ -1,5 +1,5 @@
-//! Observer and controller in one process (`launch.fused`): the same bits and the same books under every clock, one process
-//! less, one life for both, and no room for anybody else.
+//! Roles that share a process (`launch.processes`), any of them: the same bits and the same books under every clock, one life
+//! for all of them, and no room for anybody else.
 
 mod common;
 
@@ -7,7 +7,10 @@ use common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 use std::time::Duration;
 
-const FUSED: [&str; 2] = ["--set", "launch.fused=true"];
+const BOTH: [&str; 2] = ["--set", "launch.processes=[['observer','controller']]"];
+const ALL: [&str; 2] = ["--set", "launch.processes=[['leader','follower','observer','controller']]"];
+const CROSSED: [&str; 2] = ["--set", "launch.processes=[['leader','controller'],['follower','observer']]"];
+const HALVES: [&str; 2] = ["--set", "launch.processes=[['leader','follower'],['observer','controller']]"];
 const SIGKILL: i32 = 9;
 const SIGTERM: i32 = 15;
 
@@ -21,51 +24,83 @@ fn checkpoints(bench: &Bench, directory: &str) -> Vec<String> {
     text.lines().skip(1).map(str::to_owned).collect()
 }
 
-/// One follower, two of them, a fleet, a spacecraft that is leader and driven body in one, and every kind of fault.
+/// One follower, two of them, a fleet, a spacecraft that is leader and driven body in one, and every kind of fault; and the
+/// roles of each in pairs across the chain, and all in one process.
 #[test]
 fn the_bits_and_the_books_are_those_of_processes_apart_and_of_one_thread() {
     for scenario in ["rigid-pair", "rigid-trio", "rigid-fleet", "orbit-hold", "faults"] {
         let bench = Bench::new();
         let length: &[&str] = if scenario == "faults" { &[] } else { &["--duration", "1", "--set", "accept={}"] };
         let run = |clock: &str, more: &[&str]| bench.summary(scenario, &[length, &["--clock", clock], more].concat());
-        let (one, apart, fused) = (run("in-process", &FUSED), run("lockstep", &[]), run("lockstep", &FUSED));
-        for other in [&one, &apart] {
-            assert_eq!(fused["state"], other["state"], "{scenario}");
-            assert_eq!(fused["books"]["roles"], other["books"]["roles"], "{scenario}");
-            assert_eq!(fused["score"], other["score"], "{scenario}");
-            assert!(other["hosted"].is_null(), "{scenario}: roles in one thread are in nobody's process");
+        let apart = run("lockstep", &[]);
+        let roles: Vec<String> =
+            apart["books"]["roles"].as_object().unwrap().keys().map(|name| format!("'{name}'")).collect();
+        let crossed: Vec<String> = roles.iter().step_by(2).cloned().collect();
+        let processes = |names: &[String]| format!("launch.processes=[[{}]]", names.join(","));
+        let (all, crossed) = (processes(&roles), processes(&crossed));
+        for shared in [BOTH[1], &all, &crossed] {
+            let shared = ["--set", shared];
+            let (one, together) = (run("in-process", &shared), run("lockstep", &shared));
+            for other in [&one, &apart] {
+                assert_eq!(together["state"], other["state"], "{scenario} {shared:?}");
+                assert_eq!(together["books"]["roles"], other["books"]["roles"], "{scenario} {shared:?}");
+                assert_eq!(together["score"], other["score"], "{scenario} {shared:?}");
+                assert!(other["hosted"].is_null(), "{scenario}: roles in one thread are in nobody's process");
+            }
+            assert_eq!(together["books"]["links"], apart["books"]["links"], "{scenario} {shared:?}");
+            assert_eq!(together["books"]["balanced"], true, "{scenario} {shared:?}");
+            assert!(together["hosted"].as_object().is_some_and(|hosted| !hosted.is_empty()), "{scenario} {shared:?}");
         }
-        assert_eq!(fused["books"]["links"], apart["books"]["links"], "{scenario}");
-        assert_eq!(fused["books"]["balanced"], true, "{scenario}");
-        assert_eq!(fused["hosted"]["observer"], "controller", "{scenario}");
         bench.assert_clean(&[]);
     }
 }
 
 #[test]
-fn in_real_time_the_bits_are_the_same_up_to_the_first_missed_tick_and_both_roles_tell_their_latencies() {
+fn in_real_time_the_bits_are_the_same_up_to_the_first_missed_tick_and_all_roles_tell_their_latencies() {
     let bench = Bench::new();
     let common = ["--duration", "2", "--set", "accept={}", "--out"];
-    let run = |clock: &str| bench.summary("rigid-pair", &[&common[..], &[clock, "--clock", clock], &FUSED].concat());
-    let (reference, live) = (run("in-process"), run("realtime"));
-    assert_eq!(live["books"]["balanced"], true, "{:#}", live["books"]);
-    let clean = live["state"]["clean_ticks"].as_u64().unwrap() as usize;
-    println!("{clean} of 2001 ticks undisturbed");
-    let (expected, seen) = (checkpoints(&bench, "in-process"), checkpoints(&bench, "realtime"));
-    assert_eq!((expected.len(), &expected[..clean]), (2001, &seen[..clean]));
-    if live["state"]["first_disturbed_tick"].is_null() {
-        assert_eq!(live["state"]["hash"], reference["state"]["hash"]);
-    }
-    let stages = live["latencies"].as_array().unwrap();
-    for role in ["observer", "controller"] {
-        for stage in ["hop", "step", "age"] {
-            let found = stages.iter().find(|found| found["role"] == role && found["stage"] == stage).unwrap();
-            let executed = live["books"]["roles"][role]["executed"].as_u64().unwrap();
-            assert!(found["count"].as_u64().unwrap() <= executed && executed > 0, "{role} {stage}: {found}");
+    let run = |clock: &str, out: &str, processes: &[&str; 2]| {
+        bench.summary("rigid-pair", &[&common[..], &[out, "--clock", clock], processes].concat())
+    };
+    let reference = run("in-process", "in-process", &BOTH);
+    let expected = checkpoints(&bench, "in-process");
+    for (out, processes, host_of_observer) in [
+        ("both", BOTH, "controller"),
+        ("all", ALL, "controller"),
+        ("crossed", CROSSED, "observer"),
+        ("halves", HALVES, "controller"),
+    ] {
+        let live = run("realtime", out, &processes);
+        assert_eq!(live["books"]["balanced"], true, "{out}: {:#}", live["books"]);
+        let clean = live["state"]["clean_ticks"].as_u64().unwrap() as usize;
+        println!("{out}: {clean} of 2001 ticks undisturbed");
+        let seen = checkpoints(&bench, out);
+        assert_eq!((expected.len(), &expected[..clean]), (2001, &seen[..clean]), "{out}");
+        if live["state"]["first_disturbed_tick"].is_null() {
+            assert_eq!(live["state"]["hash"], reference["state"]["hash"], "{out}");
         }
+        let stages = live["latencies"].as_array().unwrap();
+        for (role, told) in [
+            ("leader", &["baseline", "lateness", "step"][..]),
+            ("follower", &["lateness", "age", "step"]),
+            ("observer", &["hop", "step", "age"]),
+            ("controller", &["hop", "step", "age"]),
+        ] {
+            let executed = live["books"]["roles"][role]["executed"].as_u64().unwrap();
+            for stage in told {
+                let found = stages.iter().find(|found| found["role"] == role && found["stage"] == *stage);
+                let count = found.unwrap_or_else(|| panic!("{out} {role} {stage}"))["count"].as_u64().unwrap();
+                assert!(
+                    count > 0 && (count <= 2001 || *stage == "lateness"),
+                    "{out} {role} {stage}: {count} of {executed}"
+                );
+            }
+        }
+        let asked = |role: &str| live["privileges"].as_array().unwrap().iter().any(|grant| grant["role"] == role);
+        assert!(asked(host_of_observer), "{out}: {}", live["privileges"]);
+        let hosted: Vec<&String> = live["hosted"].as_object().unwrap().keys().collect();
+        assert!(hosted.iter().all(|role| !asked(role)), "{out}: what was asked was asked once: {}", live["privileges"]);
     }
-    let asked = |role: &str| live["privileges"].as_array().unwrap().iter().any(|grant| grant["role"] == role);
-    assert!(asked("controller") && !asked("observer"), "what was asked was asked once: {}", live["privileges"]);
     bench.assert_clean(&[]);
 }
 
@@ -73,7 +108,7 @@ fn in_real_time_the_bits_are_the_same_up_to_the_first_missed_tick_and_both_roles
 fn killed(bench: &Bench, arguments: &[&str]) -> Running {
     let file = shipped("rigid-pair");
     let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
-    let running = bench.start(&[&common[..], &FUSED, arguments].concat());
+    let running = bench.start(&[&common[..], &BOTH, arguments].concat());
     let controller = bench.await_role("controller");
     // Leader, follower, both in one, launcher, janitor.
     await_some(|| (bench.processes().len() == 5).then_some(()));
@@ -137,19 +172,26 @@ fn the_stricter_of_both_policies_holds() {
     bench.assert_clean(&[]);
 }
 
-/// At every place of a tick, whichever of the two is there: nothing is lost that the other still needs.
+/// At every place of a tick, whichever of them is there: nothing is lost that another still needs.
 #[cfg(feature = "hooks")]
 #[test]
-fn in_lockstep_both_may_die_anywhere_in_a_tick() {
+fn in_lockstep_all_may_die_anywhere_in_a_tick() {
     let undisturbed = Bench::new().summary("rigid-pair", &["--clock", "lockstep"]);
     // Passed by the two in turn: odd is the estimate's, even the command's.
     let places = ["staged", "committing", "in-commit", "committed", "sent"];
     let places = places.iter().flat_map(|place| [901, 902].map(|count| format!("{place} {count}")));
-    for place in places.chain(["waiting 40".to_owned()]) {
+    let places: Vec<String> = places.chain(["waiting 40".to_owned()]).collect();
+    let cases =
+        [BOTH, ALL, CROSSED].into_iter().flat_map(|processes| places.iter().map(move |place| (processes, place)));
+    for (processes, place) in cases {
+        // Nobody waits for long where all is in one process.
+        if processes == ALL && place.starts_with("waiting") {
+            continue;
+        }
         let bench = Bench::new();
         let file = shipped("rigid-pair");
         let mut command = bench.command();
-        command.args(["run", file.to_str().unwrap(), "--json", "--out", "out", "--clock", "lockstep"]).args(FUSED);
+        command.args(["run", file.to_str().unwrap(), "--json", "--out", "out", "--clock", "lockstep"]).args(processes);
         command.env("COROTATE_HOOK", format!("observer {place} KILL"));
         let done = Running::new(&mut command).wait();
         assert_eq!(done.code, Some(0), "{place}: {done:?}");
@@ -166,7 +208,7 @@ fn in_lockstep_both_may_die_anywhere_in_a_tick() {
 }
 
 #[test]
-fn what_cannot_be_fused_is_refused_with_its_reason() {
+fn what_cannot_share_a_process_is_refused_with_its_reason() {
     let bench = Bench::new();
     let refused = |arguments: &[&str], words: &[&str]| {
         let done = bench.run(arguments);
@@ -178,16 +220,21 @@ fn what_cannot_be_fused_is_refused_with_its_reason() {
     let path = |name: &str| shipped(name).to_str().unwrap().to_owned();
     let (pair, alone) = (path("rigid-pair"), path("inertia"));
     for role in ["observer", "controller"] {
-        let why = format!("nobody else can be the {role}; set it to false");
-        refused(&["run", &pair, "--set=launch.fused=true", "--external", role], &["--external", role, &why]);
+        let why = format!("the {role} in a process of ours, so nobody else can be it; take it out there");
+        refused(&["run", &pair, BOTH[0], BOTH[1], "--external", role], &["--external", role, &why]);
         let list = format!("--set=launch.external=[\"{role}\"]");
-        refused(&["run", &pair, "--set=launch.fused=true", &list], &["launch.external[0]", &why]);
-        refused(&["seat", &pair, role, "--set=launch.fused=true"], &[&why]);
+        refused(&["run", &pair, BOTH[0], BOTH[1], &list], &["launch.processes[0]", &why]);
+        refused(&["seat", &pair, role, BOTH[0], BOTH[1]], &[&why]);
     }
-    let alone = ["run", &alone, "--set=launch.fused=true"];
-    refused(&alone, &["launch.fused", "no controller to fuse the observer with", "leave it false"]);
-    refused(&["run", &pair, "--set=launch.fused=1"], &["launch.fused", "give true or false"]);
-    refused(&["run", &pair, "--set=launch.fuse=true"], &["did you mean `fused`?"]);
+    refused(
+        &["run", &alone, BOTH[0], BOTH[1]],
+        &["launch.processes[0][1]", "there is no role `controller`", "observer"],
+    );
+    refused(&["run", &pair, "--set=launch.processes=[['leader']]"], &["launch.processes[0]", "name two roles or more"]);
+    let twice = "--set=launch.processes=[['leader','observer'],['observer','controller']]";
+    refused(&["run", &pair, twice], &["launch.processes[1][0]", "cannot be in two places", "name it once"]);
+    refused(&["run", &pair, "--set=launch.processes=['leader']"], &["launch.processes[0]", "list"]);
+    refused(&["run", &pair, "--set=launch.process=[]"], &["did you mean `processes`?"]);
 }
 
 /// The follower may still be anybody's; and nobody takes the observer's seat by hand.
@@ -196,7 +243,7 @@ fn a_follower_by_hand_still_joins_and_an_observer_does_not() {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let arguments = ["run", file.to_str().unwrap(), "--clock=lockstep", "--duration=1", "--set=accept={}", "--json"];
-    let running = bench.start(&[&arguments[..], &FUSED, &["--external", "follower"]].concat());
+    let running = bench.start(&[&arguments[..], &BOTH, &["--external", "follower"]].concat());
     bench.await_role("controller");
     let domains = bench.domains();
     let domain = domains[0].to_str().unwrap();

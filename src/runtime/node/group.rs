@@ -1,0 +1,298 @@
+//! Several roles in one process (`launch.processes`), driven as one node: each tick passes through them in its order.
+//!
+//! Each is what it is in a process of its own, with all its signals, state and counters, and its samples take the same links.
+//! In real time whoever has a short way to a sample sees it at once, and what else there is to do waits until all have done
+//! their tick, or one of them has to wait. Must not compute, nor change what any of them sends.
+
+use super::{Gate, Node, Poll, ReadyNode, RoleId};
+use crate::bus::BusError;
+use crate::clock::{Grid, monotonic_ns};
+use crate::telemetry::{LedgerError, StageReport, Ticks};
+
+/// So long a group sleeps on one input if it lacks several from outside, ns.
+const NAP_NS: u64 = 50_000;
+
+/// Some roles of a run.
+pub struct GroupNode {
+    /// In the order in which a tick passes through them.
+    members: Vec<Member>,
+    realtime: bool,
+    last_tick: u64,
+    /// The tick that was begun and is not over, in real time.
+    open: Option<u64>,
+}
+
+struct Member {
+    role: RoleId,
+    node: ReadyNode,
+    /// Whether it has executed a tick that is not settled.
+    executed: bool,
+}
+
+impl Member {
+    fn settle(&mut self) -> Result<(), BusError> {
+        if std::mem::take(&mut self.executed) { self.node.settle() } else { Ok(()) }
+    }
+}
+
+impl GroupNode {
+    /// These roles, given in the order of a tick, for a run up to `last_tick`.
+    pub fn new(nodes: Vec<(RoleId, ReadyNode)>, realtime: bool, last_tick: u64) -> Self {
+        let members = nodes.into_iter().map(|(role, node)| Member { role, node, executed: false }).collect();
+        Self { members, realtime, last_tick, open: None }
+    }
+
+    fn nodes(&mut self) -> impl Iterator<Item = &mut ReadyNode> {
+        self.members.iter_mut().map(|member| &mut member.node)
+    }
+
+    /// The member is started by its next tick, and has one.
+    fn timed(&self, member: &Member) -> bool {
+        self.realtime && member.node.time_triggered() && member.node.next_tick() <= self.last_tick
+    }
+
+    /// Lockstep: everybody does what can be done.
+    fn poll_in_turn(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        let mut polled = Poll::Waiting;
+        for Member { node, .. } in &mut self.members {
+            if node.poll(gate)? == Poll::Executed {
+                node.settle()?;
+                polled = Poll::Executed;
+            }
+        }
+        Ok(polled)
+    }
+
+    /// Real time: the tick, through everybody who has not done it.
+    #[inline]
+    fn poll_on_grid(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        let tick = if let Gate::Now { tick, .. } = gate { tick.min(self.last_tick) } else { self.next_tick() };
+        self.open = Some(tick);
+        let mut complete = true;
+        for index in 0..self.members.len() {
+            let timed = self.timed(&self.members[index]);
+            let member = &mut self.members[index];
+            let gate = match gate {
+                Gate::Now { .. } if !timed => Gate::Arrived,
+                gate => gate,
+            };
+            while member.node.next_tick() <= tick {
+                match member.node.poll(gate)? {
+                    Poll::Executed => {
+                        member.settle()?;
+                        member.executed = true;
+                    }
+                    Poll::Missed => {}
+                    Poll::Waiting => break,
+                }
+            }
+            let next = member.node.next_tick();
+            complete &= next > tick;
+            if next > tick + 1 && member.executed && !timed {
+                return self.pass_over(index, next - 1);
+            }
+        }
+        if complete || gate == Gate::Overdue {
+            self.open = None;
+            return Ok(Poll::Executed);
+        }
+        self.settle()?;
+        Ok(Poll::Waiting)
+    }
+
+    /// A member has executed a later tick: for those behind it, what they waited for will never come, and the later tick has a
+    /// cutoff of its own.
+    #[cold]
+    fn pass_over(&mut self, index: usize, tick: u64) -> Result<Poll, BusError> {
+        for Member { node, .. } in &mut self.members[index + 1..] {
+            if node.next_tick() < tick {
+                node.skip_to(tick);
+            }
+        }
+        self.settle()?;
+        self.open = None;
+        Ok(Poll::Missed)
+    }
+
+    /// The members whose next step needs a sample from outside, and nothing from inside before.
+    fn lacking(&self) -> impl Iterator<Item = usize> {
+        let inside = |role: RoleId| self.members.iter().find(|member| member.role == role).map(|member| &member.node);
+        let lacks = move |member: &Member| {
+            let next = member.node.next_tick();
+            let due = self.open.is_none_or(|tick| next <= tick) && !self.timed(member);
+            let behind = member.role == RoleId::Controller
+                && inside(RoleId::Observer).is_some_and(|observer| observer.next_tick() <= next);
+            due && !behind && member.node.awaits().is_some_and(|role| inside(role).is_none())
+        };
+        self.members.iter().enumerate().filter(move |(_, member)| lacks(member)).map(|(index, _)| index)
+    }
+}
+
+impl Node for GroupNode {
+    fn time_triggered(&self) -> bool {
+        self.members.iter().any(|member| self.timed(member))
+    }
+
+    /// In real time that of the members which the tick starts, as long as they have one.
+    fn next_tick(&self) -> u64 {
+        let timed = self.members.iter().filter(|member| self.timed(member)).map(|member| member.node.next_tick());
+        let all = || self.members.iter().map(|member| member.node.next_tick()).min();
+        self.open.or(timed.min()).or_else(all).unwrap_or(u64::MAX)
+    }
+
+    fn restore(&mut self) -> Result<(), LedgerError> {
+        self.nodes().try_for_each(|node| node.restore())
+    }
+
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+        self.nodes().try_for_each(|node| node.start(grid, first_tick))
+    }
+
+    #[inline]
+    fn before_tick(&mut self) -> bool {
+        self.nodes().filter_map(|node| node.before_tick().then_some(())).count() > 0
+    }
+
+    #[inline]
+    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
+        if self.realtime { self.poll_on_grid(gate) } else { self.poll_in_turn(gate) }
+    }
+
+    /// Whom the first member awaits that lacks a sample from outside.
+    fn awaits(&self) -> Option<RoleId> {
+        self.lacking().next().and_then(|index| self.members[index].node.awaits())
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+        let mut lacking = self.lacking();
+        let (first, more) = (lacking.next(), lacking.next().is_some());
+        drop(lacking);
+        // One can sleep on one input only.
+        let until_ns = if more { until_ns.min(monotonic_ns() + NAP_NS) } else { until_ns };
+        first.map_or(Ok(false), |index| self.members[index].node.sleep(until_ns))
+    }
+
+    /// The last in the tick first: others wait for what it has sent.
+    #[inline]
+    fn settle(&mut self) -> Result<(), BusError> {
+        self.members.iter_mut().rev().try_for_each(Member::settle)
+    }
+
+    fn finish(&mut self) -> Result<(), BusError> {
+        self.settle()?;
+        self.nodes().try_for_each(|node| node.finish())
+    }
+
+    fn skip_to(&mut self, tick: u64) {
+        self.open = None;
+        self.nodes().for_each(|node| node.skip_to(tick));
+    }
+
+    fn warm_up(&mut self) -> Result<(), BusError> {
+        self.nodes().try_for_each(|node| node.warm_up())
+    }
+
+    fn refresh(&mut self) -> Result<(), BusError> {
+        self.nodes().try_for_each(|node| node.refresh())
+    }
+
+    fn state_words(&mut self) -> usize {
+        self.nodes().map(|node| node.state_words()).sum()
+    }
+
+    fn ticks(&self) -> Ticks {
+        self.members.last().map_or_else(Ticks::default, |member| member.node.ticks())
+    }
+
+    fn stages(&self) -> Vec<StageReport> {
+        self.members.last().map_or_else(Vec::new, |member| member.node.stages())
+    }
+
+    fn of(&self, role: RoleId) -> Option<&dyn Node> {
+        self.members.iter().find(|member| member.role == role).map(|member| &*member.node as &dyn Node)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ledger_file;
+    use super::*;
+    use crate::bus::domain::OwnedDomain;
+    use crate::bus::iox::IoxBus;
+    use crate::config::{SHIPPED, Scenario};
+    use crate::runtime::{Occupant, build, depths, private_ledger, report, shared_ledger};
+    use crate::telemetry::Ledger;
+
+    const LAST: u64 = 6;
+    /// The leader's measurement of this tick is dropped.
+    const LOST: u64 = 3;
+    const GROUP: [RoleId; 2] = [RoleId::Observer, RoleId::Controller];
+
+    fn enter(domain: &OwnedDomain, scenario: &Scenario) -> IoxBus {
+        IoxBus::enter(domain.domain(), "test", depths(scenario)).unwrap()
+    }
+
+    fn open(scenario: &Scenario, bus: &IoxBus, books: &[Ledger; 2]) -> ReadyNode {
+        let observer = vec![(RoleId::Observer, books[0].reopened())];
+        build(scenario, Occupant::Role(RoleId::Controller, observer), bus, &books[1]).unwrap()
+    }
+
+    fn turn(node: &mut dyn Node, up_to: u64) {
+        node.refresh().unwrap();
+        if node.poll(Gate::Inputs { up_to }).unwrap() == Poll::Executed {
+            node.settle().unwrap();
+        }
+    }
+
+    /// Both die when the observer has passed a tick over, by a void that the controller has not taken: nobody has it any more.
+    #[test]
+    fn a_void_that_was_on_its_way_between_the_two_is_not_lost_with_them() {
+        let (name, text) = SHIPPED[0];
+        let fault = format!("fault=[{{kind=\"drop\", role=\"leader\", from_tick={LOST}}}]");
+        let overrides = ["clock=lockstep", "duration_s=0.1", "accept={}", &fault].map(str::to_owned);
+        let scenario = &Scenario::parse(text, name, &overrides).unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
+        let roles = [RoleId::Plant(0), RoleId::Plant(1)];
+        let bus = enter(&domain, scenario);
+        let plant_books = roles.map(|role| private_ledger(scenario, role));
+        let plant = |(role, books): (&RoleId, &Ledger)| build(scenario, *role, &bus, books).unwrap();
+        let mut plants: Vec<ReadyNode> = roles.iter().zip(&plant_books).map(plant).collect();
+        let directory = tempfile::tempdir().unwrap();
+        let books = GROUP
+            .map(|role| shared_ledger(scenario, role, &directory.path().join(ledger_file(scenario, role))).unwrap());
+
+        // Each alone, so that one can be ahead of the other.
+        let first_bus = enter(&domain, scenario);
+        let [mut observer, mut controller] = [0, 1].map(|index: usize| {
+            let mut node = build(scenario, GROUP[index], &first_bus, &books[index]).unwrap();
+            node.restore().unwrap();
+            node
+        });
+        while observer.next_tick() <= LOST {
+            plants.iter_mut().for_each(|plant| turn(&mut **plant, LOST));
+            turn(&mut *observer, LOST);
+            turn(&mut *controller, LOST - 1);
+        }
+        assert_eq!((observer.next_tick(), controller.next_tick()), (LOST + 1, LOST));
+        observer.finish().unwrap();
+        controller.finish().unwrap();
+        drop((observer, controller, first_bus));
+
+        let second_bus = enter(&domain, scenario);
+        let mut both = open(scenario, &second_bus, &books);
+        both.restore().unwrap();
+        let first_tick = both.next_tick();
+        both.start(Grid { epoch_ns: 0, period_ns: scenario.period_ns }, first_tick).unwrap();
+        let mut looks = 0;
+        while both.next_tick() <= LAST {
+            plants.iter_mut().for_each(|plant| turn(&mut **plant, LAST));
+            turn(&mut *both, LAST);
+            looks += 1;
+            assert!(looks < 100_000, "they wait for each other");
+        }
+        both.finish().unwrap();
+        let report = report(scenario, RoleId::Controller, &books[1], Vec::new(), Vec::new());
+        assert_eq!((report.read[0].void, report.read[0].gaps), (1, 0));
+        assert_eq!((report.ticks.executed, report.ticks.missed), (LAST, 1));
+    }
+}
