@@ -5,9 +5,13 @@
 //! compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The
 //! figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
-use corotate::bench::{STEP_KINDS, repeat_step};
+#[path = "contest/product.rs"]
+#[allow(dead_code, reason = "the contest uses all of it")]
+mod product;
+
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, run};
+use product::{KINDS, pass, scenario};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +20,7 @@ use std::sync::atomic::AtomicUsize;
 
 /// Passes over a second of samples in the two runs whose difference counts: everything else is in both.
 const PASSES: [u64; 2] = [1, 51];
-const STEPS_PER_PASS: u64 = 1000;
+const STEPS_PER_PASS: u64 = product::SAMPLES as u64;
 /// A tick of `rigid-pair` through all roles in one thread: hashes, guards, counters and score included.
 const TICK: &str = "in-process tick";
 /// How many more instructions than were kept are a regression, %.
@@ -48,8 +52,10 @@ fn main() -> ExitCode {
 }
 
 fn repeat(kind: &str, passes: u64) {
-    if kind != TICK {
-        return repeat_step(kind, passes);
+    if let Some((_, name, overrides)) = KINDS.iter().find(|(known, ..)| *known == kind) {
+        let scenario = scenario(name, overrides);
+        let mut pass = pass(&scenario);
+        return (0..passes).for_each(|_| _ = pass());
     }
     // At 1 kHz a pass is a second.
     let overrides = ["clock=in-process", "accept={}", &format!("duration_s={passes}")].map(str::to_owned);
@@ -71,7 +77,7 @@ fn path() -> PathBuf {
 }
 
 fn count_all() -> Result<BTreeMap<String, f64>, String> {
-    STEP_KINDS.into_iter().chain([TICK]).map(|kind| Ok((kind.to_owned(), per_step(kind)?))).collect()
+    KINDS.map(|(kind, ..)| kind).into_iter().chain([TICK]).map(|kind| Ok((kind.to_owned(), per_step(kind)?))).collect()
 }
 
 /// Instructions per step of a kind, to a tenth.

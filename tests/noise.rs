@@ -2,12 +2,17 @@
 //!
 //! `cargo test --release --test noise -- --nocapture` prints every figure.
 
-use corotate::bench::ekf::Ekf;
-use corotate::bench::recording::{CASES, Case, Recording};
+#[path = "../benches/contest/ekf.rs"]
+mod ekf;
+#[path = "../benches/contest/recording.rs"]
+mod recording;
+
 use corotate::observe::{
     Filter, GuardedKalman, HiddenRate, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
 };
+use ekf::Ekf;
 use nalgebra::Vector1;
+use recording::{CASES, Case, Recording};
 use std::f64::consts::FRAC_1_SQRT_2;
 
 /// After this time the filters' transients are over, s; the recordings are twice as long.

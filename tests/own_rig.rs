@@ -163,6 +163,38 @@ fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
     assert_eq!(summary(&bench, "out")["books"]["balanced"], true);
 }
 
+/// The rows that need a run are of the program's own scenario, and say what they do not judge.
+#[test]
+fn its_own_loop_is_measured() {
+    let bench = Bench::of(program());
+    let done = bench.run(&["bench", "chain", "tick", "lockstep", "toll", "--quick", "--json", "--out", "results"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.assert_clean(&[]);
+    let results: Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!(results["scenario"], "motor-pair");
+    let figures = results["figures"].as_array().unwrap();
+    for (row, name) in [
+        ("chain", "ours, 1000 Hz"),
+        ("chain", "observer with controller, 1000 Hz"),
+        ("chain", "all in one process, 1000 Hz"),
+        ("chain", "step of the controller, 1000 Hz"),
+        ("tick", "ours, in a run"),
+        ("tick", "rate error of a run"),
+        ("lockstep", "lockstep"),
+        ("lockstep", "in one thread, motor-pair"),
+        ("lockstep", "arithmetic alone, motor-pair"),
+        ("toll", "page faults, follower"),
+        ("toll", "allocations beyond iceoryx2's one per sample, worst role"),
+    ] {
+        let found = figures.iter().find(|figure| figure["row"] == row && figure["name"] == name);
+        assert!(found.is_some_and(|figure| figure["median"].as_f64().unwrap() >= 0.0), "{row}: {name}: {done:?}");
+    }
+    assert!(results["targets"].as_array().unwrap().is_empty(), "{done:?}");
+    assert!(done.stderr.contains("the targets are those of corotate's scenario rigid-pair"), "{done:?}");
+    let checked = bench.run(&["bench", "chain", "--check"]);
+    assert!(checked.code == Some(2) && checked.stderr.contains("nothing to judge"), "{checked:?}");
+}
+
 /// What `corotate new` writes is this example under another name.
 #[test]
 fn a_new_crate_is_the_example_under_its_name() {

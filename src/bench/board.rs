@@ -4,65 +4,6 @@
 
 use crate::telemetry::{Grant, Latency, Percentiles};
 
-/// A row of the suite.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Row {
-    /// The estimate-and-control step.
-    Step,
-    /// The control law of many followers at once.
-    Fleet,
-    /// One hop between two processes.
-    Hop,
-    /// Leader, observer, controller: from the tick to the command.
-    Chain,
-    /// How late a tick begins.
-    Tick,
-    /// Ticks per second where nobody waits for the time.
-    Lockstep,
-    /// A whole run: start, stop, memory.
-    Run,
-    /// What a tick takes of the system: calls, faults, switches, allocations.
-    Toll,
-    /// What a tick takes of the processor, by how roles wait.
-    Processor,
-}
-
-impl Row {
-    /// Every row with its name and what it is.
-    pub const ALL: [(Self, &str, &str); 9] = [
-        (Self::Step, "step", "estimate-and-control step: samples in, command out"),
-        (Self::Fleet, "fleet", "the law of N followers in one controller's step, per follower"),
-        (Self::Hop, "hop", "one hop between two processes on two cores"),
-        (Self::Chain, "chain", "leader -> observer -> controller: from the leader's tick until the command is sent"),
-        (Self::Tick, "tick", "how late a tick begins"),
-        (Self::Lockstep, "lockstep", "ticks per second where nobody waits for the time"),
-        (Self::Run, "run", "a whole `corotate run`: start, stop, memory"),
-        (Self::Toll, "toll", "system calls, faults, context switches and allocations per tick"),
-        (Self::Processor, "processor", "processor time per tick of every role, by how roles wait"),
-    ];
-
-    /// The row of this name.
-    pub fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|(_, known, _)| *known == name).map(|(row, ..)| row)
-    }
-
-    /// Its name.
-    pub fn name(self) -> &'static str {
-        self.entry().1
-    }
-
-    /// What it is, in words.
-    pub fn title(self) -> &'static str {
-        self.entry().2
-    }
-
-    fn entry(self) -> (Self, &'static str, &'static str) {
-        let entry = Self::ALL.into_iter().find(|(row, ..)| *row == self);
-        entry.expect("the table of rows has every row")
-    }
-}
-
 /// What a figure is held against.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Beside {
@@ -76,7 +17,7 @@ pub struct Beside {
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Figure {
     /// Its row.
-    pub row: Row,
+    pub row: &'static str,
     /// What it is; unique in its row.
     pub name: String,
     /// The unit of `rounds`; latencies are in µs.
@@ -98,6 +39,8 @@ pub struct Figure {
 /// Everything that was measured.
 #[derive(Debug, Default)]
 pub struct Board {
+    /// The row that is being measured.
+    row: &'static str,
     figures: Vec<Figure>,
     remarks: Vec<String>,
     grants: Vec<Grant>,
@@ -115,23 +58,28 @@ pub(super) fn median(values: &[f64]) -> f64 {
 }
 
 impl Board {
+    /// Begins a row: what is added from here on is its.
+    pub fn begin(&mut self, row: &'static str) {
+        self.row = row;
+    }
+
     /// Adds a round's value to a figure. `floor` names the figure of the same row that it stands beside.
-    pub fn add(&mut self, row: Row, name: &str, unit: &'static str, floor: Option<&str>, value: f64) {
-        self.figure(row, name, unit, floor).rounds.push(value);
-        self.settle(row, name);
+    pub fn add(&mut self, name: &str, unit: &'static str, floor: Option<&str>, value: f64) {
+        self.figure(name, unit, floor).rounds.push(value);
+        self.settle(name);
     }
 
     /// Adds a round's latencies to a figure. A round without any is none.
-    pub fn record(&mut self, row: Row, name: &str, floor: Option<&str>, latency: &Latency) {
+    pub fn record(&mut self, name: &str, floor: Option<&str>, latency: &Latency) {
         if latency.is_empty() {
             return;
         }
-        let figure = self.figure(row, name, "us", floor);
+        let figure = self.figure(name, "us", floor);
         figure.rounds.push(latency.percentiles().p50_us);
         let pooled = figure.pooled.get_or_insert_default();
         pooled.absorb(latency);
         figure.latency = Some(pooled.percentiles());
-        self.settle(row, name);
+        self.settle(name);
     }
 
     /// Adds something that a reader must know.
@@ -165,13 +113,13 @@ impl Board {
     }
 
     /// The figure of this name.
-    pub fn find(&self, row: Row, name: &str) -> Option<&Figure> {
+    pub fn find(&self, row: &str, name: &str) -> Option<&Figure> {
         self.figures.iter().find(|figure| figure.row == row && figure.name == name)
     }
 
     /// One figure over another. Of the medians of rounds: the median of the quotients of neighbouring rounds, since these
     /// had the machine in the same state.
-    pub fn ratio(&self, row: Row, over: &str, under: &str) -> Option<f64> {
+    pub fn ratio(&self, row: &str, over: &str, under: &str) -> Option<f64> {
         let (over, under) = (self.find(row, over)?, self.find(row, under)?);
         let ratio = match (&over.latency, &under.latency) {
             (Some(over), Some(under)) => over.p50_us / under.p50_us,
@@ -183,7 +131,8 @@ impl Board {
         ratio.is_finite().then_some(ratio)
     }
 
-    fn figure(&mut self, row: Row, name: &str, unit: &'static str, floor: Option<&str>) -> &mut Figure {
+    fn figure(&mut self, name: &str, unit: &'static str, floor: Option<&str>) -> &mut Figure {
+        let row = self.row;
         let index = self.figures.iter().position(|figure| figure.row == row && figure.name == name);
         let index = index.unwrap_or_else(|| {
             self.figures.push(Figure {
@@ -202,7 +151,8 @@ impl Board {
         &mut self.figures[index]
     }
 
-    fn settle(&mut self, row: Row, name: &str) {
+    fn settle(&mut self, name: &str) {
+        let row = self.row;
         if let Some(figure) = self.figures.iter_mut().find(|figure| figure.row == row && figure.name == name) {
             figure.median = median(&figure.rounds);
         }
@@ -228,37 +178,36 @@ mod tests {
     #[test]
     fn a_ratio_of_rounds_is_that_of_neighbours() {
         let mut board = Board::default();
+        board.begin("step");
         // The machine slows down by ten in the midst: the medians alone would say anything.
         for (ours, floor) in [(2.0, 1.0), (2.0, 1.0), (20.0, 10.0)] {
-            board.add(Row::Step, "ours", "ns", Some("floor"), ours);
-            board.add(Row::Step, "floor", "ns", None, floor);
+            board.add("ours", "ns", Some("floor"), ours);
+            board.add("floor", "ns", None, floor);
         }
         board.compare();
-        assert_eq!(board.find(Row::Step, "ours").unwrap().beside, Some(Beside { figure: "floor".into(), ratio: 2.0 }));
-        assert_eq!(board.find(Row::Step, "floor").unwrap().beside, None);
-        assert!(board.ratio(Row::Hop, "ours", "floor").is_none());
+        assert_eq!(board.find("step", "ours").unwrap().beside, Some(Beside { figure: "floor".into(), ratio: 2.0 }));
+        assert_eq!(board.find("step", "floor").unwrap().beside, None);
+        assert!(board.ratio("hop", "ours", "floor").is_none());
     }
 
     #[test]
     fn latencies_are_pooled_and_nothing_is_removed() {
         let mut board = Board::default();
+        board.begin("hop");
         for round in 1..=3_u64 {
             let mut latency = Latency::default();
             (0..100).for_each(|_| latency.record(0, round * 1000));
             latency.record(0, 1_000_000_000);
-            board.record(Row::Hop, "hop", None, &latency);
+            board.record("hop", None, &latency);
         }
-        let figure = board.find(Row::Hop, "hop").unwrap();
+        let figure = board.find("hop", "hop").unwrap();
         let pooled = figure.latency.unwrap();
         assert_eq!((pooled.count, figure.rounds.len()), (303, 3));
         assert!(pooled.max_us > 0.99e6 && (figure.median - 2.0).abs() < 0.01, "{figure:?}");
     }
 
     #[test]
-    fn every_row_has_a_name_of_its_own() {
-        for (row, name, _) in Row::ALL {
-            assert_eq!((Row::named(name), row.name()), (Some(row), name));
-        }
+    fn the_median_of_an_even_number_is_between_the_middle_two() {
         assert_eq!(median(&[4.0, 1.0, 3.0, 2.0]), 2.5);
     }
 }

@@ -4,54 +4,65 @@
 //! tick is due, by definition, so the hop to it is never waited for.
 
 use super::exchange::{Mechanism, Opening, Sender, Station, Wake};
-use super::hop::{in_the_leaders_place, send_paced};
+use super::hop::send_paced;
 use super::peer::Peer;
-use super::{Bench, BenchError, Board, Row};
+use super::{Bench, BenchError, Board};
 use crate::bus::domain::OwnedDomain;
 use crate::clock::{Grid, monotonic_ns};
-use crate::config::{SHIPPED, Scenario};
 use crate::launch::{Launch, Outcome};
 use crate::runtime::RoleId;
 
 const RATES_HZ: [u64; 4] = [1000, 5000, 10_000, 20_000];
 /// Words of the bare samples: 128 bytes, as much as a measurement takes, and an estimate nearly.
 const WORDS: usize = 16;
-/// `launch.processes`: each role in a process of its own, both of the performance-critical step in one, all in one.
+/// `launch.processes`: each role in a process of its own; both of the performance-critical step in one.
 pub(super) const APART: &str = "[]";
 const ESTIMATE_AND_CONTROL: &str = "[['observer', 'controller']]";
-const ALL: &str = "[['leader', 'follower', 'observer', 'controller']]";
 /// Until the first sample of a round is due, ns.
 const START_NS: u64 = 20_000_000;
 
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let (rounds, seconds) = (bench.size(4, 1), bench.size(2.0, 0.1));
+    let scenario = bench.scenario(&[])?;
+    if !RoleId::all(&scenario).contains(&RoleId::Controller) {
+        board.remark("chain is not measured: no body of this scenario is driven, so there is no command".to_owned());
+        return Ok(());
+    }
+    let all = format!("[{:?}]", scenario.rig.roles());
     let domain = OwnedDomain::create(0)?;
     let mut raw = RawChain::open(bench, board, &domain)?;
     for round in 1..=rounds {
         for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
             bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
             let (ours, floor) = (format!("ours, {hz} Hz"), format!("raw hops, {hz} Hz"));
-            for (name, processes) in [("observer with controller", ESTIMATE_AND_CONTROL), ("all in one process", ALL)] {
-                let outcome = run_pair(bench, *hz, seconds, processes)?;
-                stages(&outcome, "controller", "age")
-                    .for_each(|latency| board.record(Row::Chain, &format!("{name}, {hz} Hz"), Some(&ours), &latency));
+            let apart = match run_in_real_time(bench, *hz, seconds, APART) {
+                Err(BenchError::Scenario(reason)) => {
+                    board.remark(format!("chain is not measured at {hz} Hz: {reason}"));
+                    continue;
+                }
+                apart => apart?,
+            };
+            for (name, processes) in [("observer with controller", ESTIMATE_AND_CONTROL), ("all in one process", &all)]
+            {
+                let together = run_in_real_time(bench, *hz, seconds, processes)?;
+                stages(&together, "controller", "age")
+                    .for_each(|latency| board.record(&format!("{name}, {hz} Hz"), Some(&ours), &latency));
             }
-            let outcome = run_pair(bench, *hz, seconds, APART)?;
             for (name, role, stage, beside) in [
                 (ours.clone(), "controller", "age", Some(floor.as_str())),
                 (format!("ours until the estimate is sent, {hz} Hz"), "observer", "age", None),
                 (format!("step of the observer, {hz} Hz"), "observer", "step", None),
                 (format!("step of the controller, {hz} Hz"), "controller", "step", None),
             ] {
-                stages(&outcome, role, stage).for_each(|latency| board.record(Row::Chain, &name, beside, &latency));
+                stages(&apart, role, stage).for_each(|latency| board.record(&name, beside, &latency));
             }
-            let (missed, elapsed) = outcome.reports.iter().fold((0, 0), |(missed, elapsed), report| {
+            let (missed, elapsed) = apart.reports.iter().fold((0, 0), |(missed, elapsed), report| {
                 (missed + report.ticks.missed + report.ticks.starved, elapsed + report.ticks.elapsed)
             });
             let share = 100.0 * missed as f64 / elapsed as f64;
-            board.add(Row::Chain, &format!("missed or starved, {hz} Hz"), "%", None, share);
-            raw.measure(board, &floor, *hz, (seconds * *hz as f64) as u64)?;
+            board.add(&format!("missed or starved, {hz} Hz"), "%", None, share);
+            raw.measure(bench, board, &floor, *hz, (seconds * *hz as f64) as u64)?;
         }
     }
     Ok(())
@@ -67,17 +78,15 @@ pub(super) fn stages<'a>(
     of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
 }
 
-/// A real-time run of the pair of bodies, with these roles in one process.
-pub(super) fn run_pair(bench: &mut Bench<'_>, hz: u64, seconds: f64, processes: &str) -> Result<Outcome, BenchError> {
-    let (name, text) = SHIPPED[0];
-    let overrides = [
-        format!("tick_hz={hz}.0"),
-        format!("duration_s={seconds:?}"),
-        "accept={}".into(),
-        "clock=realtime".into(),
-        format!("launch.processes={processes}"),
-    ];
-    let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
+/// A real-time run of the scenario, with these roles in one process.
+pub(super) fn run_in_real_time(
+    bench: &mut Bench<'_>,
+    hz: u64,
+    seconds: f64,
+    processes: &str,
+) -> Result<Outcome, BenchError> {
+    let (hz, seconds) = (format!("tick_hz={hz}.0"), format!("duration_s={seconds:?}"));
+    let scenario = bench.scenario(&[&hz, &seconds, "clock=realtime", &format!("launch.processes={processes}")])?;
     let mut launch = Launch {
         program: bench.program.clone(),
         external: Vec::new(),
@@ -122,18 +131,26 @@ impl RawChain {
         Ok(Self { sender, relay, last, number: 0 })
     }
 
-    fn measure(&mut self, board: &mut Board, name: &str, hz: u64, count: u64) -> Result<(), BenchError> {
+    fn measure(
+        &mut self,
+        bench: &Bench<'_>,
+        board: &mut Board,
+        name: &str,
+        hz: u64,
+        count: u64,
+    ) -> Result<(), BenchError> {
         let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: 1_000_000_000 / hz };
         self.relay.receive(grid, self.number + 1, count, true)?;
         self.last.receive(grid, self.number + 1, count, false)?;
-        in_the_leaders_place(board, |beside| {
-            send_paced(&mut self.sender, grid, count, &mut self.number, beside.contains(&RoleId::Observer))
+        bench.in_the_leaders_place(board, |place| {
+            let beside = place.beside.contains(&RoleId::Observer);
+            send_paced(&mut self.sender, grid, count, &mut self.number, beside)
         })?;
         let (_, lost_first) = self.relay.received()?;
         let ([due, _], lost) = self.last.received()?;
-        board.record(Row::Chain, name, None, &due);
+        board.record(name, None, &due);
         let share = 100.0 * (lost + lost_first) as f64 / (2 * count) as f64;
-        board.add(Row::Chain, &format!("overtaken in {name}"), "%", None, share);
+        board.add(&format!("overtaken in {name}"), "%", None, share);
         Ok(())
     }
 }

@@ -4,15 +4,13 @@
 //! anyone: same cores, same privileges, same samples, same waits.
 
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
-use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns, pair};
-use super::{Bench, BenchError, Board, Row};
+use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns};
+use super::{Bench, BenchError, Board};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
-use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::{Grant, Latency};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fd::OwnedFd;
-use rustix::thread::{sched_getaffinity, sched_setaffinity};
 use std::io;
 use std::net::UdpSocket;
 use std::os::unix::net::UnixDatagram;
@@ -81,19 +79,19 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
         for pair in &mut *pairs {
             let (name, floor) = (pair.name.clone(), pair.floor.clone());
             bench.next(&format!("hop: {name}"))?;
-            let measured = in_the_leaders_place(board, |_| {
+            let measured = bench.in_the_leaders_place(board, |_| {
                 let paced = pair.paced(paced)?;
                 Ok((paced, pair.back_to_back(exchanges)?))
             });
             let (([due, sent], lost), one_way_us) = measured?;
             pair.lost += lost;
-            board.record(Row::Hop, &name, floor.as_deref(), &due);
+            board.record(&name, floor.as_deref(), &due);
             let suffixed =
                 |suffix: &str| (format!("{name}, {suffix}"), floor.as_ref().map(|f| format!("{f}, {suffix}")));
             let (name_sent, floor_sent) = suffixed("from send");
-            board.record(Row::Hop, &name_sent, floor_sent.as_deref(), &sent);
+            board.record(&name_sent, floor_sent.as_deref(), &sent);
             let (name_tight, floor_tight) = suffixed("back to back");
-            board.add(Row::Hop, &name_tight, "us", floor_tight.as_deref(), one_way_us);
+            board.add(&name_tight, "us", floor_tight.as_deref(), one_way_us);
         }
     }
     let lost: Vec<String> =
@@ -103,21 +101,6 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
         board.remark(format!("overtaken by the next before a late receiver looked, of {of}: {}", lost.join("; ")));
     }
     Ok(())
-}
-
-/// Does something with what the leader asks for, and gives it back; told whether others need the leader's core.
-pub(super) fn in_the_leaders_place<T>(
-    board: &mut Board,
-    work: impl FnOnce(&[RoleId]) -> Result<T, BenchError>,
-) -> Result<T, BenchError> {
-    let cores = sched_getaffinity(None).ok();
-    let Privileges { grants, beside, .. } = take_privileges(&pair(), RoleId::Plant(0));
-    board.granted(grants);
-    let done = work(&beside);
-    release_priority();
-    // Where it cannot be had back the rest of the suite stays on the leader's core.
-    let _ = cores.map(|cores| sched_setaffinity(None, &cores));
-    done
 }
 
 impl Pair {

@@ -2,17 +2,15 @@
 //! arithmetic that they cannot do without.
 
 use super::exchange::{Mechanism, Wake};
-use super::hop::{Pair, in_the_leaders_place};
-use super::{Bench, BenchError, Board, Row};
+use super::hop::Pair;
+use super::{Bench, BenchError, Board, resolve};
 use crate::bus::domain::OwnedDomain;
-use crate::bus::memory::MemoryBus;
-use crate::config::{SHIPPED, Scenario};
+use crate::config::Scenario;
 use crate::launch::{Launch, Progress};
-use crate::rig::{Command, Estimate, Measurement, Rig};
+use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
 use crate::role::{Body, Controller, Observer};
-use crate::runtime::{RoleId, build, depths, in_turn, private_ledger};
+use crate::runtime::RoleId;
 use crate::sample::Message;
-use crate::with_shipped_rig;
 use std::hint::black_box;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -22,43 +20,43 @@ const SIGTERM: usize = 15;
 /// Hops in a row that a lockstep tick waits for: a follower's measurement to the controller, the command back to it.
 const HOPS: f64 = 2.0;
 
-fn scenario(text: &str, overrides: &[&str]) -> Scenario {
-    let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
-    Scenario::parse(text, "bench", &overrides).expect("shipped scenarios are valid")
-}
-
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
-    let rounds = bench.size(5, 1);
-    let pair = scenario(SHIPPED[0].1, &["clock=lockstep", "duration_s=100.0"]);
+    let (rounds, measured) = (bench.size(5, 1), bench.scenario(&["clock=lockstep", "duration_s=100.0"])?);
     let limit = bench.size(Duration::from_secs(3), Duration::from_millis(300));
-    let shipped: Vec<_> = SHIPPED.iter().map(|(name, text)| (*name, scenario(text, &["clock=in-process"]))).collect();
+    let alone = ["clock=in-process", "launch.external=[]"];
+    let all: Result<Vec<_>, _> =
+        bench.scenarios.iter().map(|known| Ok::<_, BenchError>((known.0, resolve(*known, &alone)?))).collect();
+    let all = all?;
+    // Without a controller nobody waits for a command.
+    let floor = RoleId::all(&measured).contains(&RoleId::Controller).then_some("two raw hops back to back");
+    let arithmetic = format!("arithmetic alone, {}", bench.scenarios[0].0);
     let domain = OwnedDomain::create(0)?;
     let mut hop = Pair::open(bench, domain.domain(), Mechanism::Iceoryx, Wake::Spin, 16)?;
     board.granted(hop.grants());
     for round in 1..=rounds {
         bench.next(&format!("lockstep: round {round} of {rounds}"))?;
-        let per_second = lockstep(bench, &pair, limit)?;
-        board.add(Row::Lockstep, "lockstep", "ticks/s", Some("two raw hops back to back"), per_second);
+        let per_second = ticks_per_second(bench, &measured, limit)?;
+        board.add("lockstep", "ticks/s", floor, per_second);
         let exchanges = bench.size(20_000, 200);
-        let one_way_us = in_the_leaders_place(board, |_| hop.back_to_back(exchanges))?;
-        board.add(Row::Lockstep, "two raw hops back to back", "ticks/s", None, 1e6 / (HOPS * one_way_us));
-        let arithmetic = "arithmetic alone, rigid-pair";
-        for (name, scenario) in &shipped {
+        let one_way_us = bench.in_the_leaders_place(board, |_| hop.back_to_back(exchanges))?;
+        board.add("two raw hops back to back", "ticks/s", None, 1e6 / (HOPS * one_way_us));
+        for (index, (name, scenario)) in all.iter().enumerate() {
             bench.next(&format!("lockstep: in one thread, {name}"))?;
-            let floor = (*name == SHIPPED[0].0).then_some(arithmetic);
-            let per_second = in_one_thread(scenario)?;
-            board.add(Row::Lockstep, &format!("in one thread, {name}"), "ticks/s", floor, per_second);
+            let floor = (index == 0).then_some(&*arithmetic);
+            let per_second = ticks_per_second(bench, scenario, limit)?;
+            board.add(&format!("in one thread, {name}"), "ticks/s", floor, per_second);
         }
-        let per_second = with_shipped_rig!(pair.rig, rig => arithmetic_alone(rig, &pair));
-        board.add(Row::Lockstep, arithmetic, "ticks/s", None, per_second);
+        match measured.rig.face().arithmetic(&measured) {
+            Some(per_second) => board.add(&arithmetic, "ticks/s", None, per_second),
+            None => board.remark(format!("{arithmetic}: not measured: only that of a leader and one follower is")),
+        }
     }
     Ok(())
 }
 
-/// Ticks per second of a lockstep run, between the first tick that its launcher sees and the last; it is ended in order
-/// after so long.
-fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Result<f64, BenchError> {
+/// Ticks per second of a run, between the first tick that its launcher sees and the last; it is ended in order after so long.
+fn ticks_per_second(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Result<f64, BenchError> {
     let end = AtomicUsize::new(0);
     let mut seen: Option<[(u64, Instant); 2]> = None;
     let mut launch = Launch {
@@ -90,18 +88,11 @@ fn lockstep(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Resu
     })
 }
 
-/// Ticks per second of all roles in one thread: plants, observer, controller, links, books, hash.
-fn in_one_thread(scenario: &Scenario) -> Result<f64, BenchError> {
-    let bus = MemoryBus::new(depths(scenario));
-    let node = |role| build(scenario, role, &bus, &private_ledger(scenario, role));
-    let mut nodes = RoleId::all(scenario).into_iter().map(node).collect::<Result<Vec<_>, _>>()?;
-    let began = Instant::now();
-    in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), |_| true)?;
-    Ok((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
-}
-
-/// Ticks per second of the mathematics of all roles of a pair, called one after the other.
-fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> f64 {
+/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others.
+pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> Option<f64> {
+    let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
+        return None;
+    };
     let tick_s = scenario.tick_s();
     let (mut leader, mut follower) = (rig.body(0), rig.body(1));
     let (mut observer, mut controller) = (Observer::new(rig.estimator(), tick_s), Controller::new(rig.law(1)));
@@ -121,5 +112,5 @@ fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> f64 {
         controller.step(&estimate, &measured[1], &mut command);
     }
     black_box(&command);
-    (scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64()
+    Some((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
 }

@@ -1,4 +1,4 @@
-//! The benchmark suite: what the product costs beside its floors, everything in one run on one machine.
+//! The benchmark of a program with rigs: what it costs on this machine beside its floors, everything in one run.
 //!
 //! Contestants that are compared take turns in short rounds (A B A B …), so that whatever disturbs the machine disturbs all
 //! of them. Nothing is removed: medians are those of all rounds, percentiles those of all values. A latency is measured from
@@ -7,40 +7,73 @@
 
 mod board;
 mod chain;
-mod compiled;
-pub mod ekf;
 mod exchange;
-mod fleet;
 mod hop;
 mod lockstep;
-
 mod page;
 mod peer;
 mod processor;
-pub mod recording;
 mod report;
 mod run;
-mod step;
 mod targets;
 mod tick;
 mod toll;
 mod watch;
 
-pub use board::{Beside, Board, Figure, Row};
-pub use compiled::Compiled;
+pub use board::{Beside, Board, Figure};
+pub(crate) use lockstep::arithmetic_alone;
 pub use peer::{PeerSeat, serve_peer};
 pub use report::{Results, table, write_results};
-pub use step::{Agreement, STEP_KINDS, agreements, repeat_step};
-pub use targets::{TARGETS, Target, Verdict};
+pub use targets::{Bound, Of, Target, Verdict, target};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
-use crate::config::Realtime;
+use crate::config::{ConfigError, SHIPPED, Scenario};
 use crate::launch::LaunchError;
+use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::Grant;
+use rustix::thread::{sched_getaffinity, sched_setaffinity};
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// A row of a benchmark.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// Its name.
+    pub name: &'static str,
+    /// What it is, in words.
+    pub title: &'static str,
+    /// What its figures are held against.
+    pub targets: &'static [Target],
+    /// What measures it.
+    pub measure: fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>,
+}
+
+const fn row(
+    name: &'static str,
+    title: &'static str,
+    targets: &'static [Target],
+    measure: fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>,
+) -> Row {
+    Row { name, title, targets, measure }
+}
+
+/// What a user measures on a machine.
+pub const ROWS: [Row; 7] = [
+    row("hop", "one hop between two processes on two cores", targets::HOP, hop::measure),
+    row(
+        "chain",
+        "leader -> observer -> controller: from the leader's tick until the command is sent",
+        targets::CHAIN,
+        chain::measure,
+    ),
+    row("tick", "how late a tick begins", targets::TICK, tick::measure),
+    row("lockstep", "ticks per second where nobody waits for the time", targets::LOCKSTEP, lockstep::measure),
+    row("run", "a whole `corotate run`: start, stop, memory", targets::RUN, run::measure),
+    row("toll", "system calls, faults, context switches and allocations per tick", targets::TOLL, toll::measure),
+    row("processor", "processor time per tick of every role, by how roles wait", &[], processor::measure),
+];
 
 /// What a benchmark run is to do.
 pub struct Bench<'a> {
@@ -50,6 +83,8 @@ pub struct Bench<'a> {
     pub quick: bool,
     /// The program whose subcommands are the roles and the peers: this one.
     pub program: PathBuf,
+    /// Its scenarios, name and text; whole runs are of the first.
+    pub scenarios: &'a [(&'a str, &'a str)],
     /// The signal that asked the run to end; 0 while none has.
     pub signal: &'a AtomicUsize,
     /// Told what is being measured.
@@ -62,6 +97,12 @@ pub enum BenchError {
     /// A signal asked for the end.
     #[error("ended by signal {0} before everything was measured")]
     Interrupted(usize),
+    /// There is nothing to measure.
+    #[error("this program has no scenario of its own to measure; add one with `Program::scenario`")]
+    NoScenario,
+    /// A scenario cannot be run as a row has to run it.
+    #[error(transparent)]
+    Scenario(#[from] ConfigError),
     /// A domain could not be made.
     #[error(transparent)]
     Domain(#[from] DomainError),
@@ -90,33 +131,62 @@ impl BenchError {
     }
 }
 
-/// Measures the rows.
+/// Measures the rows. One that this program's scenario does not go with is a remark on the board.
 ///
 /// # Errors
 /// [`BenchError`].
 pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
-    let (_low_latency, grants) = crate::runtime::hold_low_latency_idle(&Realtime::default());
+    let (_low_latency, grants) = crate::runtime::hold_low_latency_idle(&bench.scenario(&[])?.realtime);
     let mut board = Board::default();
     for row in bench.rows.clone() {
-        match row {
-            Row::Step => step::measure(bench, &mut board)?,
-            Row::Fleet => fleet::measure(bench, &mut board)?,
-            Row::Hop => hop::measure(bench, &mut board)?,
-            Row::Chain => chain::measure(bench, &mut board)?,
-            Row::Tick => tick::measure(bench, &mut board)?,
-            Row::Lockstep => lockstep::measure(bench, &mut board)?,
-            Row::Run => run::measure(bench, &mut board)?,
-            Row::Toll => toll::measure(bench, &mut board)?,
-            Row::Processor => processor::measure(bench, &mut board)?,
+        board.begin(row.name);
+        match (row.measure)(bench, &mut board) {
+            Err(BenchError::Scenario(reason)) => board.remark(format!("{} is not measured: {reason}", row.name)),
+            measured => measured?,
         }
     }
     let taken = board.take_grants();
     Ok((board, [grants, taken].concat()))
 }
 
+/// A scenario with these overrides, whatever its run is judged by.
+fn resolve((name, text): (&str, &str), overrides: &[&str]) -> Result<Scenario, BenchError> {
+    let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
+    Ok(Scenario::parse(text, &format!("{name}.toml"), &overrides)?)
+}
+
 impl Bench<'_> {
-    /// Says what comes next; an error if the run is to end.
-    fn next(&mut self, what: &str) -> Result<(), BenchError> {
+    /// The scenario that is measured, undisturbed and with every role started by the launcher.
+    ///
+    /// # Errors
+    /// [`BenchError::NoScenario`], [`BenchError::Scenario`].
+    pub fn scenario(&self, overrides: &[&str]) -> Result<Scenario, BenchError> {
+        let first = self.scenarios.first().ok_or(BenchError::NoScenario)?;
+        resolve(*first, &[overrides, &["fault=[]", "launch.external=[]"]].concat())
+    }
+
+    /// Whether the scenario is the one whose figures have targets.
+    fn has_targets(&self) -> bool {
+        self.scenarios.first() == SHIPPED.first()
+    }
+
+    /// Why no target is judged; nothing if all are.
+    pub fn unjudged(&self) -> Vec<String> {
+        let quick = self.quick.then(|| "a smoke run: everything is exercised, no figure means anything".to_owned());
+        let debug = cfg!(debug_assertions)
+            .then(|| "a debug build: its figures are not those of the product; build with --release".to_owned());
+        let other = (!self.has_targets()).then(|| {
+            let (of, this) = (SHIPPED[0].0, self.scenarios.first().map_or("none", |(name, _)| *name));
+            format!("the targets are those of corotate's scenario {of}, and this is {this}")
+        });
+        quick.into_iter().chain(debug).chain(other).collect()
+    }
+
+    /// Says what comes next.
+    ///
+    /// # Errors
+    /// [`BenchError::Interrupted`] if the run is to end.
+    pub fn next(&mut self, what: &str) -> Result<(), BenchError> {
         self.interrupted()?;
         (self.progress)(what);
         Ok(())
@@ -131,7 +201,26 @@ impl Bench<'_> {
     }
 
     /// One of two sizes: of a run that counts, and of a smoke run.
-    fn size<T>(&self, full: T, quick: T) -> T {
+    pub fn size<T>(&self, full: T, quick: T) -> T {
         if self.quick { quick } else { full }
+    }
+
+    /// Does something with what the leader asks for, and gives it back; told what was granted.
+    ///
+    /// # Errors
+    /// Those of the work, and [`BenchError`] if there is no scenario.
+    pub fn in_the_leaders_place<T>(
+        &self,
+        board: &mut Board,
+        work: impl FnOnce(&Privileges) -> Result<T, BenchError>,
+    ) -> Result<T, BenchError> {
+        let cores = sched_getaffinity(None).ok();
+        let place = take_privileges(&self.scenario(&[])?, RoleId::Plant(0));
+        board.granted(place.grants.clone());
+        let done = work(&place);
+        release_priority();
+        // Where it cannot be had back the rest of the suite stays on the leader's core.
+        let _ = cores.map(|cores| sched_setaffinity(None, &cores));
+        done
     }
 }

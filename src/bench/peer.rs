@@ -8,7 +8,7 @@ use super::{Bench, BenchError};
 use crate::bus::BusError;
 use crate::bus::domain::Domain;
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::{SHIPPED, Scenario};
+use crate::config::Scenario;
 use crate::runtime::{Privileges, RoleId, take_privileges};
 use crate::telemetry::{Grant, Latency, StageReport};
 use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
@@ -28,12 +28,6 @@ pub(super) const SPIN_NS: u64 = 50_000;
 pub(super) const LOST_NS: u64 = 1_000_000_000;
 /// A peer that has said nothing for so long hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
-
-/// The scenario whose roles' places the measuring processes take.
-pub(super) fn pair() -> Scenario {
-    let (name, text) = SHIPPED[0];
-    Scenario::parse(text, name, &[]).expect("shipped scenarios are valid")
-}
 
 /// What the command line of a peer says.
 #[derive(Debug, Clone)]
@@ -68,17 +62,17 @@ enum Answer {
     Echoed,
 }
 
-/// Serves as a peer until standard input ends.
+/// Serves as a peer until standard input ends, with the privileges of a role of the scenario that is measured.
 ///
 /// # Errors
 /// Why it cannot, in words.
-pub fn serve_peer(seat: &PeerSeat) -> Result<(), String> {
+pub fn serve_peer(seat: &PeerSeat, scenario: &Scenario) -> Result<(), String> {
     let domain = Domain::join(&seat.domain).map_err(|error| error.to_string())?;
     let (role, waits_for) = match seat.observer {
         true => (RoleId::Observer, RoleId::Plant(0)),
         false => (RoleId::Controller, RoleId::Observer),
     };
-    let Privileges { grants, beside, .. } = take_privileges(&pair(), role);
+    let Privileges { grants, beside, .. } = take_privileges(scenario, role);
     say(&Answer::Here(grants))?;
     let mut ends = None;
     for line in std::io::stdin().lock().lines() {

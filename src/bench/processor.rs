@@ -3,9 +3,8 @@
 //!
 //! The kernel's own account of each process. Must not ask a process of the run for anything.
 
-use super::hop::in_the_leaders_place;
 use super::watch::{Process, Watch};
-use super::{Bench, BenchError, Board, Row};
+use super::{Bench, BenchError, Board};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use rustix::time::{ClockId, clock_gettime};
 use std::fs;
@@ -24,13 +23,13 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         for wake in WAKES {
             bench.next(&format!("processor: {wake}, round {round} of {rounds}"))?;
             for (process, us) in per_tick(bench, wake, window)? {
-                board.add(Row::Processor, &format!("{process}, {wake}"), "us/tick", Some("bare sleep"), us);
+                board.add(&format!("{process}, {wake}"), "us/tick", Some("bare sleep"), us);
             }
         }
         let ticks = window.as_nanos() as u64 / PERIOD_NS;
         for (name, lead_ns) in [("bare sleep", 0), ("bare sleep and spin", LEAD_NS)] {
-            let us = bare(board, ticks, lead_ns)?;
-            board.add(Row::Processor, name, "us/tick", None, us);
+            let us = bare(bench, board, ticks, lead_ns)?;
+            board.add(name, "us/tick", None, us);
         }
     }
     Ok(())
@@ -68,8 +67,8 @@ fn processor_ns(pid: i32) -> Option<u64> {
 }
 
 /// What a thread in the leader's place takes that only waits for each tick, with this lead, µs per tick.
-fn bare(board: &mut Board, ticks: u64, lead_ns: u64) -> Result<f64, BenchError> {
-    in_the_leaders_place(board, |_| {
+fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Result<f64, BenchError> {
+    bench.in_the_leaders_place(board, |_| {
         let grid = Grid { epoch_ns: monotonic_ns() + PERIOD_NS, period_ns: PERIOD_NS };
         let before = clock_gettime(ClockId::ThreadCPUTime);
         for tick in 0..ticks {

@@ -2,7 +2,7 @@
 //!
 //! Must not compute a figure: what is not on the board is not told.
 
-use super::{Bench, Board, Figure, Row, TARGETS, Verdict};
+use super::{Bench, Board, Figure, Row, Target, Verdict};
 use crate::files;
 use crate::launch::plain;
 use crate::telemetry::Host;
@@ -25,6 +25,10 @@ pub struct Results {
     /// Whether this was a smoke run, whose figures mean nothing.
     pub quick: bool,
     host: Host,
+    /// The scenario that was measured.
+    pub scenario: String,
+    /// Why no target is judged; nothing if all are.
+    pub not_judged: Vec<String>,
     /// Everything that was asked of the machine.
     pub privileges: Vec<Grant>,
     /// What was measured.
@@ -33,12 +37,21 @@ pub struct Results {
     pub targets: Vec<Verdict>,
     /// What a reader must know.
     pub remarks: Vec<String>,
+    #[serde(skip)]
+    rows: Vec<Row>,
 }
 
 impl Results {
     /// Draws up the results of a run that began at `started`.
     pub fn new(bench: &Bench<'_>, mut board: Board, privileges: Vec<Grant>, started: jiff::Timestamp) -> Self {
         board.compare();
+        let not_judged = bench.unjudged();
+        let verdict = |(row, target): (&'static str, &Target)| {
+            let verdict = target.judge(row, &board);
+            Verdict { met: verdict.met.filter(|_| not_judged.is_empty()), ..verdict }
+        };
+        let rows = bench.rows.iter().filter(|_| bench.has_targets());
+        let targets = rows.flat_map(|row| row.targets.iter().map(|target| (row.name, target)));
         Self {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
@@ -47,13 +60,16 @@ impl Results {
             quick: bench.quick,
             host: Host::this(),
             privileges,
-            targets: TARGETS.iter().filter_map(|target| target.judge(&board)).collect(),
+            scenario: bench.scenarios.first().map_or("", |(name, _)| *name).to_owned(),
+            targets: targets.map(verdict).collect(),
+            not_judged,
+            rows: bench.rows.clone(),
             figures: board.figures().to_vec(),
             remarks: board.remarks().to_vec(),
         }
     }
 
-    /// Whether every target that could be measured is met.
+    /// Whether every target that could be judged is met.
     pub fn met(&self) -> bool {
         self.targets.iter().all(|verdict| verdict.met != Some(false))
     }
@@ -68,16 +84,19 @@ pub fn table(results: &Results) -> String {
         "corotate {} ({}), {} cores of {}, Linux {}",
         results.version, results.revision, host.cores, host.cpu, host.kernel
     );
-    if results.quick {
-        let _ = writeln!(text, "a smoke run: everything is exercised, no figure means anything");
+    let _ = writeln!(text, "scenario {}", results.scenario);
+    for reason in &results.not_judged {
+        let _ = writeln!(text, "no target is judged: {reason}");
     }
-    for (row, name, title) in Row::ALL {
-        let figures: Vec<_> = results.figures.iter().filter(|figure| figure.row == row).collect();
+    for Row { name, title, .. } in &results.rows {
+        let figures: Vec<_> = results.figures.iter().filter(|figure| figure.row == *name).collect();
         if !figures.is_empty() {
             let _ = writeln!(text, "\n{name}: {title}\n{}", rows(&figures));
         }
     }
-    let _ = writeln!(text, "\n{}", targets(&results.targets));
+    if !results.targets.is_empty() {
+        let _ = writeln!(text, "\n{}", targets(&results.targets));
+    }
     for remark in &results.remarks {
         let _ = writeln!(text, "note: {remark}");
     }
@@ -122,13 +141,14 @@ fn rows(figures: &[&Figure]) -> comfy_table::Table {
 fn targets(targets: &[Verdict]) -> comfy_table::Table {
     let mut table = plain(&["target", "", "is", "verdict"]);
     for verdict in targets {
-        let met = match verdict.met {
-            Some(true) => "met",
-            Some(false) => "NOT MET",
-            None => "not measured",
+        let met = match (verdict.met, verdict.value) {
+            (Some(true), _) => "met",
+            (Some(false), _) => "NOT MET",
+            (None, Some(_)) => "not judged",
+            (None, None) => "not measured",
         };
         let value = verdict.value.map_or("-".to_owned(), number);
-        table.add_row([verdict.row.name().to_owned(), verdict.what.clone(), value, met.to_owned()]);
+        table.add_row([verdict.row.to_owned(), verdict.what.clone(), value, met.to_owned()]);
     }
     table
 }
@@ -158,7 +178,7 @@ pub fn write_results(directory: &Path, results: &Results) -> io::Result<()> {
     for figure in &results.figures {
         if let Some(pooled) = &figure.pooled {
             let name = figure.name.replace(|letter: char| !letter.is_ascii_alphanumeric(), "-");
-            let mut out = BufWriter::new(files::create(&latency.join(format!("{}.{name}.hgrm", figure.row.name())))?);
+            let mut out = BufWriter::new(files::create(&latency.join(format!("{}.{name}.hgrm", figure.row)))?);
             write_hgrm(pooled, None, &mut out)?;
             out.flush()?;
         }

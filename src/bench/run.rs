@@ -1,7 +1,7 @@
 //! What a whole run takes: to start, to stop, of memory; beside a bare process and a bare node.
 
 use super::watch::Watch;
-use super::{Bench, BenchError, Board, Row};
+use super::{Bench, BenchError, Board};
 use crate::bus::domain::OwnedDomain;
 use crate::bus::raw::RawNode;
 use std::process::{Command, Stdio};
@@ -19,18 +19,18 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
             ("start to first tick", Some("bare process"), observed.start_ms),
             ("last tick to end", Some("bare process"), observed.stop_ms),
         ] {
-            value.into_iter().for_each(|value| board.add(Row::Run, name, "ms", floor, value));
+            value.into_iter().for_each(|value| board.add(name, "ms", floor, value));
         }
-        board.add(Row::Run, "bare process", "ms", None, bare_process(bench)?);
-        board.add(Row::Run, "bare iceoryx2 node", "ms", None, bare_node()?);
+        board.add("bare process", "ms", None, bare_process(bench)?);
+        board.add("bare iceoryx2 node", "ms", None, bare_node()?);
         let roles = || observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
         let largest = |which: usize| roles().map(|(_, mib)| mib[which]).fold(f64::NAN, f64::max);
-        board.add(Row::Run, "memory of the largest role", "MiB", None, largest(0));
-        board.add(Row::Run, "of it not the program's own file", "MiB", None, largest(1));
+        board.add("memory of the largest role", "MiB", None, largest(0));
+        board.add("of it not the program's own file", "MiB", None, largest(1));
         for (name, [mib, _]) in &observed.resident_mib {
-            board.add(Row::Run, &format!("memory of {name}"), "MiB", None, *mib);
+            board.add(&format!("memory of {name}"), "MiB", None, *mib);
         }
-        board.add(Row::Run, "shared memory", "MiB", None, observed.shared_mib);
+        board.add("shared memory", "MiB", None, observed.shared_mib);
     }
     Ok(())
 }

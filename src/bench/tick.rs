@@ -1,12 +1,10 @@
 //! How late a tick begins: in a run, bare, and by cyclictest, in turn, at the same priority and period on the same core.
 
-use super::chain::{APART, run_pair, stages};
-use super::hop::in_the_leaders_place;
-use super::peer::pair;
+use super::chain::{APART, run_in_real_time, stages};
 use super::watch::Watch;
-use super::{Bench, BenchError, Board, Row};
+use super::{Bench, BenchError, Board};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
-use crate::runtime::take_privileges;
+use crate::runtime::RoleId;
 use crate::telemetry::{Grant, Latency};
 use std::process::{Command, Stdio};
 
@@ -19,35 +17,36 @@ const LONGEST_NS: u64 = 1_000_000;
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let (rounds, ticks) = (bench.size(5, 1), bench.size(2000, 100));
+    let leader = RoleId::Plant(0).name(&bench.scenario(&[])?).to_owned();
     for round in 1..=rounds {
         bench.next(&format!("tick: round {round} of {rounds}"))?;
-        let outcome = run_pair(bench, 1000, ticks as f64 / 1e3, APART)?;
-        for latency in stages(&outcome, "leader", "lateness") {
-            board.record(Row::Tick, "ours, in a run", Some("cyclictest"), &latency);
+        let outcome = run_in_real_time(bench, 1000, ticks as f64 / 1e3, APART)?;
+        for latency in stages(&outcome, &leader, "lateness") {
+            board.record("ours, in a run", Some("cyclictest"), &latency);
         }
-        match cyclictest(board, ticks)? {
-            Ok(latency) => board.record(Row::Tick, "cyclictest", None, &latency),
+        match cyclictest(bench, board, ticks)? {
+            Ok(latency) => board.record("cyclictest", None, &latency),
             Err(reason) => board.remark(format!("cyclictest is missing: {reason}")),
         }
-        let (spun, spun_error) = bare(board, ticks, LEAD_NS)?;
-        board.record(Row::Tick, "bare sleep and spin", Some("cyclictest"), &spun);
-        board.add(Row::Tick, "rate error of a bare sleep and spin", "%", None, spun_error);
-        let (slept, slept_error) = bare(board, ticks, 0)?;
-        board.record(Row::Tick, "bare sleep", Some("cyclictest"), &slept);
-        board.add(Row::Tick, "rate error of a bare sleep", "%", None, slept_error);
+        let (spun, spun_error) = bare(bench, board, ticks, LEAD_NS)?;
+        board.record("bare sleep and spin", Some("cyclictest"), &spun);
+        board.add("rate error of a bare sleep and spin", "%", None, spun_error);
+        let (slept, slept_error) = bare(bench, board, ticks, 0)?;
+        board.record("bare sleep", Some("cyclictest"), &slept);
+        board.add("rate error of a bare sleep", "%", None, slept_error);
         let duration = format!("duration_s={:?}", ticks as f64 / 1e3);
         let mut watch =
             Watch { overrides: &[&duration, "clock=realtime"], environment: Vec::new(), midway: &mut |_, _| {} };
         if let Some(error) = watch.run(bench)?.rate_error_percent {
-            board.add(Row::Tick, "rate error of a run", "%", None, error);
+            board.add("rate error of a run", "%", None, error);
         }
     }
     Ok(())
 }
 
 /// So many bare ticks in the leader's place, each waited for with this lead; and how far their rate was off, %.
-fn bare(board: &mut Board, ticks: u64, lead_ns: u64) -> Result<(Latency, f64), BenchError> {
-    in_the_leaders_place(board, |_| {
+fn bare(bench: &Bench<'_>, board: &mut Board, ticks: u64, lead_ns: u64) -> Result<(Latency, f64), BenchError> {
+    bench.in_the_leaders_place(board, |_| {
         let mut latency = Latency::default();
         let grid = Grid { epoch_ns: monotonic_ns() + PERIOD_NS, period_ns: PERIOD_NS };
         let (mut first_ns, mut last_ns) = (0, 0);
@@ -69,9 +68,8 @@ fn bare(board: &mut Board, ticks: u64, lead_ns: u64) -> Result<(Latency, f64), B
 }
 
 /// The same by cyclictest; or why there is none.
-fn cyclictest(board: &mut Board, ticks: u64) -> Result<Result<Latency, String>, BenchError> {
-    let grants =
-        in_the_leaders_place(board, |_| Ok(take_privileges(&pair(), crate::runtime::RoleId::Plant(0)).grants))?;
+fn cyclictest(bench: &Bench<'_>, board: &mut Board, ticks: u64) -> Result<Result<Latency, String>, BenchError> {
+    let grants = bench.in_the_leaders_place(board, |place| Ok(place.grants.clone()))?;
     let granted = |name: &str| grants.iter().find(|grant: &&Grant| grant.granted && grant.privilege == name);
     let mut command = Command::new("cyclictest");
     command.args(["--quiet", "--nsecs", "--threads=1", "--json=/dev/stdout"]);

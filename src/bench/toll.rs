@@ -3,19 +3,17 @@
 //!
 //! Counts that do not disturb each other are taken in one run; whoever watches system calls gets a run of its own.
 
-use super::compiled::{NATIVE, compile, temporary_directory};
 use super::watch::{Process, Watch, status_word};
-use super::{Bench, BenchError, Board, Row};
+use super::{Bench, BenchError, Board};
+use crate::runtime::{RoleId, ports};
 use std::ffi::OsString;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// The allocator that counts.
 const ALLOCATIONS: &str = include_str!("allocations.c");
-/// Samples that a role sends per tick: iceoryx2 allocates once for each.
-const SAMPLES: [(&str, f64); 4] = [("leader", 2.0), ("follower", 2.0), ("observer", 1.0), ("controller", 1.0)];
 /// Between two words of a role to the launcher, s; each is a sample too.
 const WORD_S: f64 = 0.02;
 
@@ -69,9 +67,10 @@ fn watch(
 
 /// Faults, switches and allocations.
 fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(), BenchError> {
-    let directory = temporary_directory().map_err(BenchError::Peer)?;
+    let scenario = bench.scenario(&[])?;
+    let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
     let mut environment = Vec::new();
-    match compile(ALLOCATIONS, NATIVE, directory.path(), "allocations") {
+    match compile_allocator(directory.path()) {
         Ok(library) => {
             environment.push(("LD_PRELOAD", library.into_os_string()));
             environment.push(("COROTATE_BENCH_ALLOCATIONS", directory.path().as_os_str().to_owned()));
@@ -92,15 +91,15 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
     })?;
     let (mut worst_faults, mut worst_allocations) = (f64::NAN, f64::NAN);
     for (process, before, after, ticks) in counted {
-        let mut add = |what: &str, value: f64| {
-            board.add(Row::Toll, &format!("{what}, {}", process.name), "per tick", None, value)
-        };
+        let mut add = |what: &str, value: f64| board.add(&format!("{what}, {}", process.name), "per tick", None, value);
         let per_tick = |before: u64, after: u64| (after - before) as f64 / ticks;
         let faults = per_tick(before.faults, after.faults);
         add("page faults", faults);
         add("voluntary context switches", per_tick(before.voluntary, after.voluntary));
         add("involuntary context switches", per_tick(before.involuntary, after.involuntary));
-        let Some((_, samples)) = SAMPLES.iter().find(|(role, _)| *role == process.name) else { continue };
+        let Some(role) = RoleId::named(&scenario, &process.name) else { continue };
+        // iceoryx2 allocates once for each.
+        let samples = ports(&scenario, role).writes.len() as f64;
         worst_faults = worst_faults.max(faults);
         if let (Some(before), Some(after)) = (before.allocations, after.allocations) {
             let all = per_tick(before, after);
@@ -113,10 +112,23 @@ fn count(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         ("allocations beyond iceoryx2's one per sample, worst role", worst_allocations),
     ] {
         if !value.is_nan() {
-            board.add(Row::Toll, name, "per tick", None, value);
+            board.add(name, "per tick", None, value);
         }
     }
     Ok(())
+}
+
+/// The allocator that counts, compiled for this machine; or why there is none.
+fn compile_allocator(directory: &Path) -> Result<PathBuf, String> {
+    let [input, output] = ["allocations.c", "allocations.so"].map(|name| directory.join(name));
+    fs::write(&input, ALLOCATIONS).map_err(|error| format!("cannot write {}: {error}", input.display()))?;
+    let mut compiler = Command::new("cc");
+    compiler.args(["-O3", "-shared", "-fPIC", "-fvisibility=hidden", "-o"]).arg(&output).arg(&input);
+    match compiler.output() {
+        Ok(done) if done.status.success() => Ok(output),
+        Ok(done) => Err(format!("cc failed: {}", String::from_utf8_lossy(&done.stderr).trim())),
+        Err(error) => Err(format!("there is no C compiler `cc` ({error}); install one (Debian: apt install gcc)")),
+    }
 }
 
 /// System calls, by whatever can count them here.
@@ -138,9 +150,9 @@ fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
                 // The counters of a process do not begin at quite the same instant.
                 let beyond_waits = all.saturating_sub(waits) as f64 / ticks;
                 let all = all as f64 / ticks;
-                board.add(Row::Toll, &format!("system calls, {}", process.name), "per tick", None, all);
+                board.add(&format!("system calls, {}", process.name), "per tick", None, all);
                 let beyond = format!("system calls beyond its waits, {}", process.name);
-                board.add(Row::Toll, &beyond, "per tick", None, beyond_waits);
+                board.add(&beyond, "per tick", None, beyond_waits);
                 if process.name != "launcher" {
                     worst = worst.max(beyond_waits);
                 }
@@ -149,7 +161,7 @@ fn calls(bench: &mut Bench<'_>, board: &mut Board, window: Duration) -> Result<(
         }
     }
     if !worst.is_nan() {
-        board.add(Row::Toll, "system calls beyond its waits, worst role", "per tick", None, worst);
+        board.add("system calls beyond its waits, worst role", "per tick", None, worst);
     }
     Ok(())
 }

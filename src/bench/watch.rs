@@ -7,11 +7,11 @@
 use super::{Bench, BenchError};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{IoxBus, IoxReader};
-use crate::bus::{Bus, Read, Reader, Signal};
+use crate::bus::{Bus, Read, Reader, Signal, WordReader};
 use crate::clock::monotonic_ns;
-use crate::config::{SHIPPED, Scenario};
-use crate::runtime::{depths, topic};
-use crate::sample::{Phase, RateMeasurement, Schedule};
+use crate::config::Scenario;
+use crate::runtime::{RoleId, depths, ports, topic};
+use crate::sample::{Phase, Schedule, Stamp};
 use rustix::process::{Pid, Signal as Kill, kill_process};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -26,6 +26,8 @@ use std::time::Duration;
 const LOOK_NS: u64 = 1_000_000;
 /// Looks between two at memory.
 const SLOW_LOOKS: u64 = 20;
+/// Words of a stamp.
+const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 /// A run that takes so much longer than it should hangs, ns.
 const HUNG_NS: u64 = 60_000_000_000;
 
@@ -54,7 +56,7 @@ pub(super) struct Observed {
 
 /// A run to be watched.
 pub(super) struct Watch<'a> {
-    /// Overrides of the shipped scenario `rigid-pair`.
+    /// Overrides of the scenario that is measured.
     pub overrides: &'a [&'a str],
     /// Environment of all its processes.
     pub environment: Vec<(&'static str, OsString)>,
@@ -66,7 +68,7 @@ pub(super) struct Watch<'a> {
 struct Line {
     domain: Domain,
     schedule: IoxReader<Schedule>,
-    leader: IoxReader<RateMeasurement>,
+    leader: WordReader,
     /// Tick and time of the first and last measurement seen.
     seen: Option<[(u64, u64); 2]>,
     /// Last, so that it is dropped after what was opened on it.
@@ -76,10 +78,7 @@ struct Line {
 impl Watch<'_> {
     /// Runs it to its end.
     pub fn run(&mut self, bench: &mut Bench<'_>) -> Result<Observed, BenchError> {
-        let (name, text) = SHIPPED[0];
-        let mut overrides: Vec<String> = self.overrides.iter().map(|text| (*text).to_owned()).collect();
-        overrides.push("accept={}".to_owned());
-        let scenario = Scenario::parse(text, name, &overrides).expect("the suite's overrides are valid");
+        let scenario = bench.scenario(self.overrides)?;
         let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
         let file = directory.path().join("scenario.toml");
         fs::write(&file, scenario.to_toml()).map_err(BenchError::system("write a scenario"))?;
@@ -175,7 +174,9 @@ impl Line {
         let domain = Domain::join(&root).ok()?;
         let bus = IoxBus::enter(&domain, "bench", depths(scenario)).ok()?;
         let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role).ok()?;
-        let leader = bus.reader(&topic(scenario, "leader", Signal::Measurement), Reader::Role).ok()?;
+        let mut written = ports(scenario, RoleId::Plant(0)).writes.into_iter();
+        let measurement = written.find(|port| port.topic.signal == Signal::Measurement)?;
+        let leader = measurement.reader(&bus, Reader::Role).ok()?;
         Some(Self { domain, schedule, leader, seen: None, _bus: bus })
     }
 
@@ -187,11 +188,13 @@ impl Line {
     }
 
     fn look_at_leader(&mut self) -> Result<(), BenchError> {
-        while self.leader.advance()? {}
-        // Generation 0 is warm-up.
-        if let Some(stamp) = self.leader.current().map(|sample| sample.stamp).filter(|stamp| stamp.generation > 0) {
-            let now = (stamp.tick, stamp.sent_ns);
-            self.seen = Some([self.seen.map_or(now, |[first, _]| first), now]);
+        while let Some(words) = self.leader.next()? {
+            let stamp: Stamp = bytemuck::pod_read_unaligned(bytemuck::cast_slice(&words[..STAMP]));
+            // Generation 0 is warm-up.
+            if stamp.generation > 0 {
+                let now = (stamp.tick, stamp.sent_ns);
+                self.seen = Some([self.seen.map_or(now, |[first, _]| first), now]);
+            }
         }
         Ok(())
     }

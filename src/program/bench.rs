@@ -1,9 +1,9 @@
-//! `corotate bench`: the benchmark suite, from the rows asked for to a table, JSON and histograms.
+//! `corotate bench`: the benchmark, from the rows asked for to a table, JSON and histograms.
 
 use super::role::die_with;
 use super::run::{catch_signals, make_directory};
-use super::{Exit, fail, print};
-use crate::bench::{Bench, BenchError, PeerSeat, Results, Row, run, serve_peer, table, write_results};
+use super::{Exit, fail, load, print, scenarios};
+use crate::bench::{Bench, BenchError, PeerSeat, ROWS, Results, Row, run, serve_peer, table, write_results};
 use indicatif::ProgressBar;
 use std::cell::RefCell;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use std::time::Duration;
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Arguments {
-    /// Rows to measure: step, fleet, hop, chain, tick, lockstep, run, toll, processor [default: all]
+    /// Rows to measure: hop, chain, tick, lockstep, run, toll, processor [default: all]
     #[arg(value_name = "ROW", value_parser = row)]
     rows: Vec<Row>,
     /// A smoke run of a few seconds, whose figures mean nothing
@@ -33,12 +33,13 @@ pub struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   corotate bench                            every row, about five minutes
-  corotate bench step hop --quick           two rows, as a smoke test
-  corotate bench step --check               exit code 3 if a target is missed";
+  corotate bench chain hop --quick          two rows, as a smoke test
+  corotate bench hop --check                exit code 3 if a target is missed";
 
 fn row(name: &str) -> Result<Row, String> {
-    let known = || Row::ALL.map(|(_, name, _)| name).join(", ");
-    Row::named(name).ok_or_else(|| format!("there is no such row; there are {}", known()))
+    let known = || ROWS.map(|row| row.name).join(", ");
+    let found = ROWS.into_iter().find(|row| row.name == name);
+    found.ok_or_else(|| format!("there is no such row; there are {}", known()))
 }
 
 /// Options of the hidden command by which the suite starts the other end of a hop.
@@ -67,25 +68,29 @@ pub fn bench(arguments: &Arguments) -> Exit {
 fn attempt(arguments: &Arguments) -> Result<Results, (Exit, String)> {
     let broken = |reason: String| (Exit::Failure, reason);
     let started = jiff::Timestamp::now();
-    let directory = make_directory(arguments.out.as_deref(), "bench", started)
-        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
-    let rows = if arguments.rows.is_empty() { Row::ALL.map(|(row, ..)| row).to_vec() } else { arguments.rows.clone() };
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner();
-    spinner.enable_steady_tick(Duration::from_millis(200));
     let last = RefCell::new(String::new());
     let mut bench = Bench {
-        rows,
+        rows: if arguments.rows.is_empty() { ROWS.to_vec() } else { arguments.rows.clone() },
         quick: arguments.quick,
         program,
+        scenarios: scenarios(),
         signal: &signal,
         progress: &mut |what| {
             spinner.set_message(what.to_owned());
             last.replace(what.to_owned());
         },
     };
+    bench.scenario(&[]).map_err(|error| (Exit::Usage, error.to_string()))?;
+    if let (true, Some(reason)) = (arguments.check, bench.unjudged().first()) {
+        return Err((Exit::Usage, format!("--check has nothing to judge: {reason}")));
+    }
+    let directory = make_directory(arguments.out.as_deref(), "bench", started)
+        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    spinner.enable_steady_tick(Duration::from_millis(200));
     let measured = run(&mut bench);
     spinner.finish_and_clear();
     let (board, privileges) = measured.map_err(|error| match error {
@@ -110,7 +115,8 @@ pub fn peer(arguments: &PeerArguments) -> Exit {
     if let Err(exit) = die_with(arguments.parent) {
         return exit;
     }
-    match serve_peer(&PeerSeat { domain: arguments.domain.clone(), observer: arguments.observer }) {
+    let seat = PeerSeat { domain: arguments.domain.clone(), observer: arguments.observer };
+    match load(None, &[]).and_then(|scenario| serve_peer(&seat, &scenario)) {
         Ok(()) => Exit::Ok,
         Err(reason) => fail(Exit::Failure, &reason),
     }

@@ -65,7 +65,7 @@ Examples:
   corotate watch                                 a screen on the newest run
   corotate run trio.toml --foxglove              live in Foxglove too, at ws://localhost:8765
   corotate doctor                                is this machine fit for real time, and what to do about it
-  corotate bench step hop                        what the step and a hop cost here, beside their floors";
+  corotate bench chain hop                       what the chain and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
 enum Command {

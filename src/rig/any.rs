@@ -4,6 +4,7 @@
 
 use super::{BodyInfo, CertificateReport, Figure, Picture, Rig};
 use crate::analysis::{self, Claim};
+use crate::bench;
 use crate::bus::{AnyBus, BusError};
 use crate::config::{Fields, Scenario, fields};
 use crate::launch::{Launch, Outcome, Scorer, run_directly, score_rig};
@@ -43,6 +44,7 @@ pub(crate) trait Face: Any + Send + Sync {
     fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>;
     fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
     fn judge(&self) -> Box<dyn Judge>;
+    fn arithmetic(&self, scenario: &Scenario) -> Option<f64>;
 }
 
 impl<R: Rig> Face for R {
@@ -124,6 +126,10 @@ impl<R: Rig> Face for R {
 
     fn judge(&self) -> Box<dyn Judge> {
         Box::new(self.clone())
+    }
+
+    fn arithmetic(&self, scenario: &Scenario) -> Option<f64> {
+        bench::arithmetic_alone(self, scenario)
     }
 }
 

@@ -313,6 +313,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     pub fn finish(&mut self) -> Result<(), BusError> {
         if std::mem::take(&mut self.shown) {
             self.port.publish()?;
+            hooks::at(Place::Sent);
             self.sent(1);
         }
         if let Some(disturbance) = &mut self.disturbance {

@@ -3,10 +3,9 @@
 //! All read three arrays of f64 and write three others: 48 bytes per follower. What is measured is what the controller of a
 //! fleet runs. The largest fleets leave the caches: there the copy is the memory's bandwidth.
 
-use super::hop::in_the_leaders_place;
-use super::{Bench, BenchError, Board, Row};
-use crate::control::{FleetLaw, Synchronizer};
-use crate::model::{Inertia, RigidBody};
+use corotate::bench::{Bench, BenchError, Board};
+use corotate::control::{FleetLaw, Synchronizer};
+use corotate::model::{Inertia, RigidBody};
 use nalgebra::Vector3;
 use std::hint::black_box;
 use std::time::Instant;
@@ -59,7 +58,7 @@ fn one_by_one(law: &Synchronizer, reference: &Vector3<f64>, from: [&[f64]; 3], [
 }
 
 /// Measures the row.
-pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let (rounds, followers) = (bench.size(41, 3), bench.size(200_000, 2000));
     let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).expect("a body has such an inertia"));
     let one = Synchronizer::new(body, Vector3::repeat(4.0), 0.0);
@@ -71,17 +70,17 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         let floor = format!("copy, N = {count}");
         for _ in 0..rounds {
             // In the leader's place, or whatever else the machine does would be measured too.
-            let [ours, copied, single] = in_the_leaders_place(board, |_| {
+            let [ours, copied, single] = bench.in_the_leaders_place(board, |_| {
                 Ok([
                     arrays.turn(followers, |rates, commands| law.command(&reference, rates, commands)),
                     arrays.turn(followers, copy),
                     arrays.turn(followers, |rates, commands| one_by_one(&one, &reference, rates, commands)),
                 ])
             })?;
-            board.add(Row::Fleet, &format!("law, N = {count}"), "ns", Some(&floor), ours);
-            board.add(Row::Fleet, &floor, "ns", None, copied);
-            board.add(Row::Fleet, &format!("bandwidth of the copy, N = {count}"), "GB/s", None, BYTES / copied);
-            board.add(Row::Fleet, &format!("law one by one, N = {count}"), "ns", Some(&floor), single);
+            board.add(&format!("law, N = {count}"), "ns", Some(&floor), ours);
+            board.add(&floor, "ns", None, copied);
+            board.add(&format!("bandwidth of the copy, N = {count}"), "GB/s", None, BYTES / copied);
+            board.add(&format!("law one by one, N = {count}"), "ns", Some(&floor), single);
         }
     }
     Ok(())

@@ -5,27 +5,25 @@
 
 use super::compiled::{Compiled, NATIVE, PORTABLE};
 use super::ekf::Ekf;
-use super::hop::in_the_leaders_place;
+use super::product::{KINDS, Ours, SAMPLES, driven, measurements, pass, scenario, timed};
 use super::recording::{CASES, Recording};
-use super::{Bench, BenchError, Board, Row};
-use crate::config::{SHIPPED, Scenario};
-use crate::observe::{
+use corotate::bench::{Bench, BenchError, Board};
+use corotate::config::{SHIPPED, Scenario};
+use corotate::model::Inertia;
+use corotate::observe::{
     Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise,
     SecondOrderFilter,
 };
-use crate::rig::{Command, Estimate, Measurement, RateLaw, Rig, RigidBodyRig};
-use crate::role::{Body, Controller, Guard, Observer};
-use crate::sample::{Message, RateEstimate, RateMeasurement, Sample, status};
-use crate::with_shipped_rig;
+use corotate::rig::{Command, Estimate, Figure, Measurement, RateLaw, Rig, RigidBodyRig};
+use corotate::role::{Controller, Guard};
+use corotate::sample::{FieldKind, RateCommand, RateEstimate, RateMeasurement, Sample, status};
+use corotate::with_shipped_rig;
 use nalgebra::{Vector1, Vector3};
 use std::hint::black_box;
 use std::sync::OnceLock;
-use std::time::Instant;
 
 /// The hand-written step.
 const REFERENCE: &str = include_str!("reference.c");
-/// Samples of one pass: a second of them.
-const SAMPLES: usize = 1000;
 /// What stands for the noise of the sensors where a filter is told of it: standard deviation, rad/s, and density of the
 /// hidden component's disturbance, (rad/s)²/s.
 const DEVIATION: f64 = 2e-3;
@@ -34,129 +32,22 @@ const DENSITY: f64 = 1e-8;
 /// One who takes part: a name, the floor, and a pass over all samples that tells how long it took, ns per step.
 struct Contestant<'a> {
     name: String,
-    floor: Option<&'static str>,
+    floor: Option<String>,
     pass: Box<dyn FnMut() -> f64 + 'a>,
 }
 
 impl<'a> Contestant<'a> {
-    fn new(name: impl Into<String>, floor: Option<&'static str>, pass: impl FnMut() -> f64 + 'a) -> Self {
-        Self { name: name.into(), floor, pass: Box::new(pass) }
-    }
-}
-
-/// The four steps that are held against C: name, the shipped scenario, and what is changed in it.
-const KINDS: [(&str, &str, &[&str]); 4] = [
-    ("first order", "rigid-pair", &[]),
-    (
-        "second order",
-        "rigid-pair",
-        &["observer={ bandwidth_rad_s = 2.0, initial_guess_rad_s = 0.0, observability_floor_rad_s = 1e-6 }"],
-    ),
-    ("identifier", "inertia", &[]),
-    ("orbit", "orbit-hold", &[]),
-];
-
-/// The figure that a figure of these kinds stands beside.
-const IN_C: [(&str, &str); 4] = [
-    ("first order", "first order in C"),
-    ("second order", "second order in C"),
-    ("identifier", "identifier in C"),
-    ("orbit", "orbit in C"),
-];
-
-/// The names of the four steps.
-pub const STEP_KINDS: [&str; 4] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0];
-
-/// Does the product's step of one kind again and again, so many times for each of a second of samples; nothing for a kind
-/// that there is not. For whoever counts instructions.
-pub fn repeat_step(kind: &str, passes: u64) {
-    if let Some((_, name, overrides)) = KINDS.iter().find(|(known, ..)| *known == kind) {
-        let scenario = scenario(name, overrides);
-        let mut ours = ours(kind, None, &scenario);
-        for _ in 0..passes {
-            (ours.pass)();
-        }
-    }
-}
-
-fn scenario(name: &str, overrides: &[&str]) -> Scenario {
-    let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).expect("the scenario ships");
-    // What is judged at the end of a run is of no concern here, and some overrides would leave nothing to judge.
-    let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
-    Scenario::parse(text, "bench", &overrides).expect("shipped scenarios are valid")
-}
-
-/// A second of the observed body's measurements, and those of the first driven body: the same one where none is.
-fn measurements<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<[Measurement<R>; 2]> {
-    let mut bodies = [rig.body(0), rig.body(driven(rig).unwrap_or(0))];
-    let tick = |tick: usize| {
-        let mut pair = [Measurement::<R>::default(); 2];
-        for (body, measurement) in bodies.iter_mut().zip(&mut pair) {
-            body.measure(0, 0, measurement);
-            (measurement.stamp_mut().tick, measurement.stamp_mut().generation) = (tick as u64, 1);
-            body.flow(scenario.tick_s());
-        }
-        pair
-    };
-    (0..SAMPLES).map(tick).collect()
-}
-
-fn driven<R: Rig>(rig: &R) -> Option<usize> {
-    rig.bodies().iter().position(|body| body.driven)
-}
-
-/// Nanoseconds per step of a pass.
-fn timed(pass: impl FnOnce()) -> f64 {
-    let began = Instant::now();
-    pass();
-    began.elapsed().as_nanos() as f64 / SAMPLES as f64
-}
-
-type StepOf<R> = fn(&mut Ours<R>, &Measurement<R>, &Measurement<R>, &mut Estimate<R>, &mut Command<R>);
-
-/// The product's step on one rig.
-struct Ours<R: Rig> {
-    observer: Observer<R::Estimator>,
-    controller: Option<Controller<R::Law>>,
-}
-
-impl<R: Rig> Ours<R> {
-    fn new(rig: &R, scenario: &Scenario) -> Self {
-        Self {
-            observer: Observer::new(rig.estimator(), scenario.tick_s()),
-            controller: driven(rig).map(|index| Controller::new(rig.law(index))),
-        }
+    fn new(name: impl Into<String>, pass: impl FnMut() -> f64 + 'a) -> Self {
+        Self { name: name.into(), floor: None, pass: Box::new(pass) }
     }
 
-    /// Samples in, command out; without a driven body, the estimate.
-    #[inline(never)]
-    fn step(
-        &mut self,
-        observed: &Measurement<R>,
-        own: &Measurement<R>,
-        estimate: &mut Estimate<R>,
-        command: &mut Command<R>,
-    ) {
-        self.observer.step(observed, estimate);
-        if let Some(controller) = &mut self.controller {
-            controller.step(estimate, own, command);
-        }
-    }
-
-    fn pass(&mut self, samples: &[[Measurement<R>; 2]]) -> f64 {
-        let step: StepOf<R> = black_box(Self::step);
-        let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
-        timed(|| {
-            for [observed, own] in samples {
-                step(self, observed, own, &mut estimate, &mut command);
-            }
-            black_box((&estimate, &command));
-        })
+    fn beside(self, floor: impl Into<String>) -> Self {
+        Self { floor: Some(floor.into()), ..self }
     }
 }
 
 /// The same step in C.
-pub(super) struct InC<'a> {
+struct InC<'a> {
     state: Vec<f64>,
     parameters: Vec<f64>,
     start: unsafe extern "C" fn(*mut f64, *const f64),
@@ -250,7 +141,7 @@ fn parameters(kind: &str, scenario: &Scenario) -> (&'static str, Vec<f64>) {
         _ => {
             let number = |path: &str| get(path).first().copied().unwrap_or(0.0);
             let filter = [number("observer.decay_rate_per_s"), number("observer.bandwidth_rad_s")];
-            let figure = |figures: Vec<crate::rig::Figure>, word: &str| {
+            let figure = |figures: Vec<Figure>, word: &str| {
                 figures.iter().find(|figure| figure.name.contains(word)).map_or(f64::MAX, |figure| figure.value)
             };
             let bound = scenario.rig.certificates().pop().map_or(0.0, |certificate| figure(certificate.bounds, "M"));
@@ -281,7 +172,7 @@ fn numbers(table: &toml::Table, path: &str) -> Vec<f64> {
 }
 
 /// How far the C code is from the product on the same samples.
-#[derive(Debug, Clone, serde::Serialize)]
+#[derive(Debug)]
 pub struct Agreement {
     /// The step.
     pub kind: &'static str,
@@ -336,8 +227,8 @@ impl Agreement {
         for field in S::FIELDS {
             for index in field.offset / 8..field.offset / 8 + field.count {
                 match field.kind {
-                    crate::sample::FieldKind::U64 => self.words &= ours[index] == theirs[index],
-                    crate::sample::FieldKind::F64 => {
+                    FieldKind::U64 => self.words &= ours[index] == theirs[index],
+                    FieldKind::F64 => {
                         let (ours, theirs) = (f64::from_bits(ours[index]), f64::from_bits(theirs[index]));
                         let difference = (ours - theirs).abs() / ours.abs().max(1.0);
                         // Also where either is no number.
@@ -366,11 +257,11 @@ fn by_ekf(scenario: &Scenario) -> Option<Contestant<'_>> {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
     let inertia: [f64; 3] = numbers(&scenario.to_toml().parse().ok()?, "leader.inertia_kg_m2").try_into().ok()?;
-    let coefficients = crate::model::Inertia::new(inertia).ok()?.coefficients();
+    let coefficients = Inertia::new(inertia).ok()?.coefficients();
     let first = Vector3::from(samples[0][0].omega_rad_s);
     let begun = move || Ekf::new(&coefficients, 3, [DEVIATION, DENSITY], &first, [0.0, 1.0]);
     let law = driven(rig)?;
-    Some(Contestant::new("first order by an EKF", Some("first order"), move || {
+    let pass = move || {
         let (mut filter, mut controller) = (begun(), Controller::new(rig.law(law)));
         let (mut estimate, mut command) = (RateEstimate::default(), Default::default());
         let step: fn(&mut Ekf, &mut Controller<_>, f64, &[RateMeasurement; 2], &mut _, &mut _) = black_box(ekf_step);
@@ -380,7 +271,8 @@ fn by_ekf(scenario: &Scenario) -> Option<Contestant<'_>> {
             }
             black_box(&command);
         })
-    }))
+    };
+    Some(Contestant::new("first order by an EKF", pass).beside("first order"))
 }
 
 #[inline(never)]
@@ -390,7 +282,7 @@ fn ekf_step(
     tick_s: f64,
     [observed, own]: &[RateMeasurement; 2],
     estimate: &mut RateEstimate,
-    command: &mut crate::sample::RateCommand,
+    command: &mut RateCommand,
 ) {
     filter.step(tick_s, &Vector3::from(observed.omega_rad_s));
     estimate.stamp = observed.stamp;
@@ -403,7 +295,7 @@ fn ekf_step(
 fn bare_copy(scenario: &Scenario) -> Option<Contestant<'_>> {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
-    Some(Contestant::new("bare copy of its samples", None, move || {
+    Some(Contestant::new("bare copy of its samples", move || {
         let copy: fn(&_, &_, &mut _, &mut _) = black_box(copy_samples);
         let (mut estimate, mut command) = (RateEstimate::default(), Default::default());
         timed(|| {
@@ -420,7 +312,7 @@ fn copy_samples(
     observed: &RateMeasurement,
     own: &RateMeasurement,
     estimate: &mut RateEstimate,
-    command: &mut crate::sample::RateCommand,
+    command: &mut RateCommand,
 ) {
     (estimate.stamp, command.stamp) = (observed.stamp, own.stamp);
     (estimate.omega_rad_s, estimate.coefficients) = (observed.omega_rad_s, observed.applied_rad_s2);
@@ -430,15 +322,14 @@ fn copy_samples(
 
 /// A kind's step, ours and in C.
 fn kind<'a>(kind: &'static str, scenario: &'a Scenario, board: &mut Board) -> Vec<Contestant<'a>> {
-    let floor = IN_C.iter().find(|(name, _)| *name == kind).map(|(_, floor)| *floor);
-    let mut contestants = vec![ours(kind, floor, scenario)];
+    let floor = format!("{kind} in C");
+    let mut contestants = vec![Contestant::new(kind, pass(scenario)).beside(&*floor)];
     let (prefix, parameters) = parameters(kind, scenario);
     for (library, suffix) in [(library(), ""), (portable_library(), ", for any machine")] {
         match library.and_then(|library| InC::new(library, prefix, parameters.clone())) {
             Ok(mut in_c) => contestants.push(with_shipped_rig!(scenario.rig, rig => {
                 let samples = measurements(rig, scenario);
-                let name = format!("{}{suffix}", floor.unwrap_or_default());
-                Contestant::new(name, None, move || pass_in_c(rig, &mut in_c, &samples))
+                Contestant::new(format!("{floor}{suffix}"), move || pass_in_c(rig, &mut in_c, &samples))
             })),
             Err(reason) => board.remark(format!("the step in C is missing: {reason}")),
         }
@@ -450,19 +341,12 @@ fn pass_in_c<R: Rig>(_: &R, in_c: &mut InC<'_>, samples: &[[Measurement<R>; 2]])
     in_c.pass::<R>(samples)
 }
 
-fn ours<'a>(name: &str, floor: Option<&'static str>, scenario: &'a Scenario) -> Contestant<'a> {
-    with_shipped_rig!(scenario.rig, rig => {
-        let samples = measurements(rig, scenario);
-        Contestant::new(name, floor, move || Ours::new(rig, scenario).pass(&samples))
-    })
-}
-
 /// What the receiving ends check before any of it: the observed body's measurement, and a driven body's.
 fn guards<'a>(name: &str, scenario: &'a Scenario) -> Option<Contestant<'a>> {
     with_shipped_rig!(scenario.rig, rig => {
         let driven = driven(rig)?;
         let samples = measurements(rig, scenario);
-        Some(Contestant::new(format!("guards of its two measurements, {name}"), None, move || {
+        Some(Contestant::new(format!("guards of its two measurements, {name}"), move || {
             let mut guards = [rig.measurement_guard(0, false), rig.measurement_guard(driven, true)];
             timed(|| {
                 for pair in &samples {
@@ -491,7 +375,7 @@ fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<
             Filter::Kalman(_) => recording.relation(),
             _ => HiddenRate::new(&recording.coefficients, 3, 1e-6).expect("the case has a relation"),
         };
-        Contestant::new(format!("filter alone, {name}: {filter_name}"), None, move || {
+        Contestant::new(format!("filter alone, {name}: {filter_name}"), move || {
             let mut filter = filter;
             timed(|| {
                 let (mut from, interval) = (relation.sight(&recording.sample(0)), Interval::from(recording.tick_s));
@@ -534,13 +418,13 @@ fn whole_body_filters<'a>(recording: &'a Recording, name: &str, guess: f64) -> [
         })
     };
     [
-        Contestant::new(format!("filter alone, {name}: guarded Kalman"), None, guarded),
-        Contestant::new(format!("filter alone, {name}: extended Kalman"), None, extended),
+        Contestant::new(format!("filter alone, {name}: guarded Kalman"), guarded),
+        Contestant::new(format!("filter alone, {name}: extended Kalman"), extended),
     ]
 }
 
 /// Measures the row.
-pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
+pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     bench.next("step: checking the C code against ours")?;
     match agreements() {
         Ok(agreements) => agreements.iter().for_each(|agreement| {
@@ -562,7 +446,8 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     contestants.extend(by_ekf(first).into_iter().chain(bare_copy(first)));
     // Samples in, command out, for every shipped scenario that has commands.
     let with_law = shipped.iter().filter(|(_, scenario)| scenario.rig.bodies().iter().any(|body| body.driven));
-    contestants.extend(with_law.clone().map(|(name, scenario)| ours(&format!("step of {name}"), None, scenario)));
+    contestants
+        .extend(with_law.clone().map(|(name, scenario)| Contestant::new(format!("step of {name}"), pass(scenario))));
     contestants.extend(with_law.filter_map(|(name, scenario)| guards(name, scenario)));
     contestants.extend(recordings.iter().flat_map(|(recording, case)| filters(recording, case.name, case.start[2])));
     bench.next("step: timing")?;
@@ -575,7 +460,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, contestants: &mut [Conte
     for round in 0..=rounds {
         bench.next(&format!("step: round {round} of {rounds}"))?;
         // In the leader's place, or whatever else the machine does would be measured too.
-        let values = in_the_leaders_place(board, |_| {
+        let values = bench.in_the_leaders_place(board, |_| {
             let mean = |contestant: &mut Contestant<'_>| {
                 let total: f64 = (0..passes).map(|_| (contestant.pass)()).sum();
                 total / f64::from(passes)
@@ -584,7 +469,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, contestants: &mut [Conte
         })?;
         // The first round warms up caches and the clock.
         for (contestant, value) in contestants.iter().zip(values).filter(|_| round > 0) {
-            board.add(Row::Step, &contestant.name, "ns", contestant.floor, value);
+            board.add(&contestant.name, "ns", contestant.floor.as_deref(), value);
         }
     }
     Ok(())

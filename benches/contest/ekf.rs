@@ -1,7 +1,7 @@
 //! The textbook's extended Kalman filter of a free body's three rates, two of them measured: what the filters of this
-//! project are measured against. No part of the product.
+//! project are measured against. No part of the library.
 
-use crate::model::{euler, rk4_step};
+use corotate::model::{euler, rk4_step};
 use nalgebra::{Matrix3, Vector3};
 
 /// Linearised about its own estimate, as the textbook has it; that is why it may diverge.

@@ -1,7 +1,7 @@
-//! A body's motion and what noisy sensors make of it, for every kind of conic; the hidden axis is 3. No part of the product.
+//! A body's motion and what noisy sensors make of it, for every kind of conic; the hidden axis is 3. No part of the library.
 
-use crate::model::{Inertia, Noise, RigidBody};
-use crate::observe::{HiddenRate, RateSample};
+use corotate::model::{Inertia, Noise, RigidBody};
+use corotate::observe::{HiddenRate, RateSample};
 use nalgebra::Vector3;
 
 /// A body and its initial rates, rad/s.

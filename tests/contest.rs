@@ -1,0 +1,58 @@
+//! The contest of `benches/contest` measures what it says, and who takes part computes the same.
+//! No figure is judged here: a smoke run on a loaded machine measures nothing.
+
+#[path = "../benches/contest/main.rs"]
+#[allow(dead_code, reason = "its command line is not used")]
+mod contest;
+
+use contest::ROWS;
+use contest::step::agreements;
+use corotate::bench::{Bench, Results, run};
+use corotate::config::SHIPPED;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicUsize;
+
+#[test]
+fn the_step_and_the_fleet_stand_beside_all_their_floors() {
+    let mut bench = Bench {
+        rows: ROWS.to_vec(),
+        quick: true,
+        program: PathBuf::new(),
+        scenarios: &SHIPPED,
+        signal: &AtomicUsize::new(0),
+        progress: &mut |_| {},
+    };
+    let (board, privileges) = run(&mut bench).unwrap();
+    let results = Results::new(&bench, board, privileges, jiff::Timestamp::now());
+    let has = |row: &str, name: &str| results.figures.iter().any(|figure| figure.row == row && figure.name == name);
+    for name in ["first order", "second order", "identifier", "orbit"] {
+        for suffix in ["", " in C", " in C, for any machine"] {
+            assert!(has("step", &format!("{name}{suffix}")), "{name}{suffix}");
+        }
+    }
+    for name in ["bare copy of its samples", "step of rigid-trio", "filter alone, elliptic: guarded Kalman"] {
+        assert!(has("step", name), "{name}");
+    }
+    for count in [1, 10, 100, 1000, 10_000, 100_000] {
+        assert!(has("fleet", &format!("law, N = {count}")) && has("fleet", &format!("copy, N = {count}")), "{count}");
+    }
+    for figure in &results.figures {
+        assert!(figure.rounds.len() == 3 && figure.rounds.iter().all(|round| *round > 0.0), "{figure:?}");
+    }
+    // Everything that has a target was measured, and none is judged by a smoke run.
+    assert_eq!(results.targets.len(), 6);
+    assert!(
+        results.targets.iter().all(|target| target.value.is_some() && target.met.is_none()),
+        "{:?}",
+        results.targets
+    );
+}
+
+#[test]
+fn the_code_in_c_computes_the_same_numbers() {
+    let agreements = agreements().unwrap();
+    assert_eq!(agreements.len(), 4);
+    for agreement in agreements {
+        assert!(agreement.words && agreement.largest < 1e-12, "{agreement:?}");
+    }
+}
