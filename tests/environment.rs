@@ -163,8 +163,7 @@ fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
     let file = shipped("rigid-pair");
     let running =
         bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=5", "--set=accept={}", "--out=out"]);
-    bench.await_role("controller");
-    std::thread::sleep(Duration::from_millis(1500));
+    bench.await_ticks("controller");
     let everybody = bench.processes();
     everybody.iter().for_each(|pid| send_signal(*pid, SIGSTOP));
     std::thread::sleep(Duration::from_secs(2));
@@ -191,8 +190,7 @@ fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
     let file = shipped("rigid-pair");
     let running =
         bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=3", "--set=accept={}", "--out=out"]);
-    let controller = bench.await_role("controller");
-    std::thread::sleep(Duration::from_millis(1500));
+    let controller = bench.await_ticks("controller");
     send_signal(controller, SIGSTOP);
     std::thread::sleep(Duration::from_millis(300));
     send_signal(controller, SIGCONT);
@@ -214,8 +212,7 @@ fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
     let file = shipped("rigid-pair");
     let running =
         bench.start(&["run", file.to_str().unwrap(), "--json", "--duration=3", "--set=accept={}", "--out=out"]);
-    bench.await_role("controller");
-    std::thread::sleep(Duration::from_millis(800));
+    bench.await_ticks("controller");
     let core = std::thread::available_parallelism().unwrap().get() - 1;
     let priority = if rustix::process::getuid().is_root() { "chrt -f 90" } else { "nice -n 0" };
     // The one that ends it must not be behind it.

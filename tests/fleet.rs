@@ -134,9 +134,8 @@ fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
     let limits = "accept={settled_by_s=5.0, sync_error_rad_s_max=1e-3}";
     let arguments = ["run", file.to_str().unwrap(), "--tick-hz", "100", "--duration", "6", "--set", limits, "--json"];
     let running = bench.start(&arguments);
-    let fleet = bench.await_role("fleet");
+    let fleet = bench.await_ticks("fleet");
     let domains = bench.domains();
-    std::thread::sleep(std::time::Duration::from_millis(1500));
     send_signal(fleet, SIGKILL);
     let done = running.wait();
     let summary: Value = serde_json::from_str(&done.stdout).unwrap();

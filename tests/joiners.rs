@@ -88,16 +88,33 @@ fn deaths(trace: &Path, domain: &Path) -> Vec<(&'static str, usize)> {
     calls(trace, domain).into_iter().flat_map(some).collect()
 }
 
-/// Waits for a joiner under strace, telling it to leave if it stays.
+/// Whether a process sleeps, and would hear that it is to leave; none if it has ended.
+fn rests(pid: &str) -> Option<bool> {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let field = |name: &str| status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim();
+    let caught = u64::from_str_radix(field("SigCgt:"), 16).unwrap_or(0);
+    (!field("State:").starts_with('Z')).then(|| field("State:").starts_with('S') && caught >> (SIGTERM - 1) & 1 == 1)
+}
+
+/// Waits for a joiner under strace, telling it to leave if it stays: once it has had nothing to do for half a second, however
+/// long a loaded machine takes until then.
 fn await_left(joiner: &Joiner, running: Running) -> Done {
     if joiner.stays {
         let children = format!("/proc/{0}/task/{0}/children", running.pid());
-        let end = Instant::now() + Duration::from_secs(1);
-        let children = || std::fs::read_to_string(&children).unwrap_or_default();
-        while Instant::now() < end && !(children().is_empty() && Instant::now() + Duration::from_millis(500) > end) {
+        let child = await_some(|| match std::fs::read_to_string(&children) {
+            Ok(text) => text.split_whitespace().next().map(|pid| Some(pid.to_owned())),
+            Err(_) => Some(None),
+        });
+        let (mut rested, end) = (0_u32, Instant::now() + Duration::from_secs(60));
+        while rested < 50 && Instant::now() < end {
+            match child.as_ref().and_then(|pid| rests(pid)) {
+                Some(true) => rested += 1,
+                Some(false) => rested = rested.saturating_sub(10),
+                None => break,
+            }
             std::thread::sleep(Duration::from_millis(10));
         }
-        children().split_whitespace().for_each(|pid| send_signal(pid.parse().unwrap(), SIGTERM));
+        child.iter().for_each(|pid| send_signal(pid.parse().unwrap(), SIGTERM));
     }
     running.wait()
 }

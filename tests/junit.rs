@@ -108,15 +108,15 @@ fn a_run_without_an_end_is_an_error() {
     bench.assert_clean(&[]);
 }
 
-/// Starts a run that lasts until it is stopped, and waits until its roles are up.
+/// Starts a run that lasts until it is stopped, and waits until its ticks run.
 fn start_endless(bench: &Bench) -> Running {
     let file = shipped("rigid-pair");
     let endless = ["--clock", "lockstep", "--duration", "100000", "--set", "accept={}", "--junit", "verdict.xml"];
     let stop = ["--set", "supervision.on_failure=stop"];
     let running = bench.start(&[&["run", file.to_str().unwrap()][..], &endless, &stop].concat());
-    bench.await_role("controller");
-    // As in tests/processes.rs: ticks are certain a little later.
-    std::thread::sleep(std::time::Duration::from_millis(1000));
+    for role in ["observer", "controller"] {
+        bench.await_ticks(role);
+    }
     running
 }
 

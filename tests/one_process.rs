@@ -109,10 +109,8 @@ fn killed(bench: &Bench, arguments: &[&str]) -> Running {
     let file = shipped("rigid-pair");
     let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
     let running = bench.start(&[&common[..], &BOTH, arguments].concat());
-    let controller = bench.await_role("controller");
+    let controller = bench.await_ticks("controller");
     // Leader, follower, both in one, launcher, janitor.
-    await_some(|| (bench.processes().len() == 5).then_some(()));
-    std::thread::sleep(Duration::from_millis(1500));
     assert_eq!(bench.processes().len(), 5, "nobody is an observer alone");
     send_signal(controller, SIGKILL);
     running
@@ -128,7 +126,7 @@ fn whoever_kills_the_process_kills_both_and_both_come_back() {
         if clock == "lockstep" {
             await_some(|| (bench.processes().len() == 4).then_some(()));
             await_some(|| (bench.processes().len() == 5).then_some(()));
-            std::thread::sleep(Duration::from_millis(1500));
+            bench.await_commits("controller", bench.commits("controller") + 1000);
             running.signal(SIGTERM);
         }
         let done = running.wait();

@@ -18,12 +18,10 @@ fn start_endless(bench: &Bench, arguments: &[&str]) -> (Running, Vec<PathBuf>) {
     let common = ["run", file.to_str().unwrap(), "--duration", "100000", "--out", "out", "--set", "accept={}"];
     let running = bench.start(&[&common[..], arguments].concat());
     for role in ["leader", "follower", "observer", "controller"] {
-        bench.await_role(role);
+        bench.await_ticks(role);
     }
     let domains = bench.domains();
     assert_eq!(domains.len(), 1);
-    // A reader of the schedule would need a seat in the run; ticks are certain a little after the roles are up.
-    std::thread::sleep(std::time::Duration::from_millis(1000));
     (running, domains)
 }
 

@@ -156,6 +156,28 @@ impl Bench {
         await_some(|| self.role(role))
     }
 
+    /// The process of a role, once it has executed ticks.
+    pub fn await_ticks(&self, role: &str) -> u32 {
+        let process = self.await_role(role);
+        self.await_commits(role, 1);
+        process
+    }
+
+    /// Waits until a role has committed its state so often.
+    pub fn await_commits(&self, role: &str, commits: u64) {
+        await_some(|| (self.commits(role) >= commits).then_some(()));
+    }
+
+    /// How often a role has committed its state: the second word of its ledger, in each tick once.
+    pub fn commits(&self, role: &str) -> u64 {
+        let ledger = format!("shared/{role}.books");
+        let word = |domain: PathBuf| {
+            let bytes = std::fs::read(domain.join(&ledger)).ok()?;
+            Some(u64::from_ne_bytes(bytes.get(8..16)?.try_into().ok()?))
+        };
+        self.domains().into_iter().filter_map(word).max().unwrap_or(0)
+    }
+
     /// The process of a role, if it runs.
     pub fn role(&self, role: &str) -> Option<u32> {
         let is_role = |pid: &u32| {
