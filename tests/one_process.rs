@@ -5,7 +5,6 @@ mod common;
 
 use common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
-use std::time::Duration;
 
 const BOTH: [&str; 2] = ["--set", "launch.processes=[['observer','controller']]"];
 const ALL: [&str; 2] = ["--set", "launch.processes=[['leader','follower','observer','controller']]"];
