@@ -13,7 +13,7 @@ use crate::config::Scenario;
 use crate::record::{
     Channel, Layout, MESSAGE_ENCODING, MessageSink, RecordError, SCHEMA_ENCODING, Taps, frame, topic_of,
 };
-use crate::runtime::{RoleError, depths, hurried, join, join_beside, topic, write_whole};
+use crate::runtime::{RoleError, depths, join, join_at_low_priority, topic, with_realtime_priority, write_whole};
 use crate::sample::{Phase, Schedule};
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle};
 use std::collections::BTreeMap;
@@ -95,10 +95,10 @@ pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), 
         None => newest_run().map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?,
     };
     let (domain, scenario) = join(&root)?;
-    let mut links = join_beside(&scenario, NICENESS, || Links::open(&domain, &scenario))
+    let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;
     let ended = show(seat, &scenario, &domain, &mut links, terminated);
-    hurried(|| drop(links));
+    with_realtime_priority(|| drop(links));
     domain.forget();
     ended
 }

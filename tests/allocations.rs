@@ -7,7 +7,7 @@ use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::{
-    DeviceLink, DeviceSeat, Occupant, Privileges, RoleId, Service, build_rig, depths, private_ledger, serve, topic,
+    DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, Service, build_rig, depths, private_ledger, serve, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::serial::{Device, Hello};
@@ -143,7 +143,7 @@ impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
 }
 
 /// Serves one role in this thread and gives its report and what it allocated.
-fn count_role(scenario: &Scenario, occupant: impl Into<Occupant>, domain: &OwnedDomain) -> (RoleReport, Count) {
+fn count_role(scenario: &Scenario, occupant: impl Into<RoleImpl>, domain: &OwnedDomain) -> (RoleReport, Count) {
     let occupant = occupant.into();
     let role = occupant.role();
     let bus = CountedBus(IoxBus::enter(domain.domain(), role.name(scenario), depths(scenario)).unwrap());
@@ -210,12 +210,12 @@ fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
 }
 
 /// The link to that device, greeted.
-fn linked(scenario: &Scenario, index: usize, path: &Path) -> Occupant {
+fn linked(scenario: &Scenario, index: usize, path: &Path) -> RoleImpl {
     let body = scenario.rig.bodies()[index].name.to_string();
     let seat = DeviceSeat { domain: PathBuf::new(), body, path: path.to_owned(), baud: None, patience_s: 60.0 };
     let mut link = DeviceLink::open(&seat, scenario, 1).unwrap();
     assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
-    Occupant::Device(index, Box::new(link))
+    RoleImpl::Device(index, Box::new(link))
 }
 
 fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Count)> {
@@ -241,7 +241,7 @@ fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Co
                 role => scope.spawn(move || {
                     let others = role.hosted(scenario).into_iter().filter(|other| other != role);
                     let others = others.map(|other| (other, private_ledger(scenario, other))).collect();
-                    count_role(scenario, Occupant::Role(*role, others), domain)
+                    count_role(scenario, RoleImpl::Role(*role, others), domain)
                 }),
             })
             .collect();

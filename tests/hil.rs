@@ -11,7 +11,7 @@ use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
 use corotate::config::{ClockKind, Scenario};
 use corotate::runtime::{
-    Gate, Input, Poll, RoleId, Seek, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
+    Input, Poll, RoleId, RunCondition, Seek, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
 };
 use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
@@ -244,8 +244,8 @@ fn built_in_under_commands(scenario: &Scenario) -> Vec<RateTruth> {
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut seen = Vec::new();
     for tick in 0..=CONDUCTED_TICKS {
-        assert_eq!(node.poll(Gate::Inputs { up_to: tick }).unwrap(), Poll::Executed);
-        node.settle().unwrap();
+        assert_eq!(node.poll(RunCondition::Inputs { up_to: tick }).unwrap(), Poll::Executed);
+        node.finish_tick().unwrap();
         seen.push(next(&mut truth));
         writer.send(|sample| *sample = command(tick)).unwrap();
     }

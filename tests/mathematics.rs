@@ -84,7 +84,7 @@ impl Motion {
         let mut errors = vec![self.rates[0][axis - 1] - guess];
         for (ends, &step) in self.rates.windows(2).zip(&self.steps) {
             let [from, to] = [ends[0], ends[1]].map(|rate| self.sample(rate, axis));
-            match relation.observe(&relation.sight(&from), &relation.sight(&to), step, filter.estimate().x) {
+            match relation.observe(&relation.regressor(&from), &relation.regressor(&to), step, filter.estimate().x) {
                 Observation::Seen(increment) => filter.step(&increment),
                 Observation::Unobservable { .. } => panic!("unobservable between {} and {}", ends[0], ends[1]),
             }

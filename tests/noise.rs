@@ -41,7 +41,12 @@ fn by_relation(recording: &Recording, mut filter: Filter<1>) -> Vec<f64> {
     let mut errors = vec![recording.truth[0].z - filter.estimate().x];
     for index in 1..recording.truth.len() {
         let (from, to) = (recording.sample(index - 1), recording.sample(index));
-        match relation.observe(&relation.sight(&from), &relation.sight(&to), recording.tick_s, filter.estimate().x) {
+        match relation.observe(
+            &relation.regressor(&from),
+            &relation.regressor(&to),
+            recording.tick_s,
+            filter.estimate().x,
+        ) {
             Observation::Seen(increment) => filter.step(&increment),
             Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),
         }
@@ -230,7 +235,7 @@ fn sparse(recording: &Recording, indices: &[usize], floor: f64) -> (Vec<[f64; 5]
         let (from, to) = (recording.sample(pair[0]), recording.sample(pair[1]));
         let step_s = (pair[1] - pair[0]) as f64 * recording.tick_s;
         for filter in &mut filters {
-            match relation.observe(&relation.sight(&from), &relation.sight(&to), step_s, filter.estimate().x) {
+            match relation.observe(&relation.regressor(&from), &relation.regressor(&to), step_s, filter.estimate().x) {
                 Observation::Seen(increment) => filter.step(&increment),
                 Observation::Unobservable { drift } => filter.predict(&drift, step_s),
             }

@@ -9,7 +9,7 @@ use corotate::clock::{Grid, monotonic_ns};
 use corotate::config::Scenario;
 use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process, topic_of};
 use corotate::runtime::{
-    Gate, Poll, ReadyNode, RoleId, build, depths, in_turn, ports, private_ledger, report, shared_ledger,
+    Poll, ReadyNode, RoleId, RunCondition, build, depths, in_turn, ports, private_ledger, report, shared_ledger,
 };
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
@@ -451,9 +451,9 @@ impl<'a> Scheduled<'a> {
     /// One look of a role at its inputs, at a tick; whether it executed.
     fn look(&mut self, index: usize, tick: u64, overdue: bool) -> bool {
         let gate = match (self.roles[index], overdue) {
-            (RoleId::Plant(_), _) => Gate::Now { tick, now_ns: self.grid.due_ns(tick) },
-            (_, true) => Gate::Overdue,
-            (_, false) => Gate::Arrived,
+            (RoleId::Plant(_), _) => RunCondition::Now { tick, now_ns: self.grid.due_ns(tick) },
+            (_, true) => RunCondition::Overdue,
+            (_, false) => RunCondition::Arrived,
         };
         let Some(node) = &mut self.nodes[index] else { return false };
         if node.next_tick() > tick {
@@ -464,7 +464,7 @@ impl<'a> Scheduled<'a> {
 
     fn settle(&mut self, index: usize) {
         if let Some(node) = &mut self.nodes[index] {
-            node.settle().unwrap();
+            node.finish_tick().unwrap();
         }
     }
 

@@ -378,9 +378,9 @@ fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<
         Contestant::new(format!("filter alone, {name}: {filter_name}"), move || {
             let mut filter = filter;
             timed(|| {
-                let (mut from, interval) = (relation.sight(&recording.sample(0)), Interval::from(recording.tick_s));
+                let (mut from, interval) = (relation.regressor(&recording.sample(0)), Interval::from(recording.tick_s));
                 for index in 1..recording.truth.len() {
-                    let to = relation.sight(&black_box(recording.sample(index)));
+                    let to = relation.regressor(&black_box(recording.sample(index)));
                     match relation.observe(&from, &to, interval, filter.estimate().x) {
                         Observation::Seen(increment) => filter.step(&increment),
                         Observation::Unobservable { drift } => filter.predict(&drift, recording.tick_s),

@@ -5,7 +5,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
 use corotate::clock::Grid;
 use corotate::config::{SHIPPED, Scenario};
-use corotate::runtime::{Gate, Input, Poll, ReadyNode, RoleId, build, depths, private_ledger, topic};
+use corotate::runtime::{RunCondition, Input, Poll, ReadyNode, RoleId, build, depths, private_ledger, topic};
 use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
@@ -51,7 +51,7 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
             _ => {}
         }
         for node in &mut nodes {
-            if node.poll(Gate::Inputs { up_to: scenario.last_tick }).unwrap() == Poll::Executed {
+            if node.poll(RunCondition::Inputs { up_to: scenario.last_tick }).unwrap() == Poll::Executed {
                 node.settle().unwrap();
             }
         }

@@ -143,8 +143,8 @@ impl RawChain {
         self.relay.receive(grid, self.number + 1, count, true)?;
         self.last.receive(grid, self.number + 1, count, false)?;
         bench.in_the_leaders_place(board, |place| {
-            let beside = place.beside.contains(&RoleId::Observer);
-            send_paced(&mut self.sender, grid, count, &mut self.number, beside)
+            let co_located = place.co_located.contains(&RoleId::Observer);
+            send_paced(&mut self.sender, grid, count, &mut self.number, co_located)
         })?;
         let (_, lost_first) = self.relay.received()?;
         let ([due, _], lost) = self.last.received()?;

@@ -119,14 +119,14 @@ pub(super) struct Opening {
 /// One end that sends.
 pub(super) struct Sender {
     carry: Box<dyn Out>,
-    bell: Bell,
+    notifier: Notification,
     words: usize,
 }
 
 /// One end that receives.
 pub(super) struct Receiver {
     carry: Box<dyn In>,
-    bell: Bell,
+    notifier: Notification,
     words: usize,
     wake: Wake,
     /// Whether the sender needs the core on which this one polls.
@@ -134,7 +134,7 @@ pub(super) struct Receiver {
 }
 
 /// What wakes a sleeper.
-enum Bell {
+enum Notification {
     /// Nobody sleeps, or what carries the sample wakes too.
     None,
     /// That of our links.
@@ -363,7 +363,7 @@ impl Station<'_> {
         let (words, direction) = (opening.words, opening.direction);
         let service = format!("bench/{}/{direction}", opening.name);
         let sleeps = opening.wake != Wake::Spin;
-        let mut bell = Bell::None;
+        let mut notifier = Notification::None;
         let carry: Box<dyn Out> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
@@ -376,7 +376,7 @@ impl Station<'_> {
             Mechanism::Iceoryx => {
                 let node = self.raw(opening)?;
                 if sleeps {
-                    bell = Bell::Notifier(node.notifier(&service)?);
+                    notifier = Notification::Notifier(node.notifier(&service)?);
                 }
                 of_size!(words, SIZE => Box::new(node.publisher::<SIZE>(&service)?))
             }
@@ -385,19 +385,19 @@ impl Station<'_> {
             }
             Mechanism::SharedMemory => {
                 if sleeps {
-                    bell = Bell::Futex(self.page(opening)?, direction);
+                    notifier = Notification::Futex(self.page(opening)?, direction);
                 }
                 Box::new(Mailbox(self.page(opening)?, direction, 0))
             }
             Mechanism::EventFd => {
-                bell = descriptor.map_or(Bell::None, Bell::EventFd);
+                notifier = descriptor.map_or(Notification::None, Notification::EventFd);
                 Box::new(Mailbox(self.page(opening)?, direction, 0))
             }
             Mechanism::Pipe | Mechanism::UnixSocket | Mechanism::Udp => {
                 Box::new(Descriptor(descriptor.ok_or_else(|| system("open a descriptor", "none was given"))?))
             }
         };
-        Ok(Sender { carry, bell, words })
+        Ok(Sender { carry, notifier, words })
     }
 
     /// Opens an end that receives.
@@ -405,12 +405,12 @@ impl Station<'_> {
         let (words, direction, wake) = (opening.words, opening.direction, opening.wake);
         let service = format!("bench/{}/{direction}", opening.name);
         let sleeps = wake != Wake::Spin;
-        let mut bell = Bell::None;
+        let mut notifier = Notification::None;
         let carry: Box<dyn In> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
                 if sleeps {
-                    bell = Bell::Ours;
+                    notifier = Notification::Ours;
                 }
                 match words {
                     8 => Box::new(bus.reader::<Probe64>(&topic, Reader::Role)?),
@@ -421,7 +421,7 @@ impl Station<'_> {
             Mechanism::Iceoryx => {
                 let node = self.raw(opening)?;
                 if sleeps {
-                    bell = Bell::Listener(node.listener(&service)?);
+                    notifier = Notification::Listener(node.listener(&service)?);
                 }
                 of_size!(words, SIZE => Box::new(node.subscriber::<SIZE>(&service)?))
             }
@@ -430,19 +430,19 @@ impl Station<'_> {
             }
             Mechanism::SharedMemory => {
                 if sleeps {
-                    bell = Bell::Futex(self.page(opening)?, direction);
+                    notifier = Notification::Futex(self.page(opening)?, direction);
                 }
                 Box::new(Mailbox(self.page(opening)?, direction, 0))
             }
             Mechanism::EventFd => {
-                bell = descriptor.map_or(Bell::None, Bell::EventFd);
+                notifier = descriptor.map_or(Notification::None, Notification::EventFd);
                 Box::new(Mailbox(self.page(opening)?, direction, 0))
             }
             Mechanism::Pipe | Mechanism::UnixSocket | Mechanism::Udp => {
                 Box::new(Descriptor(descriptor.ok_or_else(|| system("open a descriptor", "none was given"))?))
             }
         };
-        Ok(Receiver { carry, bell, words, wake, gives_way: false })
+        Ok(Receiver { carry, notifier, words, wake, gives_way: false })
     }
 }
 
@@ -453,11 +453,13 @@ impl Sender {
         let mut words = [number; MAX_WORDS];
         (words[1], words[2], words[3]) = (GENERATION, due_ns, monotonic_ns());
         self.carry.send(&words[..self.words])?;
-        match &self.bell {
-            Bell::Futex(page, direction) => page.ring(*direction).map_err(|error| system("wake", error)),
-            Bell::EventFd(fd) => rustix::io::write(fd, &1_u64.to_ne_bytes()).map(|_| ()).map_err(|e| system("wake", e)),
-            Bell::Notifier(notifier) => notifier.ring(),
-            Bell::None | Bell::Ours | Bell::Listener(_) => Ok(()),
+        match &self.notifier {
+            Notification::Futex(page, direction) => page.notify(*direction).map_err(|error| system("wake", error)),
+            Notification::EventFd(fd) => {
+                rustix::io::write(fd, &1_u64.to_ne_bytes()).map(|_| ()).map_err(|e| system("wake", e))
+            }
+            Notification::Notifier(notifier) => notifier.notify(),
+            Notification::None | Notification::Ours | Notification::Listener(_) => Ok(()),
         }
     }
 
@@ -498,8 +500,8 @@ impl Receiver {
         let words = &mut words[..self.words];
         let mut polled = 0_u32;
         loop {
-            let rung = match &self.bell {
-                Bell::Futex(page, direction) => page.rung(*direction),
+            let notified = match &self.notifier {
+                Notification::Futex(page, direction) => page.notified(*direction),
                 _ => 0,
             };
             if self.carry.receive(words)? {
@@ -520,22 +522,24 @@ impl Receiver {
             } else if monotonic_ns() > end_ns {
                 return Ok(None);
             } else {
-                self.sleep(rung)?;
+                self.sleep(notified)?;
             }
         }
     }
 
-    fn sleep(&mut self, rung: u32) -> Result<(), BusError> {
-        match &self.bell {
-            Bell::Futex(page, direction) => page.wait(*direction, rung),
-            Bell::EventFd(fd) => {
+    fn sleep(&mut self, notified: u32) -> Result<(), BusError> {
+        match &self.notifier {
+            Notification::Futex(page, direction) => page.wait(*direction, notified),
+            Notification::EventFd(fd) => {
                 rustix::io::read(fd, &mut [0; 8]).map_err(|error| system("wait", error))?;
             }
-            Bell::Listener(listener) => listener.wait(Duration::from_nanos(SLEEP_NS))?,
-            Bell::Ours => self.carry.sleep(monotonic_ns() + SLEEP_NS)?,
+            Notification::Listener(listener) => listener.wait(Duration::from_nanos(SLEEP_NS))?,
+            Notification::Ours => self.carry.sleep(monotonic_ns() + SLEEP_NS)?,
             // What carries the sample blocks by itself, or the partner keeps a spinner waiting for too long.
-            Bell::None | Bell::Notifier(_) if self.wake == Wake::Spin => sleep_until(monotonic_ns() + NAP_NS),
-            Bell::None | Bell::Notifier(_) => {}
+            Notification::None | Notification::Notifier(_) if self.wake == Wake::Spin => {
+                sleep_until(monotonic_ns() + NAP_NS)
+            }
+            Notification::None | Notification::Notifier(_) => {}
         }
         Ok(())
     }

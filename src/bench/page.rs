@@ -1,4 +1,4 @@
-//! Shared memory between a sender and a receiver: two mailboxes and two bells, the least that two processes need.
+//! Shared memory between a sender and a receiver: two mailboxes and two futexes, the least that two processes need.
 //!
 //! Every access is atomic; nobody locks. Must not outlive its domain: the files are two of the domain's.
 
@@ -13,24 +13,24 @@ const BOX_WORDS: usize = 64;
 /// Where a mailbox has its number and the samples' words: each on cache lines of its own.
 const NUMBER: usize = 0;
 const CONTENT: usize = 16;
-/// Bells are a cache line apart.
+/// Futexes are a cache line apart.
 const BELL_STRIDE: usize = 16;
 
-/// The mapped mailboxes and bells.
+/// The mapped mailboxes and futexes.
 #[derive(Debug)]
 pub(super) struct Page {
     boxes: SharedWords,
-    bells: SharedHalves,
+    futexes: SharedHalves,
 }
 
 impl Page {
-    /// Maps the mailboxes at a path and the bells beside them, made if they are not there.
+    /// Maps the mailboxes at a path and the futexes beside them, made if they are not there.
     pub fn open(path: &Path) -> io::Result<Self> {
-        let mut bells = path.as_os_str().to_owned();
-        bells.push("_bells");
+        let mut futexes = path.as_os_str().to_owned();
+        futexes.push("_bells");
         Ok(Self {
             boxes: SharedWords::open(path, 2 * BOX_WORDS)?,
-            bells: SharedHalves::open(bells.as_ref(), 2 * BELL_STRIDE)?,
+            futexes: SharedHalves::open(futexes.as_ref(), 2 * BELL_STRIDE)?,
         })
     }
 
@@ -40,8 +40,8 @@ impl Page {
     }
 
     #[inline]
-    fn bell(&self, direction: usize) -> &AtomicU32 {
-        &self.bells.halves()[(direction & 1) * BELL_STRIDE]
+    fn futex(&self, direction: usize) -> &AtomicU32 {
+        &self.futexes.halves()[(direction & 1) * BELL_STRIDE]
     }
 
     /// Puts words into the mailbox of a direction.
@@ -65,29 +65,29 @@ impl Page {
         true
     }
 
-    /// Rings the bell of a direction.
+    /// Notifies the futex of a direction.
     #[inline]
-    pub fn ring(&self, direction: usize) -> io::Result<()> {
-        let bell = self.bell(direction);
-        bell.fetch_add(1, Ordering::Release);
-        futex::wake(bell, futex::Flags::empty(), 1)?;
+    pub fn notify(&self, direction: usize) -> io::Result<()> {
+        let futex = self.futex(direction);
+        futex.fetch_add(1, Ordering::Release);
+        futex::wake(futex, futex::Flags::empty(), 1)?;
         Ok(())
     }
 
-    /// How often the bell of a direction was rung; to be read before the mailbox is looked into.
+    /// How often the futex of a direction was notified; to be read before the mailbox is looked into.
     #[inline]
-    pub fn rung(&self, direction: usize) -> u32 {
-        let rung = self.bell(direction).load(Ordering::Acquire);
+    pub fn notified(&self, direction: usize) -> u32 {
+        let notified = self.futex(direction).load(Ordering::Acquire);
         fence(Ordering::SeqCst);
-        rung
+        notified
     }
 
-    /// Waits until the bell was rung more often than `rung`.
+    /// Waits until the futex was notified more often than `notified`.
     #[inline]
-    pub fn wait(&self, direction: usize, rung: u32) {
+    pub fn wait(&self, direction: usize, notified: u32) {
         let at_most = rustix::time::Timespec { tv_sec: 1, tv_nsec: 0 };
         // Rung meanwhile, interrupted or late: the caller looks again.
-        let _ = futex::wait(self.bell(direction), futex::Flags::empty(), rung, Some(&at_most));
+        let _ = futex::wait(self.futex(direction), futex::Flags::empty(), notified, Some(&at_most));
     }
 }
 
@@ -105,9 +105,9 @@ mod tests {
         here.put(0, &[7; 32]);
         assert!(there.take(0, 0, &mut words) && words == [7; 32]);
         assert!(!there.take(0, 7, &mut words) && !here.take(1, 0, &mut words), "the other direction is another box");
-        let before = there.rung(0);
-        here.ring(0).unwrap();
+        let before = there.notified(0);
+        here.notify(0).unwrap();
         there.wait(0, before);
-        assert_eq!(there.rung(0), before + 1);
+        assert_eq!(there.notified(0), before + 1);
     }
 }

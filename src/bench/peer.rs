@@ -72,7 +72,7 @@ pub fn serve_peer(seat: &PeerSeat, scenario: &Scenario) -> Result<(), String> {
         true => (RoleId::Observer, RoleId::Plant(0)),
         false => (RoleId::Controller, RoleId::Observer),
     };
-    let Privileges { grants, beside, .. } = take_privileges(scenario, role);
+    let Privileges { grants, co_located, .. } = take_privileges(scenario, role);
     say(&Answer::Here(grants))?;
     let mut ends = None;
     for line in std::io::stdin().lock().lines() {
@@ -80,7 +80,7 @@ pub fn serve_peer(seat: &PeerSeat, scenario: &Scenario) -> Result<(), String> {
         let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
         ends.iter_mut().for_each(|(receiver, _): &mut (Receiver, _)| receiver.refresh());
         let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
-        if let (Some((receiver, _)), true) = (&mut ends, beside.contains(&waits_for)) {
+        if let (Some((receiver, _)), true) = (&mut ends, co_located.contains(&waits_for)) {
             receiver.give_way();
         }
         say(&answer)?;

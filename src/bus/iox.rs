@@ -15,8 +15,8 @@ pub use single::{IoxReader, IoxWriter};
 use self::latest::LatestWriter;
 use self::opening::{Connections, Refusal};
 use self::single::{Current, Lane};
-use super::bell::{BELLS_BYTES, Bells};
 use super::domain::Domain;
+use super::notifier::{NOTIFIERS_BYTES, Notifiers};
 use super::{Bus, BusError, Depths, Reader, Signal, Topic};
 use crate::sample::{FleetLayout, Sample};
 use crate::system::remedy;
@@ -65,7 +65,7 @@ pub fn footprint(qos: &Qos, size: usize) -> usize {
 }
 
 /// What a run takes of shared memory besides its signals, bytes.
-pub const COMMON_BYTES: usize = BELLS_BYTES;
+pub const COMMON_BYTES: usize = NOTIFIERS_BYTES;
 
 /// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -144,7 +144,7 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
 /// A node in a run's domain.
 pub struct IoxBus {
     node: Rc<Node<Ipc>>,
-    bells: Bells,
+    notifiers: Notifiers,
     depths: Depths,
     /// Whether a signal that nobody has opened yet is made.
     makes: bool,
@@ -159,7 +159,7 @@ impl IoxBus {
     /// # Errors
     /// [`BusError::Domain`].
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
-        Self::over(domain, name, depths, Bells::open(domain), true)
+        Self::over(domain, name, depths, Notifiers::open(domain), true)
     }
 
     /// The same for one who only looks: of the signals nothing is made, and one that nobody has opened is an error.
@@ -167,21 +167,21 @@ impl IoxBus {
     /// # Errors
     /// [`BusError::Domain`].
     pub fn join(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
-        Self::over(domain, name, depths, Bells::join(domain), false)
+        Self::over(domain, name, depths, Notifiers::join(domain), false)
     }
 
     fn over(
         domain: &Domain,
         name: &str,
         depths: Depths,
-        bells: io::Result<Bells>,
+        notifiers: io::Result<Notifiers>,
         makes: bool,
     ) -> Result<Self, BusError> {
         cause::hear();
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
-        let bells = bells.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
+        let notifiers = notifiers.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
         let node = Rc::new(enter(domain.root(), domain, name).map_err(failed)?);
-        Ok(Self { node, bells, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
+        Ok(Self { node, notifiers, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
     }
 
     /// The same, with another limit on how long an opening may take.
@@ -297,7 +297,14 @@ impl Bus for IoxBus {
             let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
             connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
         })?;
-        Ok(IoxWriter { publisher, latest, loan: None, shown: None, bell: self.bells.of(topic), topic: topic.clone() })
+        Ok(IoxWriter {
+            publisher,
+            latest,
+            loan: None,
+            shown: None,
+            notifier: self.notifiers.of(topic),
+            topic: topic.clone(),
+        })
     }
 
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<IoxReader<S>, BusError> {
@@ -313,9 +320,9 @@ impl Bus for IoxBus {
             Reader::Role if self.has_lane(topic) => Lane::Wanted { generation: 1 },
             _ => Lane::None,
         };
-        let (node, bell, topic) = (self.node.clone(), self.bells.of(topic), topic.clone());
+        let (node, notifier, topic) = (self.node.clone(), self.notifiers.of(topic), topic.clone());
         let (current, pending, newest) = (Current::None, None, (0, 0));
-        Ok(IoxReader { node, service, subscriber, current, pending, newest, lane, idle: 0, bell, topic })
+        Ok(IoxReader { node, service, subscriber, current, pending, newest, lane, idle: 0, notifier, topic })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {

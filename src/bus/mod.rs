@@ -2,12 +2,12 @@
 //!
 //! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2 (and `raw`, which measures it bare); [`memory`] is its twin within one thread.
 
-mod bell;
 mod carried;
 pub mod domain;
 pub mod iox;
 pub mod memory;
 mod names;
+mod notifier;
 pub(crate) mod raw;
 mod unfinished;
 mod words;

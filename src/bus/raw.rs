@@ -29,7 +29,7 @@ pub(crate) struct RawSubscriber<const WORDS: usize>(Subscriber<Ipc, [u64; WORDS]
 pub(crate) struct RawBoardWriter<const WORDS: usize>(EntryHandleMut<Ipc, u64, [u64; WORDS]>);
 /// Its reading end.
 pub(crate) struct RawBoardReader<const WORDS: usize>(EntryHandle<Ipc, u64, [u64; WORDS]>);
-/// The end of a bare event that rings.
+/// The end of a bare event that notifies.
 pub(crate) struct RawNotifier(Notifier<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
 /// The end that waits.
 pub(crate) struct RawListener(Listener<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
@@ -121,7 +121,7 @@ impl RawNode {
         self.0.service_builder(&name_of).event().open_or_create().map_err(|error| refused(name, end, error))
     }
 
-    /// The end of an event that rings.
+    /// The end of an event that notifies.
     pub fn notifier(&self, name: &str) -> Result<RawNotifier, BusError> {
         let notifier = self.event(name, "notifier")?.notifier_builder().create();
         notifier.map(|end| RawNotifier(end, self.1.clone())).map_err(|error| refused(name, "notifier", error))
@@ -175,13 +175,13 @@ impl<const WORDS: usize> RawBoardReader<WORDS> {
 impl RawNotifier {
     /// Rings.
     #[inline]
-    pub fn ring(&self) -> Result<(), BusError> {
+    pub fn notify(&self) -> Result<(), BusError> {
         self.0.notify().map(|_| ()).map_err(send_failed)
     }
 }
 
 impl RawListener {
-    /// Waits for the next ring, at most so long.
+    /// Waits for the next notification, at most so long.
     #[inline]
     pub fn wait(&self, at_most: Duration) -> Result<(), BusError> {
         self.0.timed_wait(|_| (), at_most).map(|_| ()).map_err(receive_failed)

@@ -91,7 +91,7 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
     Ok(())
 }
 
-/// The run, its books, and the criteria in their order.
+/// The run, its counters, and the criteria in their order.
 fn cases(summary: &Summary) -> Vec<Case> {
     let stopped = summary.incidents.iter().find(|incident| incident.action == Action::Stopped);
     let run = match (stopped, summary.signal) {

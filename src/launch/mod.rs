@@ -96,7 +96,7 @@ pub enum LaunchError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// The roles' books could not be opened.
+    /// The roles' counters could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
     /// There are too few descriptors. Found out later it would fail in the midst of the transport.

@@ -1,6 +1,6 @@
-//! What a run came to: verdict, books, hash, latencies; and the files that say so.
+//! What a run came to: verdict, counters, hash, latencies; and the files that say so.
 //!
-//! Must not soften anything: what was not measured is said to be so, and books that do not balance are a failure.
+//! Must not soften anything: what was not measured is said to be so, and counters that do not balance are a failure.
 
 use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
@@ -11,7 +11,7 @@ use crate::files;
 use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
-use crate::serial::LineBook;
+use crate::serial::LineCounters;
 use crate::telemetry::{
     Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm,
     write_hlog,
@@ -30,7 +30,7 @@ const SCHEMA: &str = "corotate/summary/v1";
 pub struct Outcome {
     /// The roles' own accounts, in the order of a tick.
     pub reports: Vec<RoleReport>,
-    /// External roles that keep no books.
+    /// External roles that keep no counters.
     pub unbooked: Vec<String>,
     /// What is wrong with accounts that were left.
     pub problems: Vec<String>,
@@ -93,15 +93,15 @@ pub struct Summary {
     pub watchdog: Option<WatchReport>,
     /// What may be claimed of the loop, per driven body.
     pub certificates: Vec<Claim>,
-    /// The books.
-    pub books: Books,
+    /// The counters.
+    pub books: Accounting,
     /// The state hash.
     pub state: State,
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
-    /// The books of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
+    /// The counters of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub lines: BTreeMap<String, LineBook>,
+    pub lines: BTreeMap<String, LineCounters>,
     /// What was recorded, if that was asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
@@ -122,14 +122,14 @@ pub struct Criterion {
     pub holds: Option<bool>,
 }
 
-/// The books of a run.
+/// The counters of a run.
 #[derive(Debug, Serialize)]
-pub struct Books {
+pub struct Accounting {
     /// Whether they balance.
     pub balanced: bool,
     /// Where they do not.
     pub problems: Vec<String>,
-    /// External roles that keep no books: nothing is known of their ticks, nor of the links that they write and read.
+    /// External roles that keep no counters: nothing is known of their ticks, nor of the links that they write and read.
     pub unbooked: Vec<String>,
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
@@ -143,7 +143,7 @@ pub struct Books {
     pub injected_faults: u64,
 }
 
-/// One reading end beside its writing end. Of a writer that keeps no books nothing is known but what its reader met.
+/// One reading end beside its writing end. Of a writer that keeps no counters nothing is known but what its reader met.
 #[derive(Debug, Serialize)]
 pub struct LinkBook {
     /// The service.
@@ -175,7 +175,7 @@ pub struct LinkBook {
 pub struct State {
     /// The hash over everything that was published.
     pub hash: String,
-    /// How many ticks the run came to: those that every role with books executed or missed.
+    /// How many ticks the run came to: those that every role with counters executed or missed.
     pub elapsed_ticks: u64,
     /// The first tick whose samples may differ from an undisturbed run's, if any.
     pub first_disturbed_tick: Option<u64>,
@@ -232,7 +232,7 @@ impl Summary {
         let lost: Vec<&str> =
             lost.flat_map(|incident| incident.with.iter().chain([&incident.role])).map(String::as_str).collect();
         let interrupted = outcome.signal != 0 || !lost.is_empty();
-        let books = Books::new(scenario, outcome, interrupted, &lost);
+        let books = Accounting::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies, interrupted);
         let accepted = accepted(&criteria, interrupted);
         Self {
@@ -268,7 +268,7 @@ impl Summary {
     }
 }
 
-impl Books {
+impl Accounting {
     fn new(scenario: &Scenario, outcome: &Outcome, interrupted: bool, lost: &[&str]) -> Self {
         let (reports, mut problems) = (&outcome.reports, outcome.problems.clone());
         let written = reports.iter().flat_map(|report| report.written.iter().map(move |link| (&*report.role, link)));
@@ -287,7 +287,7 @@ impl Books {
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {
             let written = written.iter().find(|(_, written)| written.service == read.service);
-            // A role that died may have sent a sample that it had no time to book: whoever received it knows.
+            // A role that died may have sent a sample that it had no time to count: whoever received it knows.
             let in_flight =
                 written.is_some_and(|(writer, written)| lost.contains(writer) && read.last_tick > written.last_tick);
             let written = written.map(|(_, written)| *written);
@@ -318,7 +318,7 @@ impl LinkBook {
     ) -> Self {
         let covered = read.last_tick.map_or(0, |tick| tick + 1);
         let sent = |written: &LinkWritten| written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
-        let book = Self {
+        let counters = Self {
             service: read.service.clone(),
             reader: reader.to_owned(),
             published: written.map(|written| written.published + u64::from(in_flight)),
@@ -348,15 +348,15 @@ impl LinkBook {
             });
             problems.push(format!(
                 "{} at {reader}: {} received, {} gaps, {} stale, {} void; {writer}",
-                book.service, book.received, book.gaps, read.stale, read.void
+                counters.service, counters.received, counters.gaps, read.stale, read.void
             ));
         }
-        book
+        counters
     }
 }
 
 impl State {
-    fn new(reports: &[RoleReport], books: &Books) -> Self {
+    fn new(reports: &[RoleReport], books: &Accounting) -> Self {
         let written = reports.iter().flat_map(|report| &report.written);
         let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
         links.sort_by_key(|(service, _)| *service);
@@ -421,7 +421,7 @@ fn hosted(scenario: &Scenario) -> BTreeMap<String, String> {
     hosted.map(|(role, host)| (role.name(scenario).to_owned(), host.name(scenario).to_owned())).collect()
 }
 
-fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineBook> {
+fn lines(reports: &[RoleReport]) -> BTreeMap<String, LineCounters> {
     reports.iter().filter_map(|report| Some((report.role.clone(), report.line?))).collect()
 }
 
@@ -454,7 +454,7 @@ fn verdict(accepted: Option<bool>, no_criteria: bool, interrupted: bool) -> Stri
 fn judge(
     scenario: &Scenario,
     outcome: &Outcome,
-    books: &Books,
+    books: &Accounting,
     latencies: &[StageFigures],
     interrupted: bool,
 ) -> Vec<Criterion> {

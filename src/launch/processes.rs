@@ -67,14 +67,14 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         _ => (None, Vec::new()),
     };
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
-    let mut crew = Crew::start(scenario, launch, domain, &bus, &mut janitor)?;
-    let mut scorer = score::open(scenario, &bus).map_err(|error| crew.blame(error.into()))?;
-    let signal = crew.conduct(&mut *scorer, launch, &grants).map_err(|error| crew.blame(error))?;
-    let mut dismissal = crew.dismiss();
-    dismissal.leave_out_partial(|role| is_external(scenario, launch, role));
-    let Dismissal { reports, unbooked, problems } = dismissal;
+    let mut supervisor = Supervisor::start(scenario, launch, domain, &bus, &mut janitor)?;
+    let mut scorer = score::open(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
+    let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
+    let mut shutdown = supervisor.shut_down();
+    shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
+    let ShutdownReport { reports, unbooked, problems } = shutdown;
     let score = scorer.finish()?;
-    let (incidents, recorder) = crew.incidents(&score.recoveries_s);
+    let (incidents, recorder) = supervisor.incidents(&score.recoveries_s);
     let recording = recorder.finish(domain, &reports);
     let domain = Some(domain.root().to_owned());
     let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
@@ -112,15 +112,15 @@ fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> 
 
 /// What the roles left when they went.
 #[derive(Default)]
-struct Dismissal {
+struct ShutdownReport {
     reports: Vec<RoleReport>,
-    /// External roles that keep no books.
+    /// External roles that keep no counters.
     unbooked: Vec<String>,
     /// What is wrong with what was left.
     problems: Vec<String>,
 }
 
-impl Dismissal {
+impl ShutdownReport {
     /// Leaves out the account of an external role that covers less than others have read of it: that of a program which took
     /// the seat after another, and knows nothing of that one.
     fn leave_out_partial(&mut self, is_external: impl Fn(&str) -> bool) {
@@ -161,7 +161,7 @@ fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
 }
 
 /// All roles of a run, and the launcher's line to them.
-struct Crew<'a> {
+struct Supervisor<'a> {
     scenario: &'a Scenario,
     domain: &'a Domain,
     janitor: &'a mut Janitor,
@@ -175,7 +175,7 @@ struct Crew<'a> {
     foxglove: FoxgloveWatch,
 }
 
-impl<'a> Crew<'a> {
+impl<'a> Supervisor<'a> {
     fn start(
         scenario: &'a Scenario,
         launch: &Launch<'_>,
@@ -225,7 +225,7 @@ impl<'a> Crew<'a> {
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
-    fn conduct(
+    fn run_phases(
         &mut self,
         scorer: &mut dyn Scorer,
         launch: &mut Launch<'_>,
@@ -424,16 +424,16 @@ impl<'a> Crew<'a> {
 
     fn denied(&mut self, own: &[Grant]) -> LaunchError {
         let mut denied: Vec<(String, Grant)> = own.iter().map(|grant| ("launcher".to_owned(), grant.clone())).collect();
-        for report in self.dismiss().reports {
+        for report in self.shut_down().reports {
             denied.extend(report.grants.into_iter().map(|grant| (report.role.clone(), grant)));
         }
         denied.retain(|(_, grant)| !grant.granted);
         LaunchError::Privileges { denied }
     }
 
-    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its books, unless it was none of
+    /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its counters, unless it was none of
     /// ours.
-    fn dismiss(&mut self) -> Dismissal {
+    fn shut_down(&mut self) -> ShutdownReport {
         self.word.phase = Phase::Stop as u64;
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
         // Told first, and then nobody is waited for who is dead: an external role that was killed has left once its remains
@@ -453,7 +453,7 @@ impl<'a> Crew<'a> {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
-        let mut dismissal = Dismissal::default();
+        let mut shutdown = ShutdownReport::default();
         for member in &mut self.members {
             let reported = report_path(self.domain.root(), &member.name).exists();
             if let Some(failure) = member.bad_end(reported) {
@@ -465,14 +465,14 @@ impl<'a> Crew<'a> {
                 self.incidents.push(incident);
             }
             for (role, ledger) in member.books() {
-                dismissal.gather(self.scenario, self.domain, role, ledger);
+                shutdown.gather(self.scenario, self.domain, role, ledger);
             }
         }
         // In the order of a tick, whoever shares a process with whom.
         let order = RoleId::all(self.scenario);
         let place = |name: &str| order.iter().position(|role| role.name(self.scenario) == name);
-        dismissal.reports.sort_by_key(|report| place(&report.role));
-        dismissal
+        shutdown.reports.sort_by_key(|report| place(&report.role));
+        shutdown
     }
 
     /// What happened, with the scorer's times of recovery; and the recorder, which has yet to end.

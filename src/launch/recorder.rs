@@ -122,7 +122,7 @@ impl RecorderWatch {
         }
     }
 
-    /// Tells what is in the file, beside the roles' final books. A recorder that has not ended by now is ended.
+    /// Tells what is in the file, beside the roles' final counters. A recorder that has not ended by now is ended.
     pub fn finish(mut self, domain: &Domain, roles: &[RoleReport]) -> Option<RecordingReport> {
         let file = self.file.take()?;
         self.process = None;

@@ -58,7 +58,7 @@ pub fn replay_as_process(
         ahead_ticks: window_ticks(scenario) * 3 / 4,
     };
     prompter.lead()?;
-    prompter.dismiss();
+    prompter.shut_down();
     Ok(prompter.comparer.finish(&script, &script.steps, script.limit.clone()))
 }
 
@@ -189,7 +189,7 @@ impl Prompter<'_> {
         self.schedule.send(|sample| *sample = word)
     }
 
-    fn dismiss(&mut self) {
+    fn shut_down(&mut self) {
         self.word.phase = Phase::Stop as u64;
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
         while self.process.ended().is_none() && monotonic_ns() < limit_ns {

@@ -7,7 +7,7 @@ use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
-use crate::runtime::{Horizon, Input, Seek, topic};
+use crate::runtime::{AcceptedTicks, Input, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -174,10 +174,10 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         })
     }
 
-    fn expect(&mut self, horizon: Horizon) {
+    fn expect(&mut self, accepted_ticks: AcceptedTicks) {
         match self {
-            Self::One(input) => input.expect(horizon),
-            Self::Fleet(input) => input.expect(horizon),
+            Self::One(input) => input.expect(accepted_ticks),
+            Self::Fleet(input) => input.expect(accepted_ticks),
         }
     }
 
@@ -361,7 +361,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         let mut estimate =
             Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
                 .guarded(rig.estimate_guard());
-        estimate.expect(crate::runtime::horizon(scenario, None));
+        estimate.expect(crate::runtime::accepted_ticks(scenario, None));
         let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);
         Ok(Self {
             truths: rig.bodies().iter().map(truth).collect::<Result<_, _>>()?,
@@ -462,9 +462,9 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
     }
 
     fn start(&mut self, grid: Grid) {
-        let horizon = Horizon::Due(grid);
-        self.truths.iter_mut().for_each(|truth| truth.expect(horizon));
-        self.estimate.expect(horizon);
+        let accepted_ticks = AcceptedTicks::Due(grid);
+        self.truths.iter_mut().for_each(|truth| truth.expect(accepted_ticks));
+        self.estimate.expect(accepted_ticks);
     }
 
     fn incident(&mut self, tick: u64) {

@@ -121,7 +121,7 @@ pub(super) struct Member {
     pub external: bool,
     pub last: Health,
     pub ledger: Ledger,
-    /// The other roles in its process, all earlier in a tick, with their books.
+    /// The other roles in its process, all earlier in a tick, with their counters.
     hosted: Vec<(RoleId, Ledger)>,
     /// What an external role sends; all there is to go by where it says nothing of itself.
     trace: Option<Trace>,
@@ -171,7 +171,7 @@ impl Member {
         })
     }
 
-    /// All roles in its process with their books, in the order of a tick.
+    /// All roles in its process with their counters, in the order of a tick.
     pub fn books(&self) -> impl Iterator<Item = (RoleId, &Ledger)> {
         self.hosted.iter().map(|(role, ledger)| (*role, ledger)).chain([(self.role, &self.ledger)])
     }

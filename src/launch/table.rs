@@ -3,7 +3,7 @@
 use super::outcome::{LinkBook, State};
 use super::{Incident, Summary};
 use crate::analysis::digits;
-use crate::serial::LineBook;
+use crate::serial::LineCounters;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -36,40 +36,40 @@ pub fn table(summary: &Summary) -> String {
     }
     books(summary, &mut text);
     watchdog(summary, &mut text);
-    for (body, book) in &summary.lines {
-        let _ = writeln!(text, "{}", line_words(body, book));
+    for (body, counters) in &summary.lines {
+        let _ = writeln!(text, "{}", line_words(body, counters));
     }
     privileges(summary, &mut text);
     text
 }
 
-/// The books of a serial line in words, one line for what went well and one for what did not.
-pub fn line_words(body: &str, book: &LineBook) -> String {
+/// The counters of a serial line in words, one line for what went well and one for what did not.
+pub fn line_words(body: &str, counters: &LineCounters) -> String {
     let well = format!(
         "line of {body}: {} frames and {} bytes sent, {} and {} received, {}",
-        book.frames_sent,
-        book.bytes_sent,
-        book.frames_received,
-        book.bytes_received,
-        match book.handshakes {
+        counters.frames_sent,
+        counters.bytes_sent,
+        counters.frames_received,
+        counters.bytes_received,
+        match counters.handshakes {
             1 => "1 handshake".to_owned(),
             count => format!("{count} handshakes"),
         },
     );
     let ill = [
-        (book.restarts, "times the device lost the run, its body at the initial state again"),
-        (book.crc_errors, "CRC errors"),
-        (book.malformed, "malformed blocks"),
-        (book.dropped_bytes, "bytes dropped"),
-        (book.resyncs, "resyncs"),
-        (book.sequence_gaps, "frames lost on the way here"),
-        (book.repeats, "requests repeated"),
-        (book.unanswered, "ticks unanswered"),
-        (book.late, "late answers"),
-        (book.duplicates, "answers twice"),
-        (book.echoes, "echoes"),
-        (book.unsent, "frames the line did not take"),
-        (book.reopened, "times opened again"),
+        (counters.restarts, "times the device lost the run, its body at the initial state again"),
+        (counters.crc_errors, "CRC errors"),
+        (counters.malformed, "malformed blocks"),
+        (counters.dropped_bytes, "bytes dropped"),
+        (counters.resyncs, "resyncs"),
+        (counters.sequence_gaps, "frames lost on the way here"),
+        (counters.repeats, "requests repeated"),
+        (counters.unanswered, "ticks unanswered"),
+        (counters.late, "late answers"),
+        (counters.duplicates, "answers twice"),
+        (counters.echoes, "echoes"),
+        (counters.unsent, "frames the line did not take"),
+        (counters.reopened, "times opened again"),
     ];
     let ill: Vec<String> =
         ill.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();

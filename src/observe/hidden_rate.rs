@@ -73,7 +73,7 @@ persist_fields!(RateSample, rate_rad_s, torque_rad_s2);
 
 /// A sample as one relation sees it. Made once, although two steps need it: the one that ends here and the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sight {
+pub struct Regressor {
     /// The measured components ω_i and ω_j, rad/s.
     i: f64,
     j: f64,
@@ -149,12 +149,12 @@ pub enum Observation {
 /// let relation = HiddenRate::new(&inertia.coefficients(), 3, 1e-6).unwrap();
 /// let mut filter = InvariantFilter::new(Vector1::new(6.0), Vector1::new(0.0));
 /// let mut rate = Vector3::new(0.6, -0.4, 0.8);
-/// let sight = |rate: Vector3<f64>| {
-///     relation.sight(&RateSample { rate_rad_s: rate, torque_rad_s2: Vector3::zeros() })
+/// let regressor = |rate: Vector3<f64>| {
+///     relation.regressor(&RateSample { rate_rad_s: rate, torque_rad_s2: Vector3::zeros() })
 /// };
 /// for _ in 0..5000 {
 ///     let next = body.flow(&rate, &Vector3::zeros(), h);
-///     match relation.observe(&sight(rate), &sight(next), h, filter.estimate().x) {
+///     match relation.observe(&regressor(rate), &regressor(next), h, filter.estimate().x) {
 ///         Observation::Seen(increment) => filter.step(&increment),
 ///         Observation::Unobservable { drift } => filter.predict(&drift),
 ///     }
@@ -293,26 +293,26 @@ impl HiddenRate {
 
     /// What the relation makes of a sample, whose components are finite.
     #[inline(always)]
-    pub fn sight(&self, sample: &RateSample) -> Sight {
+    pub fn regressor(&self, sample: &RateSample) -> Regressor {
         let [i, j, _] = cyclic(&sample.rate_rad_s, self.hidden);
         self.at([i, j], cyclic(&sample.torque_rad_s2, self.hidden))
     }
 
     #[inline(always)]
-    fn at(&self, [i, j]: [f64; 2], torque: [f64; 3]) -> Sight {
+    fn at(&self, [i, j]: [f64; 2], torque: [f64; 3]) -> Regressor {
         let Constants { omega, bend, .. } = self.constants;
         let (x, y) = (omega * i, self.a[0] * j);
         let bend = bend[0] * (j * j) + bend[1] * (i * i);
-        Sight { i, j, x, y, square: x * x + y * y, drift: self.a[2] * i * j, bend, torque }
+        Regressor { i, j, x, y, square: x * x + y * y, drift: self.a[2] * i * j, bend, torque }
     }
 
     /// Passes what was made of a sample; see [`Persist`]. Of it, only what was measured is kept.
-    pub fn persist_sight<W: Words>(&self, sight: &mut Sight, words: &mut W) {
-        let Sight { mut i, mut j, mut torque, .. } = *sight;
+    pub fn persist_regressor<W: Words>(&self, regressor: &mut Regressor, words: &mut W) {
+        let Regressor { mut i, mut j, mut torque, .. } = *regressor;
         i.persist(words);
         j.persist(words);
         torque.persist(words);
-        *sight = self.at([i, j], torque);
+        *regressor = self.at([i, j], torque);
     }
 
     /// A measured angular velocity with `estimate` in the place of the hidden component, rad/s.
@@ -326,8 +326,8 @@ impl HiddenRate {
     }
 
     /// The torque over inertia of a sample, rad/s².
-    pub fn torque(&self, sight: &Sight) -> Vector3<f64> {
-        let [i, j, k] = sight.torque;
+    pub fn torque(&self, regressor: &Regressor) -> Vector3<f64> {
+        let [i, j, k] = regressor.torque;
         match self.hidden {
             0 => Vector3::new(k, i, j),
             1 => Vector3::new(j, k, i),
@@ -337,7 +337,13 @@ impl HiddenRate {
 
     /// What the step over the interval (s, positive) from `from` to `to` tells, with `estimate` (rad/s) the estimate at its
     /// start.
-    pub fn observe(&self, from: &Sight, to: &Sight, interval: impl Into<Interval>, estimate: f64) -> Observation {
+    pub fn observe(
+        &self,
+        from: &Regressor,
+        to: &Regressor,
+        interval: impl Into<Interval>,
+        estimate: f64,
+    ) -> Observation {
         let interval = interval.into();
         let exact = (|y, x| Some(series::atan2(y, x)), |x| Some(series::ln_1p(x)));
         let Some((growth, share)) = self.growth(from, to, interval.length(), estimate, exact) else {
@@ -361,7 +367,7 @@ impl HiddenRate {
     #[inline(always)]
     pub fn step_usual(
         &self,
-        [from, to]: [&Sight; 2],
+        [from, to]: [&Regressor; 2],
         interval: &Interval,
         estimate: f64,
         filter: &mut impl StepAgain<1>,
@@ -376,7 +382,7 @@ impl HiddenRate {
         Some((estimate, increment.reconstruction().x - estimate))
     }
 
-    fn unobservable(&self, from: &Sight, to: &Sight, interval: &Interval, estimate: f64) -> Observation {
+    fn unobservable(&self, from: &Regressor, to: &Regressor, interval: &Interval, estimate: f64) -> Observation {
         let push = [from, to].map(|end| self.push(end, &from.torque));
         Observation::Unobservable { drift: Vector1::new(drift(from, to, push, interval, estimate).0) }
     }
@@ -386,8 +392,8 @@ impl HiddenRate {
     #[inline(always)]
     fn growth(
         &self,
-        from: &Sight,
-        to: &Sight,
+        from: &Regressor,
+        to: &Regressor,
         dt_s: f64,
         estimate: f64,
         (atan2, ln_1p): (impl Fn(f64, f64) -> Option<f64>, impl Fn(f64) -> Option<f64> + Copy),
@@ -412,8 +418,8 @@ impl HiddenRate {
     #[inline(always)]
     fn logarithmic_growth(
         &self,
-        from: &Sight,
-        to: &Sight,
+        from: &Regressor,
+        to: &Regressor,
         ln_1p: impl Fn(f64) -> Option<f64> + Copy,
     ) -> Option<(f64, f64)> {
         let (plus, minus) = (from.x + from.y, from.x - from.y);
@@ -443,7 +449,7 @@ impl HiddenRate {
     }
 
     /// The part of Δφ that is not the torque's, and the torque's part in how the drift changes at the ends.
-    fn undriven(&self, ends: [&Sight; 2], share: f64, interval: &Interval, growth: f64) -> (f64, [f64; 2]) {
+    fn undriven(&self, ends: [&Regressor; 2], share: f64, interval: &Interval, growth: f64) -> (f64, [f64; 2]) {
         let torque = &ends[0].torque;
         let gradients = ends.map(|end| self.gradient(end, share));
         let rough = growth - interval.length() * torque_share(gradients, torque);
@@ -452,13 +458,13 @@ impl HiddenRate {
 
     /// a_k (u_i ω_j + u_j ω_i), rad/s³.
     #[inline]
-    fn push(&self, end: &Sight, torque: &[f64; 3]) -> f64 {
+    fn push(&self, end: &Regressor, torque: &[f64; 3]) -> f64 {
         self.a[2] * (torque[0] * end.j + torque[1] * end.i)
     }
 
     /// (∂φ/∂ω_i, ∂φ/∂ω_j) at one instant, s.
     #[inline]
-    fn gradient(&self, p: &Sight, share: f64) -> [f64; 2] {
+    fn gradient(&self, p: &Regressor, share: f64) -> [f64; 2] {
         let [ai, aj, _] = self.a;
         match self.conic {
             Conic::Elliptic { .. } => [p.y / p.square, -ai * p.i / p.square],
@@ -475,10 +481,10 @@ impl HiddenRate {
 
     /// ∫(φ_i u_i + φ_j u_j) dt by Simpson's rule, the middle of the path by its cubic Hermite interpolation.
     #[inline]
-    fn torque_growth(&self, [from, to]: [&Sight; 2], share: f64, interval: &Interval, rough: f64) -> f64 {
+    fn torque_growth(&self, [from, to]: [&Regressor; 2], share: f64, interval: &Interval, rough: f64) -> f64 {
         let (dt_s, torque) = (interval.length(), from.torque);
         let hidden = hidden_at_ends(known_drift(from, to), interval, rough * interval.span.inverse());
-        let velocity = |p: &Sight, hidden: f64| {
+        let velocity = |p: &Regressor, hidden: f64| {
             Vector2::new(self.a[0] * p.j * hidden + torque[0], self.a[1] * hidden * p.i + torque[1])
         };
         let turned = velocity(from, hidden[0]) - velocity(to, hidden[1]);
@@ -491,7 +497,7 @@ impl HiddenRate {
     /// The increment with the covariance of its potential φ and its drift, from that of the measured pair.
     ///
     /// The drift feels a sample as the end of one step and as the start of the next, half a step's weight each.
-    fn noisy(&self, exact: Increment<1>, to: &Sight, share: f64, variance: [f64; 2]) -> Increment<1> {
+    fn noisy(&self, exact: Increment<1>, to: &Regressor, share: f64, variance: [f64; 2]) -> Increment<1> {
         let step = self.a[2] * exact.weight;
         let (phi, drift) = (self.gradient(to, share), [step * to.j, step * to.i]);
         let covariance = |x: [f64; 2], y: [f64; 2]| Vector1::new(x[0] * y[0] * variance[0] + x[1] * y[1] * variance[1]);
@@ -506,14 +512,14 @@ impl HiddenRate {
 
 /// Whether a torque acts on the measured axes.
 #[inline(always)]
-fn driven(from: &Sight) -> bool {
+fn driven(from: &Regressor) -> bool {
     // All bits but the signs.
     (from.torque[0].to_bits() | from.torque[1].to_bits()) << 1 != 0
 }
 
 /// The increment whose potential grew by `potential`.
 #[inline(always)]
-fn increment(from: &Sight, to: &Sight, push: [f64; 2], interval: &Interval, potential: f64) -> Increment<1> {
+fn increment(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interval, potential: f64) -> Increment<1> {
     let span = interval.span;
     let (drift, moment) = drift(from, to, push, interval, potential * span.inverse());
     Increment::exact(Vector1::new(potential), span, Vector1::new(drift), Vector1::new(moment))
@@ -528,7 +534,7 @@ fn torque_share(gradients: [[f64; 2]; 2], torque: &[f64; 3]) -> f64 {
 
 /// g = a_k ω_i ω_j + u_k at the two ends of a step, rad/s².
 #[inline(always)]
-fn known_drift(from: &Sight, to: &Sight) -> [f64; 2] {
+fn known_drift(from: &Regressor, to: &Regressor) -> [f64; 2] {
     [from.drift + from.torque[2], to.drift + from.torque[2]]
 }
 
@@ -542,7 +548,7 @@ fn hidden_at_ends(g: [f64; 2], interval: &Interval, mean: f64) -> [f64; 2] {
 /// ∫g and ∫∫g over a step: g by its cubic Hermite polynomial through both ends, where it has the slopes ω_k · bend + `push`;
 /// `mean` is that of ω_k.
 #[inline(always)]
-fn drift(from: &Sight, to: &Sight, push: [f64; 2], interval: &Interval, mean: f64) -> (f64, f64) {
+fn drift(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interval, mean: f64) -> (f64, f64) {
     let [g0, g1] = known_drift(from, to);
     let hidden = hidden_at_ends([g0, g1], interval, mean);
     let (s0, s1) = (from.bend * hidden[0] + push[0], to.bend * hidden[1] + push[1]);
@@ -567,7 +573,7 @@ fn branch_growth(share: f64, change: f64, z: f64, ln_1p: impl Fn(f64) -> Option<
 ///
 /// Either branch alone loses all its digits as Ω vanishes, their best mean none.
 #[inline(always)]
-fn branch_share(from: &Sight, to: &Sight, ratio: f64) -> f64 {
+fn branch_share(from: &Regressor, to: &Regressor, ratio: f64) -> f64 {
     let (x, y) = (from.x + to.x, from.y + to.y);
     (x + y) * (x + ratio * y) / (2.0 * (x * x + ratio * y * y))
 }
@@ -607,9 +613,9 @@ mod tests {
         }
 
         fn step(&mut self, h: f64) {
-            let from = self.relation.sight(&self.sample());
+            let from = self.relation.regressor(&self.sample());
             self.rate = self.body.flow(&self.rate, &self.torque, h);
-            let to = self.relation.sight(&self.sample());
+            let to = self.relation.regressor(&self.sample());
             match self.relation.observe(&from, &to, h, self.filter.estimate().x) {
                 Observation::Seen(increment) => self.filter.step(&increment),
                 Observation::Unobservable { drift } => {
@@ -684,9 +690,9 @@ mod tests {
             let (mut short, mut usual) = (run.filter, 0);
             let interval = Interval::from(1e-3);
             for _ in 0..3000 {
-                let from = run.relation.sight(&run.sample());
+                let from = run.relation.regressor(&run.sample());
                 run.step(1e-3);
-                let to = run.relation.sight(&run.sample());
+                let to = run.relation.regressor(&run.sample());
                 let estimate = short.estimate().x;
                 match run.relation.step_usual([&from, &to], &interval, estimate, &mut short) {
                     Some((estimate, _)) => {

@@ -16,7 +16,7 @@ mod series;
 pub use axisymmetric::{Axisymmetric, AxisymmetricError};
 pub use filter::{Increment, InvariantFilter, Span, StepAgain};
 pub use guarded::{GuardedKalman, RateNoise};
-pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Interval, Observation, RateSample, Sight};
+pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Interval, Observation, RateSample, Regressor};
 pub use hurwitz::{Eigenvalues, Hurwitz, HurwitzError};
 pub use inertia::{Identification, InertiaRatioError, InertiaRatios, InertiaRelation};
 pub use orbit_velocity::{OrbitSample, OrbitVelocity, to_inertial, to_polar};

@@ -58,9 +58,9 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
         patience_s: arguments.patience,
     };
     let welcomed = |device: &str| tell(format_args!("{} on {}: {device}", seat.body, seat.path.display()));
-    let book = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
-    if let Some(book) = book {
-        tell(line_words(&seat.body, &book));
+    let counters = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
+    if let Some(counters) = counters {
+        tell(line_words(&seat.body, &counters));
     }
     Ok(Exit::Ok)
 }

@@ -5,7 +5,7 @@
 //! | `layout` | the layout of a sample as a ROS 2 message definition |
 //! | `writer` | the MCAP file: chunks of bounded age, a full disk |
 //! | `taps` | takes every sample of a run off a bus, and keeps count |
-//! | `recorder` | a recording in the making, and its books |
+//! | `recorder` | a recording in the making, and its counters |
 //! | `process` | the recorder as a process beside a loop |
 //! | `reader` | a recording as data: metadata, signals, samples, columns |
 //! | `script` | what a role did, so that it can do it again |

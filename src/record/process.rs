@@ -12,8 +12,8 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    Backoff, RoleError, RoleId, depths, hurried, join, join_beside, open_ledger, report, report_path, topic,
-    window_ticks, write_whole,
+    Backoff, RoleError, RoleId, depths, join, join_at_low_priority, open_ledger, report, report_path, topic,
+    window_ticks, with_realtime_priority, write_whole,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::RoleReport;
@@ -48,11 +48,11 @@ pub struct RecorderSeat {
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join(&seat.domain)?;
     // Not nice to ordinary processes: it must not lose samples because something is being compiled.
-    let (_bus, mut line, mut recorder) = join_beside(&scenario, 0, || open(seat, &domain, &scenario))?;
+    let (_bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended = follow(&mut recorder, &mut line, credit_ticks, terminated);
-    hurried(|| recorder.leave());
+    with_realtime_priority(|| recorder.leave());
     let report = recorder.finish(&books(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
     let text = serde_json::to_vec(&report).expect("a report of plain values is JSON");
@@ -133,16 +133,16 @@ fn drain(recorder: &mut Recorder, terminated: &AtomicBool) -> Result<(), RecordE
     Ok(())
 }
 
-/// The books of all roles, as far as they have got: their own account, or what their ledgers say.
+/// The counters of all roles, as far as they have got: their own account, or what their ledgers say.
 fn books(domain: &Domain, scenario: &Scenario) -> Vec<RoleReport> {
-    let book = |role: RoleId| {
+    let counters = |role: RoleId| {
         let file = std::fs::read(report_path(domain.root(), role.name(scenario))).ok();
         file.and_then(|bytes| serde_json::from_slice(&bytes).ok()).or_else(|| {
             let ledger = open_ledger(domain, scenario, role).ok().filter(|ledger| ledger.generation() > 0)?;
             Some(report(scenario, role, &ledger, Vec::new(), Vec::new()))
         })
     };
-    RoleId::all(scenario).into_iter().filter_map(book).collect()
+    RoleId::all(scenario).into_iter().filter_map(counters).collect()
 }
 
 /// The recorder's line to the launcher.

@@ -120,9 +120,9 @@ pub struct EndInfo {
     pub complete: bool,
     /// Why not.
     pub problem: String,
-    /// The books of every signal.
+    /// The counters of every signal.
     pub signals: Vec<SignalReport>,
-    /// The roles' books.
+    /// The roles' counters.
     pub ticks: BTreeMap<String, Ticks>,
     /// The roles' privileges.
     pub privileges: BTreeMap<String, Vec<Grant>>,

@@ -1,8 +1,8 @@
-//! Writes what the taps take to a file, and holds what came against the books of the roles. Must not judge a sample.
+//! Writes what the taps take to a file, and holds what came against the counters of the roles. Must not judge a sample.
 
 use super::RecordError;
 use super::layout::Layout;
-use super::taps::{Book, Taps};
+use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;
 use crate::clock::monotonic_ns;
@@ -41,7 +41,7 @@ pub struct RecordingReport {
     pub signals: Vec<SignalReport>,
 }
 
-/// The books of one recorded signal, beside those of its writer.
+/// The counters of one recorded signal, beside those of its writer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SignalReport {
     /// The service.
@@ -52,7 +52,7 @@ pub struct SignalReport {
     pub void: u64,
     /// Samples beside the one of their tick: second, late, broken ones.
     pub extra: u64,
-    /// Samples that its writer published by its own books; none if it keeps none.
+    /// Samples that its writer published by its own counters; none if it keeps none.
     pub published: Option<u64>,
     /// Published and not recorded; none if that is not known.
     pub lost: Option<u64>,
@@ -65,21 +65,21 @@ pub struct SignalReport {
 }
 
 impl SignalReport {
-    fn new((service, book): (String, Book)) -> Self {
+    fn new((service, counters): (String, SignalCounters)) -> Self {
         Self {
             service,
-            recorded: book.recorded,
-            void: book.void,
-            extra: book.extra,
+            recorded: counters.recorded,
+            void: counters.void,
+            extra: counters.extra,
             published: None,
             lost: None,
-            last_tick: book.next.checked_sub(1),
-            gaps: book.gaps,
-            more_gaps: book.more_gaps,
+            last_tick: counters.next.checked_sub(1),
+            gaps: counters.gaps,
+            more_gaps: counters.more_gaps,
         }
     }
 
-    /// Holds what was recorded against the books of the roles. Again, if the loop went on after the recording.
+    /// Holds what was recorded against the counters of the roles. Again, if the loop went on after the recording.
     fn reconcile(&mut self, roles: &[RoleReport]) {
         let Some(link) = roles.iter().flat_map(|role| &role.written).find(|link| link.service == self.service) else {
             return;
@@ -95,7 +95,7 @@ impl SignalReport {
 }
 
 impl RecordingReport {
-    /// Holds the recording against the roles' final books.
+    /// Holds the recording against the roles' final counters.
     pub fn reconcile(&mut self, roles: &[RoleReport]) {
         self.signals.iter_mut().for_each(|signal| signal.reconcile(roles));
         let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
@@ -172,7 +172,7 @@ impl Recorder {
         self.signals.extend(self.taps.close().into_iter().map(SignalReport::new));
     }
 
-    /// Ends the file, with the books of the recording beside those of the roles. `problem` is what ended it before its time.
+    /// Ends the file, with the counters of the recording beside those of the roles. `problem` is what ended it before its time.
     pub fn finish(mut self, roles: &[RoleReport], problem: Option<&RecordError>) -> RecordingReport {
         self.leave();
         let mut report = RecordingReport {

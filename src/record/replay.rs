@@ -9,7 +9,7 @@ use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
 use crate::config::Scenario;
-use crate::runtime::{Gate, Poll, ReadyNode, RoleId, build, depths, ports, private_ledger};
+use crate::runtime::{Poll, ReadyNode, RoleId, RunCondition, build, depths, ports, private_ledger};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::Ledger;
 
@@ -283,10 +283,10 @@ impl Stage<'_> {
                 self.script.inputs[input].write(item, &mut self.bytes);
                 self.inlets.send(input, &self.bytes)?;
             }
-            if !executed && node.poll(Gate::Inputs { up_to: step.tick })? == Poll::Executed {
+            if !executed && node.poll(RunCondition::Inputs { up_to: step.tick })? == Poll::Executed {
                 executed = true;
-                if step.settled {
-                    node.settle()?;
+                if step.finished {
+                    node.finish_tick()?;
                 }
             }
             look()?;

@@ -30,7 +30,7 @@ pub struct Step {
     /// Which life of the role.
     pub generation: u64,
     /// Whether the role lived to do what a tick leaves to be done.
-    pub settled: bool,
+    pub finished: bool,
 }
 
 /// One sample to be fed.
@@ -235,12 +235,12 @@ impl Reading<'_> {
                         steps.pop();
                     }
                     if let Some(last) = steps.last_mut().filter(|last| last.tick == stamp.tick) {
-                        last.settled = false;
+                        last.finished = false;
                     }
                     (next, life) = (stamp.tick, generation);
                 }
                 if stamp.tick == next {
-                    steps.push(Step { tick: next, generation: life, settled: true });
+                    steps.push(Step { tick: next, generation: life, finished: true });
                     next += 1;
                 } else if stamp.tick > next && !disturbed {
                     gap = Some(next);
@@ -330,7 +330,7 @@ impl Reading<'_> {
             }
         }
         withheld.retain(|tick| !ticks.contains_key(tick));
-        self.unsettled(&mut ticks);
+        self.unfinished(&mut ticks);
         if let Some(first) = withheld.first().filter(|_| !self.executed_all(&ticks, withheld.len() as u64)) {
             let first = *first;
             self.limit(first, || {
@@ -340,11 +340,11 @@ impl Reading<'_> {
             ticks.extend(withheld.into_iter().map(|tick| (tick, (0, true))));
         }
         let mut life = 1;
-        let step = |(tick, (generation, settled)): (u64, (u64, bool))| {
+        let step = |(tick, (generation, finished)): (u64, (u64, bool))| {
             if (life + 1..life + LIVES_MAX).contains(&generation) {
                 life = generation;
             }
-            Step { tick, generation: life, settled }
+            Step { tick, generation: life, finished }
         };
         let steps: Vec<Step> = ticks.into_iter().map(step).collect();
         self.anew(&steps);
@@ -373,7 +373,7 @@ impl Reading<'_> {
     }
 
     /// A plant that died between its measurement and its truth had moved nothing.
-    fn unsettled(&mut self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
+    fn unfinished(&mut self, ticks: &mut BTreeMap<u64, (u64, bool)>) {
         let mut untold = None;
         if let Some(output) = self.outputs.first().filter(|_| self.delay() == 1) {
             for index in 0..output.len() {

@@ -47,7 +47,7 @@ pub trait MessageSink {
 
 /// What has come of one signal.
 #[derive(Default)]
-pub struct Book {
+pub struct SignalCounters {
     /// The tick behind the last one of which something has come.
     pub next: u64,
     begun: bool,
@@ -63,7 +63,7 @@ pub struct Book {
     pub more_gaps: u64,
 }
 
-impl Book {
+impl SignalCounters {
     /// Enters a sample; `due` is the last tick that it can be of.
     fn enter(&mut self, stamp: &Stamp, due: u64) {
         if stamp.tick < self.next || stamp.tick > due {
@@ -100,7 +100,7 @@ struct Tap {
     role: String,
     reader: WordReader,
     channel: Channel,
-    book: Book,
+    counters: SignalCounters,
 }
 
 impl Tap {
@@ -110,19 +110,19 @@ impl Tap {
         while let Some(words) = self.reader.next()? {
             let body = bytemuck::cast_slice(words);
             let stamp: Stamp = bytemuck::pod_read_unaligned(&body[..size_of::<Stamp>()]);
-            if stamp.generation == 0 && !self.book.begun {
+            if stamp.generation == 0 && !self.counters.begun {
                 continue;
             }
             let now_ns = monotonic_ns();
-            let due = match (desk.realtime, self.book.begun) {
+            let due = match (desk.realtime, self.counters.begun) {
                 (true, _) => desk.grid.tick_at(now_ns).min(desk.last_tick),
                 // Where nothing is lost, a sample is of the next tick or of none.
-                (false, true) => self.book.next,
+                (false, true) => self.counters.next,
                 (false, false) => desk.last_tick,
             };
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
             desk.sink.message(self.channel, stamp.tick as u32, due_ns, now_ns, body)?;
-            self.book.enter(&stamp, due);
+            self.counters.enter(&stamp, due);
             taken += 1;
         }
         Ok(taken)
@@ -161,7 +161,7 @@ impl Taps {
         for role in RoleId::all(scenario) {
             for port in ports(scenario, role).writes {
                 let (reader, role) = (port.reader(bus, Reader::Scorer)?, role.name(scenario).to_owned());
-                taps.push(Tap { port, role, reader, channel: 0, book: Book::default() });
+                taps.push(Tap { port, role, reader, channel: 0, counters: SignalCounters::default() });
             }
         }
         Ok(Self {
@@ -201,12 +201,12 @@ impl Taps {
 
     /// The tick of which not every signal is here yet.
     pub fn next_tick(&self) -> u64 {
-        self.taps.iter().map(|tap| tap.book.next).min().unwrap_or(0)
+        self.taps.iter().map(|tap| tap.counters.next).min().unwrap_or(0)
     }
 
     /// Closes every signal; gives services and what came of them.
-    pub fn close(&mut self) -> Vec<(String, Book)> {
-        let close = |tap: Tap| (tap.port.topic.to_string(), tap.book);
+    pub fn close(&mut self) -> Vec<(String, SignalCounters)> {
+        let close = |tap: Tap| (tap.port.topic.to_string(), tap.counters);
         std::mem::take(&mut self.taps).into_iter().map(close).collect()
     }
 }

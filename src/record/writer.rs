@@ -40,7 +40,7 @@ const CHUNK_BYTES: usize = 256 << 10;
 const CHUNK_NS: u64 = 500_000_000;
 /// The most that is written around a message's body: its header in the chunk and its entry in the index, bytes.
 const MESSAGE_OVERHEAD: usize = 31 + 16;
-/// The least room kept for the end of the file: indexes, statistics, books; bytes.
+/// The least room kept for the end of the file: indexes, statistics, counters; bytes.
 const END_BYTES: u64 = 64 << 10;
 /// What the summary says of a chunk, and of each channel in it; bytes.
 const CHUNK_INDEX_BYTES: u64 = 128;

@@ -32,7 +32,7 @@ pub struct Summary {
     pub limits: Vec<Figure>,
     pub watchdog: Option<WatchReport>,
     pub certificates: Vec<Certificate>,
-    pub books: Books,
+    pub books: Accounting,
     pub state: State,
     pub latencies: Vec<Stage>,
     pub recording: Option<Recorded>,
@@ -126,7 +126,7 @@ pub struct Condition {
 }
 
 #[derive(Debug, Deserialize)]
-pub struct Books {
+pub struct Accounting {
     pub balanced: bool,
     pub problems: Vec<String>,
     pub unbooked: Vec<String>,

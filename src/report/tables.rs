@@ -173,7 +173,7 @@ fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
     strings(&[role, &ticks.elapsed, &ticks.executed, &ticks.missed, &ticks.starved, &ticks.safe, &ticks.stalled])
 }
 
-/// The books of roles and links.
+/// The counters of roles and links.
 pub fn books(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
@@ -236,7 +236,7 @@ pub fn books(source: &Source) -> Section {
             state.first_disturbed_tick.map_or_else(undisturbed, |tick| format!("first disturbed tick {tick}"));
         blocks.push(Block::Text(format!("State hash {}; {disturbed}.", state.hash)));
     }
-    Section { id: "books", title: "Books", blocks }
+    Section { id: "books", title: "Accounting", blocks }
 }
 
 /// What was recorded.

@@ -10,7 +10,7 @@ use crate::config::{Fields, Scenario, fields};
 use crate::launch::{Launch, Outcome, Scorer, run_directly, score_rig};
 use crate::record::{RecordError, Recording};
 use crate::report::{Traces, trace_rig};
-use crate::runtime::{DeviceError, DeviceLink, DeviceSeat, Occupant, Port, ReadyNode, RoleId, build_rig, ports_of_rig};
+use crate::runtime::{DeviceError, DeviceLink, DeviceSeat, Port, ReadyNode, RoleId, RoleImpl, build_rig, ports_of_rig};
 use crate::telemetry::Ledger;
 use crate::watch::Judge;
 use std::any::Any;
@@ -35,7 +35,7 @@ pub(crate) trait Face: Any + Send + Sync {
     fn node(
         &self,
         scenario: &Scenario,
-        occupant: Occupant,
+        occupant: RoleImpl,
         bus: AnyBus<'_>,
         ledger: &Ledger,
     ) -> Result<ReadyNode, BusError>;
@@ -95,7 +95,7 @@ impl<R: Rig> Face for R {
     fn node(
         &self,
         scenario: &Scenario,
-        occupant: Occupant,
+        occupant: RoleImpl,
         bus: AnyBus<'_>,
         ledger: &Ledger,
     ) -> Result<ReadyNode, BusError> {

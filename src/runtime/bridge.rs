@@ -4,14 +4,14 @@
 //! what its samples mean.
 
 use super::line::{Line, LineError};
-use super::node::{Occupant, RoleId};
+use super::node::{RoleId, RoleImpl};
 use super::process::{RoleError, find_role, in_domain, join};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::Rearm;
 use crate::sample::{Sample, content_length};
-use crate::serial::{Answer, Heard, Hello, Host, LineBook, Refuse, Terms, VERSION};
+use crate::serial::{Answer, Heard, Hello, Host, LineCounters, Refuse, Terms, VERSION};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -284,15 +284,15 @@ impl DeviceLink {
     }
 
     fn silent(&mut self, now_ns: u64) -> DeviceError {
-        let book = self.host.book();
+        let counters = self.host.counters();
         let hint = match self.line.reopen() {
             Err(error) => error.to_string(),
-            Ok(()) if book.echoes > 0 => {
+            Ok(()) if counters.echoes > 0 => {
                 "its own frames came back: is the line looped, or does the far end echo?".to_owned()
             }
-            Ok(()) if book.frames_received == 0 && book.bytes_received > 0 => format!(
+            Ok(()) if counters.frames_received == 0 && counters.bytes_received > 0 => format!(
                 "{} bytes came and no frame was among them: do both ends have the same speed (--baud)?",
-                book.bytes_received
+                counters.bytes_received
             ),
             Ok(()) => "is it powered, wired (RX to TX), and running a program of this protocol?".to_owned(),
         };
@@ -300,9 +300,9 @@ impl DeviceLink {
         DeviceError::Silent { path: self.line.path().to_owned(), waited_s, hint }
     }
 
-    /// The line's books.
-    pub fn book(&self) -> LineBook {
-        self.host.book()
+    /// The line's counters.
+    pub fn counters(&self) -> LineCounters {
+        self.host.counters()
     }
 }
 
@@ -361,7 +361,7 @@ fn driven(scenario: &Scenario, name: &str) -> Result<usize, RoleError> {
 }
 
 /// Puts a device into the seat of a driven body and serves it to the end of the run. `welcomed` is told the device's name.
-/// Gives the line's books, if a run was served.
+/// Gives the line's counters, if a run was served.
 ///
 /// # Errors
 /// [`RoleError`].
@@ -369,7 +369,7 @@ pub fn run_bridge(
     seat: &DeviceSeat,
     terminated: &AtomicBool,
     welcomed: impl FnOnce(&str),
-) -> Result<Option<LineBook>, RoleError> {
+) -> Result<Option<LineCounters>, RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let index = driven(&scenario, &seat.body)?;
     // A bridge that is started again in the same run finds a device that knows it.
@@ -377,7 +377,7 @@ pub fn run_bridge(
     let mut link = DeviceLink::open(seat, &scenario, run)?;
     let Some(name) = link.greet(terminated)? else { return Ok(None) };
     welcomed(&name);
-    let (mut book, occupant) = (None, Occupant::Device(index, Box::new(link)));
-    in_domain(&domain, &scenario, occupant, terminated, |report| book = report.line)?;
-    Ok(book)
+    let (mut counters, occupant) = (None, RoleImpl::Device(index, Box::new(link)));
+    in_domain(&domain, &scenario, occupant, terminated, |report| counters = report.line)?;
+    Ok(counters)
 }

@@ -7,7 +7,7 @@ use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario, ScriptedFault};
 use crate::fault::{Action, Change, Fault, Interruption, Transport};
 use crate::state::{Persist, Words};
-use crate::telemetry::TickBook;
+use crate::telemetry::TickCounters;
 use std::borrow::{Borrow, BorrowMut};
 
 /// What happens to the samples of one signal.
@@ -106,9 +106,9 @@ pub fn extra_samples(scenario: &Scenario) -> usize {
     scenario.faults.iter().filter(extra).count()
 }
 
-/// What a role has suffered before a tick.
+/// The scripted faults that a role has met before a tick.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-struct Suffered {
+struct InjectedFaults {
     /// So many stalls.
     stalls: u64,
     /// Its life is over, where it has no process that could be killed: whoever drives it builds it anew.
@@ -135,39 +135,39 @@ impl Interruptions {
         Self { faults, first_life: generation == 1, process, next: 0 }
     }
 
-    /// Acts before the next tick of a role, once, and enters it into the role's book; true if the role's life is over.
+    /// Acts before the next tick of a role, once, and enters it into the role's counters; true if the role's life is over.
     #[inline]
-    pub fn before_next(&mut self, book: &mut TickBook) -> bool {
-        let suffered = self.before(book.next());
-        book.stalled(suffered.stalls);
-        suffered.killed
+    pub fn before_next(&mut self, counters: &mut TickCounters) -> bool {
+        let injected = self.before(counters.next());
+        counters.stalled(injected.stalls);
+        injected.killed
     }
 
     #[inline]
-    fn before(&mut self, tick: u64) -> Suffered {
-        if self.faults.is_empty() || tick < self.next { Suffered::default() } else { self.act(tick) }
+    fn before(&mut self, tick: u64) -> InjectedFaults {
+        if self.faults.is_empty() || tick < self.next { InjectedFaults::default() } else { self.act(tick) }
     }
 
     #[cold]
-    fn act(&mut self, tick: u64) -> Suffered {
+    fn act(&mut self, tick: u64) -> InjectedFaults {
         self.next = tick + 1;
-        let mut suffered = Suffered::default();
+        let mut injected = InjectedFaults::default();
         for fault in self.faults.iter().filter(|fault| fault.acts(tick)) {
             match fault.action {
                 Action::Role(Interruption::Stall { ns }) => {
                     stall(ns);
-                    suffered.stalls += 1;
+                    injected.stalls += 1;
                 }
                 Action::Role(Interruption::Kill) if self.first_life => {
                     if self.process {
                         kill();
                     }
-                    suffered.killed = true;
+                    injected.killed = true;
                 }
                 _ => {}
             }
         }
-        suffered
+        injected
     }
 }
 

@@ -3,8 +3,8 @@
 //! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a bell; what is
 //! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
-use super::hooks::{self, Place};
-use super::node::{Gate, Node, Poll, ReadyNode, RoleId};
+use super::hooks::{self, Failpoint};
+use super::node::{Node, Poll, ReadyNode, RoleId, RunCondition};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
@@ -32,7 +32,7 @@ pub enum Ended {
 }
 
 /// What one role says of itself.
-pub struct Voice<B: Bus> {
+pub struct Heartbeat<B: Bus> {
     /// Whose it is.
     pub role: RoleId,
     /// Where it is said.
@@ -41,10 +41,10 @@ pub struct Voice<B: Bus> {
     pub generation: u64,
 }
 
-/// A process's line to the launcher, with the voice of each of its roles.
+/// A process's line to the launcher, with the heartbeat of each of its roles.
 pub struct Control<'a, B: Bus> {
     schedule: B::Reader<Schedule>,
-    voices: Vec<Voice<B>>,
+    heartbeats: Vec<Heartbeat<B>>,
     denied: u64,
     terminated: &'a AtomicBool,
 }
@@ -52,13 +52,18 @@ pub struct Control<'a, B: Bus> {
 impl<'a, B: Bus> Control<'a, B> {
     /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
     /// that asks the process to end.
-    pub fn new(schedule: B::Reader<Schedule>, voices: Vec<Voice<B>>, denied: u64, terminated: &'a AtomicBool) -> Self {
-        Self { schedule, voices, denied, terminated }
+    pub fn new(
+        schedule: B::Reader<Schedule>,
+        heartbeats: Vec<Heartbeat<B>>,
+        denied: u64,
+        terminated: &'a AtomicBool,
+    ) -> Self {
+        Self { schedule, heartbeats, denied, terminated }
     }
 
     /// Whether nobody has had these seats before.
     pub fn first(&self) -> bool {
-        self.voices.iter().all(|voice| voice.generation == 1)
+        self.heartbeats.iter().all(|heartbeat| heartbeat.generation == 1)
     }
 
     /// Tells the launcher how the roles are.
@@ -67,7 +72,7 @@ impl<'a, B: Bus> Control<'a, B> {
     /// [`BusError::Send`].
     pub fn announce(&mut self, state: RoleState, node: &dyn Node) -> Result<(), BusError> {
         let denied = self.denied;
-        for Voice { role, health, generation } in &mut self.voices {
+        for Heartbeat { role, health, generation } in &mut self.heartbeats {
             let ticks = node.of(*role).unwrap_or(node).ticks();
             health.send(|health| {
                 let sent_ns = monotonic_ns();
@@ -108,7 +113,7 @@ pub struct Waiting<'a> {
     /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
     pub spin_ns: u64,
     /// For samples of these roles it does not spin but gives way: they need its core.
-    pub give_way: &'a [RoleId],
+    pub yields_to: &'a [RoleId],
     /// The part of the period after which it goes on without what is missing.
     pub cutoff: f64,
 }
@@ -144,11 +149,11 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
             let executed = if waits { self.on_arrival(node, grid, waiting)? } else { Some(begun) };
             match executed {
                 Some(Poll::Executed) => {
-                    if begun == Poll::Executed && !waiting.give_way.is_empty() {
+                    if begun == Poll::Executed && !waiting.yields_to.is_empty() {
                         // What it sent is what the others wait for, and they wait for its core too.
                         std::thread::yield_now();
                     }
-                    node.settle()?;
+                    node.finish_tick()?;
                 }
                 Some(Poll::Waiting | Poll::Missed) => {}
                 None => return Ok(Ended::Stopped),
@@ -163,7 +168,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
     fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, BusError> {
         let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
-        node.poll(Gate::Now { tick: grid.tick_at(now_ns), now_ns })
+        node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
     /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the bell of
@@ -175,14 +180,14 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + waiting.spin_ns;
         loop {
             let now_ns = monotonic_ns();
-            let gate = if now_ns >= overdue_ns { Gate::Overdue } else { Gate::Arrived };
-            match node.poll(gate)? {
+            let condition = if now_ns >= overdue_ns { RunCondition::Overdue } else { RunCondition::Arrived };
+            match node.poll(condition)? {
                 Poll::Waiting => {}
                 done => return Ok(Some(done)),
             }
-            hooks::at(Place::Waiting);
+            hooks::at(Failpoint::Waiting);
             if waiting.spin_ns > 0 && now_ns < spin_end_ns {
-                spin(node, waiting.give_way);
+                spin(node, waiting.yields_to);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
@@ -200,7 +205,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
     fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, BusError> {
         while monotonic_ns() < until_ns {
-            hooks::at(Place::Waiting);
+            hooks::at(Failpoint::Waiting);
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
             if until_ns > monotonic_ns() && self.turn(node)? {
                 return Ok(true);
@@ -249,14 +254,14 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         let mut backoff = Backoff::default();
         while node.next_tick() <= self.last_tick {
             node.before_tick();
-            if node.poll(Gate::Inputs { up_to })? == Poll::Executed {
-                node.settle()?;
+            if node.poll(RunCondition::Inputs { up_to })? == Poll::Executed {
+                node.finish_tick()?;
                 backoff = Backoff::default();
                 if !node.next_tick().is_multiple_of(TURN_TICKS) {
                     continue;
                 }
             } else {
-                hooks::at(Place::Waiting);
+                hooks::at(Failpoint::Waiting);
                 self.rest(node, up_to, &mut backoff)?;
             }
             if self.turn_is_due() {
@@ -273,8 +278,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
 }
 
 /// One round of waiting for a sample that is due: whoever is to send it may need this core.
-fn spin(node: &dyn Node, give_way: &[RoleId]) {
-    if node.awaits().is_some_and(|role| give_way.contains(&role)) {
+fn spin(node: &dyn Node, yields_to: &[RoleId]) {
+    if node.awaits().is_some_and(|role| yields_to.contains(&role)) {
         std::thread::yield_now();
     } else {
         std::hint::spin_loop();
@@ -326,8 +331,8 @@ pub fn in_turn(
                 nodes.insert(index, successor);
             }
             let node = &mut nodes[index];
-            if node.poll(Gate::Inputs { up_to: tick })? == Poll::Executed {
-                node.settle()?;
+            if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
+                node.finish_tick()?;
             }
         }
         if !after_tick(tick) {

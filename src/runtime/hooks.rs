@@ -6,7 +6,7 @@
 
 /// A place in a role's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
+pub enum Failpoint {
     /// Before it opens its links.
     Opening,
     /// All is open and warm; it waits for the word to run.
@@ -30,7 +30,7 @@ pub use off::{at, enter};
 
 #[cfg(not(feature = "hooks"))]
 mod off {
-    use super::Place;
+    use super::Failpoint;
 
     /// Nothing.
     #[inline(always)]
@@ -38,7 +38,7 @@ mod off {
 
     /// Nothing.
     #[inline(always)]
-    pub fn at(_place: Place) {}
+    pub fn at(_place: Failpoint) {}
 }
 
 #[cfg(feature = "hooks")]
@@ -46,13 +46,13 @@ pub use on::{at, enter};
 
 #[cfg(feature = "hooks")]
 mod on {
-    use super::Place;
+    use super::Failpoint;
     use rustix::process::{Signal, getpid, kill_process};
     use std::sync::OnceLock;
     use std::sync::atomic::{AtomicU64, Ordering};
 
     struct Hook {
-        place: Place,
+        place: Failpoint,
         left: AtomicU64,
         signal: Signal,
     }
@@ -70,14 +70,14 @@ mod on {
             return None;
         }
         let place = match words.next()? {
-            "opening" => Place::Opening,
-            "ready" => Place::Ready,
-            "staged" => Place::Staged,
-            "committing" => Place::Committing,
-            "in-commit" => Place::InCommit,
-            "committed" => Place::Committed,
-            "sent" => Place::Sent,
-            "waiting" => Place::Waiting,
+            "opening" => Failpoint::Opening,
+            "ready" => Failpoint::Ready,
+            "staged" => Failpoint::Staged,
+            "committing" => Failpoint::Committing,
+            "in-commit" => Failpoint::InCommit,
+            "committed" => Failpoint::Committed,
+            "sent" => Failpoint::Sent,
+            "waiting" => Failpoint::Waiting,
             _ => return None,
         };
         let left = AtomicU64::new(words.next()?.parse().ok()?);
@@ -91,7 +91,7 @@ mod on {
 
     /// Passes a place.
     #[inline]
-    pub fn at(place: Place) {
+    pub fn at(place: Failpoint) {
         if let Some(Some(hook)) = HOOK.get()
             && hook.place == place
             && hook.left.fetch_sub(1, Ordering::Relaxed) == 1

@@ -4,7 +4,7 @@ mod input;
 mod kept;
 mod output;
 
-pub use input::{Horizon, Input, Seek};
+pub use input::{AcceptedTicks, Input, Seek};
 pub use kept::Kept;
 pub(super) use output::written;
 pub use output::{Extent, Output};

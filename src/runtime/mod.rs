@@ -1,4 +1,4 @@
-//! Drives roles: a node is one role on a bus with its books; a driver decides when it runs.
+//! Drives roles: a node is one role on a bus with its counters; a driver decides when it runs.
 //!
 //! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
 //! arrive from outside. Must not decide what a run is for, nor start processes.
@@ -18,14 +18,16 @@ pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
-pub use link::{Horizon, Input, Output, Seek};
+pub use link::{AcceptedTicks, Input, Output, Seek};
 pub use node::{
-    Gate, Node, Occupant, Poll, Port, Ports, ReadyNode, RoleId, build, build_rig, ports, private_ledger, report,
-    shared_ledger, topic,
+    Node, Poll, Port, Ports, ReadyNode, RoleId, RoleImpl, RunCondition, build, build_rig, ports, private_ledger,
+    report, shared_ledger, topic,
 };
-pub(crate) use node::{horizon, next_tick, ports_of_rig, shared_memory_bytes};
+pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};
-pub(crate) use privileges::{hurried, join_beside, release as release_priority, take as take_privileges};
+pub(crate) use privileges::{
+    join_at_low_priority, release as release_priority, take as take_privileges, with_realtime_priority,
+};
 pub use process::{RoleError, RoleSeat, Service, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};

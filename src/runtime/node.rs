@@ -1,4 +1,4 @@
-//! One role on a bus: takes its samples, lets the pure role compute, sends, keeps the books.
+//! One role on a bus: takes its samples, lets the pure role compute, sends, keeps the counters.
 //!
 //! Must not wait, and must not decide when it runs; a driver does.
 
@@ -14,8 +14,8 @@ pub use ports::{Port, Ports, ports};
 
 use super::bridge::DeviceLink;
 use super::disturb::{Disturbance, Interruptions};
-use super::hooks::{self, Place};
-use super::link::{self, Extent, Horizon, Input, Kept, Output};
+use super::hooks::{self, Failpoint};
+use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
@@ -23,9 +23,11 @@ use crate::config::{ClockKind, Scenario};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Fleet, Rig};
 use crate::role::Guard;
-use crate::serial::LineBook;
+use crate::serial::LineCounters;
 use crate::state::{Count, Persist, Restore, Words};
-use crate::telemetry::{Grant, Ledger, LedgerError, ReadBook, RoleReport, StageReport, TickBook, Ticks, WatchReport};
+use crate::telemetry::{
+    Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, Ticks, WatchReport,
+};
 use plant::PlantNode;
 use std::path::Path;
 
@@ -96,14 +98,14 @@ impl RoleId {
 }
 
 /// Who takes a role's seat.
-pub enum Occupant {
+pub enum RoleImpl {
     /// This program, with other roles in the same process: these, in the order of a tick, with their ledgers.
     Role(RoleId, Vec<(RoleId, Ledger)>),
     /// A device, as the driven body with this index.
     Device(usize, Box<DeviceLink>),
 }
 
-impl Occupant {
+impl RoleImpl {
     /// The seat.
     pub fn role(&self) -> RoleId {
         match self {
@@ -123,7 +125,7 @@ impl Occupant {
     }
 }
 
-impl From<RoleId> for Occupant {
+impl From<RoleId> for RoleImpl {
     fn from(role: RoleId) -> Self {
         Self::Role(role, Vec::new())
     }
@@ -131,7 +133,7 @@ impl From<RoleId> for Occupant {
 
 /// When a node may execute its next tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Gate {
+pub enum RunCondition {
     /// Lockstep: when every input of the tick is there and the tick is at most this one.
     Inputs {
         /// The farthest tick allowed.
@@ -153,7 +155,7 @@ pub enum Gate {
 /// Whether a node executed a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Poll {
-    /// It did; [`Node::settle`] is due.
+    /// It did; [`Node::finish_tick`] is due.
     Executed,
     /// It waits for inputs, or has passed over a tick of which there are none.
     Waiting,
@@ -161,7 +163,7 @@ pub enum Poll {
     Missed,
 }
 
-/// A role with its links and books.
+/// A role with its links and counters.
 pub trait Node {
     /// Whether the tick alone starts it, or its inputs do. What is started by its tick may still wait for something that
     /// the tick sets off: then it is polled until that has arrived, or is overdue.
@@ -181,11 +183,11 @@ pub trait Node {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError>;
     /// Lets scripted interruptions of this role act: before every tick, once.
     fn before_tick(&mut self) -> bool;
-    /// Executes the next tick if the gate allows it: takes inputs, computes, commits, sends. The critical path.
+    /// Executes the next tick if the condition allows it: takes inputs, computes, commits, sends. The critical path.
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError>;
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError>;
     /// Whose sample the next tick lacks, as far as it is known.
     fn awaits(&self) -> Option<RoleId>;
     /// Sleeps until the input that the next tick lacks may be there, at most until `until_ns`; false if it lacks none.
@@ -197,7 +199,7 @@ pub trait Node {
     ///
     /// # Errors
     /// [`BusError`] if a link failed.
-    fn settle(&mut self) -> Result<(), BusError>;
+    fn finish_tick(&mut self) -> Result<(), BusError>;
     /// Settles what is left of a tick that the end of the run has come upon, and commits the state for the last time.
     ///
     /// # Errors
@@ -216,7 +218,7 @@ pub trait Node {
     /// # Errors
     /// [`BusError`] if a link failed.
     fn refresh(&mut self) -> Result<(), BusError>;
-    /// The tick books.
+    /// The tick counters.
     fn ticks(&self) -> Ticks;
     /// The latencies.
     fn stages(&self) -> Vec<StageReport>;
@@ -226,8 +228,8 @@ pub trait Node {
     fn of(&self, _role: RoleId) -> Option<&dyn Node> {
         None
     }
-    /// The books of its device's serial line, if it has one.
-    fn line(&self) -> Option<LineBook> {
+    /// The counters of its device's serial line, if it has one.
+    fn line(&self) -> Option<LineCounters> {
         None
     }
 }
@@ -252,13 +254,13 @@ trait Persistent {
 fn commit(node: &mut impl Persistent) {
     if node.ledger().is_shared() {
         let ledger = node.ledger().reopened();
-        hooks::at(Place::Committing);
+        hooks::at(Failpoint::Committing);
         ledger.commit(|store| {
             node.counters(store);
-            hooks::at(Place::InCommit);
+            hooks::at(Failpoint::InCommit);
             node.state(store);
         });
-        hooks::at(Place::Committed);
+        hooks::at(Failpoint::Committed);
     }
 }
 
@@ -324,7 +326,7 @@ impl<B: Bus> Seat<'_, B> {
         let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?
             .inheriting(self.kept(&topic), body.bodies())
             .guarded(guard);
-        input.expect(horizon(self.scenario, None));
+        input.expect(accepted_ticks(self.scenario, None));
         Ok(input)
     }
 
@@ -366,11 +368,11 @@ impl<B: Bus> Seat<'_, B> {
 }
 
 /// Which ticks samples can have; in real time only once the grid is known.
-pub(crate) fn horizon(scenario: &Scenario, grid: Option<Grid>) -> Horizon {
+pub(crate) fn accepted_ticks(scenario: &Scenario, grid: Option<Grid>) -> AcceptedTicks {
     match (scenario.clock, grid) {
-        (ClockKind::Realtime, None) => Horizon::Unknown,
-        (ClockKind::Realtime, Some(grid)) => Horizon::Due(grid),
-        (ClockKind::Lockstep | ClockKind::InProcess, _) => Horizon::Next,
+        (ClockKind::Realtime, None) => AcceptedTicks::Unknown,
+        (ClockKind::Realtime, Some(grid)) => AcceptedTicks::Due(grid),
+        (ClockKind::Lockstep | ClockKind::InProcess, _) => AcceptedTicks::Next,
     }
 }
 
@@ -437,7 +439,7 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
 
 /// The tick that a role has not executed, by its ledger.
 pub(crate) fn next_tick(ledger: &Ledger) -> u64 {
-    let mut ticks = TickBook::default();
+    let mut ticks = TickCounters::default();
     ticks.persist(&mut Restore(&ledger.record().unwrap_or_default()));
     ticks.next()
 }
@@ -454,14 +456,14 @@ pub fn report(
     // Of a role that has committed nothing there are zeros.
     let record = ledger.record().unwrap_or_default();
     let record_words = &mut Restore(&record);
-    let (mut ticks, voids) = (TickBook::default(), scenario.clock != ClockKind::Realtime);
+    let (mut ticks, voids) = (TickCounters::default(), scenario.clock != ClockKind::Realtime);
     ticks.persist(record_words);
     let written = |port: &Port| {
         link::written(record_words, &port.topic.to_string(), words(port), voids, (ledger, extent(scenario)))
     };
     let written = ports.writes.iter().map(written).collect();
     let read = |port: &Port| {
-        let mut read = ReadBook::default();
+        let mut read = ReadCounters::default();
         read.persist(record_words);
         read.report(&port.topic.to_string())
     };
@@ -491,13 +493,13 @@ pub fn topic(scenario: &Scenario, body: &str, signal: Signal) -> Topic {
     Topic { scenario: scenario.name.clone(), body: body.to_owned(), signal }
 }
 
-/// Opens a role's links and builds its node, with its books in the ledger: new, or a predecessor's.
+/// Opens a role's links and builds its node, with its counters in the ledger: new, or a predecessor's.
 ///
 /// # Errors
 /// [`BusError::Open`].
 pub fn build<'a>(
     scenario: &Scenario,
-    occupant: impl Into<Occupant>,
+    occupant: impl Into<RoleImpl>,
     bus: impl Into<AnyBus<'a>>,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
@@ -511,7 +513,7 @@ pub fn build<'a>(
 pub fn build_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Scenario,
-    occupant: impl Into<Occupant>,
+    occupant: impl Into<RoleImpl>,
     bus: &B,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
@@ -522,7 +524,7 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
         let generation = ledger.enter();
         Seat { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
     };
-    if let Occupant::Device(index, link) = occupant {
+    if let RoleImpl::Device(index, link) = occupant {
         let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
         return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
     }

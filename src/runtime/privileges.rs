@@ -39,10 +39,10 @@ pub struct Privileges {
     /// Everything that was asked for, granted or not.
     pub grants: Vec<Grant>,
     /// Whether the role runs before all ordinary processes.
-    pub first_served: bool,
+    pub has_realtime: bool,
     /// The other roles on the role's core, all of one priority. Among these whoever waits for another's sample gives way to
     /// it: a switch between equals costs a fraction of what falling asleep does.
-    pub beside: Vec<RoleId>,
+    pub co_located: Vec<RoleId>,
 }
 
 /// Takes what a role of a scenario asks for, for the calling thread.
@@ -59,21 +59,21 @@ pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
         let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
         grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), remedy));
     }
-    let first_served = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
+    let has_realtime = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
     // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
-    let cores = cores(settings, first_served);
-    let mut beside = Vec::new();
+    let cores = cores(settings, has_realtime);
+    let mut co_located = Vec::new();
     if let Some(core) = core_of(&cores, role, scenario) {
         let mut set = CpuSet::new();
         set.set(core);
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
-        if pinned.is_ok() && first_served {
-            beside = RoleId::all(scenario);
-            beside.retain(|other| other.host(scenario) != role && core_of(&cores, *other, scenario) == Some(core));
+        if pinned.is_ok() && has_realtime {
+            co_located = RoleId::all(scenario);
+            co_located.retain(|other| other.host(scenario) != role && core_of(&cores, *other, scenario) == Some(core));
         }
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
-    Privileges { grants, first_served, beside }
+    Privileges { grants, has_realtime, co_located }
 }
 
 /// Opens `/dev/cpu_dma_latency` and asks for 0 µs. The request lasts as long as the file is open.
@@ -99,10 +99,10 @@ fn grant(privilege: &str, asked: String, result: io::Result<()>, remedy: &str) -
 }
 
 /// The cores that roles are to be bound to; none if they are not.
-fn cores(settings: &Realtime, first_served: bool) -> Vec<usize> {
+fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
     match &settings.cores {
         Cores::List(cores) => cores.clone(),
-        Cores::Named(NamedCores::Auto) if first_served => sched_getaffinity(None)
+        Cores::Named(NamedCores::Auto) if has_realtime => sched_getaffinity(None)
             .map_or(Vec::new(), |allowed| (0..CpuSet::MAX_CPU).filter(|core| allowed.is_set(*core)).collect()),
         Cores::Named(_) => Vec::new(),
     }
@@ -127,9 +127,9 @@ fn set_fifo(priority: i32) -> io::Result<()> {
 }
 
 /// Opens links to a loop that may be running, for a process that no role waits for, and gives way to everybody from then on.
-pub fn join_beside<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() -> T) -> T {
-    let opened = hurried(open);
-    give_way(scenario, niceness);
+pub fn join_at_low_priority<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() -> T) -> T {
+    let opened = with_realtime_priority(open);
+    yield_cores(scenario, niceness);
     opened
 }
 
@@ -137,7 +137,7 @@ pub fn join_beside<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() ->
 ///
 /// A role that finds a link half made waits until it is whole, and must not wait for a process that others keep from going
 /// on.
-pub fn hurried<T>(act: impl FnOnce() -> T) -> T {
+pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
     // Not granted, it takes its chance; a role's priority is above this in any case.
     let _ = set_fifo(1);
     let done = act();
@@ -146,7 +146,7 @@ pub fn hurried<T>(act: impl FnOnce() -> T) -> T {
 }
 
 /// Lets everybody pass, and leaves the cores that the scenario names for roles. What is not granted is no harm.
-fn give_way(scenario: &Scenario, niceness: i32) {
+fn yield_cores(scenario: &Scenario, niceness: i32) {
     let _ = nice(niceness);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
         critical.iter().for_each(|core| allowed.unset(*core));
@@ -214,8 +214,8 @@ mod tests {
     fn what_is_not_granted_is_reported_with_a_remedy() {
         let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
         let scenario = shipped("rigid-pair", &overrides);
-        let Privileges { grants, first_served, beside } = take(&scenario, RoleId::Observer);
-        assert_eq!((grants.len(), first_served, beside), (1, false, Vec::new()));
+        let Privileges { grants, has_realtime, co_located } = take(&scenario, RoleId::Observer);
+        assert_eq!((grants.len(), has_realtime, co_located), (1, false, Vec::new()));
         assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");
     }
 }

@@ -3,9 +3,9 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::bridge::DeviceError;
-use super::drive::{Control, Drive, Ended, Voice, Waiting};
-use super::hooks::{self, Place};
-use super::node::{self, Occupant, ReadyNode, RoleId, ledger_file, ledger_words, report, topic};
+use super::drive::{Control, Drive, Ended, Heartbeat, Waiting};
+use super::hooks::{self, Failpoint};
+use super::node::{self, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
 use super::privileges::Privileges;
 use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError};
@@ -91,7 +91,7 @@ pub enum RoleError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// The books could not be opened.
+    /// The counters could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),
     /// The launcher did not give the word in time.
@@ -130,7 +130,7 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     require_process(&scenario, role)?;
     let others = role.hosted(&scenario).into_iter().filter(|other| *other != role);
     let others = others.map(|other| Ok((other, take_ledger(&domain, &scenario, other)?)));
-    let occupant = Occupant::Role(role, others.collect::<Result<_, LedgerError>>()?);
+    let occupant = RoleImpl::Role(role, others.collect::<Result<_, LedgerError>>()?);
     in_domain(&domain, &scenario, occupant, terminated, |_| {})
 }
 
@@ -158,7 +158,7 @@ pub(super) fn find_role(scenario: &Scenario, name: &str) -> Result<RoleId, RoleE
 pub(super) fn in_domain(
     domain: &Domain,
     scenario: &Scenario,
-    occupant: Occupant,
+    occupant: RoleImpl,
     terminated: &AtomicBool,
     mut reported: impl FnMut(&RoleReport),
 ) -> Result<(), RoleError> {
@@ -169,7 +169,7 @@ pub(super) fn in_domain(
     let ledger = take_ledger(domain, scenario, role)?;
     let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
     hooks::enter(&roles, ledger.generation() + 1);
-    hooks::at(Place::Opening);
+    hooks::at(Failpoint::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
     let build = |occupant| node::build(scenario, occupant, &bus, &ledger);
     let service = Service { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
@@ -213,7 +213,7 @@ pub struct Service<'a, B> {
     pub scenario: &'a Scenario,
     /// The bus.
     pub bus: &'a B,
-    /// The books, new or a predecessor's.
+    /// The counters, new or a predecessor's.
     pub ledger: &'a Ledger,
     /// Whether this process was asked to end.
     pub terminated: &'a AtomicBool,
@@ -228,25 +228,25 @@ pub struct Service<'a, B> {
 /// [`RoleError`].
 pub fn serve<B: Bus + 'static>(
     service: Service<'_, B>,
-    occupant: impl Into<Occupant>,
-    build: impl FnOnce(Occupant) -> Result<ReadyNode, BusError>,
+    occupant: impl Into<RoleImpl>,
+    build: impl FnOnce(RoleImpl) -> Result<ReadyNode, BusError>,
     mut deliver: impl FnMut(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
     let Service { scenario, bus, ledger, terminated, privileges } = service;
     let occupant = occupant.into();
     let (role, books) = (occupant.role(), occupant.books(ledger));
-    let voice = |(role, ledger): &(RoleId, Ledger)| {
+    let heartbeat = |(role, ledger): &(RoleId, Ledger)| {
         let (role, generation) = (*role, ledger.generation() + 1);
         let health = bus.writer(&topic(scenario, role.name(scenario), Signal::Health), generation)?;
-        Ok(Voice { role, health, generation })
+        Ok(Heartbeat { role, health, generation })
     };
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
-    let voices = books.iter().map(voice).collect::<Result<_, BusError>>()?;
+    let heartbeats = books.iter().map(heartbeat).collect::<Result<_, BusError>>()?;
     let mut node = build(occupant)?;
     node.restore()?;
     let mut control = Control::<B>::new(
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
-        voices,
+        heartbeats,
         privileges.grants.iter().filter(|grant| !grant.granted).count() as u64,
         terminated,
     );
@@ -301,7 +301,7 @@ fn begin<B: Bus>(
     if scenario.clock == ClockKind::Realtime && leads && control.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
-    hooks::at(Place::Ready);
+    hooks::at(Failpoint::Ready);
     await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
 }
 
@@ -349,12 +349,12 @@ fn await_phase<B: Bus>(
 fn waiting<'a>(scenario: &Scenario, privileges: &'a Privileges) -> Waiting<'a> {
     let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
     let [lead_ns, spin_ns] = [wake_lead_us, spin_us].map(|us| ((us * 1e3) as u64).min(scenario.period_ns / 4));
-    let (spin_ns, give_way) = match wake {
-        Wake::Auto if privileges.first_served => (spin_ns, &privileges.beside[..]),
+    let (spin_ns, yields_to) = match wake {
+        Wake::Auto if privileges.has_realtime => (spin_ns, &privileges.co_located[..]),
         Wake::Spin => (spin_ns, &[][..]),
         Wake::Auto | Wake::Event => (0, &[][..]),
     };
-    Waiting { lead_ns, spin_ns, give_way, cutoff }
+    Waiting { lead_ns, spin_ns, yields_to, cutoff }
 }
 
 fn drive<B: Bus>(

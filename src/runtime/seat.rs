@@ -53,7 +53,7 @@ pub struct SeatDescription {
     /// The bit of a sample's `generation` that makes it a void: its tick has no sample.
     void_bit: u32,
     warm_up: WarmUp,
-    /// Where the role may leave its books, and where this description lies while a run waits; none without a domain.
+    /// Where the role may leave its counters, and where this description lies while a run waits; none without a domain.
     report: Option<PathBuf>,
     /// The scenario as resolved: parameters and initial states of all bodies.
     scenario: toml::Table,

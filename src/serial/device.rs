@@ -120,8 +120,8 @@ impl<B: SingleBody, M: FnMut(&Hello<'_>) -> Option<B>> Device<B, M> {
     }
 
     /// What has been met on the line.
-    pub fn book(&self) -> FrameBook {
-        self.decoder.book()
+    pub fn counters(&self) -> FrameBook {
+        self.decoder.counters()
     }
 }
 

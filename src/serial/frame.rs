@@ -71,7 +71,7 @@ pub struct Decoder {
     excess: u64,
     /// Whether a block was dropped since the last good frame.
     lost: bool,
-    book: FrameBook,
+    counters: FrameBook,
 }
 
 enum Fault {
@@ -81,14 +81,14 @@ enum Fault {
 
 impl Default for Decoder {
     fn default() -> Self {
-        Self { block: [0; MAX_BLOCK], length: 0, excess: 0, lost: false, book: FrameBook::default() }
+        Self { block: [0; MAX_BLOCK], length: 0, excess: 0, lost: false, counters: FrameBook::default() }
     }
 }
 
 impl Decoder {
     /// Takes one byte; returns the payload of the frame that it completes, if it does.
     pub fn push(&mut self, byte: u8) -> Option<&[u8]> {
-        self.book.bytes += 1;
+        self.counters.bytes += 1;
         if byte != DELIMITER {
             self.keep(byte);
             return None;
@@ -100,14 +100,15 @@ impl Decoder {
         let opened = if excess == 0 { open(&mut self.block[..length]) } else { Err(Fault::Form) };
         match opened {
             Ok(payload) => {
-                self.book.frames += 1;
-                self.book.resyncs += u64::from(core::mem::take(&mut self.lost));
+                self.counters.frames += 1;
+                self.counters.resyncs += u64::from(core::mem::take(&mut self.lost));
                 Some(&self.block[..payload])
             }
             Err(fault) => {
-                let count = if let Fault::Crc = fault { &mut self.book.crc_errors } else { &mut self.book.malformed };
+                let count =
+                    if let Fault::Crc = fault { &mut self.counters.crc_errors } else { &mut self.counters.malformed };
                 *count += 1;
-                self.book.dropped_bytes += length as u64 + excess;
+                self.counters.dropped_bytes += length as u64 + excess;
                 self.lost = true;
                 None
             }
@@ -126,13 +127,13 @@ impl Decoder {
     /// Forgets the block at hand: the line was cut there.
     pub fn cut(&mut self) {
         self.lost |= self.length > 0;
-        self.book.dropped_bytes += self.length as u64 + self.excess;
+        self.counters.dropped_bytes += self.length as u64 + self.excess;
         (self.length, self.excess) = (0, 0);
     }
 
     /// What has been met so far.
-    pub fn book(&self) -> FrameBook {
-        self.book
+    pub fn counters(&self) -> FrameBook {
+        self.counters
     }
 
     fn keep(&mut self, byte: u8) {
@@ -165,7 +166,7 @@ mod tests {
     fn decode(bytes: &[u8]) -> (Vec<Vec<u8>>, FrameBook) {
         let (mut decoder, mut found) = (Decoder::default(), Vec::new());
         decoder.feed(bytes, |payload| found.push(payload.to_vec()));
-        (found, decoder.book())
+        (found, decoder.counters())
     }
 
     /// The check value of the catalogue of CRCs, and a frame that firmware may be compared with.
@@ -186,10 +187,10 @@ mod tests {
     #[test]
     fn what_is_no_frame_is_counted() {
         let bytes = [&[0, 1, 2, 3, 0, 2, 5, 0][..], &frame(b"payload"), &vec![9; 2000], &frame(b"again")].concat();
-        let (found, book) = decode(&bytes);
+        let (found, counters) = decode(&bytes);
         assert_eq!(found, [b"payload".to_vec(), b"again".to_vec()]);
-        assert_eq!((book.frames, book.resyncs, book.crc_errors), (2, 2, 0));
-        assert_eq!((book.malformed, book.dropped_bytes, book.bytes), (3, 2005, bytes.len() as u64));
+        assert_eq!((counters.frames, counters.resyncs, counters.crc_errors), (2, 2, 0));
+        assert_eq!((counters.malformed, counters.dropped_bytes, counters.bytes), (3, 2005, bytes.len() as u64));
     }
 
     #[test]
@@ -200,7 +201,7 @@ mod tests {
         decoder.cut();
         let mut found = 0;
         decoder.feed(&whole, |_| found += 1);
-        assert_eq!((found, decoder.book().dropped_bytes, decoder.book().resyncs), (1, 4, 1));
+        assert_eq!((found, decoder.counters().dropped_bytes, decoder.counters().resyncs), (1, 4, 1));
     }
 
     fn payload() -> impl Strategy<Value = Vec<u8>> {
@@ -210,10 +211,10 @@ mod tests {
     proptest! {
         #[test]
         fn no_bytes_make_it_fail_and_all_of_them_are_accounted_for(bytes in prop::collection::vec(any::<u8>(), 0..3000)) {
-            let (found, book) = decode(&bytes);
-            prop_assert_eq!(found.len() as u64, book.frames);
-            prop_assert_eq!(book.bytes, bytes.len() as u64);
-            prop_assert!(book.dropped_bytes <= book.bytes);
+            let (found, counters) = decode(&bytes);
+            prop_assert_eq!(found.len() as u64, counters.frames);
+            prop_assert_eq!(counters.bytes, bytes.len() as u64);
+            prop_assert!(counters.dropped_bytes <= counters.bytes);
         }
 
         /// Garbage takes no frame with it, wherever it ends: every frame brings its own delimiters.
@@ -232,9 +233,9 @@ mod tests {
             let mut bytes = frame(&payload);
             let at = at.index(bytes.len());
             bytes[at] ^= flip;
-            let (found, book) = decode(&bytes);
+            let (found, counters) = decode(&bytes);
             // A delimiter that is damaged joins the frame with what is around it, here nothing.
-            prop_assert!(found.iter().all(|found| *found == payload), "{:?}", book);
+            prop_assert!(found.iter().all(|found| *found == payload), "{:?}", counters);
             if at > 0 && at < bytes.len() - 1 {
                 prop_assert!(found.is_empty());
             }

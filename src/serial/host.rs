@@ -1,4 +1,4 @@
-//! The host's end: what to send when, which answers count, and the books of the line.
+//! The host's end: what to send when, which answers count, and the counters of the line.
 //!
 //! A request is repeated until it is answered or given up, and a device that is silent for long is greeted anew. Must not
 //! do I/O, nor look at a clock: both are handed in.
@@ -18,9 +18,9 @@ const LONGEST_REPEAT_NS: u64 = 1_000_000_000;
 const PATIENT_ROUND_TRIPS: u64 = 2;
 const SMOOTHING: u32 = 3;
 
-/// The books of a line.
+/// The counters of a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct LineBook {
+pub struct LineCounters {
     /// Frames sent, repeated ones too.
     pub frames_sent: u64,
     /// Their bytes.
@@ -117,7 +117,7 @@ pub struct Host {
     silent_since_ns: Option<u64>,
     /// Smoothed, ns.
     round_trip_ns: u64,
-    book: LineBook,
+    counters: LineCounters,
 }
 
 impl Host {
@@ -136,7 +136,7 @@ impl Host {
             silent: 0,
             silent_since_ns: None,
             round_trip_ns: 0,
-            book: LineBook::default(),
+            counters: LineCounters::default(),
         }
     }
 
@@ -158,7 +158,7 @@ impl Host {
 
     /// Asks no more for the tick at hand.
     pub fn give_up(&mut self) {
-        self.book.unanswered += u64::from(self.request.take().is_some());
+        self.counters.unanswered += u64::from(self.request.take().is_some());
     }
 
     /// The frame to be sent now, if there is one. To be asked again until there is none.
@@ -181,7 +181,7 @@ impl Host {
         request.due_ns = now_ns + (repeat_ns << request.sent.min(8)).min(LONGEST_REPEAT_NS.max(repeat_ns));
         (request.sent_ns, request.sequence) = (now_ns, sequence);
         request.sent += 1;
-        self.book.repeats += u64::from(request.sent > 1);
+        self.counters.repeats += u64::from(request.sent > 1);
         self.silent += 1;
         self.silent_since_ns.get_or_insert(now_ns);
         let (tick, command, length) = (request.tick, request.command, request.length);
@@ -195,29 +195,29 @@ impl Host {
 
     /// Takes a byte that has arrived, and tells what it completes.
     pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<Heard<'_>> {
-        let Self { terms, decoder, heard, book, .. } = self;
+        let Self { terms, decoder, heard, counters, .. } = self;
         let (sequence, message) = match parse(decoder.push(byte)?) {
             Ok(said) => said,
             Err(ParseError::Version(version)) => return Some(Heard::OtherVersion(version)),
             Err(ParseError::Malformed) => {
-                book.malformed += 1;
+                counters.malformed += 1;
                 return None;
             }
         };
         match message {
-            Message::Hello(_) | Message::Tick(_) | Message::Stop => book.echoes += 1,
+            Message::Hello(_) | Message::Tick(_) | Message::Stop => counters.echoes += 1,
             Message::Welcome(welcome) if welcome.run == terms.run => {
                 // A greeted device that welcomes again has heard two greetings.
                 let restarted = !self.greeted && self.answered.is_some_and(|answered| welcome.next_tick <= answered);
                 if restarted {
-                    book.restarts += 1;
+                    counters.restarts += 1;
                     // It counts from 0: the next frame is the first that is comparable.
                     *heard = None;
                 } else {
-                    note(heard, book, sequence);
+                    note(heard, counters, sequence);
                 }
                 if !self.greeted {
-                    book.handshakes += 1;
+                    counters.handshakes += 1;
                     self.greeted = true;
                     self.silent = 0;
                     if let Some(request) = &mut self.request {
@@ -227,18 +227,18 @@ impl Host {
                 }
             }
             // Of another run: it was on its way for long.
-            Message::Welcome(_) => book.late += 1,
+            Message::Welcome(_) => counters.late += 1,
             Message::Refuse(Refuse { reason: Reason::NotGreeted, .. }) => {
-                note(heard, book, sequence);
+                note(heard, counters, sequence);
                 self.greeted = false;
             }
             Message::Refuse(refusal) => return Some(Heard::Refused(refusal)),
             Message::Answer(answer) => {
-                note(heard, book, sequence);
+                note(heard, counters, sequence);
                 let lengths = (answer.measurement.len(), answer.truth.len());
                 if lengths != (terms.measurement_length, terms.truth_length) && lengths != (terms.measurement_length, 0)
                 {
-                    book.malformed += 1;
+                    counters.malformed += 1;
                     return None;
                 }
                 self.silent = 0;
@@ -251,8 +251,8 @@ impl Host {
                         }
                         return Some(Heard::Answer(answer));
                     }
-                    None if self.answered.is_some_and(|tick| answer.tick == tick) => book.duplicates += 1,
-                    None => book.late += 1,
+                    None if self.answered.is_some_and(|tick| answer.tick == tick) => counters.duplicates += 1,
+                    None => counters.late += 1,
                 }
             }
         }
@@ -267,12 +267,12 @@ impl Host {
 
     /// The line was opened again.
     pub fn reopened(&mut self) {
-        self.book.reopened += 1;
+        self.counters.reopened += 1;
     }
 
     /// The line did not take a frame.
     pub fn unsent(&mut self) {
-        self.book.unsent += 1;
+        self.counters.unsent += 1;
     }
 
     /// For how long the device has not answered, ns; 0 if nothing is waited for.
@@ -290,17 +290,17 @@ impl Host {
         self.silent_since_ns = None;
     }
 
-    /// The books.
-    pub fn book(&self) -> LineBook {
-        let frames = self.decoder.book();
-        LineBook {
+    /// The counters.
+    pub fn counters(&self) -> LineCounters {
+        let frames = self.decoder.counters();
+        LineCounters {
             frames_received: frames.frames,
             bytes_received: frames.bytes,
             crc_errors: frames.crc_errors,
-            malformed: self.book.malformed + frames.malformed,
+            malformed: self.counters.malformed + frames.malformed,
             dropped_bytes: frames.dropped_bytes,
             resyncs: frames.resyncs,
-            ..self.book
+            ..self.counters
         }
     }
 
@@ -321,18 +321,18 @@ impl Host {
             .and_then(|payload| encode(payload, &mut self.frame))
             .expect("every message whose texts and contents are within their limits fits into a frame");
         self.sequence = self.sequence.wrapping_add(1);
-        self.book.frames_sent += 1;
-        self.book.bytes_sent += frame.len() as u64;
+        self.counters.frames_sent += 1;
+        self.counters.bytes_sent += frame.len() as u64;
         frame
     }
 }
 
 /// Counts the frames between the newest one heard and this one. One that is not newer came again: it is no gap, and nothing
 /// is counted from it.
-fn note(heard: &mut Option<u32>, book: &mut LineBook, sequence: u32) {
+fn note(heard: &mut Option<u32>, counters: &mut LineCounters, sequence: u32) {
     let ahead = heard.map_or(1, |newest| sequence.wrapping_sub(newest));
     if (1..=u32::MAX / 2).contains(&ahead) {
-        book.sequence_gaps += u64::from(ahead - 1);
+        counters.sequence_gaps += u64::from(ahead - 1);
         *heard = Some(sequence);
     }
 }

@@ -72,7 +72,7 @@ mod tests;
 
 pub use device::Device;
 pub use frame::{CRC, Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, TooLong, encode};
-pub use host::{Heard, Host, LineBook, Terms};
+pub use host::{Heard, Host, LineCounters, Terms};
 pub use message::{
     Answer, Hello, MAX_CONTENT, MAX_TEXT, Message, ParseError, Reason, Refuse, Tick, VERSION, Welcome, parse, write,
 };
@@ -82,5 +82,5 @@ pub use message::{
 pub fn decode(bytes: &[u8], mut each: impl FnMut(Result<(u32, Message<'_>), ParseError>)) -> FrameBook {
     let mut decoder = Decoder::default();
     decoder.feed(bytes, |payload| each(parse(payload)));
-    decoder.book()
+    decoder.counters()
 }

@@ -220,9 +220,15 @@ fn a_device_answers_as_the_built_in_plant_does() {
     for (tick, expected) in (0..).zip(built_in(50)) {
         assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 1_000_000_000), Some(expected));
     }
-    let book = rig.host.book();
-    assert_eq!((book.handshakes, book.repeats, book.duplicates, book.late, book.sequence_gaps), (1, 0, 0, 0, 0));
-    assert_eq!((book.frames_sent, book.frames_received, book.crc_errors, book.dropped_bytes), (51, 51, 0, 0));
+    let counters = rig.host.counters();
+    assert_eq!(
+        (counters.handshakes, counters.repeats, counters.duplicates, counters.late, counters.sequence_gaps),
+        (1, 0, 0, 0, 0)
+    );
+    assert_eq!(
+        (counters.frames_sent, counters.frames_received, counters.crc_errors, counters.dropped_bytes),
+        (51, 51, 0, 0)
+    );
 }
 
 proptest! {
@@ -234,8 +240,8 @@ proptest! {
         for (tick, expected) in (0..).zip(built_in(100)) {
             prop_assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 3_600_000_000_000), Some(expected));
         }
-        let book = rig.host.book();
-        prop_assert!(book.frames_received + book.crc_errors + book.malformed + book.sequence_gaps >= 101);
+        let counters = rig.host.counters();
+        prop_assert!(counters.frames_received + counters.crc_errors + counters.malformed + counters.sequence_gaps >= 101);
     }
 }
 
@@ -246,9 +252,12 @@ fn a_faulty_line_is_seen_in_the_books() {
     for tick in 0..300 {
         assert!(rig.ask(tick, Some(0.0), 3_600_000_000_000).is_some());
     }
-    let book = rig.host.book();
-    assert!(book.crc_errors > 10 && book.repeats > 30 && book.resyncs > 10 && book.dropped_bytes > 500, "{book:?}");
-    assert!(book.sequence_gaps > 10 && book.frames_sent > 330 && book.late == 0, "{book:?}");
+    let counters = rig.host.counters();
+    assert!(
+        counters.crc_errors > 10 && counters.repeats > 30 && counters.resyncs > 10 && counters.dropped_bytes > 500,
+        "{counters:?}"
+    );
+    assert!(counters.sequence_gaps > 10 && counters.frames_sent > 330 && counters.late == 0, "{counters:?}");
 }
 
 #[test]
@@ -333,8 +342,8 @@ fn a_device_that_began_anew_is_greeted_at_once() {
     let Some(Event::Answer(2, CommandEvent::Applied, measurement, _)) = rig.ask(2, Some(1.0), 20 * PERIOD_NS) else {
         panic!()
     };
-    let book = rig.host.book();
-    assert_eq!((measurement.omega_rad_s[0], book.handshakes, book.restarts), (1.0, 2, 1));
+    let counters = rig.host.counters();
+    assert_eq!((measurement.omega_rad_s[0], counters.handshakes, counters.restarts), (1.0, 2, 1));
 }
 
 #[test]
@@ -347,14 +356,16 @@ fn a_silent_device_is_greeted_anew_and_goes_on_where_it_was() {
     for tick in 2..20 {
         assert_eq!(rig.ask(tick, Some(1.0), PERIOD_NS), None);
     }
-    assert!(!rig.host.greeted() && rig.host.book().unanswered == 18 && rig.host.silent_ns(rig.now_ns) > 10 * PERIOD_NS);
+    assert!(
+        !rig.host.greeted() && rig.host.counters().unanswered == 18 && rig.host.silent_ns(rig.now_ns) > 10 * PERIOD_NS
+    );
     rig.cut = false;
     let Some(Event::Answer(20, CommandEvent::Applied, measurement, _)) = rig.ask(20, Some(1.0), 20 * PERIOD_NS) else {
         panic!()
     };
     assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15, "it was safe meanwhile, not reset: {measurement:?}");
-    let book = rig.host.book();
-    assert_eq!((book.handshakes, book.restarts, rig.host.silent_ns(rig.now_ns)), (2, 0, 0));
+    let counters = rig.host.counters();
+    assert_eq!((counters.handshakes, counters.restarts, rig.host.silent_ns(rig.now_ns)), (2, 0, 0));
 }
 
 #[test]
@@ -413,8 +424,8 @@ fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
     rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
     assert_eq!(rig.hear(&answer).len(), 1);
     assert!(rig.hear(&answer).is_empty() && rig.hear(&asked).is_empty());
-    let book = rig.host.book();
-    assert_eq!((book.late, book.duplicates, book.echoes, book.unanswered), (1, 1, 1, 1));
+    let counters = rig.host.counters();
+    assert_eq!((counters.late, counters.duplicates, counters.echoes, counters.unanswered), (1, 1, 1, 1));
 }
 
 /// A frame of the device with this sequence number, which is no answer to anything that is asked.
@@ -446,7 +457,7 @@ proptest! {
             if again {
                 rig.hear(&frame_of(heard[old.index(heard.len())]));
             }
-            prop_assert_eq!(rig.host.book().sequence_gaps, lost);
+            prop_assert_eq!(rig.host.counters().sequence_gaps, lost);
         }
     }
 
@@ -476,8 +487,8 @@ proptest! {
             }
         }
         prop_assert!(rig.ask(tick, None, 20 * PERIOD_NS).is_some());
-        let book = rig.host.book();
-        prop_assert_eq!((book.restarts, book.sequence_gaps), (restarts, 0));
+        let counters = rig.host.counters();
+        prop_assert_eq!((counters.restarts, counters.sequence_gaps), (restarts, 0));
     }
 }
 
@@ -497,7 +508,7 @@ fn an_answer_of_another_length_is_none() {
         frame.iter().for_each(|byte| heard += usize::from(rig.host.push(*byte, rig.now_ns).is_some()));
         assert_eq!(heard, expected);
     }
-    assert_eq!(rig.host.book().malformed, 2);
+    assert_eq!(rig.host.counters().malformed, 2);
 }
 
 #[test]

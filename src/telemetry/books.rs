@@ -9,7 +9,7 @@ use crate::state::persist_fields;
 
 /// The counters of a role's ticks.
 #[derive(Debug, Default)]
-pub struct TickBook {
+pub struct TickCounters {
     next: u64,
     executed: u64,
     missed: u64,
@@ -20,9 +20,9 @@ pub struct TickBook {
     first_disturbed: Option<u64>,
 }
 
-persist_fields!(TickBook, next, executed, missed, starved, safe, stalled, anew, first_disturbed);
+persist_fields!(TickCounters, next, executed, missed, starved, safe, stalled, anew, first_disturbed);
 
-impl TickBook {
+impl TickCounters {
     /// The next tick to execute.
     #[inline]
     pub fn next(&self) -> u64 {
@@ -95,7 +95,7 @@ impl TickBook {
 
 /// The counters of a signal's writing end, with its hash.
 #[derive(Debug)]
-pub struct WriteBook {
+pub struct WriteCounters {
     published: u64,
     skipped: u64,
     void: u64,
@@ -105,9 +105,9 @@ pub struct WriteBook {
     hash: StateHash,
 }
 
-persist_fields!(WriteBook, published, skipped, void, extra, injected, last_tick, hash);
+persist_fields!(WriteCounters, published, skipped, void, extra, injected, last_tick, hash);
 
-impl WriteBook {
+impl WriteCounters {
     /// Words of the ledger beside the record, for a run that ends with `last_tick`.
     pub fn words(last_tick: u64) -> usize {
         StateHash::words(last_tick)
@@ -167,7 +167,7 @@ impl WriteBook {
 
 /// The counters of a signal's reading end.
 #[derive(Debug, Default)]
-pub struct ReadBook {
+pub struct ReadCounters {
     received: u64,
     gaps: u64,
     stale: u64,
@@ -177,9 +177,9 @@ pub struct ReadBook {
     rejected: u64,
 }
 
-persist_fields!(ReadBook, received, gaps, stale, covered, void, rejected);
+persist_fields!(ReadCounters, received, gaps, stale, covered, void, rejected);
 
-impl ReadBook {
+impl ReadCounters {
     /// The tick after the last that is counted.
     #[inline]
     pub fn covered(&self) -> u64 {

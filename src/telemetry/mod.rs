@@ -10,7 +10,7 @@ mod latency;
 mod ledger;
 mod report;
 
-pub use books::{ReadBook, TickBook, WriteBook};
+pub use books::{ReadCounters, TickCounters, WriteCounters};
 pub use export::{write_hgrm, write_hlog};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;

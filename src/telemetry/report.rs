@@ -1,7 +1,7 @@
-//! What a role says of its run when it ends: the books, the hash, the histograms, the privileges.
+//! What a role says of its run when it ends: the counters, the hash, the histograms, the privileges.
 
 use super::{Checkpoints, Latency};
-use crate::serial::LineBook;
+use crate::serial::LineCounters;
 use serde::{Deserialize, Serialize};
 
 /// A role's account of itself.
@@ -24,8 +24,8 @@ pub struct RoleReport {
     /// What it asked of the machine, and what it got.
     #[serde(default)]
     pub grants: Vec<Grant>,
-    /// The books of its device's serial line, if a device has the seat.
-    pub line: Option<LineBook>,
+    /// The counters of its device's serial line, if a device has the seat.
+    pub line: Option<LineCounters>,
 }
 
 /// What a watchdog saw.
@@ -54,7 +54,7 @@ pub struct WatchedReport {
     pub largest: Option<f64>,
 }
 
-/// The books of a role's ticks: `elapsed` = `executed` + `missed`.
+/// The counters of a role's ticks: `elapsed` = `executed` + `missed`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Ticks {
     /// Ticks that the role should have executed until it ended.
@@ -79,7 +79,7 @@ pub struct Ticks {
     pub first_disturbed: Option<u64>,
 }
 
-/// The books of a signal's writing end: `published` + `void` + `skipped` = `last_tick` + 1.
+/// The counters of a signal's writing end: `published` + `void` + `skipped` = `last_tick` + 1.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct LinkWritten {
     /// The service.
@@ -104,7 +104,7 @@ pub struct LinkWritten {
     pub hash: Option<Checkpoints>,
 }
 
-/// The books of a signal's reading end: `received` + `void` + `gaps` = `last_tick` + 1.
+/// The counters of a signal's reading end: `received` + `void` + `gaps` = `last_tick` + 1.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LinkRead {
     /// The service.

@@ -10,7 +10,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
-use crate::runtime::{RoleError, depths, hurried, join, join_beside, topic};
+use crate::runtime::{RoleError, depths, join, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -64,7 +64,7 @@ impl Session {
             tick_s: scenario.tick_s(),
             ..Model::default()
         };
-        let joined = join_beside(&scenario, NICENESS, || Joined::open(&domain, &scenario, end_ns, &mut model));
+        let joined = join_at_low_priority(&scenario, NICENESS, || Joined::open(&domain, &scenario, end_ns, &mut model));
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
@@ -109,7 +109,7 @@ impl Session {
     fn leave(&mut self) {
         self.refresh();
         if let Some(joined) = self.joined.take() {
-            hurried(|| drop(joined));
+            with_realtime_priority(|| drop(joined));
             self.model.ended = true;
             self.domain.forget();
         }

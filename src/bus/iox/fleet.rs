@@ -1,7 +1,7 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
 use super::{Connections, IoxBus, Ipc, buffer_size, cause};
-use crate::bus::bell::Bell;
+use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample};
 use bytemuck::TransparentWrapper;
@@ -39,7 +39,7 @@ pub struct IoxFleetWriter<L: FleetLayout> {
     publisher: Publisher<Ipc, [Word<L>], ()>,
     loan: Option<SampleMut<Ipc, [Word<L>], ()>>,
     length: usize,
-    bell: Bell,
+    notifier: Notifier,
     topic: Topic,
 }
 
@@ -52,7 +52,7 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
             let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
             connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
         })?;
-        Ok(Self { publisher, loan: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
+        Ok(Self { publisher, loan: None, length, notifier: bus.notifiers.of(topic), topic: topic.clone() })
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, [Word<L>], ()>, BusError> {
@@ -85,7 +85,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     fn deliver(&mut self) -> Result<(), BusError> {
         let Some(sample) = self.loan.take() else { return Ok(()) };
         sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
-        self.bell.ring();
+        self.notifier.notify();
         Ok(())
     }
 
@@ -109,7 +109,7 @@ pub struct IoxFleetReader<L: FleetLayout> {
     subscriber: Subscriber<Ipc, [Word<L>], ()>,
     current: Option<Received<Ipc, [Word<L>], ()>>,
     length: usize,
-    bell: Bell,
+    notifier: Notifier,
     topic: Topic,
 }
 
@@ -128,7 +128,7 @@ impl<L: FleetLayout> IoxFleetReader<L> {
             connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
         })?;
         let length = FleetSample::<L>::length(bodies);
-        Ok(Self { service, subscriber, current: None, length, bell: bus.bells.of(topic), topic: topic.clone() })
+        Ok(Self { service, subscriber, current: None, length, notifier: bus.notifiers.of(topic), topic: topic.clone() })
     }
 
     #[cold]
@@ -165,7 +165,7 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
         let news =
             || self.subscriber.has_samples().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))));
-        self.bell.sleep(until_ns, news)
+        self.notifier.sleep(until_ns, news)
     }
 
     fn refresh(&mut self) {}

@@ -2,7 +2,7 @@
 
 use super::latest::{LatestReader, LatestWriter};
 use super::{Ipc, Wire, cause, is_written};
-use crate::bus::bell::Bell;
+use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Topic, Write};
 use crate::sample::{Sample, VOID};
 use iceoryx2::node::Node;
@@ -21,7 +21,7 @@ pub struct IoxWriter<S: Sample> {
     pub(super) loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
     /// What was shown in the lane and is not sent.
     pub(super) shown: Option<SampleMut<Ipc, Wire<S>, ()>>,
-    pub(super) bell: Bell,
+    pub(super) notifier: Notifier,
     pub(super) topic: Topic,
 }
 
@@ -33,7 +33,7 @@ impl<S: Sample> IoxWriter<S> {
         if let Some(latest) = &self.latest {
             latest.put(&sample.payload().0);
             // Whoever looks at the lane need not sleep until the queues are served.
-            self.bell.ring();
+            self.notifier.notify();
         }
         Some(sample)
     }
@@ -41,7 +41,7 @@ impl<S: Sample> IoxWriter<S> {
     #[inline]
     fn queue(&self, sample: SampleMut<Ipc, Wire<S>, ()>) -> Result<(), BusError> {
         sample.send().map_err(|error| self.failed(cause::reason(|| format!("{error:?}"))))?;
-        self.bell.ring();
+        self.notifier.notify();
         Ok(())
     }
 
@@ -117,7 +117,7 @@ pub struct IoxReader<S: Sample> {
     pub(super) pending: Option<Received<Ipc, Wire<S>, ()>>,
     /// Generation and tick of the last sample told of.
     pub(super) newest: (u64, u64),
-    pub(super) bell: Bell,
+    pub(super) notifier: Notifier,
     pub(super) topic: Topic,
 }
 
@@ -209,14 +209,14 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let Self { subscriber, lane, idle, pending, bell, topic, .. } = self;
+        let Self { subscriber, lane, idle, pending, notifier, topic, .. } = self;
         let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
         let Lane::Open(latest) = lane else {
-            return bell.sleep(until_ns, || {
+            return notifier.sleep(until_ns, || {
                 subscriber.has_samples().map_err(|error| failed(cause::reason(|| format!("{error:?}"))))
             });
         };
-        bell.sleep(until_ns, || {
+        notifier.sleep(until_ns, || {
             // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
             while !latest.has_news() && pending.is_none() {
                 match subscriber.receive() {

@@ -4,7 +4,7 @@ use super::learner::Learner;
 use crate::model::RigidBody;
 use crate::observe::{
     Filter, GuardedKalman, HiddenRate, InertiaRatios, Interval, InvariantFilter, Observation, RateNoise, RateSample,
-    Sight,
+    Regressor,
 };
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
@@ -111,7 +111,7 @@ pub struct HiddenObserver {
     filter: Filter<1>,
     /// The valid bits that it cannot do without.
     needed: u64,
-    last: Sight,
+    last: Regressor,
     /// The angular velocity with the supplied component in its place, rad/s; while no measurement is usable, where the model
     /// has taken it since.
     rate: Vector3<f64>,
@@ -131,7 +131,7 @@ impl HiddenObserver {
             guess,
             filter: guess,
             needed: ALL & !(1 << relation.hidden()),
-            last: relation.sight(&nothing),
+            last: relation.regressor(&nothing),
             rate: nothing.rate_rad_s,
             interval: 1.0.into(),
             innovation: 0.0,
@@ -146,12 +146,12 @@ impl HiddenObserver {
     /// Begins anew from a known estimate at a known instant.
     pub(super) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
         (self.filter, self.innovation, self.status) = (filter, 0.0, status);
-        self.keep(&at, self.relation.sight(&at));
+        self.keep(&at, self.relation.regressor(&at));
     }
 
     pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let sample = seen(measurement);
-        let to = self.relation.sight(&sample);
+        let to = self.relation.regressor(&sample);
         if self.interval.length() != dt_s {
             self.interval = dt_s.into();
         }
@@ -169,8 +169,8 @@ impl HiddenObserver {
         self.keep(&sample, to);
     }
 
-    fn keep(&mut self, sample: &RateSample, sight: Sight) {
-        (self.last, self.rate) = (sight, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
+    fn keep(&mut self, sample: &RateSample, regressor: Regressor) {
+        (self.last, self.rate) = (regressor, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
     }
 
     /// [`Estimator::step_usual`]: as long as the last one, with all that is needed in the measurement.
@@ -183,7 +183,7 @@ impl HiddenObserver {
             return false;
         }
         let sample = seen(measurement);
-        let to = self.relation.sight(&sample);
+        let to = self.relation.regressor(&sample);
         let (ends, estimate) = ([&self.last, &to], self.filter.estimate().x);
         let done = match &mut self.filter {
             Filter::First(filter) => self.relation.step_usual(ends, &self.interval, estimate, filter),
@@ -229,7 +229,7 @@ impl HiddenObserver {
 impl Persist for HiddenObserver {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.filter.persist(words);
-        self.relation.persist_sight(&mut self.last, words);
+        self.relation.persist_regressor(&mut self.last, words);
         self.rate.persist(words);
         self.innovation.persist(words);
         self.status.persist(words);

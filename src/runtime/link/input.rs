@@ -9,7 +9,7 @@ use crate::clock::{Grid, monotonic_ns};
 use crate::role::{Guard, Unguarded};
 use crate::sample::{Stamp, VOID};
 use crate::state::{Persist, Words};
-use crate::telemetry::ReadBook;
+use crate::telemetry::ReadCounters;
 use std::borrow::{Borrow, BorrowMut};
 
 /// What a reading end has for a tick.
@@ -27,7 +27,7 @@ pub enum Seek {
 
 /// Which ticks a sample can have.
 #[derive(Debug, Clone, Copy)]
-pub enum Horizon {
+pub enum AcceptedTicks {
     /// Any.
     Unknown,
     /// The next only: nothing is lost on this link.
@@ -51,7 +51,7 @@ enum Newest {
 pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
     port: S::Reader<B>,
     guard: G,
-    horizon: Horizon,
+    accepted_ticks: AcceptedTicks,
     /// Tick and generation of the newest tick that something is known of.
     last: Option<(u64, u64)>,
     /// Whatever arrives displaces what was at hand, usable or not.
@@ -61,7 +61,7 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
     /// Whether what arrives may be what a predecessor of this end has counted already.
     pub(super) repeated: bool,
     inheritance: Option<Inheritance<S>>,
-    book: ReadBook,
+    counters: ReadCounters,
 }
 
 /// What was on its way to a predecessor: it may have died together with the writer.
@@ -87,20 +87,20 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
         Ok(Self {
             port: S::reader(bus, topic, reader, bodies)?,
             guard: Unguarded,
-            horizon: Horizon::Unknown,
+            accepted_ticks: AcceptedTicks::Unknown,
             last: None,
             newest: Newest::None,
             doubted: None,
             repeated: false,
             inheritance: None,
-            book: ReadBook::default(),
+            counters: ReadCounters::default(),
         })
     }
 
     /// The same with a guard.
     pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
-        let Self { port, horizon, last, newest, doubted, repeated, inheritance, book, .. } = self;
-        Input { port, guard, horizon, last, newest, doubted, repeated, inheritance, book }
+        let Self { port, accepted_ticks, last, newest, doubted, repeated, inheritance, counters, .. } = self;
+        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, inheritance, counters }
     }
 
     /// The same for a successor, with what the writer of a signal of so many bodies has kept.
@@ -111,8 +111,8 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
 
 impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// Says which ticks samples can have from now on.
-    pub fn expect(&mut self, horizon: Horizon) {
-        self.horizon = horizon;
+    pub fn expect(&mut self, accepted_ticks: AcceptedTicks) {
+        self.accepted_ticks = accepted_ticks;
     }
 
     /// Moves on to the sample of `tick`, or as far as there are older ones.
@@ -163,7 +163,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     #[inline]
     fn inherits(&mut self) -> bool {
         let Some(Inheritance { kept, sample }) = &mut self.inheritance else { return false };
-        let found = kept.find(self.book.covered(), sample.borrow_mut().words_mut());
+        let found = kept.find(self.counters.covered(), sample.borrow_mut().words_mut());
         if !found {
             (self.inheritance, self.newest) = (None, Newest::None);
         }
@@ -176,7 +176,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()))
     }
 
-    /// Enters a sample into the books.
+    /// Enters a sample into the counters.
     ///
     /// Ticks rise also from one generation of the sender to the next: a successor goes on with the grid. It may repeat the
     /// tick in which its predecessor died.
@@ -194,45 +194,45 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             if self.repeated {
                 self.repeated = stamp.tick < tick || generation == 0;
             } else if generation == known {
-                self.book.stale();
+                self.counters.stale();
             }
             return Newest::None;
         }
         // What is inherited may come once more, by the link.
         self.repeated = self.inheritance.is_some();
         if !self.possible(stamp.tick) {
-            self.book.stray();
+            self.counters.stray();
             return Newest::None;
         }
         if generation < known && self.doubted.replace(generation) != Some(generation) {
             self.last = Some((stamp.tick, known));
-            self.book.rejected(stamp.tick);
+            self.counters.rejected(stamp.tick);
             return Newest::Rejected;
         }
         self.doubted = None;
         self.last = Some((stamp.tick, generation));
         if stamp.generation & VOID != 0 {
-            self.book.void(stamp.tick);
+            self.counters.void(stamp.tick);
             return Newest::None;
         }
         // Not by `current`: the guard is another part of this end.
         let sample = self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()));
         if sample.is_some_and(|sample| self.guard.accepts(sample)) {
-            self.book.received(stamp.tick);
+            self.counters.received(stamp.tick);
             return Newest::AtHand;
         }
-        self.book.rejected(stamp.tick);
+        self.counters.rejected(stamp.tick);
         Newest::Rejected
     }
 
     /// Whether a sample can be of this tick, which is newer than the newest.
     #[inline]
     fn possible(&self, tick: u64) -> bool {
-        tick <= self.book.covered()
-            || match self.horizon {
-                Horizon::Unknown => true,
-                Horizon::Next => false,
-                Horizon::Due(grid) => grid.due_ns(tick) <= monotonic_ns(),
+        tick <= self.counters.covered()
+            || match self.accepted_ticks {
+                AcceptedTicks::Unknown => true,
+                AcceptedTicks::Next => false,
+                AcceptedTicks::Due(grid) => grid.due_ns(tick) <= monotonic_ns(),
             }
     }
 
@@ -286,8 +286,8 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
 
 impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
     /// The counters.
-    pub fn counters(&mut self) -> &mut ReadBook {
-        &mut self.book
+    pub fn counters(&mut self) -> &mut ReadCounters {
+        &mut self.counters
     }
 
     /// Expects what a predecessor, which this end continues, may have had already.

@@ -8,10 +8,10 @@ use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
 use crate::fault::Transport;
 use crate::runtime::disturb::Disturbance;
-use crate::runtime::hooks::{self, Place};
+use crate::runtime::hooks::{self, Failpoint};
 use crate::sample::{Stamp, VOID};
 use crate::state::{Persist, Words, persist_fields};
-use crate::telemetry::{Ledger, LinkWritten, Slots, WriteBook};
+use crate::telemetry::{Ledger, LinkWritten, Slots, WriteCounters};
 use std::borrow::{Borrow, BorrowMut};
 
 /// Words of a stamp.
@@ -33,7 +33,7 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     /// Whether one is shown and not published.
     shown: bool,
     disturbance: Option<Box<Disturbance<S>>>,
-    book: WriteBook,
+    counters: WriteCounters,
     /// How much of a tick has been sent, for a successor: the tick + 1, and 16 bits for the number of samples.
     progress: Option<Slots>,
     kept: Option<Kept>,
@@ -67,10 +67,10 @@ impl Staged {
 
     /// Counts it, the content of the sample given.
     #[inline]
-    fn count(&mut self, book: &mut WriteBook, content: &[u8], voids: bool) {
+    fn count(&mut self, counters: &mut WriteCounters, content: &[u8], voids: bool) {
         match std::mem::take(&mut self.kind) {
-            Self::SAMPLE => book.enter(self.tick, content),
-            Self::WITHHELD | Self::ABSENT => book.enter_void(self.tick, voids),
+            Self::SAMPLE => counters.enter(self.tick, content),
+            Self::WITHHELD | Self::ABSENT => counters.enter_void(self.tick, voids),
             _ => {}
         }
     }
@@ -88,7 +88,7 @@ pub struct Extent {
 impl Extent {
     /// Words of the ledger beside the record, for samples of so many words.
     pub fn words(self, length: usize) -> usize {
-        1 + WriteBook::words(self.last_tick) + Kept::words(self.kept_ticks, length)
+        1 + WriteCounters::words(self.last_tick) + Kept::words(self.kept_ticks, length)
     }
 }
 
@@ -106,7 +106,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         extent: Extent,
     ) -> Result<Self, BusError> {
         let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
-        let book = WriteBook::open(ledger, extent.last_tick);
+        let counters = WriteCounters::open(ledger, extent.last_tick);
         let kept = Kept::open(ledger, extent.kept_ticks, S::length(bodies));
         Ok(Self {
             port: S::writer(bus, topic, bodies, generation)?,
@@ -118,7 +118,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             shows: false,
             shown: false,
             disturbance: None,
-            book,
+            counters,
             progress,
             kept,
         })
@@ -159,7 +159,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let stamp = *kept.stamp();
         self.staged =
             Staged { tick: stamp.tick, kind: Staged::SAMPLE, stamp: bytemuck::cast(stamp), late: 0, copies: 1 };
-        hooks::at(Place::Staged);
+        hooks::at(Failpoint::Staged);
         Ok(())
     }
 
@@ -175,7 +175,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let tampered = disturbance.tamper(stamp.tick, sample, self.sample.borrow());
         let way = disturbance.way(stamp.tick);
         if tampered || way.is_some() {
-            self.book.injected();
+            self.counters.injected();
         }
         let late = disturbance.due(stamp.tick);
         // A sample with a broken stamp goes out as it is, but not as the one of its tick.
@@ -190,13 +190,13 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             Some(Transport::Duplicate) => 2,
             None => 1,
         };
-        self.book.extra(late + copies - u64::from(delivered));
+        self.counters.extra(late + copies - u64::from(delivered));
         let kind = if delivered { Staged::SAMPLE } else { Staged::WITHHELD };
         self.staged = Staged { tick: stamp.tick, kind, stamp: bytemuck::cast(*sample.stamp()), late, copies };
         let kept = self.sample.borrow_mut();
         kept.assign(sample);
         *kept.stamp_mut() = stamp;
-        hooks::at(Place::Staged);
+        hooks::at(Failpoint::Staged);
     }
 
     /// Says that there is no sample for this tick, where readers wait for one: an input was missing.
@@ -220,7 +220,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.shown = true;
         } else {
             self.port.deliver()?;
-            hooks::at(Place::Sent);
+            hooks::at(Failpoint::Sent);
             self.sent(1);
         }
         Ok(())
@@ -299,7 +299,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                     })?;
                 }
             }
-            hooks::at(Place::Sent);
+            hooks::at(Failpoint::Sent);
             self.sent(index + 1);
         }
         Ok(())
@@ -313,14 +313,14 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     pub fn finish(&mut self) -> Result<(), BusError> {
         if std::mem::take(&mut self.shown) {
             self.port.publish()?;
-            hooks::at(Place::Sent);
+            hooks::at(Failpoint::Sent);
             self.sent(1);
         }
         if let Some(disturbance) = &mut self.disturbance {
             disturbance.forget(self.staged.late);
         }
         self.staged.late = 0;
-        self.staged.count(&mut self.book, self.sample.borrow().content(), self.voids);
+        self.staged.count(&mut self.counters, self.sample.borrow().content(), self.voids);
         self.port.prepare()
     }
 
@@ -359,8 +359,8 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     }
 
     /// The counters, without what is staged.
-    pub fn counters(&self) -> &WriteBook {
-        &self.book
+    pub fn counters(&self) -> &WriteCounters {
+        &self.counters
     }
 }
 
@@ -368,7 +368,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
 impl<B: Bus, S: Carried + ?Sized> Persist for Output<B, S> {
     #[inline]
     fn persist<W: Words>(&mut self, words: &mut W) {
-        self.book.persist(words);
+        self.counters.persist(words);
         self.staged.persist(words);
         self.sample.borrow_mut().words_mut().persist(words);
     }
@@ -390,12 +390,12 @@ pub fn written(
     (ledger, extent): (&Ledger, Extent),
 ) -> LinkWritten {
     ledger.take(1);
-    let (mut book, mut staged) = (WriteBook::open(ledger, extent.last_tick), Staged::default());
+    let (mut counters, mut staged) = (WriteCounters::open(ledger, extent.last_tick), Staged::default());
     ledger.take(Kept::words(extent.kept_ticks, length));
     let mut sample = vec![0_u64; length];
-    book.persist(words);
+    counters.persist(words);
     staged.persist(words);
     sample.persist(words);
-    staged.count(&mut book, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], voids);
-    book.report(service)
+    staged.count(&mut counters, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], voids);
+    counters.report(service)
 }

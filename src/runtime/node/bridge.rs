@@ -2,23 +2,23 @@
 //!
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
-use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
+use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::CommandEvent;
 use crate::runtime::bridge::DeviceLink;
 use crate::runtime::disturb::Interruptions;
-use crate::runtime::link::{Horizon, Input, Output, Seek};
+use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
-use crate::serial::{Answer, LineBook, MAX_CONTENT};
+use crate::serial::{Answer, LineCounters, MAX_CONTENT};
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
 /// Between two looks at the line, ns.
 const LOOK_NS: u64 = 50_000;
 
-/// A device with its links and books.
+/// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
     link: Box<DeviceLink>,
     command: Input<B, Command<R>, R::CommandGuard>,
@@ -27,7 +27,7 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     clock: Clock,
     grid: Grid,
     last_tick: u64,
-    book: TickBook,
+    counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
     /// Whether the device has been asked for the next tick, when, and when its command's chain began, ns.
@@ -78,7 +78,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             clock: seat.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            book: TickBook::default(),
+            counters: TickCounters::default(),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
             asked: false,
@@ -96,13 +96,13 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     }
 
     fn inputs_ready(&mut self) -> Result<bool, BusError> {
-        let next = self.book.next();
+        let next = self.counters.next();
         Ok(next == 0 || self.command.seek(next - 1)? != Seek::NotYet)
     }
 
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
-        for missed in self.book.next()..tick {
+        for missed in self.counters.next()..tick {
             self.lateness.record(self.grid.due_ns(missed), now_ns);
         }
         self.skip_to(tick);
@@ -111,7 +111,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     /// Asks the device for the next tick, with its command if that is there.
     #[inline]
     fn ask(&mut self, now_ns: u64) -> Result<(), BusError> {
-        let tick = self.book.next();
+        let tick = self.counters.next();
         let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
         let command = self.command.sample().filter(|_| found);
         self.command_origin_ns = command.map(|command| command.stamp().origin_ns);
@@ -135,7 +135,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     }
 
     fn publish(&mut self, now_ns: u64) -> Result<Poll, BusError> {
-        let (tick, clock) = (self.book.next(), self.clock);
+        let (tick, clock) = (self.counters.next(), self.clock);
         let origin_ns = self.grid.due_ns(tick);
         let Reply { event, measurement, truth } = &self.reply;
         let stamp = Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() };
@@ -149,13 +149,13 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             *sample.stamp_mut() = stamp;
         })?;
         if event.missed() {
-            self.book.starved(tick);
+            self.counters.starved(tick);
         }
-        if self.link.book().restarts > 0 {
-            self.book.disturbed(tick);
+        if self.link.counters().restarts > 0 {
+            self.counters.disturbed(tick);
         }
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
-            self.book.safe();
+            self.counters.safe();
         }
         if self.clock == Clock::Monotonic {
             self.serial.record(self.asked_ns, now_ns);
@@ -164,7 +164,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             }
         }
         self.asked = false;
-        self.book.executed();
+        self.counters.executed();
         commit(self);
         self.measurement.dispatch()?;
         Ok(Poll::Executed)
@@ -174,7 +174,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     fn give_up(&mut self) -> Poll {
         self.link.give_up();
         self.asked = false;
-        self.book.skip_to(self.book.next() + 1);
+        self.counters.skip_to(self.counters.next() + 1);
         Poll::Missed
     }
 }
@@ -185,12 +185,12 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next()
+        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.began_anew();
+            self.counters.began_anew();
         }
         self.command.expect_repeats();
         Ok(())
@@ -200,7 +200,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         self.grid = grid;
         if self.clock == Clock::Monotonic {
-            self.command.expect(Horizon::Due(grid));
+            self.command.expect(AcceptedTicks::Due(grid));
         }
         self.measurement.dispatch()?;
         self.measurement.finish()?;
@@ -212,29 +212,29 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.book)
+        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        match gate {
-            Gate::Inputs { up_to } => {
-                if !self.asked && self.book.next() <= up_to && self.inputs_ready()? {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        match condition {
+            RunCondition::Inputs { up_to } => {
+                if !self.asked && self.counters.next() <= up_to && self.inputs_ready()? {
                     self.ask(monotonic_ns())?;
                 }
             }
-            Gate::Now { tick, now_ns } => {
+            RunCondition::Now { tick, now_ns } => {
                 self.catch_up(tick.min(self.last_tick + 1), now_ns);
-                if self.book.next() > self.last_tick {
+                if self.counters.next() > self.last_tick {
                     return Ok(Poll::Waiting);
                 }
                 self.lateness.record(self.grid.due_ns(tick), now_ns);
                 self.ask(now_ns)?;
             }
-            Gate::Arrived | Gate::Overdue => {}
+            RunCondition::Arrived | RunCondition::Overdue => {}
         }
         let polled = if self.asked { self.look()? } else { Poll::Waiting };
-        let overdue = self.asked && gate == Gate::Overdue;
+        let overdue = self.asked && condition == RunCondition::Overdue;
         Ok(if overdue { self.give_up() } else { polled })
     }
 
@@ -253,20 +253,20 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     #[inline]
-    fn settle(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), BusError> {
         self.truth.dispatch()?;
         self.measurement.finish()?;
         self.truth.finish()
     }
 
     fn finish(&mut self) -> Result<(), BusError> {
-        self.settle()?;
+        self.finish_tick()?;
         commit_last(self);
         Ok(())
     }
 
     fn skip_to(&mut self, tick: u64) {
-        if self.book.skip_to(tick) > 0 && self.asked {
+        if self.counters.skip_to(tick) > 0 && self.asked {
             self.link.give_up();
             self.asked = false;
         }
@@ -289,15 +289,15 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     fn ticks(&self) -> Ticks {
-        self.book.report()
+        self.counters.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
         StageReport::all(&[("lateness", &self.lateness), ("serial", &self.serial), ("age", &self.age)])
     }
 
-    fn line(&self) -> Option<LineBook> {
-        Some(self.link.book())
+    fn line(&self) -> Option<LineCounters> {
+        Some(self.link.counters())
     }
 }
 
@@ -308,7 +308,7 @@ impl<R: Rig, B: Bus> Persistent for BridgeNode<R, B> {
     }
 
     fn counters<W: Words>(&mut self, words: &mut W) {
-        self.book.persist(words);
+        self.counters.persist(words);
         self.measurement.persist(words);
         self.truth.persist(words);
         self.command.counters().persist(words);

@@ -1,17 +1,17 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
 use super::ports::driven;
-use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
+use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
-use crate::runtime::link::{Horizon, Input, Output, Seek};
+use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::Message;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
 /// What drives the bodies of a rig one by one.
 type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
@@ -100,7 +100,13 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 
     /// Takes in what a command leaves to be done.
     #[inline]
-    fn settle(&mut self, timed: bool, origin_ns: u64, step: &mut Latency, age: &mut Latency) -> Result<(), BusError> {
+    fn finish_tick(
+        &mut self,
+        timed: bool,
+        origin_ns: u64,
+        step: &mut Latency,
+        age: &mut Latency,
+    ) -> Result<(), BusError> {
         if timed && self.ready {
             step.record(self.began_ns, self.sent_ns);
             age.record(origin_ns, self.sent_ns);
@@ -129,14 +135,14 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 }
 
-/// A controller with its links and books.
+/// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
     rig: R,
     estimate: Input<B, Estimate<R>, R::EstimateGuard>,
     channels: Vec<Single<R, B>>,
     fleets: Vec<Many<R, B>>,
     clock: Clock,
-    book: TickBook,
+    counters: TickCounters,
     watchdog: Watchdog,
     interruptions: Interruptions,
     ledger: Ledger,
@@ -154,7 +160,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
         let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
-        // In the order of the books: everything written, then everything read; fleets last.
+        // In the order of the counters: everything written, then everything read; fleets last.
         let written = |(_, body)| seat.output(body, Signal::Command);
         let commands: Vec<Output<B, Command<R>>> = bodies(false).map(written).collect::<Result<_, _>>()?;
         let written = |(_, body)| seat.output(body, Signal::Command);
@@ -175,7 +181,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             channels,
             fleets,
             clock: seat.clock,
-            book: TickBook::default(),
+            counters: TickCounters::default(),
             watchdog: Watchdog::new(seat.scenario.watch),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
@@ -191,13 +197,13 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     /// Whether nothing is known of the next tick's estimate.
     pub fn lacks_estimate(&self) -> bool {
-        !self.estimate.knows(self.book.next())
+        !self.estimate.knows(self.counters.next())
     }
 
     /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
-        if self.estimate.seek(self.book.next())? == Seek::NotYet {
+        if self.estimate.seek(self.counters.next())? == Seek::NotYet {
             if self.clock == Clock::Monotonic {
                 // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
                 // rule.
@@ -235,7 +241,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     /// There is no estimate for the next tick that could be used, and so there are no commands.
     #[cold]
     fn pass_over(&mut self) -> Result<(), BusError> {
-        let next = self.book.next();
+        let next = self.counters.next();
         for tick in next..=self.estimate.last_tick().unwrap_or(next) {
             self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
             self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
@@ -314,9 +320,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
         self.skip_to(stamp.tick);
         if starved {
-            self.book.starved(stamp.tick);
+            self.counters.starved(stamp.tick);
         }
-        self.book.executed();
+        self.counters.executed();
         commit(self);
         self.dispatch()?;
         Ok(Poll::Executed)
@@ -329,12 +335,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next()
+        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.began_anew();
+            self.counters.began_anew();
         }
         self.estimate.expect_repeats();
         self.channels.iter_mut().for_each(|channel| channel.measurement.expect_repeats());
@@ -344,9 +350,9 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
-            self.estimate.expect(Horizon::Due(grid));
-            self.channels.iter_mut().for_each(|channel| channel.measurement.expect(Horizon::Due(grid)));
-            self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(Horizon::Due(grid)));
+            self.estimate.expect(AcceptedTicks::Due(grid));
+            self.channels.iter_mut().for_each(|channel| channel.measurement.expect(AcceptedTicks::Due(grid)));
+            self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(AcceptedTicks::Due(grid)));
         }
         self.dispatch()?;
         self.finish_commands()?;
@@ -356,17 +362,17 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.book)
+        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
-        if allowed && self.gather(gate == Gate::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
+        if allowed && self.gather(condition == RunCondition::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
     }
 
     fn awaits(&self) -> Option<RoleId> {
-        let next = self.book.next();
+        let next = self.counters.next();
         let single = || self.channels.iter().find_map(|channel| channel.late(next));
         let late = single().or_else(|| self.fleets.iter().find_map(|fleet| fleet.late(next)));
         Some(late.map_or(RoleId::Observer, RoleId::Plant))
@@ -374,7 +380,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
-        let tick = self.book.next();
+        let tick = self.counters.next();
         if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
         } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
@@ -388,16 +394,16 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     #[inline]
-    fn settle(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), BusError> {
         let timed = self.clock == Clock::Monotonic;
         if timed {
             self.hop.record(self.estimate_sent_ns, self.received_ns);
         }
         for channel in &mut self.channels {
-            channel.settle(timed, self.origin_ns, &mut self.step, &mut self.age)?;
+            channel.finish_tick(timed, self.origin_ns, &mut self.step, &mut self.age)?;
         }
         for fleet in &mut self.fleets {
-            fleet.settle(timed, self.origin_ns, &mut self.step, &mut self.age)?;
+            fleet.finish_tick(timed, self.origin_ns, &mut self.step, &mut self.age)?;
         }
         Ok(())
     }
@@ -409,7 +415,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn skip_to(&mut self, tick: u64) {
-        self.book.skip_to(tick);
+        self.counters.skip_to(tick);
     }
 
     fn warm_up(&mut self) -> Result<(), BusError> {
@@ -429,7 +435,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn ticks(&self) -> Ticks {
-        self.book.report()
+        self.counters.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
@@ -444,7 +450,7 @@ impl<R: Rig, B: Bus> Persistent for ControllerNode<R, B> {
 
     #[inline]
     fn counters<W: Words>(&mut self, words: &mut W) {
-        self.book.persist(words);
+        self.counters.persist(words);
         self.channels.iter_mut().for_each(|channel| channel.command.persist(words));
         self.fleets.iter_mut().for_each(|fleet| fleet.command.persist(words));
         self.estimate.counters().persist(words);

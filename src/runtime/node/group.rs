@@ -4,7 +4,7 @@
 //! In real time whoever has a short way to a sample sees it at once, and what else there is to do waits until all have done
 //! their tick, or one of them has to wait. Must not compute, nor change what any of them sends.
 
-use super::{Gate, Node, Poll, ReadyNode, RoleId};
+use super::{Node, Poll, ReadyNode, RoleId, RunCondition};
 use crate::bus::BusError;
 use crate::clock::{Grid, monotonic_ns};
 use crate::telemetry::{LedgerError, StageReport, Ticks};
@@ -30,8 +30,8 @@ struct Member {
 }
 
 impl Member {
-    fn settle(&mut self) -> Result<(), BusError> {
-        if std::mem::take(&mut self.executed) { self.node.settle() } else { Ok(()) }
+    fn finish_tick(&mut self) -> Result<(), BusError> {
+        if std::mem::take(&mut self.executed) { self.node.finish_tick() } else { Ok(()) }
     }
 }
 
@@ -52,11 +52,11 @@ impl GroupNode {
     }
 
     /// Lockstep: everybody does what can be done.
-    fn poll_in_turn(&mut self, gate: Gate) -> Result<Poll, BusError> {
+    fn poll_in_turn(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
         let mut polled = Poll::Waiting;
         for Member { node, .. } in &mut self.members {
-            if node.poll(gate)? == Poll::Executed {
-                node.settle()?;
+            if node.poll(condition)? == Poll::Executed {
+                node.finish_tick()?;
                 polled = Poll::Executed;
             }
         }
@@ -65,21 +65,22 @@ impl GroupNode {
 
     /// Real time: the tick, through everybody who has not done it.
     #[inline]
-    fn poll_on_grid(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        let tick = if let Gate::Now { tick, .. } = gate { tick.min(self.last_tick) } else { self.next_tick() };
+    fn poll_on_grid(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        let tick =
+            if let RunCondition::Now { tick, .. } = condition { tick.min(self.last_tick) } else { self.next_tick() };
         self.open = Some(tick);
         let mut complete = true;
         for index in 0..self.members.len() {
             let timed = self.timed(&self.members[index]);
             let member = &mut self.members[index];
-            let gate = match gate {
-                Gate::Now { .. } if !timed => Gate::Arrived,
-                gate => gate,
+            let condition = match condition {
+                RunCondition::Now { .. } if !timed => RunCondition::Arrived,
+                condition => condition,
             };
             while member.node.next_tick() <= tick {
-                match member.node.poll(gate)? {
+                match member.node.poll(condition)? {
                     Poll::Executed => {
-                        member.settle()?;
+                        member.finish_tick()?;
                         member.executed = true;
                     }
                     Poll::Missed => {}
@@ -92,11 +93,11 @@ impl GroupNode {
                 return self.pass_over(index, next - 1);
             }
         }
-        if complete || gate == Gate::Overdue {
+        if complete || condition == RunCondition::Overdue {
             self.open = None;
             return Ok(Poll::Executed);
         }
-        self.settle()?;
+        self.finish_tick()?;
         Ok(Poll::Waiting)
     }
 
@@ -109,7 +110,7 @@ impl GroupNode {
                 node.skip_to(tick);
             }
         }
-        self.settle()?;
+        self.finish_tick()?;
         self.open = None;
         Ok(Poll::Missed)
     }
@@ -154,8 +155,8 @@ impl Node for GroupNode {
     }
 
     #[inline]
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        if self.realtime { self.poll_on_grid(gate) } else { self.poll_in_turn(gate) }
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        if self.realtime { self.poll_on_grid(condition) } else { self.poll_in_turn(condition) }
     }
 
     /// Whom the first member awaits that lacks a sample from outside.
@@ -174,12 +175,12 @@ impl Node for GroupNode {
 
     /// The last in the tick first: others wait for what it has sent.
     #[inline]
-    fn settle(&mut self) -> Result<(), BusError> {
-        self.members.iter_mut().rev().try_for_each(Member::settle)
+    fn finish_tick(&mut self) -> Result<(), BusError> {
+        self.members.iter_mut().rev().try_for_each(Member::finish_tick)
     }
 
     fn finish(&mut self) -> Result<(), BusError> {
-        self.settle()?;
+        self.finish_tick()?;
         self.nodes().try_for_each(|node| node.finish())
     }
 
@@ -220,7 +221,7 @@ mod tests {
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
     use crate::config::{SHIPPED, Scenario};
-    use crate::runtime::{Occupant, build, depths, private_ledger, report, shared_ledger};
+    use crate::runtime::{RoleImpl, build, depths, private_ledger, report, shared_ledger};
     use crate::telemetry::Ledger;
 
     const LAST: u64 = 6;
@@ -234,13 +235,13 @@ mod tests {
 
     fn open(scenario: &Scenario, bus: &IoxBus, books: &[Ledger; 2]) -> ReadyNode {
         let observer = vec![(RoleId::Observer, books[0].reopened())];
-        build(scenario, Occupant::Role(RoleId::Controller, observer), bus, &books[1]).unwrap()
+        build(scenario, RoleImpl::Role(RoleId::Controller, observer), bus, &books[1]).unwrap()
     }
 
     fn turn(node: &mut dyn Node, up_to: u64) {
         node.refresh().unwrap();
-        if node.poll(Gate::Inputs { up_to }).unwrap() == Poll::Executed {
-            node.settle().unwrap();
+        if node.poll(RunCondition::Inputs { up_to }).unwrap() == Poll::Executed {
+            node.finish_tick().unwrap();
         }
     }
 

@@ -1,15 +1,15 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
+use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
-use crate::runtime::link::{Horizon, Input, Output, Seek};
+use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::Message;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -20,13 +20,13 @@ struct Instants {
     done: u64,
 }
 
-/// An observer with its links and books.
+/// An observer with its links and counters.
 pub struct ObserverNode<R: Rig, B: Bus> {
     observer: Observer<R::Estimator>,
     measurement: Input<B, Measurement<R>, R::MeasurementGuard>,
     estimate: Output<B, Estimate<R>>,
     clock: Clock,
-    book: TickBook,
+    counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
     instants: Instants,
@@ -44,7 +44,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             measurement: seat.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
             estimate,
             clock: seat.clock,
-            book: TickBook::default(),
+            counters: TickCounters::default(),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
             instants: Instants::default(),
@@ -71,7 +71,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         })?;
         self.instants = Instants { origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
         self.skip_to(stamp.tick);
-        self.book.executed();
+        self.counters.executed();
         commit(self);
         self.estimate.dispatch()?;
         Ok(Poll::Executed)
@@ -80,7 +80,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     /// There is no measurement for the next tick, and so there is no estimate.
     #[cold]
     fn pass_over(&mut self) -> Result<Poll, BusError> {
-        let next = self.book.next();
+        let next = self.counters.next();
         for tick in next..=self.measurement.last_tick().unwrap_or(next) {
             self.estimate.stage_void(tick);
             self.skip_to(tick + 1);
@@ -98,12 +98,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next()
+        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.book.began_anew();
+            self.counters.began_anew();
         }
         self.measurement.expect_repeats();
         Ok(())
@@ -111,7 +111,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
-            self.measurement.expect(Horizon::Due(grid));
+            self.measurement.expect(AcceptedTicks::Due(grid));
         }
         self.estimate.dispatch()?;
         self.estimate.finish()?;
@@ -121,13 +121,13 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.book)
+        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        let allowed = !matches!(gate, Gate::Inputs { up_to } if self.book.next() > up_to);
-        let there = allowed && self.measurement.seek(self.book.next())? != Seek::NotYet;
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
+        let there = allowed && self.measurement.seek(self.counters.next())? != Seek::NotYet;
         if there { self.execute() } else { Ok(Poll::Waiting) }
     }
 
@@ -141,7 +141,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     #[inline]
-    fn settle(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), BusError> {
         if self.clock == Clock::Monotonic {
             let Instants { origin, sent, received, done } = self.instants;
             self.hop.record(sent, received);
@@ -158,7 +158,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn skip_to(&mut self, tick: u64) {
-        self.book.skip_to(tick);
+        self.counters.skip_to(tick);
     }
 
     fn warm_up(&mut self) -> Result<(), BusError> {
@@ -176,7 +176,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn ticks(&self) -> Ticks {
-        self.book.report()
+        self.counters.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
@@ -191,7 +191,7 @@ impl<R: Rig, B: Bus> Persistent for ObserverNode<R, B> {
 
     #[inline]
     fn counters<W: Words>(&mut self, words: &mut W) {
-        self.book.persist(words);
+        self.counters.persist(words);
         self.estimate.persist(words);
         self.measurement.counters().persist(words);
     }

@@ -1,22 +1,22 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Gate, Inherited, Node, Persistent, Poll, RoleId, Seat, commit, commit_last, length, restore};
+use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::BodyInfo;
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::disturb::Interruptions;
-use crate::runtime::link::{Horizon, Input, Output, Seek};
+use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickBook, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
 /// A body whose samples links carry: one, or a fleet.
 pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
 
 impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> Hosted for P {}
 
-/// A plant with its links and books.
+/// A plant with its links and counters.
 pub struct PlantNode<P: Hosted, G, B: Bus> {
     plant: Plant<P>,
     command: Option<Input<B, P::Command, G>>,
@@ -25,12 +25,12 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     clock: Clock,
     grid: Grid,
     last_tick: u64,
-    book: TickBook,
+    counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
-    unsettled: Option<u64>,
+    unfinished: Option<u64>,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -50,11 +50,11 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             clock: seat.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
-            book: TickBook::default(),
+            counters: TickCounters::default(),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
             inherited: Inherited::Nothing,
-            unsettled: None,
+            unfinished: None,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -63,14 +63,14 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
     fn inputs_ready(&mut self) -> Result<bool, BusError> {
         match &mut self.command {
-            Some(command) if self.book.next() > 0 => Ok(command.seek(self.book.next() - 1)? != Seek::NotYet),
+            Some(command) if self.counters.next() > 0 => Ok(command.seek(self.counters.next() - 1)? != Seek::NotYet),
             _ => Ok(true),
         }
     }
 
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
-        for missed in self.book.next()..tick {
+        for missed in self.counters.next()..tick {
             self.lateness.record(self.grid.due_ns(missed), now_ns);
         }
         self.skip_to(tick);
@@ -80,7 +80,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     fn take_over(&mut self) -> Result<(), BusError> {
         self.measurement.dispatch()?;
         self.measurement.finish()?;
-        if let Some(tick) = self.unsettled.take() {
+        if let Some(tick) = self.unfinished.take() {
             self.stage_truth(tick)?;
             self.truth.dispatch_rest()?;
             self.truth.finish()?;
@@ -98,13 +98,13 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
     #[inline]
     fn execute(&mut self, now_ns: u64) -> Result<Poll, BusError> {
-        let tick = self.book.next();
+        let tick = self.counters.next();
         let event = self.take_command(tick, now_ns)?;
         if event.missed() {
-            self.book.starved(tick);
+            self.counters.starved(tick);
         }
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
-            self.book.safe();
+            self.counters.safe();
         }
         let (plant, clock) = (&mut self.plant, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
@@ -112,8 +112,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             stamp.sent_ns = clock.now_ns();
             plant.measure(&stamp, sample);
         })?;
-        self.unsettled = Some(tick);
-        self.book.executed();
+        self.unfinished = Some(tick);
+        self.counters.executed();
         commit(self);
         self.measurement.dispatch()?;
         Ok(Poll::Executed)
@@ -141,14 +141,14 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     fn next_tick(&self) -> u64 {
-        self.book.next()
+        self.counters.next()
     }
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         self.inherited = restore(self)?;
         self.command.iter_mut().for_each(Input::expect_repeats);
         if self.inherited == Inherited::Counters {
-            self.book.began_anew();
+            self.counters.began_anew();
         }
         Ok(())
     }
@@ -156,7 +156,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
         self.grid = grid;
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
-            command.expect(Horizon::Due(grid));
+            command.expect(AcceptedTicks::Due(grid));
         }
         if self.inherited != Inherited::Nothing {
             self.take_over()?;
@@ -170,34 +170,34 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
 
     #[inline]
     fn before_tick(&mut self) -> bool {
-        self.interruptions.before_next(&mut self.book)
+        self.interruptions.before_next(&mut self.counters)
     }
 
     #[inline]
-    fn poll(&mut self, gate: Gate) -> Result<Poll, BusError> {
-        match gate {
-            Gate::Inputs { up_to } if self.book.next() <= up_to && self.inputs_ready()? => self.execute(0),
-            Gate::Now { tick, now_ns } => {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+        match condition {
+            RunCondition::Inputs { up_to } if self.counters.next() <= up_to && self.inputs_ready()? => self.execute(0),
+            RunCondition::Now { tick, now_ns } => {
                 self.catch_up(tick.min(self.last_tick + 1), now_ns);
-                if self.book.next() > self.last_tick {
+                if self.counters.next() > self.last_tick {
                     return Ok(Poll::Waiting);
                 }
                 self.lateness.record(self.grid.due_ns(tick), now_ns);
                 self.execute(now_ns)
             }
-            Gate::Inputs { .. } | Gate::Arrived | Gate::Overdue => Ok(Poll::Waiting),
+            RunCondition::Inputs { .. } | RunCondition::Arrived | RunCondition::Overdue => Ok(Poll::Waiting),
         }
     }
 
     /// In lockstep. In real time a body waits for the tick alone.
     fn awaits(&self) -> Option<RoleId> {
-        let last = self.book.next().checked_sub(1)?;
+        let last = self.counters.next().checked_sub(1)?;
         let lacks = self.command.as_ref().is_some_and(|command| !command.knows(last));
         lacks.then_some(RoleId::Controller)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
-        let Some(last) = self.book.next().checked_sub(1) else { return Ok(false) };
+        let Some(last) = self.counters.next().checked_sub(1) else { return Ok(false) };
         let lacking = self.command.as_mut().filter(|command| !command.knows(last));
         let lacks = lacking.is_some();
         lacking.map_or(Ok(()), |command| command.sleep(until_ns))?;
@@ -205,8 +205,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     #[inline]
-    fn settle(&mut self) -> Result<(), BusError> {
-        let Some(tick) = self.unsettled.take() else { return Ok(()) };
+    fn finish_tick(&mut self) -> Result<(), BusError> {
+        let Some(tick) = self.unfinished.take() else { return Ok(()) };
         self.stage_truth(tick)?;
         self.truth.dispatch()?;
         let before_ns = self.clock.now_ns();
@@ -219,13 +219,13 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     fn finish(&mut self) -> Result<(), BusError> {
-        self.settle()?;
+        self.finish_tick()?;
         commit_last(self);
         Ok(())
     }
 
     fn skip_to(&mut self, tick: u64) {
-        let missed = self.book.skip_to(tick);
+        let missed = self.counters.skip_to(tick);
         self.plant.advance_alone(missed);
     }
 
@@ -250,7 +250,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     fn ticks(&self) -> Ticks {
-        self.book.report()
+        self.counters.report()
     }
 
     fn stages(&self) -> Vec<StageReport> {
@@ -265,7 +265,7 @@ impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
 
     #[inline]
     fn counters<W: Words>(&mut self, words: &mut W) {
-        self.book.persist(words);
+        self.counters.persist(words);
         self.measurement.persist(words);
         self.truth.persist(words);
         self.command.iter_mut().for_each(|command| command.counters().persist(words));
@@ -274,7 +274,7 @@ impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
     #[inline]
     fn state<W: Words>(&mut self, words: &mut W) {
         self.plant.persist(words);
-        self.unsettled.persist(words);
+        self.unfinished.persist(words);
         self.command.iter_mut().for_each(|command| command.persist(words));
         self.measurement.persist_late(words);
     }

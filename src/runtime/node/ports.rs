@@ -1,6 +1,6 @@
-//! Which signals a role writes and reads, with the layout of each: the one list, for books and for foreign programs.
+//! Which signals a role writes and reads, with the layout of each: the one list, for counters and for foreign programs.
 //!
-//! In the order in which the nodes open them, which is that of their books. Must not open anything.
+//! In the order in which the nodes open them, which is that of their counters. Must not open anything.
 
 use super::{RoleId, topic};
 use crate::bus::iox::Qos;

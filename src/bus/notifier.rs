@@ -1,6 +1,6 @@
-//! Doorbells: a reader that has nothing to do sleeps on the bell of the signal it lacks, and its writer wakes it.
+//! Futex notifiers: a reader that has nothing to do sleeps on the notifier of the signal it lacks, and its writer wakes it.
 //!
-//! A bell is a futex in memory that the processes of a run share. It has no owner, so nobody's death can lock it. A writer
+//! A notifier is a futex in memory that the processes of a run share. It has no owner, so nobody's death can lock it. A writer
 //! that finds nobody asleep makes no system call. Must not carry anything: who is woken looks at the link.
 
 use super::Topic;
@@ -14,37 +14,37 @@ use std::rc::Rc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Bells of a run. Where there are more signals, some share one and wake each other's readers in vain.
-const BELLS: usize = 512;
-/// Bells are a cache line apart: what one writer rings must not slow another down.
+/// Notifiers of a run. Where there are more signals, some share one and wake each other's readers in vain.
+const NOTIFIERS: usize = 512;
+/// Notifiers are a cache line apart: one writer's notifications must not slow another down.
 const STRIDE: usize = 16;
-/// Beside a bell: whose it is.
+/// Beside a notifier: whose it is.
 const OWNER: usize = 1;
-/// Set while somebody is asleep; the count of rings is above it.
+/// Set while somebody is asleep; the count of notifications is above it.
 const ASLEEP: u32 = 1;
 const RING: u32 = 2;
-/// A writer that has never rung is perhaps none of ours and never will: its reader looks again after so long, ns.
+/// A writer that has never notified is perhaps none of ours and never will: its reader looks again after so long, ns.
 const UNRUNG_NS: u64 = 50_000;
 /// One that has may have died before it rang: its reader looks again after so long, ns. Not after a tick: two that wake at
 /// one time are in each other's way.
 const RUNG_NS: u64 = 10_000_000;
 
-/// Bytes of shared memory for the bells of a run.
-pub const BELLS_BYTES: usize = BELLS * STRIDE * size_of::<u32>();
+/// Bytes of shared memory for the notifiers of a run.
+pub const NOTIFIERS_BYTES: usize = NOTIFIERS * STRIDE * size_of::<u32>();
 
-/// The bells of a run.
+/// The notifiers of a run.
 #[derive(Debug, Clone)]
-pub struct Bells {
+pub struct Notifiers {
     memory: Rc<SharedHalves>,
 }
 
-impl Bells {
+impl Notifiers {
     /// Those of a domain.
     ///
     /// # Errors
     /// The system's reason.
     pub fn open(domain: &Domain) -> io::Result<Self> {
-        Self::over(SharedHalves::open(&domain.shared("bells"), BELLS * STRIDE)?)
+        Self::over(SharedHalves::open(&domain.shared("notifiers"), NOTIFIERS * STRIDE)?)
     }
 
     /// Those of a domain that has some already.
@@ -52,26 +52,26 @@ impl Bells {
     /// # Errors
     /// The system's reason.
     pub fn join(domain: &Domain) -> io::Result<Self> {
-        Self::over(SharedHalves::existing(&domain.shared("bells"))?)
+        Self::over(SharedHalves::existing(&domain.shared("notifiers"))?)
     }
 
     fn over(memory: SharedHalves) -> io::Result<Self> {
-        if memory.halves().len() < BELLS * STRIDE {
-            return Err(io::Error::other("the bells of this run are another version's"));
+        if memory.halves().len() < NOTIFIERS * STRIDE {
+            return Err(io::Error::other("the notifiers of this run are another version's"));
         }
         Ok(Self { memory: Rc::new(memory) })
     }
 
-    /// The bell of a signal.
-    pub fn of(&self, topic: &Topic) -> Bell {
+    /// The notifier of a signal.
+    pub fn of(&self, topic: &Topic) -> Notifier {
         // XXH3 with seed 0 of the service's name: every build of this program must find the same.
         let hash = xxh3_64(topic.to_string().as_bytes());
-        let (home, owner) = (hash as usize % BELLS, (hash >> 32) as u32 | 1);
-        let index = (home..BELLS).chain(0..home).find(|index| self.claim(*index, owner)).unwrap_or(home);
-        Bell { memory: self.memory.clone(), index: index * STRIDE }
+        let (home, owner) = (hash as usize % NOTIFIERS, (hash >> 32) as u32 | 1);
+        let index = (home..NOTIFIERS).chain(0..home).find(|index| self.claim(*index, owner)).unwrap_or(home);
+        Notifier { memory: self.memory.clone(), index: index * STRIDE }
     }
 
-    /// Takes a bell for a signal, unless it is another one's.
+    /// Takes a notifier for a signal, unless it is another one's.
     fn claim(&self, index: usize, owner: u32) -> bool {
         let present = self.memory.halves()[index * STRIDE + OWNER].compare_exchange(
             0,
@@ -83,14 +83,14 @@ impl Bells {
     }
 }
 
-/// The bell of one signal.
+/// The notifier of one signal.
 #[derive(Debug)]
-pub struct Bell {
+pub struct Notifier {
     memory: Rc<SharedHalves>,
     index: usize,
 }
 
-impl Bell {
+impl Notifier {
     #[inline]
     fn word(&self) -> &AtomicU32 {
         &self.memory.halves()[self.index]
@@ -98,7 +98,7 @@ impl Bell {
 
     /// Wakes whoever sleeps. After the sample is there.
     #[inline]
-    pub fn ring(&self) {
+    pub fn notify(&self) {
         if self.word().fetch_add(RING, Ordering::SeqCst) & ASLEEP != 0 {
             self.wake();
         }
@@ -111,12 +111,12 @@ impl Bell {
         let _ = futex::wake(self.word(), futex::Flags::empty(), i32::MAX as u32);
     }
 
-    /// Sleeps until the bell rings, at most until `until_ns`, and not at all if `news` says that there is something. May end
+    /// Sleeps until it is notified, at most until `until_ns`, and not at all if `news` says that there is something. May end
     /// early.
     #[inline]
     pub fn sleep<E>(&self, until_ns: u64, news: impl FnOnce() -> Result<bool, E>) -> Result<(), E> {
         let seen = self.word().fetch_or(ASLEEP, Ordering::SeqCst) | ASLEEP;
-        // Looked at after the mark is set: what arrives from here on rings.
+        // Looked at after the mark is set: what arrives from here on wakes.
         if news()? {
             return Ok(());
         }
@@ -145,46 +145,46 @@ mod tests {
     #[test]
     fn whoever_sleeps_is_woken_by_the_ring_and_not_by_the_clock() {
         let domain = OwnedDomain::create(0).unwrap();
-        let (rings, waits) = (domain.domain().clone(), domain.domain().clone());
+        let (notifies, waits) = (domain.domain().clone(), domain.domain().clone());
         let (said, heard) = std::sync::mpsc::channel();
         let ringer = std::thread::spawn(move || {
-            let bell = Bells::open(&rings).unwrap().of(&topic("b"));
-            bell.ring();
+            let notifier = Notifiers::open(&notifies).unwrap().of(&topic("b"));
+            notifier.notify();
             while heard.try_recv().is_err() {
-                bell.ring();
+                notifier.notify();
                 std::thread::yield_now();
             }
         });
-        let bell = Bells::open(&waits).unwrap().of(&topic("b"));
+        let notifier = Notifiers::open(&waits).unwrap().of(&topic("b"));
         for _ in 0..200 {
-            bell.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(false)).unwrap();
+            notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(false)).unwrap();
         }
         said.send(()).unwrap();
         ringer.join().unwrap();
-        assert!(bell.word().load(Ordering::SeqCst) >= RING);
+        assert!(notifier.word().load(Ordering::SeqCst) >= RING);
     }
 
     #[test]
     fn nobody_sleeps_over_news_or_longer_than_told() {
         let domain = OwnedDomain::create(0).unwrap();
-        let bell = Bells::open(domain.domain()).unwrap().of(&topic("b"));
-        bell.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(true)).unwrap();
-        bell.sleep(0, || Ok::<_, Infallible>(false)).unwrap();
-        assert_eq!(bell.sleep(0, || Err(7)), Err(7));
+        let notifier = Notifiers::open(domain.domain()).unwrap().of(&topic("b"));
+        notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(true)).unwrap();
+        notifier.sleep(0, || Ok::<_, Infallible>(false)).unwrap();
+        assert_eq!(notifier.sleep(0, || Err(7)), Err(7));
     }
 
     #[test]
     fn when_no_bell_is_left_signals_share() {
         let domain = OwnedDomain::create(0).unwrap();
-        let bells = Bells::open(domain.domain()).unwrap();
-        let indices: Vec<usize> = (0..2 * BELLS).map(|n| bells.of(&topic(&n.to_string())).index).collect();
-        assert!(indices.iter().all(|index| *index < BELLS * STRIDE));
+        let notifiers = Notifiers::open(domain.domain()).unwrap();
+        let indices: Vec<usize> = (0..2 * NOTIFIERS).map(|n| notifiers.of(&topic(&n.to_string())).index).collect();
+        assert!(indices.iter().all(|index| *index < NOTIFIERS * STRIDE));
     }
 
     #[test]
     fn the_bells_of_a_signal_are_one_for_every_process() {
         let domain = OwnedDomain::create(0).unwrap();
-        let (one, other) = (Bells::open(domain.domain()).unwrap(), Bells::open(domain.domain()).unwrap());
+        let (one, other) = (Notifiers::open(domain.domain()).unwrap(), Notifiers::open(domain.domain()).unwrap());
         let indices: Vec<usize> = (0..400).map(|n| one.of(&topic(&n.to_string())).index).collect();
         assert_eq!(indices, (0..400).map(|n| other.of(&topic(&n.to_string())).index).collect::<Vec<_>>());
         let distinct: std::collections::HashSet<usize> = indices.iter().copied().collect();
@@ -195,10 +195,10 @@ mod tests {
     #[test]
     fn a_signal_has_the_same_place_in_every_build() {
         let domain = OwnedDomain::create(0).unwrap();
-        let bell = Bells::open(domain.domain()).unwrap().of(&topic("b"));
+        let notifier = Notifiers::open(domain.domain()).unwrap().of(&topic("b"));
         // XXH3-64 of "corotate/s/b/estimate", by the reference implementation.
         const HASH: u64 = 0x4c41_63f9_45f3_9fcc;
-        assert_eq!(bell.index, HASH as usize % BELLS * STRIDE);
-        assert_eq!(bell.memory.halves()[bell.index + OWNER].load(Ordering::SeqCst), (HASH >> 32) as u32 | 1);
+        assert_eq!(notifier.index, HASH as usize % NOTIFIERS * STRIDE);
+        assert_eq!(notifier.memory.halves()[notifier.index + OWNER].load(Ordering::SeqCst), (HASH >> 32) as u32 | 1);
     }
 }
