@@ -102,7 +102,7 @@ fn the_hop_stands_beside_all_its_floors() {
 #[test]
 fn whole_runs_stand_beside_theirs() {
     let bench = Bench::new();
-    let rows = ["chain", "tick", "lockstep", "run", "toll", "processor"];
+    let rows = ["chain", "tick", "lockstep", "run", "overhead", "processor"];
     let results = measure(&bench, &rows);
     assert_rows(&bench, &results, &rows);
     for (row, name) in [
@@ -119,9 +119,9 @@ fn whole_runs_stand_beside_theirs() {
         ("run", "bare iceoryx2 node"),
         ("run", "memory of observer"),
         ("run", "shared memory"),
-        ("toll", "page faults, leader"),
-        ("toll", "allocations, controller"),
-        ("toll", "voluntary context switches, follower"),
+        ("overhead", "page faults, leader"),
+        ("overhead", "allocations, controller"),
+        ("overhead", "voluntary context switches, follower"),
         ("processor", "bare sleep"),
         ("processor", "observer, event"),
         ("processor", "controller, spin"),

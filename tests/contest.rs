@@ -6,7 +6,8 @@
 mod contest;
 
 use contest::ROWS;
-use contest::step::agreements;
+use contest::compiled::NATIVE;
+use contest::step::{agreements, library};
 use corotate::bench::{Bench, Results, run};
 use corotate::config::SHIPPED;
 use std::path::PathBuf;
@@ -50,7 +51,7 @@ fn the_step_and_the_fleet_stand_beside_all_their_floors() {
 
 #[test]
 fn the_code_in_c_computes_the_same_numbers() {
-    let agreements = agreements().unwrap();
+    let agreements = agreements(&library(NATIVE)).unwrap();
     assert_eq!(agreements.len(), 4);
     for agreement in agreements {
         assert!(agreement.words && agreement.largest < 1e-12, "{agreement:?}");

@@ -167,7 +167,7 @@ fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
 #[test]
 fn its_own_loop_is_measured() {
     let bench = Bench::of(program());
-    let done = bench.run(&["bench", "chain", "tick", "lockstep", "toll", "--quick", "--json", "--out", "results"]);
+    let done = bench.run(&["bench", "chain", "tick", "lockstep", "overhead", "--quick", "--json", "--out", "results"]);
     assert_eq!(done.code, Some(0), "{done:?}");
     bench.assert_clean(&[]);
     let results: Value = serde_json::from_str(&done.stdout).unwrap();
@@ -183,8 +183,8 @@ fn its_own_loop_is_measured() {
         ("lockstep", "lockstep"),
         ("lockstep", "in one thread, motor-pair"),
         ("lockstep", "arithmetic alone, motor-pair"),
-        ("toll", "page faults, follower"),
-        ("toll", "allocations beyond iceoryx2's one per sample, worst role"),
+        ("overhead", "page faults, follower"),
+        ("overhead", "allocations beyond iceoryx2's one per sample, worst role"),
     ] {
         let found = figures.iter().find(|figure| figure["row"] == row && figure["name"] == name);
         assert!(found.is_some_and(|figure| figure["median"].as_f64().unwrap() >= 0.0), "{row}: {name}: {done:?}");

@@ -20,7 +20,6 @@ use corotate::sample::{FieldKind, RateCommand, RateEstimate, RateMeasurement, Sa
 use corotate::with_shipped_rig;
 use nalgebra::{Vector1, Vector3};
 use std::hint::black_box;
-use std::sync::OnceLock;
 
 /// The hand-written step.
 const REFERENCE: &str = include_str!("reference.c");
@@ -186,8 +185,8 @@ pub struct Agreement {
 ///
 /// # Errors
 /// Why there is no C code, in words.
-pub fn agreements() -> Result<Vec<Agreement>, String> {
-    let library = library()?;
+pub fn agreements(library: &Result<Compiled, String>) -> Result<Vec<Agreement>, String> {
+    let library = library.as_ref().map_err(Clone::clone)?;
     KINDS.iter().map(|(kind, name, overrides)| agreement(library, kind, &scenario(name, overrides))).collect()
 }
 
@@ -240,16 +239,9 @@ impl Agreement {
     }
 }
 
-/// The C code, compiled once for this very machine.
-fn library() -> Result<&'static Compiled, String> {
-    static LIBRARY: OnceLock<Result<Compiled, String>> = OnceLock::new();
-    LIBRARY.get_or_init(|| Compiled::new(REFERENCE, NATIVE)).as_ref().map_err(Clone::clone)
-}
-
-/// The same for any machine: what a portable program that gives the same bits everywhere can have.
-fn portable_library() -> Result<&'static Compiled, String> {
-    static LIBRARY: OnceLock<Result<Compiled, String>> = OnceLock::new();
-    LIBRARY.get_or_init(|| Compiled::new(REFERENCE, PORTABLE)).as_ref().map_err(Clone::clone)
+/// The C code, compiled in one way.
+pub fn library(flags: &[&str]) -> Result<Compiled, String> {
+    Compiled::new(REFERENCE, flags)
 }
 
 /// The same job by a textbook's filter: measured rates in, command of the same law out.
@@ -321,12 +313,17 @@ fn copy_samples(
 }
 
 /// A kind's step, ours and in C.
-fn kind<'a>(kind: &'static str, scenario: &'a Scenario, board: &mut Board) -> Vec<Contestant<'a>> {
+fn kind<'a>(
+    kind: &'static str,
+    scenario: &'a Scenario,
+    libraries: &'a [Result<Compiled, String>; 2],
+    board: &mut Board,
+) -> Vec<Contestant<'a>> {
     let floor = format!("{kind} in C");
     let mut contestants = vec![Contestant::new(kind, pass(scenario)).beside(&*floor)];
     let (prefix, parameters) = parameters(kind, scenario);
-    for (library, suffix) in [(library(), ""), (portable_library(), ", for any machine")] {
-        match library.and_then(|library| InC::new(library, prefix, parameters.clone())) {
+    for (library, suffix) in libraries.iter().zip(["", ", for any machine"]) {
+        match library.as_ref().map_err(Clone::clone).and_then(|library| InC::new(library, prefix, parameters.clone())) {
             Ok(mut in_c) => contestants.push(with_shipped_rig!(scenario.rig, rig => {
                 let samples = measurements(rig, scenario);
                 Contestant::new(format!("{floor}{suffix}"), move || pass_in_c(rig, &mut in_c, &samples))
@@ -426,7 +423,8 @@ fn whole_body_filters<'a>(recording: &'a Recording, name: &str, guess: f64) -> [
 /// Measures the row.
 pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     bench.next("step: checking the C code against ours")?;
-    match agreements() {
+    let libraries = [library(NATIVE), library(PORTABLE)];
+    match agreements(&libraries[0]) {
         Ok(agreements) => agreements.iter().for_each(|agreement| {
             let Agreement { kind, largest, words } = agreement;
             let same = if *words { "same words" } else { "OTHER WORDS" };
@@ -442,7 +440,7 @@ pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchErro
         CASES[..3].iter().map(|case| (Recording::new(case, 1e-3, SAMPLES as f64 * 1e-3, DEVIATION, 1), case)).collect();
     let first = &kinds[0].1;
     let mut contestants: Vec<Contestant<'_>> =
-        kinds.iter().flat_map(|(name, scenario)| kind(name, scenario, board)).collect();
+        kinds.iter().flat_map(|(name, scenario)| kind(name, scenario, &libraries, board)).collect();
     contestants.extend(by_ekf(first).into_iter().chain(bare_copy(first)));
     // Samples in, command out, for every shipped scenario that has commands.
     let with_law = shipped.iter().filter(|(_, scenario)| scenario.rig.bodies().iter().any(|body| body.driven));

@@ -36,6 +36,13 @@ pub struct Figure {
     floor: Option<String>,
 }
 
+impl Figure {
+    fn push(&mut self, round: f64) {
+        self.rounds.push(round);
+        self.median = median(&self.rounds);
+    }
+}
+
 /// Everything that was measured.
 #[derive(Debug, Default)]
 pub struct Board {
@@ -43,7 +50,7 @@ pub struct Board {
     row: &'static str,
     figures: Vec<Figure>,
     remarks: Vec<String>,
-    grants: Vec<Grant>,
+    pub(super) grants: Vec<Grant>,
 }
 
 /// The median of some values; the mean of the middle two of an even number.
@@ -65,8 +72,7 @@ impl Board {
 
     /// Adds a round's value to a figure. `floor` names the figure of the same row that it stands beside.
     pub fn add(&mut self, name: &str, unit: &'static str, floor: Option<&str>, value: f64) {
-        self.figure(name, unit, floor).rounds.push(value);
-        self.settle(name);
+        self.figure(name, unit, floor).push(value);
     }
 
     /// Adds a round's latencies to a figure. A round without any is none.
@@ -75,11 +81,10 @@ impl Board {
             return;
         }
         let figure = self.figure(name, "us", floor);
-        figure.rounds.push(latency.percentiles().p50_us);
+        figure.push(latency.percentiles().p50_us);
         let pooled = figure.pooled.get_or_insert_default();
         pooled.absorb(latency);
         figure.latency = Some(pooled.percentiles());
-        self.settle(name);
     }
 
     /// Adds something that a reader must know.
@@ -96,10 +101,6 @@ impl Board {
                 self.grants.push(grant);
             }
         }
-    }
-
-    pub(super) fn take_grants(&mut self) -> Vec<Grant> {
-        std::mem::take(&mut self.grants)
     }
 
     /// What was measured, in the order in which it was begun.
@@ -149,13 +150,6 @@ impl Board {
             self.figures.len() - 1
         });
         &mut self.figures[index]
-    }
-
-    fn settle(&mut self, name: &str) {
-        let row = self.row;
-        if let Some(figure) = self.figures.iter_mut().find(|figure| figure.row == row && figure.name == name) {
-            figure.median = median(&figure.rounds);
-        }
     }
 
     /// Computes what every figure is to the one that it stands beside, once all are there.

@@ -9,7 +9,7 @@ use super::peer::Peer;
 use super::{Bench, BenchError, Board};
 use crate::bus::domain::OwnedDomain;
 use crate::clock::{Grid, monotonic_ns};
-use crate::launch::{Launch, Outcome};
+use crate::launch::Outcome;
 use crate::runtime::RoleId;
 
 const RATES_HZ: [u64; 4] = [1000, 5000, 10_000, 20_000];
@@ -36,7 +36,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
             bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
             let (ours, floor) = (format!("ours, {hz} Hz"), format!("raw hops, {hz} Hz"));
-            let apart = match run_in_real_time(bench, *hz, seconds, APART) {
+            let apart = match run_live(bench, *hz, seconds, APART) {
                 Err(BenchError::Scenario(reason)) => {
                     board.remark(format!("chain is not measured at {hz} Hz: {reason}"));
                     continue;
@@ -45,7 +45,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
             };
             for (name, processes) in [("observer with controller", ESTIMATE_AND_CONTROL), ("all in one process", &all)]
             {
-                let together = run_in_real_time(bench, *hz, seconds, processes)?;
+                let together = run_live(bench, *hz, seconds, processes)?;
                 stages(&together, "controller", "age")
                     .for_each(|latency| board.record(&format!("{name}, {hz} Hz"), Some(&ours), &latency));
             }
@@ -62,7 +62,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
             });
             let share = 100.0 * missed as f64 / elapsed as f64;
             board.add(&format!("missed or starved, {hz} Hz"), "%", None, share);
-            raw.measure(bench, board, &floor, *hz, (seconds * *hz as f64) as u64)?;
+            raw.measure(bench, board, *hz, (seconds * *hz as f64) as u64)?;
         }
     }
     Ok(())
@@ -78,27 +78,11 @@ pub(super) fn stages<'a>(
     of_role.flat_map(|report| &report.stages).filter(move |found| found.stage == stage).map(|found| found.latency())
 }
 
-/// A real-time run of the scenario, with these roles in one process.
-pub(super) fn run_in_real_time(
-    bench: &mut Bench<'_>,
-    hz: u64,
-    seconds: f64,
-    processes: &str,
-) -> Result<Outcome, BenchError> {
+/// A run of the scenario in real time, with these roles in one process.
+pub(super) fn run_live(bench: &Bench<'_>, hz: u64, seconds: f64, processes: &str) -> Result<Outcome, BenchError> {
     let (hz, seconds) = (format!("tick_hz={hz}.0"), format!("duration_s={seconds:?}"));
     let scenario = bench.scenario(&[&hz, &seconds, "clock=realtime", &format!("launch.processes={processes}")])?;
-    let mut launch = Launch {
-        program: bench.program.clone(),
-        external: Vec::new(),
-        record: None,
-        foxglove: None,
-        require_realtime: false,
-        signal: bench.signal,
-        progress: &mut |_| {},
-    };
-    let outcome = crate::launch::run(&scenario, &mut launch)?;
-    bench.interrupted()?;
-    Ok(outcome)
+    bench.launch(&scenario, bench.signal, &mut |_| {})
 }
 
 /// Bare hops in a row: this process in the leader's place, a peer in the observer's, one in the controller's.
@@ -131,14 +115,8 @@ impl RawChain {
         Ok(Self { sender, relay, last, number: 0 })
     }
 
-    fn measure(
-        &mut self,
-        bench: &Bench<'_>,
-        board: &mut Board,
-        name: &str,
-        hz: u64,
-        count: u64,
-    ) -> Result<(), BenchError> {
+    fn measure(&mut self, bench: &Bench<'_>, board: &mut Board, hz: u64, count: u64) -> Result<(), BenchError> {
+        let name = format!("raw hops, {hz} Hz");
         let grid = Grid { epoch_ns: monotonic_ns() + START_NS, period_ns: 1_000_000_000 / hz };
         self.relay.receive(grid, self.number + 1, count, true)?;
         self.last.receive(grid, self.number + 1, count, false)?;
@@ -148,7 +126,7 @@ impl RawChain {
         })?;
         let (_, lost_first) = self.relay.received()?;
         let ([due, _], lost) = self.last.received()?;
-        board.record(name, None, &due);
+        board.record(&name, None, &due);
         let share = 100.0 * (lost + lost_first) as f64 / (2 * count) as f64;
         board.add(&format!("overtaken in {name}"), "%", None, share);
         Ok(())

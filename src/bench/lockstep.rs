@@ -6,7 +6,7 @@ use super::hop::Pair;
 use super::{Bench, BenchError, Board, resolve};
 use crate::bus::domain::OwnedDomain;
 use crate::config::Scenario;
-use crate::launch::{Launch, Progress};
+use crate::launch::Progress;
 use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
 use crate::role::{Body, Controller, Observer};
 use crate::runtime::RoleId;
@@ -56,31 +56,22 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
 }
 
 /// Ticks per second of a run, between the first tick that its launcher sees and the last; it is ended in order after so long.
-fn ticks_per_second(bench: &mut Bench<'_>, scenario: &Scenario, limit: Duration) -> Result<f64, BenchError> {
+fn ticks_per_second(bench: &Bench<'_>, scenario: &Scenario, limit: Duration) -> Result<f64, BenchError> {
     let end = AtomicUsize::new(0);
     let mut seen: Option<[(u64, Instant); 2]> = None;
-    let mut launch = Launch {
-        program: bench.program.clone(),
-        external: Vec::new(),
-        record: None,
-        foxglove: None,
-        require_realtime: false,
-        signal: &end,
-        progress: &mut |progress| {
-            if let Progress::Running { tick, .. } = progress {
-                let now = (*tick, Instant::now());
-                let first = seen.map_or(now, |[first, _]| first);
-                seen = Some([first, now]);
-                if now.1 > first.1 + limit || bench.interrupted().is_err() {
-                    end.store(SIGTERM, Ordering::Relaxed);
-                }
+    let mut progress = |progress: &Progress<'_>| {
+        if let Progress::Running { tick, .. } = progress {
+            let now = (*tick, Instant::now());
+            let first = seen.map_or(now, |[first, _]| first);
+            seen = Some([first, now]);
+            if now.1 > first.1 + limit || bench.interrupted().is_err() {
+                end.store(SIGTERM, Ordering::Relaxed);
             }
-        },
+        }
     };
     let began = Instant::now();
-    crate::launch::run(scenario, &mut launch)?;
+    bench.launch(scenario, &end, &mut progress)?;
     let whole = began.elapsed();
-    bench.interrupted()?;
     Ok(match seen {
         Some([(first, from), (last, to)]) if last > first => (last - first) as f64 / (to - from).as_secs_f64(),
         // A run too short to be looked at twice: its start and stop count too.

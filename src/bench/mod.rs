@@ -17,19 +17,19 @@ mod report;
 mod run;
 mod targets;
 mod tick;
-mod toll;
+mod overhead;
 mod watch;
 
 pub use board::{Beside, Board, Figure};
 pub(crate) use lockstep::arithmetic_alone;
-pub use peer::{PeerSeat, serve_peer};
+pub use peer::serve_peer;
 pub use report::{Results, table, write_results};
 pub use targets::{Bound, Of, Target, Verdict, target};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ConfigError, SHIPPED, Scenario};
-use crate::launch::LaunchError;
+use crate::launch::{self, Launch, LaunchError, Outcome, Progress};
 use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::Grant;
 use rustix::thread::{sched_getaffinity, sched_setaffinity};
@@ -42,36 +42,28 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 pub struct Row {
     /// Its name.
     pub name: &'static str,
-    /// What it is, in words.
-    pub title: &'static str,
+    title: &'static str,
     /// What its figures are held against.
     pub targets: &'static [Target],
-    /// What measures it.
-    pub measure: fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>,
+    measure: Measure,
 }
 
-const fn row(
-    name: &'static str,
-    title: &'static str,
-    targets: &'static [Target],
-    measure: fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>,
-) -> Row {
+/// Measures a row and puts its figures on the board.
+pub type Measure = fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>;
+
+/// A row by its name, what it is in words, what its figures are held against, and what measures it.
+pub const fn row(name: &'static str, title: &'static str, targets: &'static [Target], measure: Measure) -> Row {
     Row { name, title, targets, measure }
 }
 
 /// What a user measures on a machine.
-pub const ROWS: [Row; 7] = [
+pub const ROWS: &[Row] = &[
     row("hop", "one hop between two processes on two cores", targets::HOP, hop::measure),
-    row(
-        "chain",
-        "leader -> observer -> controller: from the leader's tick until the command is sent",
-        targets::CHAIN,
-        chain::measure,
-    ),
+    row("chain", "leader -> observer -> controller: from tick to command sent", targets::CHAIN, chain::measure),
     row("tick", "how late a tick begins", targets::TICK, tick::measure),
     row("lockstep", "ticks per second where nobody waits for the time", targets::LOCKSTEP, lockstep::measure),
-    row("run", "a whole `corotate run`: start, stop, memory", targets::RUN, run::measure),
-    row("toll", "system calls, faults, context switches and allocations per tick", targets::TOLL, toll::measure),
+    row("run", "a whole run: start, stop, memory", targets::RUN, run::measure),
+    row("overhead", "system calls, faults, context switches and allocations per tick", targets::OVERHEAD, overhead::measure),
     row("processor", "processor time per tick of every role, by how roles wait", &[], processor::measure),
 ];
 
@@ -145,7 +137,7 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
             measured => measured?,
         }
     }
-    let taken = board.take_grants();
+    let taken = std::mem::take(&mut board.grants);
     Ok((board, [grants, taken].concat()))
 }
 
@@ -156,13 +148,13 @@ fn resolve((name, text): (&str, &str), overrides: &[&str]) -> Result<Scenario, B
 }
 
 impl Bench<'_> {
-    /// The scenario that is measured, undisturbed and with every role started by the launcher.
+    /// The scenario that is measured: without faults, unwatched, and with every role started by the launcher.
     ///
     /// # Errors
     /// [`BenchError::NoScenario`], [`BenchError::Scenario`].
     pub fn scenario(&self, overrides: &[&str]) -> Result<Scenario, BenchError> {
         let first = self.scenarios.first().ok_or(BenchError::NoScenario)?;
-        resolve(*first, &[overrides, &["fault=[]", "launch.external=[]"]].concat())
+        resolve(*first, &[overrides, &["fault=[]", "watchdog={}", "launch.external=[]"]].concat())
     }
 
     /// Whether the scenario is the one whose figures have targets.
@@ -172,14 +164,33 @@ impl Bench<'_> {
 
     /// Why no target is judged; nothing if all are.
     pub fn unjudged(&self) -> Vec<String> {
-        let quick = self.quick.then(|| "a smoke run: everything is exercised, no figure means anything".to_owned());
-        let debug = cfg!(debug_assertions)
-            .then(|| "a debug build: its figures are not those of the product; build with --release".to_owned());
-        let other = (!self.has_targets()).then(|| {
+        let mut reasons = Vec::new();
+        if self.quick {
+            reasons.push("a smoke run: everything is exercised, no figure means anything".to_owned());
+        }
+        if cfg!(debug_assertions) {
+            reasons.push("a debug build: its figures are not those of the product; build with --release".to_owned());
+        }
+        if !self.has_targets() {
             let (of, this) = (SHIPPED[0].0, self.scenarios.first().map_or("none", |(name, _)| *name));
-            format!("the targets are those of corotate's scenario {of}, and this is {this}")
-        });
-        quick.into_iter().chain(debug).chain(other).collect()
+            reasons.push(format!("the targets are those of corotate's scenario {of}, and this is {this}"));
+        }
+        reasons
+    }
+
+    /// Runs a scenario by this program, until `signal` is one.
+    fn launch(
+        &self,
+        scenario: &Scenario,
+        signal: &AtomicUsize,
+        progress: &mut dyn FnMut(&Progress<'_>),
+    ) -> Result<Outcome, BenchError> {
+        let (program, external) = (self.program.clone(), Vec::new());
+        let (record, foxglove, require_realtime) = (None, None, false);
+        let mut launch = Launch { program, external, record, foxglove, require_realtime, signal, progress };
+        let outcome = launch::run(scenario, &mut launch)?;
+        self.interrupted()?;
+        Ok(outcome)
     }
 
     /// Says what comes next.
@@ -222,5 +233,44 @@ impl Bench<'_> {
         // Where it cannot be had back the rest of the suite stays on the leader's core.
         let _ = cores.map(|cores| sched_setaffinity(None, &cores));
         done
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with<T>(name: &str, scenarios: &[(&str, &str)], act: impl FnOnce(&mut Bench<'_>) -> T) -> T {
+        act(&mut Bench {
+            rows: ROWS.iter().filter(|row| row.name == name).copied().collect(),
+            quick: true,
+            program: PathBuf::new(),
+            scenarios,
+            signal: &AtomicUsize::new(0),
+            progress: &mut |_| {},
+        })
+    }
+
+    #[test]
+    fn what_a_scenario_does_not_go_with_is_named_and_not_measured() {
+        let (_, text) = SHIPPED.iter().find(|(name, _)| *name == "orbit-rendezvous").unwrap();
+        let mut free: toml::Table = text.parse().unwrap();
+        free.retain(|key, _| !["controller", "follower"].contains(&key));
+        let (board, _) = with("chain", &[("free", &free.to_string())], run).unwrap();
+        assert!(board.figures().is_empty() && board.remarks()[0].contains("no body of this"), "{:?}", board.remarks());
+        let scenarios = [SHIPPED[0], ("wrong", "tick_hz = 0")];
+        let (board, _) = with("lockstep", &scenarios, run).unwrap();
+        assert!(board.figures().is_empty() && board.remarks()[0].contains("wrong.toml"), "{:?}", board.remarks());
+        assert!(matches!(with("lockstep", &scenarios[1..], run), Err(BenchError::Scenario(_))));
+        assert!(matches!(with("lockstep", &[], run), Err(BenchError::NoScenario)));
+    }
+
+    #[test]
+    fn what_disturbs_or_outlasts_a_short_run_is_left_out() {
+        let (_, text) = SHIPPED.iter().find(|(name, _)| *name == "faults").unwrap();
+        let text = text.replace("\n[watchdog]", "\n[launch]\nexternal = [\"follower\"]\n[watchdog]");
+        assert!(resolve(("disturbed", &text), &[]).is_ok_and(|whole| !whole.faults.is_empty()));
+        let short = with("", &[("disturbed", &text)], |bench| bench.scenario(&["duration_s=0.1"])).unwrap();
+        assert!(short.faults.is_empty() && short.external.is_empty(), "{short:?}");
     }
 }

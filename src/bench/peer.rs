@@ -15,7 +15,7 @@ use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
 use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver as Lines, channel};
 use std::time::Duration;
@@ -28,15 +28,6 @@ pub(super) const SPIN_NS: u64 = 50_000;
 pub(super) const LOST_NS: u64 = 1_000_000_000;
 /// A peer that has said nothing for so long hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
-
-/// What the command line of a peer says.
-#[derive(Debug, Clone)]
-pub struct PeerSeat {
-    /// The domain's directory.
-    pub domain: PathBuf,
-    /// Whether it has the observer's place, beside the leader where cores are few; else the controller's.
-    pub observer: bool,
-}
 
 /// What a peer is asked to do.
 #[derive(Debug, Serialize, Deserialize)]
@@ -62,13 +53,14 @@ enum Answer {
     Echoed,
 }
 
-/// Serves as a peer until standard input ends, with the privileges of a role of the scenario that is measured.
+/// Serves as a peer of the benchmark in this domain until standard input ends, in the place of the observer of this scenario,
+/// beside the leader where cores are few; else of the controller.
 ///
 /// # Errors
 /// Why it cannot, in words.
-pub fn serve_peer(seat: &PeerSeat, scenario: &Scenario) -> Result<(), String> {
-    let domain = Domain::join(&seat.domain).map_err(|error| error.to_string())?;
-    let (role, waits_for) = match seat.observer {
+pub fn serve_peer(domain: &Path, scenario: &Scenario, observer: bool) -> Result<(), String> {
+    let domain = Domain::join(domain).map_err(|error| error.to_string())?;
+    let (role, waits_for) = match observer {
         true => (RoleId::Observer, RoleId::Plant(0)),
         false => (RoleId::Controller, RoleId::Observer),
     };

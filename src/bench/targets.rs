@@ -70,7 +70,7 @@ pub(super) const RUN: &[Target] = &[
     target("memory of the largest role", None, Median, AtMost(12.0)),
     target("shared memory", None, Median, AtMost(4.0)),
 ];
-pub(super) const TOLL: &[Target] = &[
+pub(super) const OVERHEAD: &[Target] = &[
     target("system calls beyond its waits, worst role", None, Median, AtMost(0.01)),
     target("page faults, worst role", None, Median, AtMost(0.0)),
     target("allocations beyond iceoryx2's one per sample, worst role", None, Median, AtMost(0.01)),

@@ -1,6 +1,6 @@
 //! How late a tick begins: in a run, bare, and by cyclictest, in turn, at the same priority and period on the same core.
 
-use super::chain::{APART, run_in_real_time, stages};
+use super::chain::{APART, run_live, stages};
 use super::watch::Watch;
 use super::{Bench, BenchError, Board};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
@@ -20,7 +20,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let leader = RoleId::Plant(0).name(&bench.scenario(&[])?).to_owned();
     for round in 1..=rounds {
         bench.next(&format!("tick: round {round} of {rounds}"))?;
-        let outcome = run_in_real_time(bench, 1000, ticks as f64 / 1e3, APART)?;
+        let outcome = run_live(bench, 1000, ticks as f64 / 1e3, APART)?;
         for latency in stages(&outcome, &leader, "lateness") {
             board.record("ours, in a run", Some("cyclictest"), &latency);
         }

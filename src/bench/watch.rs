@@ -117,12 +117,12 @@ impl Watch<'_> {
                 observed.rate_error_percent = line.as_ref().and_then(|line: &Line| line.rate_error(scenario));
                 return match status.success() {
                     true => Ok(observed),
-                    false => Err(BenchError::Peer(format!("`corotate run` ended with {status}"))),
+                    false => Err(BenchError::Peer(format!("a whole run ended with {status}"))),
                 };
             }
             bench.interrupted()?;
             if monotonic_ns() > started_ns + length_ns + HUNG_NS {
-                return Err(BenchError::Peer("`corotate run` hangs".to_owned()));
+                return Err(BenchError::Peer("a whole run hangs".to_owned()));
             }
             match &mut line {
                 None => {

@@ -22,12 +22,12 @@ const STRIDE: usize = 16;
 const OWNER: usize = 1;
 /// Set while somebody is asleep; the count of notifications is above it.
 const ASLEEP: u32 = 1;
-const RING: u32 = 2;
+const NOTIFICATION: u32 = 2;
 /// A writer that has never notified is perhaps none of ours and never will: its reader looks again after so long, ns.
-const UNRUNG_NS: u64 = 50_000;
-/// One that has may have died before it rang: its reader looks again after so long, ns. Not after a tick: two that wake at
+const SILENT_NS: u64 = 50_000;
+/// One that has may have died before it notified: its reader looks again after so long, ns. Not after a tick: two that wake at
 /// one time are in each other's way.
-const RUNG_NS: u64 = 10_000_000;
+const NOTIFIED_NS: u64 = 10_000_000;
 
 /// Bytes of shared memory for the notifiers of a run.
 pub const NOTIFIERS_BYTES: usize = NOTIFIERS * STRIDE * size_of::<u32>();
@@ -99,7 +99,7 @@ impl Notifier {
     /// Wakes whoever sleeps. After the sample is there.
     #[inline]
     pub fn notify(&self) {
-        if self.word().fetch_add(RING, Ordering::SeqCst) & ASLEEP != 0 {
+        if self.word().fetch_add(NOTIFICATION, Ordering::SeqCst) & ASLEEP != 0 {
             self.wake();
         }
     }
@@ -120,7 +120,7 @@ impl Notifier {
         if news()? {
             return Ok(());
         }
-        let longest_ns = if seen >= RING { RUNG_NS } else { UNRUNG_NS };
+        let longest_ns = if seen >= NOTIFICATION { NOTIFIED_NS } else { SILENT_NS };
         let wait_ns = until_ns.saturating_sub(monotonic_ns()).min(longest_ns);
         let timeout = Timespec { tv_sec: 0, tv_nsec: wait_ns as _ };
         // Rung, interrupted or over: the caller looks for itself.
@@ -161,7 +161,7 @@ mod tests {
         }
         said.send(()).unwrap();
         ringer.join().unwrap();
-        assert!(notifier.word().load(Ordering::SeqCst) >= RING);
+        assert!(notifier.word().load(Ordering::SeqCst) >= NOTIFICATION);
     }
 
     #[test]

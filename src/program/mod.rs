@@ -23,6 +23,7 @@ mod run;
 mod seat;
 mod watch;
 
+use crate::bench::Row;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::rig::{Rig, RigKind, register};
@@ -242,21 +243,43 @@ impl Program {
     /// # Panics
     /// If a scenario was read before: the rigs are known from then on.
     pub fn main(self) -> ExitCode {
-        assert!(register(self.rigs), "Program::main comes before any scenario is read");
-        let _ = SCENARIOS.set(self.scenarios);
-        // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
-        let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
+        self.begin();
         let version = concat!("with corotate ", env!("CARGO_PKG_VERSION"));
         let line = Arguments::command().name(name());
         let mut line = if name() == env!("CARGO_PKG_NAME") { line } else { line.version(version) };
         let command = Arguments::from_arg_matches_mut(&mut line.get_matches_mut());
         let command = command.unwrap_or_else(|error| error.exit()).command;
-        tell_defects();
         // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
         let exit = std::panic::catch_unwind(|| obey(command))
             .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
         exit.into()
     }
+
+    /// Measures rows as the command `bench` does its own, with its options: the whole `main` of a bench target.
+    ///
+    /// # Panics
+    /// If a scenario was read before: the rigs are known from then on.
+    pub fn bench(self, rows: &[Row]) -> ExitCode {
+        self.begin();
+        // `cargo bench` adds a word of its own.
+        let words = std::env::args().filter(|word| word != "--bench");
+        bench::bench(&BenchArguments::parse_from(words).bench, rows).into()
+    }
+
+    fn begin(self) {
+        assert!(register(self.rigs), "a program comes before any scenario is read");
+        let _ = SCENARIOS.set(self.scenarios);
+        // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
+        let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
+        tell_defects();
+    }
+}
+
+/// The command line of a bench target.
+#[derive(Parser)]
+struct BenchArguments {
+    #[command(flatten)]
+    bench: bench::Arguments,
 }
 
 static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
@@ -321,7 +344,7 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
-        Some(Command::Bench(arguments)) => bench::bench(&arguments),
+        Some(Command::Bench(arguments)) => bench::bench(&arguments, crate::bench::ROWS),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),
     }

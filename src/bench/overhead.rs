@@ -46,9 +46,9 @@ impl Counts {
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let (rounds, window) = (bench.size(3, 1), bench.size(Duration::from_secs(2), Duration::from_millis(300)));
     for round in 1..=rounds {
-        bench.next(&format!("toll: counts, round {round} of {rounds}"))?;
+        bench.next(&format!("overhead: counts, round {round} of {rounds}"))?;
         count(bench, board, window)?;
-        bench.next(&format!("toll: system calls, round {round} of {rounds}"))?;
+        bench.next(&format!("overhead: system calls, round {round} of {rounds}"))?;
         calls(bench, board, window)?;
     }
     Ok(())
