@@ -2,11 +2,12 @@
 //!
 //! Every way carries the same words and is used as a plain, careful program would use it. Must not know what is measured.
 
+use super::BenchError;
 use super::page::Page;
 use crate::bus::domain::Domain;
 use crate::bus::iox::{IoxBus, IoxReader, IoxWriter};
 use crate::bus::raw::{RawBoardReader, RawBoardWriter, RawListener, RawNode, RawNotifier, RawPublisher, RawSubscriber};
-use crate::bus::{Bus, BusError, Depths, Read, Reader, Signal, Topic, Write};
+use crate::bus::{Bus, Depths, Read, Reader, Signal, Topic, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::{Sample, sample};
 use rustix::fd::OwnedFd;
@@ -147,24 +148,24 @@ enum Notification {
 
 trait Out {
     /// Sends these words.
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError>;
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError>;
     /// Gets ready for the next.
-    fn prepare(&mut self) -> Result<(), BusError> {
+    fn prepare(&mut self) -> Result<(), BenchError> {
         Ok(())
     }
     /// Tells readers that came late of this end.
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), BenchError> {
         Ok(())
     }
 }
 
 trait In {
     /// Takes the next words, if they are there. What blocks by itself waits for them.
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError>;
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError>;
     /// Finds the shortest way to a writer that has come.
     fn refresh(&mut self) {}
     /// Sleeps until there may be some, if it knows how to.
-    fn sleep(&mut self, _until_ns: u64) -> Result<(), BusError> {
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BenchError> {
         Ok(())
     }
 }
@@ -176,8 +177,8 @@ pub(super) struct Station<'a> {
     pub process: &'static str,
 }
 
-fn system(what: &str, error: impl std::fmt::Display) -> BusError {
-    BusError::Device { reason: format!("cannot {what}: {error}") }
+pub(super) fn system(what: &'static str, error: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> BenchError {
+    BenchError::System { what, source: std::io::Error::other(error) }
 }
 
 sample! {
@@ -207,24 +208,25 @@ sample! {
 /// Ours: the stamp has the first words.
 impl<S: Sample> Out for IoxWriter<S> {
     #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         Write::send(self, |sample: &mut S| {
             bytemuck::bytes_of_mut(sample).copy_from_slice(bytemuck::cast_slice(words));
-        })
+        })?;
+        Ok(())
     }
 
-    fn prepare(&mut self) -> Result<(), BusError> {
-        Write::prepare(self)
+    fn prepare(&mut self) -> Result<(), BenchError> {
+        Ok(Write::prepare(self)?)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
-        Write::refresh(self)
+    fn refresh(&mut self) -> Result<(), BenchError> {
+        Ok(Write::refresh(self)?)
     }
 }
 
 impl<S: Sample> In for IoxReader<S> {
     #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError> {
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let there = self.advance()?;
         if let (true, Some(sample)) = (there, self.current()) {
             words.copy_from_slice(bytemuck::cast_slice(bytemuck::bytes_of(sample)));
@@ -236,21 +238,21 @@ impl<S: Sample> In for IoxReader<S> {
         Read::refresh(self);
     }
 
-    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        Read::sleep(self, until_ns)
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BenchError> {
+        Ok(Read::sleep(self, until_ns)?)
     }
 }
 
 impl<const WORDS: usize> Out for RawPublisher<WORDS> {
     #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
-        RawPublisher::send(self, words)
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
+        Ok(RawPublisher::send(self, words)?)
     }
 }
 
 impl<const WORDS: usize> In for RawSubscriber<WORDS> {
     #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError> {
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let there = RawSubscriber::receive(self, |sample| words.copy_from_slice(sample))?;
         Ok(there.is_some())
     }
@@ -258,7 +260,7 @@ impl<const WORDS: usize> In for RawSubscriber<WORDS> {
 
 impl<const WORDS: usize> Out for RawBoardWriter<WORDS> {
     #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         RawBoardWriter::send(self, words);
         Ok(())
     }
@@ -269,7 +271,7 @@ struct Newest<const WORDS: usize>(RawBoardReader<WORDS>, u64);
 
 impl<const WORDS: usize> In for Newest<WORDS> {
     #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError> {
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let value = self.0.get();
         let there = value[0] != self.1;
         self.1 = value[0];
@@ -283,7 +285,7 @@ struct Mailbox(Page, usize, u64);
 
 impl Out for Mailbox {
     #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         self.0.put(self.1, words);
         Ok(())
     }
@@ -291,7 +293,7 @@ impl Out for Mailbox {
 
 impl In for Mailbox {
     #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError> {
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let there = self.0.take(self.1, self.2, words);
         if there {
             self.2 = words[0];
@@ -305,7 +307,7 @@ struct Descriptor(OwnedFd);
 
 impl Out for Descriptor {
     #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
         let bytes: &[u8] = bytemuck::cast_slice(words);
         let sent = rustix::io::write(&self.0, bytes).map_err(|error| system("write", error))?;
         if sent == bytes.len() { Ok(()) } else { Err(system("write", "only a part was taken")) }
@@ -314,7 +316,7 @@ impl Out for Descriptor {
 
 impl In for Descriptor {
     #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BusError> {
+    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(words);
         let received = rustix::io::read(&self.0, &mut *bytes).map_err(|error| system("read", error))?;
         if received == bytes.len() { Ok(true) } else { Err(system("read", "the other end is gone")) }
@@ -342,24 +344,24 @@ macro_rules! of_size {
 }
 
 impl Station<'_> {
-    fn raw(&self, opening: &Opening) -> Result<RawNode, BusError> {
-        RawNode::enter(self.domain, &format!("{}-{}", opening.name, self.process))
+    fn raw(&self, opening: &Opening) -> Result<RawNode, BenchError> {
+        Ok(RawNode::enter(self.domain, &format!("{}-{}", opening.name, self.process))?)
     }
 
-    fn ours(&self, opening: &Opening) -> Result<(IoxBus, Topic), BusError> {
+    fn ours(&self, opening: &Opening) -> Result<(IoxBus, Topic), BenchError> {
         let depths = Depths { role: 1, scorer: 64, history: 0 };
         let bus = IoxBus::enter(self.domain, &format!("{}-{}", opening.name, self.process), depths)?;
         let body = format!("{}-{}", opening.name, opening.direction);
         Ok((bus, Topic { scenario: "bench".to_owned(), body, signal: Signal::Measurement }))
     }
 
-    fn page(&self, opening: &Opening) -> Result<Page, BusError> {
+    fn page(&self, opening: &Opening) -> Result<Page, BenchError> {
         let path = self.domain.shared(&format!("{}.page", opening.name));
         Page::open(&path).map_err(|error| system("map shared memory", error))
     }
 
     /// Opens an end that sends.
-    pub fn sender(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Sender, BusError> {
+    pub fn sender(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Sender, BenchError> {
         let (words, direction) = (opening.words, opening.direction);
         let service = format!("bench/{}/{direction}", opening.name);
         let sleeps = opening.wake != Wake::Spin;
@@ -401,7 +403,7 @@ impl Station<'_> {
     }
 
     /// Opens an end that receives.
-    pub fn receiver(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Receiver, BusError> {
+    pub fn receiver(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Receiver, BenchError> {
         let (words, direction, wake) = (opening.words, opening.direction, opening.wake);
         let service = format!("bench/{}/{direction}", opening.name);
         let sleeps = wake != Wake::Spin;
@@ -449,7 +451,7 @@ impl Station<'_> {
 impl Sender {
     /// Sends a sample and wakes whoever sleeps; what was sent when is in it.
     #[inline]
-    pub fn send(&mut self, number: u64, due_ns: u64) -> Result<(), BusError> {
+    pub fn send(&mut self, number: u64, due_ns: u64) -> Result<(), BenchError> {
         let mut words = [number; MAX_WORDS];
         (words[1], words[2], words[3]) = (GENERATION, due_ns, monotonic_ns());
         self.carry.send(&words[..self.words])?;
@@ -458,18 +460,18 @@ impl Sender {
             Notification::EventFd(fd) => {
                 rustix::io::write(fd, &1_u64.to_ne_bytes()).map(|_| ()).map_err(|e| system("wake", e))
             }
-            Notification::Notifier(notifier) => notifier.notify(),
+            Notification::Notifier(notifier) => Ok(notifier.notify()?),
             Notification::None | Notification::Ours | Notification::Listener(_) => Ok(()),
         }
     }
 
     /// Gets ready for the next sample, off the critical path.
-    pub fn prepare(&mut self) -> Result<(), BusError> {
+    pub fn prepare(&mut self) -> Result<(), BenchError> {
         self.carry.prepare()
     }
 
     /// Tells readers that came late of this end.
-    pub fn refresh(&mut self) -> Result<(), BusError> {
+    pub fn refresh(&mut self) -> Result<(), BenchError> {
         self.carry.refresh()
     }
 }
@@ -493,9 +495,9 @@ impl Receiver {
     /// Waits for the next sample: polls until `spin_end_ns`, then as it does. `None` if there is none by `end_ns`.
     ///
     /// # Errors
-    /// [`BusError`]; also if a sample is torn.
+    /// [`BenchError`]; also if a sample is torn.
     #[inline]
-    pub fn receive(&mut self, spin_end_ns: u64, end_ns: u64) -> Result<Option<Content>, BusError> {
+    pub fn receive(&mut self, spin_end_ns: u64, end_ns: u64) -> Result<Option<Content>, BenchError> {
         let mut words = [0; MAX_WORDS];
         let words = &mut words[..self.words];
         let mut polled = 0_u32;
@@ -527,7 +529,7 @@ impl Receiver {
         }
     }
 
-    fn sleep(&mut self, notified: u32) -> Result<(), BusError> {
+    fn sleep(&mut self, notified: u32) -> Result<(), BenchError> {
         match &self.notifier {
             Notification::Futex(page, direction) => page.wait(*direction, notified),
             Notification::EventFd(fd) => {

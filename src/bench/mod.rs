@@ -10,6 +10,7 @@ mod chain;
 mod exchange;
 mod hop;
 mod lockstep;
+mod overhead;
 mod page;
 mod peer;
 mod processor;
@@ -17,7 +18,6 @@ mod report;
 mod run;
 mod targets;
 mod tick;
-mod overhead;
 mod watch;
 
 pub use board::{Beside, Board, Figure};
@@ -63,7 +63,12 @@ pub const ROWS: &[Row] = &[
     row("tick", "how late a tick begins", targets::TICK, tick::measure),
     row("lockstep", "ticks per second where nobody waits for the time", targets::LOCKSTEP, lockstep::measure),
     row("run", "a whole run: start, stop, memory", targets::RUN, run::measure),
-    row("overhead", "system calls, faults, context switches and allocations per tick", targets::OVERHEAD, overhead::measure),
+    row(
+        "overhead",
+        "system calls, faults, context switches and allocations per tick",
+        targets::OVERHEAD,
+        overhead::measure,
+    ),
     row("processor", "processor time per tick of every role, by how roles wait", &[], processor::measure),
 ];
 

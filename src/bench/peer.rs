@@ -3,9 +3,8 @@
 //! Asks for the same privileges as the role whose place it has. Takes its orders as lines of JSON on standard input and
 //! answers on standard output, never while it measures. Dies with its parent.
 
-use super::exchange::{Opening, Receiver, Sender, Station, Wake};
+use super::exchange::{Opening, Receiver, Sender, Station, Wake, system};
 use super::{Bench, BenchError};
-use crate::bus::BusError;
 use crate::bus::domain::Domain;
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
@@ -86,7 +85,7 @@ fn say(answer: &Answer) -> Result<(), String> {
     writeln!(stdout, "{line}").and_then(|()| stdout.flush()).map_err(|error| error.to_string())
 }
 
-fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Sender>)>) -> Result<Answer, BusError> {
+fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Sender>)>) -> Result<Answer, BenchError> {
     match (order, ends) {
         (Order::Open { inlet, outlet }, ends) => {
             let station = Station { domain, process: "peer" };
@@ -102,14 +101,14 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
         (Order::Echo { count }, Some((receiver, Some(sender)))) => {
             for _ in 0..*count {
                 let Some(content) = receiver.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)? else {
-                    return Err(BusError::Device { reason: "a sample is lost that nothing could overtake".to_owned() });
+                    return Err(system("relay a sample", "one is lost that nothing could overtake"));
                 };
                 sender.send(content.number, content.due_ns)?;
                 sender.prepare()?;
             }
             Ok(Answer::Echoed)
         }
-        _ => Err(BusError::Device { reason: "nothing is open".to_owned() }),
+        _ => Err(system("obey", "nothing is open")),
     }
 }
 
@@ -132,7 +131,7 @@ fn receive(
     count: u64,
     receiver: &mut Receiver,
     mut sender: Option<&mut Sender>,
-) -> Result<Answer, BusError> {
+) -> Result<Answer, BenchError> {
     let (mut due, mut sent, mut lost, mut tick) = (Latency::default(), Latency::default(), 0, 0);
     while tick < count {
         let due_ns = grid.due_ns(tick + 1);

@@ -47,12 +47,6 @@ pub enum BusError {
         /// The transport's reason.
         reason: String,
     },
-    /// The device at the end of a serial line is gone for good.
-    #[error("{reason}")]
-    Device {
-        /// Which, why, and what to do.
-        reason: String,
-    },
     /// A sample could not be received.
     #[error("cannot receive on {service}: {reason}")]
     Receive {

@@ -37,6 +37,7 @@ use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
 use crate::record::RecordError;
+use crate::runtime::NodeError;
 use crate::system::remedy;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;
@@ -96,6 +97,9 @@ pub enum LaunchError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// A role cannot go on.
+    #[error(transparent)]
+    Node(#[from] NodeError),
     /// The roles' counters could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),

@@ -82,8 +82,10 @@ pub fn exit_of(error: &RecordError) -> Exit {
         RecordError::Layout { .. } | RecordError::Missing { .. } => Exit::Usage,
         RecordError::Read { source, .. } if source.kind() == ErrorKind::NotFound => Exit::Usage,
         RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,
-        RecordError::Bus(_) | RecordError::Full { .. } | RecordError::Write { .. } | RecordError::Read { .. } => {
-            Exit::Failure
-        }
+        RecordError::Bus(_)
+        | RecordError::Node(_)
+        | RecordError::Full { .. }
+        | RecordError::Write { .. }
+        | RecordError::Read { .. } => Exit::Failure,
     }
 }

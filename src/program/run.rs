@@ -231,6 +231,7 @@ pub fn exit_of(error: &LaunchError) -> Exit {
         LaunchError::Domain(_)
         | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)
+        | LaunchError::Node(_)
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }
         | LaunchError::Record(_)

@@ -45,7 +45,7 @@ pub(crate) use taps::{Channel, MessageSink, Taps};
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::ConfigError;
-use crate::runtime::RoleError;
+use crate::runtime::{NodeError, RoleError};
 use crate::system::remedy;
 use std::io;
 use std::path::PathBuf;
@@ -62,6 +62,9 @@ pub enum RecordError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// A role cannot go on.
+    #[error(transparent)]
+    Node(#[from] NodeError),
     /// There is no room for more.
     #[error("the disk is full: {} ends here, readable ({source}); free some room, or record elsewhere with --out", path.display())]
     Full {

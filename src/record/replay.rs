@@ -9,7 +9,7 @@ use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
 use crate::config::Scenario;
-use crate::runtime::{Poll, ReadyNode, RoleId, RunCondition, build, depths, ports, private_ledger};
+use crate::runtime::{NodeError, Poll, ReadyNode, RoleId, RunCondition, build, depths, ports, private_ledger};
 use crate::sample::{FieldKind, Stamp, VOID};
 use crate::telemetry::Ledger;
 
@@ -269,7 +269,7 @@ struct Stage<'a> {
 
 impl Stage<'_> {
     /// Plays one step: feeds what the role had, one tick after the other, and lets it execute.
-    fn play(&mut self, number: usize, look: &mut dyn FnMut() -> Result<(), BusError>) -> Result<(), BusError> {
+    fn play(&mut self, number: usize, look: &mut dyn FnMut() -> Result<(), BusError>) -> Result<(), NodeError> {
         let step = self.script.steps[number];
         self.enter(step)?;
         let Some(node) = &mut self.node else { return Ok(()) };
@@ -295,7 +295,7 @@ impl Stage<'_> {
     }
 
     /// Builds the role anew for every life that it had.
-    fn enter(&mut self, step: Step) -> Result<(), BusError> {
+    fn enter(&mut self, step: Step) -> Result<(), NodeError> {
         while self.node.is_none() || self.ledger.generation() < step.generation {
             if let Some(mut left) = self.node.take() {
                 left.finish()?;

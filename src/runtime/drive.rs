@@ -4,7 +4,7 @@
 //! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
 use super::hooks::{self, Failpoint};
-use super::node::{Node, Poll, ReadyNode, RoleId, RunCondition};
+use super::node::{Node, NodeError, Poll, ReadyNode, RoleId, RunCondition};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
@@ -135,8 +135,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     /// Drives a node on the time grid.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, BusError> {
+    /// [`NodeError`] if a link failed.
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, NodeError> {
         while node.next_tick() <= self.last_tick {
             let due_ns = grid.due_ns(node.next_tick());
             let timed = node.time_triggered() || waiting.spin_ns > 0;
@@ -166,14 +166,19 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
-    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, BusError> {
+    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, NodeError> {
         let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
         node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
     /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the bell of
     /// the input that it lacks.
-    fn on_arrival(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Option<Poll>, BusError> {
+    fn on_arrival(
+        &mut self,
+        node: &mut dyn Node,
+        grid: Grid,
+        waiting: &Waiting<'_>,
+    ) -> Result<Option<Poll>, NodeError> {
         let tick = node.next_tick();
         let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;
         let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
@@ -203,7 +208,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
-    fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, BusError> {
+    fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, NodeError> {
         while monotonic_ns() < until_ns {
             hooks::at(Failpoint::Waiting);
             sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
@@ -215,13 +220,13 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Now and then: how this role is, and whether the run is over.
-    fn turn(&mut self, node: &mut dyn Node) -> Result<bool, BusError> {
+    fn turn(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
         if !self.turn_is_due() {
             return Ok(false);
         }
         self.control.announce(RoleState::Running, node)?;
         node.refresh()?;
-        self.control.stopped()
+        Ok(self.control.stopped()?)
     }
 
     fn turn_is_due(&mut self) -> bool {
@@ -234,7 +239,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     }
 
     /// Waits for the input that a node lacks, or for credit.
-    fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), BusError> {
+    fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), NodeError> {
         if backoff.brief() {
             return Ok(());
         }
@@ -248,8 +253,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
     /// Drives a node by its inputs alone, at most its window ahead of the slowest consumer.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    pub fn lockstep(&mut self, node: &mut dyn Node) -> Result<Ended, BusError> {
+    /// [`NodeError`] if a link failed.
+    pub fn lockstep(&mut self, node: &mut dyn Node) -> Result<Ended, NodeError> {
         let mut up_to = self.window_ticks.min(self.last_tick);
         let mut backoff = Backoff::default();
         while node.next_tick() <= self.last_tick {
@@ -313,13 +318,13 @@ impl Backoff {
 /// (its index) its successor, or ends the run.
 ///
 /// # Errors
-/// [`BusError`] if a link failed, or if the roles wait for one another in a circle.
+/// [`NodeError`] if a link failed, or if the roles wait for one another in a circle.
 pub fn in_turn(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
-    mut revive: impl FnMut(usize) -> Result<Option<ReadyNode>, BusError>,
+    mut revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
     mut after_tick: impl FnMut(u64) -> bool,
-) -> Result<Ended, BusError> {
+) -> Result<Ended, NodeError> {
     for tick in 0..=last_tick {
         for index in 0..nodes.len() {
             if nodes[index].before_tick() {
@@ -342,7 +347,7 @@ pub fn in_turn(
     leave(nodes, Ended::Finished)
 }
 
-fn leave(nodes: &mut [ReadyNode], ended: Ended) -> Result<Ended, BusError> {
+fn leave(nodes: &mut [ReadyNode], ended: Ended) -> Result<Ended, NodeError> {
     nodes.iter_mut().try_for_each(|node| node.finish())?;
     Ok(ended)
 }

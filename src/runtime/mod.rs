@@ -20,8 +20,8 @@ pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{AcceptedTicks, Input, Output, Seek};
 pub use node::{
-    Node, Poll, Port, Ports, ReadyNode, RoleId, RoleImpl, RunCondition, build, build_rig, ports, private_ledger,
-    report, shared_ledger, topic,
+    Node, NodeError, Poll, Port, Ports, ReadyNode, RoleId, RoleImpl, RunCondition, build, build_rig, ports,
+    private_ledger, report, shared_ledger, topic,
 };
 pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_bytes};
 pub use privileges::{Privileges, hold_low_latency_idle};

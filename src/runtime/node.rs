@@ -12,7 +12,7 @@ mod ports;
 pub(crate) use ports::ports_of_rig;
 pub use ports::{Port, Ports, ports};
 
-use super::bridge::DeviceLink;
+use super::bridge::{DeviceError, DeviceLink};
 use super::disturb::{Disturbance, Interruptions};
 use super::hooks::{self, Failpoint};
 use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
@@ -163,6 +163,17 @@ pub enum Poll {
     Missed,
 }
 
+/// Why a node cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeError {
+    /// A link failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The device at the end of a serial line is gone for good.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
 /// A role with its links and counters.
 pub trait Node {
     /// Whether the tick alone starts it, or its inputs do. What is started by its tick may still wait for something that
@@ -179,45 +190,45 @@ pub trait Node {
     /// send is sent; what it left undone before that tick counts as missed.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError>;
+    /// [`NodeError`].
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError>;
     /// Lets scripted interruptions of this role act: before every tick, once.
     fn before_tick(&mut self) -> bool;
     /// Executes the next tick if the condition allows it: takes inputs, computes, commits, sends. The critical path.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError>;
+    /// [`NodeError`].
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError>;
     /// Whose sample the next tick lacks, as far as it is known.
     fn awaits(&self) -> Option<RoleId>;
     /// Sleeps until the input that the next tick lacks may be there, at most until `until_ns`; false if it lacks none.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError>;
+    /// [`NodeError`].
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError>;
     /// Does what the executed tick left to be done: integrates, counts, prepares the next sample.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn finish_tick(&mut self) -> Result<(), BusError>;
+    /// [`NodeError`].
+    fn finish_tick(&mut self) -> Result<(), NodeError>;
     /// Settles what is left of a tick that the end of the run has come upon, and commits the state for the last time.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn finish(&mut self) -> Result<(), BusError>;
+    /// [`NodeError`].
+    fn finish(&mut self) -> Result<(), NodeError>;
     /// Counts every tick before `tick` that was not executed as missed.
     fn skip_to(&mut self, tick: u64);
     /// Exercises all links with a sample that no role uses.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn warm_up(&mut self) -> Result<(), BusError>;
+    /// [`NodeError`].
+    fn warm_up(&mut self) -> Result<(), NodeError>;
     /// Lets readers that have come later know of this role's signals, and finds the writers that have. Off the critical
     /// path.
     ///
     /// # Errors
-    /// [`BusError`] if a link failed.
-    fn refresh(&mut self) -> Result<(), BusError>;
+    /// [`NodeError`].
+    fn refresh(&mut self) -> Result<(), NodeError>;
     /// The tick counters.
     fn ticks(&self) -> Ticks;
     /// The latencies.

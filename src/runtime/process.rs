@@ -5,7 +5,7 @@
 use super::bridge::DeviceError;
 use super::drive::{Control, Drive, Ended, Heartbeat, Waiting};
 use super::hooks::{self, Failpoint};
-use super::node::{self, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
+use super::node::{self, NodeError, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
 use super::privileges::Privileges;
 use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError};
@@ -91,6 +91,9 @@ pub enum RoleError {
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// The role cannot go on.
+    #[error(transparent)]
+    Node(#[from] NodeError),
     /// The counters could not be opened.
     #[error(transparent)]
     Ledger(#[from] LedgerError),

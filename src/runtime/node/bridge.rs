@@ -2,7 +2,9 @@
 //!
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
-use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
+use super::{
+    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
@@ -95,7 +97,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         })
     }
 
-    fn inputs_ready(&mut self) -> Result<bool, BusError> {
+    fn inputs_ready(&mut self) -> Result<bool, NodeError> {
         let next = self.counters.next();
         Ok(next == 0 || self.command.seek(next - 1)? != Seek::NotYet)
     }
@@ -110,7 +112,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
 
     /// Asks the device for the next tick, with its command if that is there.
     #[inline]
-    fn ask(&mut self, now_ns: u64) -> Result<(), BusError> {
+    fn ask(&mut self, now_ns: u64) -> Result<(), NodeError> {
         let tick = self.counters.next();
         let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
         let command = self.command.sample().filter(|_| found);
@@ -122,19 +124,17 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
 
     /// Serves the line; publishes the measurement if the answer has come.
     #[inline]
-    fn look(&mut self) -> Result<Poll, BusError> {
+    fn look(&mut self) -> Result<Poll, NodeError> {
         let (now_ns, reply) = (monotonic_ns(), &mut self.reply);
         let mut answered = false;
-        self.link
-            .turn(now_ns, |answer| {
-                reply.take(answer);
-                answered = true;
-            })
-            .map_err(|error| BusError::Device { reason: error.to_string() })?;
+        self.link.turn(now_ns, |answer| {
+            reply.take(answer);
+            answered = true;
+        })?;
         if answered { self.publish(now_ns) } else { Ok(Poll::Waiting) }
     }
 
-    fn publish(&mut self, now_ns: u64) -> Result<Poll, BusError> {
+    fn publish(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let (tick, clock) = (self.counters.next(), self.clock);
         let origin_ns = self.grid.due_ns(tick);
         let Reply { event, measurement, truth } = &self.reply;
@@ -197,7 +197,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     /// The device is where it is: it needs nothing of what a predecessor knew.
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.grid = grid;
         if self.clock == Clock::Monotonic {
             self.command.expect(AcceptedTicks::Due(grid));
@@ -216,7 +216,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     #[inline]
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         match condition {
             RunCondition::Inputs { up_to } => {
                 if !self.asked && self.counters.next() <= up_to && self.inputs_ready()? {
@@ -243,7 +243,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     /// What it waits for comes over the line, or is a command.
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         if self.asked {
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
         } else {
@@ -253,13 +253,13 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 
     #[inline]
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         self.truth.dispatch()?;
         self.measurement.finish()?;
-        self.truth.finish()
+        Ok(self.truth.finish()?)
     }
 
-    fn finish(&mut self) -> Result<(), BusError> {
+    fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_tick()?;
         commit_last(self);
         Ok(())
@@ -272,16 +272,16 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         }
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         self.command.warm_up()?;
         self.measurement.warm_up()?;
-        self.truth.warm_up()
+        Ok(self.truth.warm_up()?)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         self.command.refresh();
         self.measurement.refresh()?;
-        self.truth.refresh()
+        Ok(self.truth.refresh()?)
     }
 
     fn state_words(&mut self) -> usize {

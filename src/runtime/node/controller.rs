@@ -1,7 +1,9 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
 use super::ports::driven;
-use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
+use super::{
+    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::control::Watchdog;
@@ -51,7 +53,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 
     /// Looks for the measurement of a tick; whether it is known what has become of it.
     #[inline]
-    fn gather(&mut self, tick: u64) -> Result<bool, BusError> {
+    fn gather(&mut self, tick: u64) -> Result<bool, NodeError> {
         let found = self.measurement.seek(tick)?;
         self.ready = found == Seek::Found;
         Ok(found != Seek::NotYet)
@@ -64,7 +66,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 
     /// There is no estimate for this tick, and so there is no command.
-    fn pass_over(&mut self, tick: u64) -> Result<(), BusError> {
+    fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
         // What is not used now will never be, and must not fill the link.
         self.measurement.seek(tick)?;
         self.ready = false;
@@ -81,7 +83,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         silent: bool,
         (clock, began_ns): (Clock, u64),
         starved: &mut bool,
-    ) -> Result<u64, BusError> {
+    ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
         self.ready &= !silent;
         let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
@@ -106,12 +108,12 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         origin_ns: u64,
         step: &mut Latency,
         age: &mut Latency,
-    ) -> Result<(), BusError> {
+    ) -> Result<(), NodeError> {
         if timed && self.ready {
             step.record(self.began_ns, self.sent_ns);
             age.record(origin_ns, self.sent_ns);
         }
-        self.command.finish()
+        Ok(self.command.finish()?)
     }
 
     fn state<W: Words>(&mut self, words: &mut W)
@@ -124,14 +126,14 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         self.command.persist_late(words);
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         self.measurement.warm_up()?;
-        self.command.warm_up()
+        Ok(self.command.warm_up()?)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         self.measurement.refresh();
-        self.command.refresh()
+        Ok(self.command.refresh()?)
     }
 }
 
@@ -202,7 +204,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
     #[inline]
-    fn gather(&mut self, overdue: bool) -> Result<bool, BusError> {
+    fn gather(&mut self, overdue: bool) -> Result<bool, NodeError> {
         if self.estimate.seek(self.counters.next())? == Seek::NotYet {
             if self.clock == Clock::Monotonic {
                 // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
@@ -227,7 +229,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     /// Takes what has come for one channel, each time for another.
     #[inline]
-    fn look_ahead(&mut self) -> Result<(), BusError> {
+    fn look_ahead(&mut self) -> Result<(), NodeError> {
         let (single, all) = (self.channels.len(), self.channels.len() + self.fleets.len());
         self.look = if self.look + 1 < all { self.look + 1 } else { 0 };
         if let Some(channel) = self.channels.get_mut(self.look) {
@@ -240,7 +242,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     /// There is no estimate for the next tick that could be used, and so there are no commands.
     #[cold]
-    fn pass_over(&mut self) -> Result<(), BusError> {
+    fn pass_over(&mut self) -> Result<(), NodeError> {
         let next = self.counters.next();
         for tick in next..=self.estimate.last_tick().unwrap_or(next) {
             self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
@@ -255,14 +257,14 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     /// Sends the commands that are staged.
     #[inline]
-    fn dispatch(&mut self) -> Result<(), BusError> {
+    fn dispatch(&mut self) -> Result<(), NodeError> {
         self.channels.iter_mut().try_for_each(|channel| channel.command.dispatch())?;
-        self.fleets.iter_mut().try_for_each(|fleet| fleet.command.dispatch())
+        Ok(self.fleets.iter_mut().try_for_each(|fleet| fleet.command.dispatch())?)
     }
 
-    fn finish_commands(&mut self) -> Result<(), BusError> {
+    fn finish_commands(&mut self) -> Result<(), NodeError> {
         self.channels.iter_mut().try_for_each(|channel| channel.command.finish())?;
-        self.fleets.iter_mut().try_for_each(|fleet| fleet.command.finish())
+        Ok(self.fleets.iter_mut().try_for_each(|fleet| fleet.command.finish())?)
     }
 
     /// Holds the estimate against the physics. Whatever comes of it is up to the watchdog.
@@ -297,7 +299,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     }
 
     #[inline]
-    fn execute(&mut self) -> Result<Poll, BusError> {
+    fn execute(&mut self) -> Result<Poll, NodeError> {
         self.received_ns = self.clock.now_ns();
         if self.watchdog.active() {
             self.watch();
@@ -348,7 +350,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         Ok(())
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(AcceptedTicks::Due(grid));
             self.channels.iter_mut().for_each(|channel| channel.measurement.expect(AcceptedTicks::Due(grid)));
@@ -366,7 +368,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     #[inline]
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
         if allowed && self.gather(condition == RunCondition::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
     }
@@ -379,7 +381,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let tick = self.counters.next();
         if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
@@ -394,7 +396,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     #[inline]
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         let timed = self.clock == Clock::Monotonic;
         if timed {
             self.hop.record(self.estimate_sent_ns, self.received_ns);
@@ -408,7 +410,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         Ok(())
     }
 
-    fn finish(&mut self) -> Result<(), BusError> {
+    fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_commands()?;
         commit_last(self);
         Ok(())
@@ -418,13 +420,13 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         self.counters.skip_to(tick);
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         self.estimate.warm_up()?;
         self.channels.iter_mut().try_for_each(Channel::warm_up)?;
         self.fleets.iter_mut().try_for_each(Channel::warm_up)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         self.estimate.refresh();
         self.channels.iter_mut().try_for_each(Channel::refresh)?;
         self.fleets.iter_mut().try_for_each(Channel::refresh)

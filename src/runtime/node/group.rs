@@ -4,8 +4,7 @@
 //! In real time whoever has a short way to a sample sees it at once, and what else there is to do waits until all have done
 //! their tick, or one of them has to wait. Must not compute, nor change what any of them sends.
 
-use super::{Node, Poll, ReadyNode, RoleId, RunCondition};
-use crate::bus::BusError;
+use super::{Node, NodeError, Poll, ReadyNode, RoleId, RunCondition};
 use crate::clock::{Grid, monotonic_ns};
 use crate::telemetry::{LedgerError, StageReport, Ticks};
 
@@ -30,7 +29,7 @@ struct Member {
 }
 
 impl Member {
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         if std::mem::take(&mut self.executed) { self.node.finish_tick() } else { Ok(()) }
     }
 }
@@ -52,7 +51,7 @@ impl GroupNode {
     }
 
     /// Lockstep: everybody does what can be done.
-    fn poll_in_turn(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll_in_turn(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let mut polled = Poll::Waiting;
         for Member { node, .. } in &mut self.members {
             if node.poll(condition)? == Poll::Executed {
@@ -65,7 +64,7 @@ impl GroupNode {
 
     /// Real time: the tick, through everybody who has not done it.
     #[inline]
-    fn poll_on_grid(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll_on_grid(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let tick =
             if let RunCondition::Now { tick, .. } = condition { tick.min(self.last_tick) } else { self.next_tick() };
         self.open = Some(tick);
@@ -104,7 +103,7 @@ impl GroupNode {
     /// A member has executed a later tick: for those behind it, what they waited for will never come, and the later tick has a
     /// cutoff of its own.
     #[cold]
-    fn pass_over(&mut self, index: usize, tick: u64) -> Result<Poll, BusError> {
+    fn pass_over(&mut self, index: usize, tick: u64) -> Result<Poll, NodeError> {
         for Member { node, .. } in &mut self.members[index + 1..] {
             if node.next_tick() < tick {
                 node.skip_to(tick);
@@ -145,7 +144,7 @@ impl Node for GroupNode {
         self.nodes().try_for_each(|node| node.restore())
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.nodes().try_for_each(|node| node.start(grid, first_tick))
     }
 
@@ -155,7 +154,7 @@ impl Node for GroupNode {
     }
 
     #[inline]
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         if self.realtime { self.poll_on_grid(condition) } else { self.poll_in_turn(condition) }
     }
 
@@ -164,7 +163,7 @@ impl Node for GroupNode {
         self.lacking().next().and_then(|index| self.members[index].node.awaits())
     }
 
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let mut lacking = self.lacking();
         let (first, more) = (lacking.next(), lacking.next().is_some());
         drop(lacking);
@@ -175,11 +174,11 @@ impl Node for GroupNode {
 
     /// The last in the tick first: others wait for what it has sent.
     #[inline]
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         self.members.iter_mut().rev().try_for_each(Member::finish_tick)
     }
 
-    fn finish(&mut self) -> Result<(), BusError> {
+    fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_tick()?;
         self.nodes().try_for_each(|node| node.finish())
     }
@@ -189,11 +188,11 @@ impl Node for GroupNode {
         self.nodes().for_each(|node| node.skip_to(tick));
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         self.nodes().try_for_each(|node| node.warm_up())
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         self.nodes().try_for_each(|node| node.refresh())
     }
 

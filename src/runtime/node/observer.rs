@@ -1,6 +1,8 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
+use super::{
+    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
@@ -55,7 +57,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     }
 
     #[inline]
-    fn execute(&mut self) -> Result<Poll, BusError> {
+    fn execute(&mut self) -> Result<Poll, NodeError> {
         let received = self.clock.now_ns();
         let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
         let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
@@ -79,7 +81,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
 
     /// There is no measurement for the next tick, and so there is no estimate.
     #[cold]
-    fn pass_over(&mut self) -> Result<Poll, BusError> {
+    fn pass_over(&mut self) -> Result<Poll, NodeError> {
         let next = self.counters.next();
         for tick in next..=self.measurement.last_tick().unwrap_or(next) {
             self.estimate.stage_void(tick);
@@ -109,7 +111,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         Ok(())
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.measurement.expect(AcceptedTicks::Due(grid));
         }
@@ -125,7 +127,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     #[inline]
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
         let there = allowed && self.measurement.seek(self.counters.next())? != Seek::NotYet;
         if there { self.execute() } else { Ok(Poll::Waiting) }
@@ -135,23 +137,23 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         Some(RoleId::Plant(0))
     }
 
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         self.measurement.sleep(until_ns)?;
         Ok(true)
     }
 
     #[inline]
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             let Instants { origin, sent, received, done } = self.instants;
             self.hop.record(sent, received);
             self.step.record(received, done);
             self.age.record(origin, done);
         }
-        self.estimate.finish()
+        Ok(self.estimate.finish()?)
     }
 
-    fn finish(&mut self) -> Result<(), BusError> {
+    fn finish(&mut self) -> Result<(), NodeError> {
         self.estimate.finish()?;
         commit_last(self);
         Ok(())
@@ -161,14 +163,14 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         self.counters.skip_to(tick);
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         self.measurement.warm_up()?;
-        self.estimate.warm_up()
+        Ok(self.estimate.warm_up()?)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         self.measurement.refresh();
-        self.estimate.refresh()
+        Ok(self.estimate.refresh()?)
     }
 
     fn state_words(&mut self) -> usize {

@@ -1,6 +1,8 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{Inherited, Node, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore};
+use super::{
+    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::BodyInfo;
@@ -61,7 +63,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         })
     }
 
-    fn inputs_ready(&mut self) -> Result<bool, BusError> {
+    fn inputs_ready(&mut self) -> Result<bool, NodeError> {
         match &mut self.command {
             Some(command) if self.counters.next() > 0 => Ok(command.seek(self.counters.next() - 1)? != Seek::NotYet),
             _ => Ok(true),
@@ -77,7 +79,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 
     /// Does what a predecessor was committed to. From then on its body moved by itself, and its actuators protected it.
-    fn take_over(&mut self) -> Result<(), BusError> {
+    fn take_over(&mut self) -> Result<(), NodeError> {
         self.measurement.dispatch()?;
         self.measurement.finish()?;
         if let Some(tick) = self.unfinished.take() {
@@ -89,15 +91,15 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         Ok(())
     }
 
-    fn stage_truth(&mut self, tick: u64) -> Result<(), BusError> {
+    fn stage_truth(&mut self, tick: u64) -> Result<(), NodeError> {
         let (plant, clock, origin_ns) = (&self.plant, self.clock, self.grid.due_ns(tick));
-        self.truth.stage(|sample| {
+        Ok(self.truth.stage(|sample| {
             plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
-        })
+        })?)
     }
 
     #[inline]
-    fn execute(&mut self, now_ns: u64) -> Result<Poll, BusError> {
+    fn execute(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
         let event = self.take_command(tick, now_ns)?;
         if event.missed() {
@@ -120,7 +122,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 
     #[inline]
-    fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, BusError> {
+    fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, NodeError> {
         let Some(input) = &mut self.command else { return Ok(self.plant.command(tick, None)) };
         let found = if tick > 0 { input.seek(tick - 1)? } else { Seek::NotYet };
         if found == Seek::Rejected {
@@ -153,7 +155,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         Ok(())
     }
 
-    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), BusError> {
+    fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.grid = grid;
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
             command.expect(AcceptedTicks::Due(grid));
@@ -174,7 +176,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     #[inline]
-    fn poll(&mut self, condition: RunCondition) -> Result<Poll, BusError> {
+    fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         match condition {
             RunCondition::Inputs { up_to } if self.counters.next() <= up_to && self.inputs_ready()? => self.execute(0),
             RunCondition::Now { tick, now_ns } => {
@@ -196,7 +198,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         lacks.then_some(RoleId::Controller)
     }
 
-    fn sleep(&mut self, until_ns: u64) -> Result<bool, BusError> {
+    fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let Some(last) = self.counters.next().checked_sub(1) else { return Ok(false) };
         let lacking = self.command.as_mut().filter(|command| !command.knows(last));
         let lacks = lacking.is_some();
@@ -205,7 +207,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     #[inline]
-    fn finish_tick(&mut self) -> Result<(), BusError> {
+    fn finish_tick(&mut self) -> Result<(), NodeError> {
         let Some(tick) = self.unfinished.take() else { return Ok(()) };
         self.stage_truth(tick)?;
         self.truth.dispatch()?;
@@ -215,10 +217,10 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
             self.step.record(before_ns, self.clock.now_ns());
         }
         self.measurement.finish()?;
-        self.truth.finish()
+        Ok(self.truth.finish()?)
     }
 
-    fn finish(&mut self) -> Result<(), BusError> {
+    fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_tick()?;
         commit_last(self);
         Ok(())
@@ -229,20 +231,20 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
         self.plant.advance_alone(missed);
     }
 
-    fn warm_up(&mut self) -> Result<(), BusError> {
+    fn warm_up(&mut self) -> Result<(), NodeError> {
         if let Some(command) = &mut self.command {
             command.warm_up()?;
         }
         self.measurement.warm_up()?;
-        self.truth.warm_up()
+        Ok(self.truth.warm_up()?)
     }
 
-    fn refresh(&mut self) -> Result<(), BusError> {
+    fn refresh(&mut self) -> Result<(), NodeError> {
         if let Some(command) = &mut self.command {
             command.refresh();
         }
         self.measurement.refresh()?;
-        self.truth.refresh()
+        Ok(self.truth.refresh()?)
     }
 
     fn state_words(&mut self) -> usize {
