@@ -4,21 +4,32 @@
 //! |---|---|
 //! | `columns` | which column is what, and in which unit |
 //! | `csv` | rows of a CSV file |
+//! | `mcap` | rows of an MCAP file |
+//! | `parquet` | rows of a Parquet file, with the feature of that name |
 //! | `stamp` | time stamps without rounding |
+//! | `identification` | a body's inertia from logs |
+//! | `estimation` | a log's hidden component |
 //!
 //! A log may be larger than memory: a row is read when it is asked for. Must not interpolate, repair or invent a value; what
 //! is left out is counted, and what is assumed is told.
 
 mod columns;
 mod csv;
+mod estimation;
+mod identification;
+mod mcap;
+#[cfg(feature = "parquet")]
+mod parquet;
 mod stamp;
 
 pub use columns::{RateUnit, TimeUnit};
+pub use estimation::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
+pub use identification::{Identified, LogAccount, Ways, identify_logs};
 
 use stamp::Stamp;
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{self, Read};
+use std::io::{self, Read, Seek};
 use std::path::{Path, PathBuf};
 
 /// So many rows are read ahead to learn the usual interval.
@@ -49,6 +60,8 @@ const LONGEST_INTERVAL_S: f64 = 100.0;
 /// ```
 #[derive(Debug, Clone)]
 pub struct Options {
+    /// The topic of an MCAP file, or the end of its name. Such a file needs none of the other names and units.
+    pub topic: Option<String>,
     /// The column of time stamps, by name, or by number from 1 where there is no header.
     pub time: Option<String>,
     /// The columns of the three rates; a `-` stands for one that the log does not have.
@@ -70,6 +83,7 @@ pub struct Options {
 impl Default for Options {
     fn default() -> Self {
         Self {
+            topic: None,
             time: None,
             rates: None,
             time_unit: None,
@@ -258,7 +272,7 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens a log; `-` is the standard input.
+    /// Opens a log; `-` is the standard input. What a file is is told by its first bytes: MCAP, Parquet, else CSV.
     ///
     /// # Errors
     /// [`DataError`]: from here on, and for every row.
@@ -267,9 +281,28 @@ impl Log {
             return Self::from_csv(io::stdin(), "standard input".as_ref(), options);
         }
         let failed = |source| DataError::Read { path: path.to_owned(), source };
-        let file = File::open(path).map_err(failed)?;
-        if file.metadata().map_err(failed)?.is_dir() {
+        let mut file = File::open(path).map_err(failed)?;
+        let about = file.metadata().map_err(failed)?;
+        if about.is_dir() {
             return Err(failed(io::ErrorKind::IsADirectory.into()));
+        }
+        // A pipe cannot be read twice.
+        if about.is_file() {
+            let mut start = Vec::new();
+            file.by_ref().take(8).read_to_end(&mut start).map_err(failed)?;
+            file.rewind().map_err(failed)?;
+            if mcap::Mcap::is_begun(&start) {
+                return Self::new(Box::new(mcap::Mcap::new(file, path, options)), path, options);
+            }
+            #[cfg(feature = "parquet")]
+            if parquet::ParquetLog::is_begun(&start) {
+                return Self::new(Box::new(parquet::ParquetLog::new(file, path, options)?), path, options);
+            }
+            #[cfg(not(feature = "parquet"))]
+            if start.starts_with(b"PAR1") {
+                let reason = "it is Parquet, and this program was built without; build it with `--features parquet`";
+                return Err(DataError::Form { path: path.to_owned(), line: 0, reason: reason.to_owned() });
+            }
         }
         Self::from_csv(file, path, options)
     }

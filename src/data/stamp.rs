@@ -12,7 +12,6 @@ pub struct Stamp {
 
 impl Stamp {
     /// A whole number of units.
-    #[cfg(test)]
     pub fn whole(whole: i64, unit: TimeUnit) -> Self {
         Self { whole, part: 0.0, unit }
     }
@@ -21,7 +20,7 @@ impl Stamp {
     pub fn float(value: f64, unit: TimeUnit) -> Option<Self> {
         let whole = value.trunc();
         // 2^62 is a float.
-        (whole.abs() < (1_i64 << 62) as f64).then(|| Self { whole: whole as i64, part: value - whole, unit })
+        (whole.abs() < (1_i64 << 62) as f64).then_some(Self { whole: whole as i64, part: value - whole, unit })
     }
 
     /// A number in decimal digits, perhaps with a sign and a point; none for another text.

@@ -175,13 +175,11 @@ fn about_axes(fit: &AxesFit, found: &mut Vec<Finding>) {
         found.push(Finding::Sphere);
         return;
     }
-    for axis in 0..3 {
+    for axis in (0..3).filter(|axis| excited[*axis]) {
         // A coefficient of zero says that the other two moments are equal.
-        if excited[axis] && zero(axis) {
+        if zero(axis) {
             found.push(Finding::Symmetric { axis });
-        }
-        let unexplained = fit.r_squared[axis] < EXPLAINED && excited[axis] && !zero(axis);
-        if unexplained {
+        } else if fit.r_squared[axis] < EXPLAINED {
             found.push(Finding::Unexplained { axis, r_squared: fit.r_squared[axis] });
         }
     }

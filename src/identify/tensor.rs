@@ -12,7 +12,7 @@ use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, SymmetricEigen, Vec
 
 /// Rounds of weighing, at most, and the change of J at which they end.
 const ROUNDS: usize = 40;
-const SETTLED: f64 = 1e-10;
+const SETTLED: f64 = 1e-9;
 /// A weight is not greater than for a moment of this part of the largest.
 const LEAST_MOMENT: f64 = 1e-3;
 /// Sweeps of the eigenvalue solver, at most.
