@@ -230,10 +230,10 @@ fn filter(request: &Request, choice: Option<&RateChoice>, path: &Path) -> Result
         FilterOrder::Second => FilterKind::Second { bandwidth_rad_s: decay_per_s },
         FilterOrder::Kalman => {
             let choice = choice.ok_or_else(none)?;
-            let noise_rad_s = request.noise_rad_s.unwrap_or(choice.noise_rad_s);
-            // What noise does to the potential is as large as the noise.
-            let potential_noise = choice.potential_noise * noise_rad_s / choice.noise_rad_s;
-            let density = RateChoice { decay_per_s, potential_noise, ..*choice }.density();
+            // A log without noise has its rounding.
+            let rounding = f64::EPSILON * choice.fastest_rad_s;
+            let noise_rad_s = request.noise_rad_s.unwrap_or(choice.noise_rad_s.max(rounding));
+            let density = choice.density(decay_per_s, noise_rad_s);
             FilterKind::Kalman { noise_rad_s, density, guess_deviation_rad_s: 2.0 * choice.fastest_rad_s }
         }
     })

@@ -55,15 +55,15 @@ pub struct RateChoice {
     pub interval_s: f64,
     /// The fastest measured rate, rad/s.
     pub fastest_rad_s: f64,
-    /// What noise does to the potential φ, rad.
-    pub potential_noise: f64,
+    /// What an error of a measured rate does to the potential φ, geometric mean, s.
+    pub potential_per_rate_s: f64,
 }
 
 impl RateChoice {
-    /// Density of what the model does not know for a Kalman filter of this rate, (rad/s)²/s: its bandwidth is
+    /// Density of what the model does not know for a Kalman filter of the given rate and noise, (rad/s)²/s: its bandwidth is
     /// (q/(σ²h))^(1/4), with the noise σ of the potential and the interval h.
-    pub fn density(&self) -> f64 {
-        let square = self.decay_per_s * self.decay_per_s * self.potential_noise;
+    pub fn density(&self, decay_per_s: f64, noise_rad_s: f64) -> f64 {
+        let square = decay_per_s * decay_per_s * self.potential_per_rate_s * noise_rad_s;
         square * square * self.interval_s
     }
 }
@@ -137,7 +137,8 @@ impl Survey {
         }
         let noise_rad_s = libm::sqrt(mean(self.noise) / ORDER_POWER);
         let drift_rad_s2 = libm::sqrt(mean(self.drift));
-        let potential_noise = noise_rad_s * libm::exp(mean(self.gradient));
+        let potential_per_rate_s = libm::exp(mean(self.gradient));
+        let potential_noise = noise_rad_s * potential_per_rate_s;
         let model = MODEL_ERROR;
         let balance_per_s =
             libm::sqrt(model * drift_rad_s2 / libm::sqrt(model * model + potential_noise * potential_noise));
@@ -155,7 +156,7 @@ impl Survey {
             segment_s,
             interval_s,
             fastest_rad_s: self.fastest_rad_s,
-            potential_noise,
+            potential_per_rate_s,
         })
     }
 }
@@ -163,4 +164,55 @@ impl Survey {
 fn add(mean: &mut (f64, u64), value: f64) {
     mean.0 += value;
     mean.1 += 1;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{Inertia, Noise, RigidBody};
+
+    /// The choice for segments of so many samples at 100 Hz.
+    fn choice(noise_rad_s: f64, samples: u32) -> RateChoice {
+        let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
+        let mut noise = Noise::new(9, 0, [noise_rad_s; 3], [0.0; 3]);
+        let mut survey = Survey::new(body.coefficients(), 3);
+        for _ in 0..4000 / samples {
+            let mut rate = Vector3::new(2.0, -3.0, 2.5);
+            for tick in 0..samples {
+                survey.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: rate + noise.sample() });
+                rate = body.flow(&rate, &Vector3::zeros(), 0.01);
+            }
+            survey.end_segment();
+        }
+        survey.choose().unwrap()
+    }
+
+    #[test]
+    fn noise_is_told_from_motion_and_lowers_the_rate() {
+        for noise_rad_s in [1e-3, 1e-2, 0.1] {
+            let found = choice(noise_rad_s, 4000).noise_rad_s;
+            assert!((found / noise_rad_s - 1.0).abs() < 0.1, "{noise_rad_s}: {found}");
+        }
+        let [quiet, loud] = [0.0, 0.3].map(|noise_rad_s| choice(noise_rad_s, 4000));
+        // Without noise it is the motion's own time scale.
+        assert!((quiet.balance_per_s / quiet.drift_rad_s2.sqrt() - 1.0).abs() < 1e-3, "{quiet:?}");
+        assert!(loud.balance_per_s < 0.5 * quiet.balance_per_s, "{loud:?}");
+    }
+
+    #[test]
+    fn short_segments_ask_for_more_and_a_step_is_the_limit() {
+        let short = choice(1e-3, 80);
+        assert!((short.segment_s - 0.79).abs() < 1e-9, "{short:?}");
+        assert!((short.decay_per_s - 100.0_f64.ln() / 0.395).abs() < 1e-9, "{short:?}");
+        assert_eq!(choice(1e-3, 4).decay_per_s, 1.0 / choice(1e-3, 4).interval_s);
+    }
+
+    #[test]
+    fn a_log_without_motion_or_time_has_no_rate() {
+        let coefficients = Vector3::new(-0.5, 0.75, -0.4);
+        assert!(Survey::new(&coefficients, 3).choose().is_none());
+        let mut survey = Survey::new(&coefficients, 1);
+        survey.push(&Sample { time_s: 0.0, rate_rad_s: Vector3::zeros() });
+        assert!(survey.choose().is_none());
+    }
 }

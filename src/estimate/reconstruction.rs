@@ -9,8 +9,6 @@ use nalgebra::{Vector1, Vector3};
 
 /// The damping ratio of the filter of second order.
 const DAMPING_RATIO: f64 = core::f64::consts::FRAC_1_SQRT_2;
-/// Standard deviation of the Kalman filter's guess as a multiple of the fastest rate to be expected.
-const GUESS_DEVIATIONS: f64 = 1.0;
 
 /// Which filter weighs the steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -155,7 +153,7 @@ impl Reconstruction {
                 positive("noise, rad/s", noise_rad_s)?;
                 number("density, rad2/s3", density, density >= 0.0, false)?;
                 positive("deviation of the guess, rad/s", guess_deviation_rad_s)?;
-                let deviation = Vector1::new(GUESS_DEVIATIONS * guess_deviation_rad_s);
+                let deviation = Vector1::new(guess_deviation_rad_s);
                 let filter = KalmanFilter::new(Vector1::new(density), first, deviation);
                 (relation.with_noise(&Vector3::repeat(noise_rad_s)), Filter::Kalman(filter))
             }

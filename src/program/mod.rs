@@ -107,7 +107,7 @@ enum Command {
     /// Find a body's inertia in a log of its angular velocity
     Identify(identify::Arguments),
     /// Find the rate about one axis in a log of the other two
-    Estimate(estimate::Arguments),
+    Estimate(Box<estimate::Arguments>),
     /// Tell whether this machine is fit for real time, and what to do about it
     Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
