@@ -146,7 +146,7 @@ fn what_cannot_be_done_is_refused_with_place_reason_and_remedy() {
         (&["identify", "good.csv", "--decay", "-1"], "above 0"),
         (&["identify", "good.csv", "--decay=0"], "above 0"),
         (&["identify", "good.csv", "--method", "axisymmetric"], "add --symmetry-axis"),
-        (&["estimate", "good.csv", "--hidden", "z"], "--inertia"),
+        (&["estimate", "good.csv", "--hidden", "z"], "--body <FILE>"),
         (&["estimate", "good.csv", "--hidden", "w", "--inertia", "1,2,2.5"], "the axes are x, y and z"),
         (&["estimate", "good.csv", "--hidden", "z", "--inertia", "1,2,9"], "triangle inequality"),
         (&["estimate", "good.csv", "--hidden", "z", "--inertia", "1,1,1"], "turns like a sphere"),
@@ -167,7 +167,7 @@ fn what_cannot_be_done_is_refused_with_place_reason_and_remedy() {
         assert!(refused.stderr.contains(words), "{arguments:?}: {}", refused.stderr);
     }
     assert!(std::fs::read_to_string(bench.path("good.csv")).unwrap().starts_with("t_s"));
-    // A log that says nothing of a body: read, told, and no body.
+    // A log that says nothing of a body: read, told, and no body, however well zeros fit it.
     let empty = bench.run(&["identify", "good.csv"]);
     assert_eq!(empty.code, Some(1), "{empty:?}");
     assert!(empty.stderr.contains("tells of no body"), "{empty:?}");

@@ -45,12 +45,12 @@ const LONGEST_INTERVAL_S: f64 = 100.0;
 /// use corotate::data::{Log, Options, RateUnit};
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
-/// let text = "run;t [ms];gx;gy;gz\na;0;180;0;90\na;10;;0;90\na;20;180;0;90\nb;0;0;0;0\n";
+/// let text = "run;t [ms];wx;wy;wz\na;0;180;0;90\na;10;;0;90\na;20;180;0;90\nb;0;0;0;0\n";
 /// let options = Options { rate_unit: Some(RateUnit::DegreesPerSecond), by: Some("run".into()), ..Options::default() };
 /// let mut log = Log::from_csv(text.as_bytes(), "gyro.csv".as_ref(), &options)?;
 /// let first = log.next().expect("there are rows")?;
 /// assert_eq!(first.rate_rad_s[0], std::f64::consts::PI);
-/// let second = log.next().expect("the row without gx is left out")?;
+/// let second = log.next().expect("the row without wx is left out")?;
 /// assert_eq!((second.row, second.time_s, second.begins), (4, 0.02, false));
 /// let third = log.next().expect("another run")?;
 /// assert_eq!((third.segment, third.begins), (1, true));

@@ -8,7 +8,9 @@ use nalgebra::Vector3;
 const CERTAIN: f64 = 3.0;
 /// A rate of which less than this part is explained was not moved as Euler's equations say.
 const EXPLAINED: f64 = 0.9;
-/// A coefficient that moves its rate by less than so many times what is left of it is not known by this log.
+/// A coefficient, which no body has beyond 1, is not known by this log if its standard deviation is so large, or where that is
+/// not known if it moves its rate by less than so many times what is left of it.
+const UNKNOWN: f64 = 0.3;
 const EXCITED: f64 = 0.5;
 /// A tensor that fits no better than this, compared with the next one, is not known by this log.
 const DISTINCT: f64 = 2.0;
@@ -47,8 +49,8 @@ pub enum Finding {
     },
     /// One coefficient has no say in this motion.
     #[error(
-        "a{} is not known by this log: what it does to the rate about {} ({excitation_rad_s:.2e} rad/s) is no larger than what \
-         the fit leaves ({residual_rad_s:.2e} rad/s); log a motion about all axes", axis + 1, AXES[*axis]
+        "a{} is not known by this log: what it does to the rate about {} ({excitation_rad_s:.2e} rad/s) is too little beside \
+         what the fit leaves ({residual_rad_s:.2e} rad/s); log a motion about all axes", axis + 1, AXES[*axis]
     )]
     Unexcited {
         /// The index of the axis.
@@ -137,6 +139,18 @@ pub enum Finding {
     },
 }
 
+impl Finding {
+    /// Whether it leaves no body about the sensor's axes.
+    pub fn forbids_axes(&self) -> bool {
+        matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Unexcited { .. })
+    }
+
+    /// Whether it leaves no whole tensor.
+    pub fn forbids_tensor(&self) -> bool {
+        matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Indistinct { .. })
+    }
+}
+
 /// What is to be known of these fits, the most serious first; scale is always among them.
 pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorFit>) -> Vec<Finding> {
     let account = motion.account();
@@ -164,7 +178,11 @@ fn about_axes(fit: &AxesFit, found: &mut Vec<Finding>) {
     let mut excited = [true; 3];
     for (axis, excited) in excited.iter_mut().enumerate() {
         let (excitation_rad_s, residual_rad_s) = (fit.excitation_rad_s[axis], fit.residual_rad_s[axis]);
-        *excited = excitation_rad_s > 0.0 && excitation_rad_s > EXCITED * residual_rad_s;
+        let known = match fit.deviation {
+            Some(deviation) => deviation[axis] < UNKNOWN,
+            None => excitation_rad_s > EXCITED * residual_rad_s,
+        };
+        *excited = excitation_rad_s > 0.0 && known;
         if !*excited {
             found.push(Finding::Unexcited { axis, excitation_rad_s, residual_rad_s });
         }

@@ -135,6 +135,8 @@ fn what_a_log_cannot_tell_is_said() {
     let still = Tumble { speed_rad_s: 1e-6, noise_rad_s: 1e-3, ..Tumble::default() };
     has(&still, |f| matches!(f, Finding::Unexcited { .. }));
     has(&still, |f| matches!(f, Finding::Still { .. }));
+    has(&still, Finding::forbids_axes);
+    has(&still, Finding::forbids_tensor);
 }
 
 #[test]

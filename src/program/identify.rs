@@ -3,7 +3,7 @@
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
 use super::{Exit, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
-use crate::identify::{AxesFit, RecursiveFit, TensorFit, nearest_body};
+use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;
 use nalgebra::{Matrix3, SVector, Vector3};
 use serde_json::{Value, json};
@@ -94,6 +94,15 @@ pub fn identify(arguments: &Arguments) -> Exit {
 
 /// The body of the method that was asked for; why there is none.
 fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> {
+    let forbids = |finding: &&Finding| match arguments.method {
+        Method::Tensor => finding.forbids_tensor(),
+        Method::Axes | Method::Recursive => finding.forbids_axes(),
+        // One axis of spin is enough for its one coefficient.
+        Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
+    };
+    if let Some(finding) = identified.findings.iter().find(forbids) {
+        return Err(format!("the log tells of no body: {finding}"));
+    }
     let nothing = || "the log tells of no body: it has no motion that can be fitted; see the notes".to_owned();
     let of_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, String> {
         let fit = fit.as_ref().ok_or_else(nothing)?;
