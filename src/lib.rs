@@ -6,6 +6,8 @@
 //! |---|---|---|
 //! | [`model`] | bodies and their motion | yes, `no_std` |
 //! | [`observe`] | invariant relations and the filter that serves them all | yes, `no_std` |
+//! | [`identify`] | the inertia of a body from a log of its angular velocity | yes, `no_std` |
+//! | [`estimate`] | the component that a log of angular velocity lacks, from the other two | yes, `no_std` |
 //! | [`control`] | control laws and their certificates | yes, `no_std` |
 //! | [`fault`] | scripted faults: what goes wrong with a sample or a role, and when | yes, `no_std` |
 //! | [`sample`](mod@sample) | the fixed-size samples that travel between roles | yes, `no_std` |
@@ -14,6 +16,7 @@
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
 //! | `config` | scenario files: as typed, then as resolved | no |
+//! | `data` | logs that others wrote, read row by row | no |
 //! | `analysis` | what may be claimed of the loop that runs: its rate, its floor | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
 //! | `clock` | the time grid and how to wait on it | no |
@@ -43,7 +46,9 @@ pub use bytemuck;
 pub use nalgebra;
 
 pub mod control;
+pub mod estimate;
 pub mod fault;
+pub mod identify;
 pub mod model;
 pub mod observe;
 pub mod role;
@@ -63,6 +68,8 @@ pub mod bus;
 pub mod clock;
 #[cfg(feature = "runtime")]
 pub mod config;
+#[cfg(feature = "runtime")]
+pub mod data;
 #[cfg(feature = "runtime")]
 pub mod doctor;
 #[cfg(feature = "runtime")]

@@ -127,11 +127,11 @@ impl Default for Realtime {
 #[serde(rename_all = "kebab-case")]
 pub enum Wake {
     /// Where SCHED_FIFO is granted: gives way to a sender on the same core, spins for one on another, then sleeps on the
-    /// sender's bell. Elsewhere as `event`: among equals, who spins holds up whom it waits for.
+    /// sender's notifier. Elsewhere as `event`: among equals, who spins holds up whom it waits for.
     Auto,
-    /// Spins, whoever the sender is, then sleeps on its bell.
+    /// Spins, whoever the sender is, then sleeps on its notifier.
     Spin,
-    /// Sleeps on the sender's bell at once.
+    /// Sleeps on the sender's notifier at once.
     Event,
 }
 

@@ -9,10 +9,13 @@
 mod bench;
 mod bridge;
 mod check;
+mod data;
 mod diff;
 mod doctor;
+mod estimate;
 mod export;
 mod foxglove;
+mod identify;
 mod init;
 mod new;
 mod record;
@@ -102,6 +105,10 @@ enum Command {
     Watch(watch::Arguments),
     /// Show a running loop on a Foxglove WebSocket
     Foxglove(foxglove::Arguments),
+    /// Find a body's inertia in a log of its angular velocity
+    Identify(identify::Arguments),
+    /// Find the rate about one axis in a log of the other two
+    Estimate(Box<estimate::Arguments>),
     /// Tell whether this machine is fit for real time, and what to do about it
     Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
@@ -343,6 +350,8 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
+        Some(Command::Identify(arguments)) => identify::identify(&arguments),
+        Some(Command::Estimate(arguments)) => estimate::estimate(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments, crate::bench::ROWS),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),

@@ -6,6 +6,7 @@
 //! | `summary` | `summary.json`, read back |
 //! | `traces` | one pass over a recording |
 //! | `columns` | signals of any length in a bounded number of columns, their extremes kept |
+//! | `hidden` | another page: the hidden component of a log |
 //! | `counterpart` | the run that an orbit's is compared with |
 //! | `percentiles` | latency distributions as curves |
 //! | `model` | what is shown, in which order |
@@ -20,6 +21,7 @@ mod axis;
 mod chart;
 mod columns;
 mod counterpart;
+mod hidden;
 mod html;
 mod model;
 mod page;
@@ -30,6 +32,7 @@ mod summary;
 mod tables;
 mod traces;
 
+pub use hidden::{HiddenFacts, HiddenPage};
 pub(crate) use traces::{Traces, trace_rig};
 
 use crate::config::{ConfigError, RunId};

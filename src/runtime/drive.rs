@@ -1,6 +1,6 @@
 //! Decides when a node runs: by the time grid, or by its inputs. One driver per clock.
 //!
-//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a bell; what is
+//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a notifier; what is
 //! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
 use super::hooks::{self, Failpoint};
@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const TURN_NS: u64 = 20_000_000;
 /// How long a role naps between two looks where there is no input that it could sleep on, ns.
 const NAP_NS: u64 = 50_000;
-/// How long a role sleeps on the bell of the input that it lacks before it looks around, ns.
+/// How long a role sleeps on the notifier of the input that it lacks before it looks around, ns.
 const SLEEP_NS: u64 = 20_000_000;
 /// How long after its last tick a role still waits for inputs, ns and periods.
 const GRACE_NS: u64 = 1_000_000_000;
@@ -171,7 +171,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
-    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the bell of
+    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the notifier of
     /// the input that it lacks.
     fn on_arrival(
         &mut self,

@@ -1,0 +1,240 @@
+//! A log's hidden component, row by row: rotation into principal axes, the choice of a rate, the reconstruction, its score.
+//!
+//! So many samples are read ahead as a rate is chosen from; beyond that, memory grows with the number of segments only.
+
+use super::identification::{LogAccount, sample};
+use super::{DataError, Entry, Log, Options};
+use crate::estimate::{
+    FilterKind, RateChoice, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup, Survey,
+};
+use crate::identify::Sample;
+use nalgebra::{Matrix3, Vector3};
+use std::path::Path;
+
+/// A rate is chosen from at most so many samples.
+const SURVEY_SAMPLES: usize = 100_000;
+/// Rates of so many times their noise tell something.
+const FLOOR_NOISES: f64 = 10.0;
+const LEAST_FLOOR_RAD_S: f64 = 1e-6;
+/// A part of a rotation that is smaller mixes nothing.
+const UNMIXED: f64 = 1e-9;
+/// How far a rotation may be from one.
+const ROTATION: f64 = 1e-3;
+
+/// Which filter is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum FilterOrder {
+    /// The papers' filter of first order.
+    #[default]
+    First,
+    /// The filter of second order.
+    Second,
+    /// The Kalman filter of the relation.
+    Kalman,
+}
+
+/// What is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Request {
+    /// The hidden axis, 1 to 3, among the principal ones.
+    pub axis: usize,
+    /// The coefficients a of \[D\](2).
+    pub coefficients: Vector3<f64>,
+    /// Damping by a torque −c I ω, 1/s.
+    pub damping_per_s: f64,
+    /// The principal axes as columns in the sensor's axes; none where these are the same.
+    pub axes: Option<Matrix3<f64>>,
+    /// The filter.
+    pub order: FilterOrder,
+    /// Its rate, 1/s; chosen from the log's start if none is given.
+    pub decay_per_s: Option<f64>,
+    /// Standard deviation of one measured rate, rad/s; that of the log's start if none is given. Only the Kalman filter asks.
+    pub noise_rad_s: Option<f64>,
+    /// The first estimate of every segment, rad/s.
+    pub guess_rad_s: Option<f64>,
+    /// Below this the measured rates carry no information, rad/s; ten times the noise of the log's start if none is given.
+    pub floor_rad_s: Option<f64>,
+}
+
+/// Why there is no estimate.
+#[derive(Debug, thiserror::Error)]
+pub enum EstimateError {
+    /// The log cannot be read.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// What was asked for is impossible.
+    #[error(transparent)]
+    Setup(#[from] ReconstructionError),
+    /// The axes are none.
+    #[error(
+        "the axes are no rotation: their columns must be of length 1, at right angles, and right-handed; take them from \
+         `corotate identify --json`"
+    )]
+    Axes,
+    /// The principal axes are turned, and a sensor is missing.
+    #[error(
+        "the principal axes are turned against the sensor's, and the log has no column of the rate about {axis}: it takes all \
+         three to know two rates about principal axes; leave the axes out if the sensor is nearly aligned"
+    )]
+    Mixed {
+        /// The letter of the axis.
+        axis: &'static str,
+    },
+    /// No rate can be chosen.
+    #[error("{path}: no rate can be chosen, for nothing moves in its first rows; give one with --decay")]
+    NoRate {
+        /// The log.
+        path: String,
+    },
+    /// Somebody who was given the rows failed.
+    #[error(transparent)]
+    Sink(std::io::Error),
+}
+
+/// A row with its estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimated {
+    /// The row.
+    pub entry: Entry,
+    /// The angular velocity about the principal axes, rad/s; not a number where it was not measured.
+    pub principal_rad_s: Vector3<f64>,
+    /// The hidden component.
+    pub told: Reconstructed,
+}
+
+/// What became of a log.
+#[derive(Debug, Clone)]
+pub struct Estimation {
+    /// The log.
+    pub log: LogAccount,
+    /// What was used.
+    pub filter: FilterKind,
+    /// Below this the measured rates counted as telling nothing, rad/s.
+    pub floor_rad_s: f64,
+    /// How its rate was chosen, if it was, and what of the log it was chosen by.
+    pub choice: Option<RateChoice>,
+    /// Whether the rate is the chosen one.
+    pub chosen: bool,
+    /// The segments with their names and scores, in the order of the log.
+    pub segments: Vec<(String, SegmentScore)>,
+}
+
+/// Estimates the hidden component of a log, and gives every row to `each`.
+///
+/// # Errors
+/// [`EstimateError`].
+pub fn estimate_log(
+    path: &Path,
+    options: &Options,
+    request: &Request,
+    mut each: impl FnMut(&Estimated, &str) -> std::io::Result<()>,
+) -> Result<Estimation, EstimateError> {
+    let axes = request.axes.unwrap_or_else(Matrix3::identity);
+    let defect = (axes.transpose() * axes - Matrix3::identity()).amax();
+    if !(defect < ROTATION && axes.determinant() > 0.0) {
+        return Err(EstimateError::Axes);
+    }
+    let hidden = request.axis.wrapping_sub(1);
+    // Which sensors the two rates about the other principal axes are made of.
+    let needed = [0, 1, 2].map(|sensor| (0..3).any(|own| own != hidden && axes[(sensor, own)].abs() > UNMIXED));
+    let options = Options { needed, ..options.clone() };
+    let absent = |sensor: &usize| options.rates.as_ref().is_some_and(|names| names[*sensor] == "-");
+    if let Some(sensor) = (0..3).filter(|sensor| needed[*sensor]).find(absent).filter(|_| request.axes.is_some()) {
+        return Err(EstimateError::Mixed { axis: ["x", "y", "z"][sensor] });
+    }
+    let mut log = Log::open(path, &options)?;
+    let principal = |entry: &Entry| {
+        let measured = Vector3::from(entry.rate_rad_s);
+        if request.axes.is_none() {
+            return measured;
+        }
+        // A rate that is not known does not spoil those that have no part of it.
+        Vector3::from_fn(|own, _| {
+            let parts = (0..3).map(|sensor| (axes[(sensor, own)], measured[sensor]));
+            parts.filter(|(part, _)| part.abs() > UNMIXED).map(|(part, rate)| part * rate).sum()
+        })
+    };
+    let (head, survey) = survey(&mut log, request, principal)?;
+    let choice = survey.choose();
+    let filter = filter(request, choice.as_ref(), path)?;
+    let noise_rad_s = choice.map_or(0.0, |choice| choice.noise_rad_s);
+    let floor_rad_s = request.floor_rad_s.unwrap_or((FLOOR_NOISES * noise_rad_s).max(LEAST_FLOOR_RAD_S));
+    let mut reconstruction = Reconstruction::new(&Setup {
+        coefficients: request.coefficients,
+        axis: request.axis,
+        damping_per_s: request.damping_per_s,
+        filter,
+        guess_rad_s: request.guess_rad_s,
+        floor_rad_s,
+    })?;
+    let (mut score, mut segments, mut name) = (Score::default(), Vec::new(), String::new());
+    let mut take = |entry: &Entry, named: &str| -> Result<(), EstimateError> {
+        if entry.begins {
+            segments.extend(score.end_segment().map(|score| (name.clone(), score)));
+            reconstruction.end_segment();
+            named.clone_into(&mut name);
+        }
+        let principal_rad_s = principal(entry);
+        let told = reconstruction.push(&Sample { time_s: entry.time_s, rate_rad_s: principal_rad_s });
+        score.push(told.rate_rad_s, principal_rad_s[hidden], told.observed);
+        each(&Estimated { entry: *entry, principal_rad_s, told }, &name).map_err(EstimateError::Sink)
+    };
+    let mut names = String::new();
+    for (entry, named) in &head {
+        if let Some(named) = named {
+            names.clone_from(named);
+        }
+        take(entry, &names)?;
+    }
+    drop(head);
+    while let Some(entry) = log.next().transpose()? {
+        if entry.begins {
+            names = log.segment_name();
+        }
+        take(&entry, &names)?;
+    }
+    segments.extend(score.end_segment().map(|score| (name, score)));
+    let account = LogAccount { path: path.to_owned(), meaning: log.meaning().clone(), counts: *log.counts() };
+    Ok(Estimation { log: account, filter, floor_rad_s, choice, chosen: request.decay_per_s.is_none(), segments })
+}
+
+/// Reads a log's start, with the name of every segment that begins there.
+#[allow(clippy::type_complexity, reason = "it is taken apart at once")]
+fn survey(
+    log: &mut Log,
+    request: &Request,
+    principal: impl Fn(&Entry) -> Vector3<f64>,
+) -> Result<(Vec<(Entry, Option<String>)>, Survey), EstimateError> {
+    let (mut head, mut survey) = (Vec::new(), Survey::new(&request.coefficients, request.axis));
+    while head.len() < SURVEY_SAMPLES {
+        let Some(entry) = log.next().transpose()? else { break };
+        if entry.begins {
+            survey.end_segment();
+        }
+        survey.push(&Sample { rate_rad_s: principal(&entry), ..sample(&entry) });
+        head.push((entry, entry.begins.then(|| log.segment_name())));
+    }
+    Ok((head, survey))
+}
+
+/// The filter that was asked for, its rate and its noise those of the log's start where none are given.
+fn filter(request: &Request, choice: Option<&RateChoice>, path: &Path) -> Result<FilterKind, EstimateError> {
+    let none = || EstimateError::NoRate { path: path.display().to_string() };
+    let decay_per_s = match (request.decay_per_s, choice) {
+        (Some(given), _) => given,
+        (None, Some(choice)) => choice.decay_per_s,
+        (None, None) => return Err(none()),
+    };
+    Ok(match request.order {
+        FilterOrder::First => FilterKind::First { decay_per_s },
+        FilterOrder::Second => FilterKind::Second { bandwidth_rad_s: decay_per_s },
+        FilterOrder::Kalman => {
+            let choice = choice.ok_or_else(none)?;
+            // A log without noise has its rounding.
+            let rounding = f64::EPSILON * choice.fastest_rad_s;
+            let noise_rad_s = request.noise_rad_s.unwrap_or(choice.noise_rad_s.max(rounding));
+            let density = choice.density(decay_per_s, noise_rad_s);
+            FilterKind::Kalman { noise_rad_s, density, guess_deviation_rad_s: 2.0 * choice.fastest_rad_s }
+        }
+    })
+}

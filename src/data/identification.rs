@@ -1,0 +1,161 @@
+//! Logs identified: every way of [`identify`](crate::identify) along the rows of files, in bounded memory.
+
+use super::{Counts, DataError, Entry, Log, Meaning, Options};
+use crate::identify::{
+    Account, AxesFit, Finding, Motion, Recursive, RecursiveAxisymmetric, RecursiveFit, Sample, TensorFit, findings,
+};
+use std::path::{Path, PathBuf};
+
+/// How logs shall be identified.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ways {
+    /// Whether the torque of the air is part of the fit.
+    pub damping: bool,
+    /// The recursive identifiers' decay rate per unit of excitation; without one they forget nothing.
+    pub decay: Option<f64>,
+    /// The axis of symmetry, 1 to 3, if the body is known to have one.
+    pub symmetry_axis: Option<usize>,
+}
+
+/// A log that was read.
+#[derive(Debug, Clone)]
+pub struct LogAccount {
+    /// Its name.
+    pub path: PathBuf,
+    /// What its columns mean.
+    pub meaning: Meaning,
+    /// What became of its rows.
+    pub counts: Counts,
+}
+
+/// What logs say of a body.
+#[derive(Debug, Clone)]
+pub struct Identified {
+    /// The logs.
+    pub logs: Vec<LogAccount>,
+    /// What they amount to.
+    pub account: Account,
+    /// Least squares about the sensor's axes, each axis by itself.
+    pub axes: Option<AxesFit>,
+    /// Least squares about the sensor's axes, of one body.
+    pub body: Option<TensorFit>,
+    /// Least squares of the whole tensor.
+    pub tensor: Option<TensorFit>,
+    /// The papers' filter.
+    pub recursive: RecursiveFit<3>,
+    /// The papers' filter for an axisymmetric body.
+    pub axisymmetric: Option<RecursiveFit<1>>,
+    /// The damping that the recursive filters took as known, 1/s.
+    pub recursive_damping_per_s: f64,
+    /// What is to be known of all this.
+    pub findings: Vec<Finding>,
+}
+
+/// Reads logs of one body and identifies it. Files are read twice, the second time by the recursive filters, which take the
+/// damping from the least squares; what can be read but once (`-`) they take as not damped.
+///
+/// # Errors
+/// [`DataError`].
+pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Result<Identified, DataError> {
+    let all = Options { needed: [true; 3], ..options.clone() };
+    let rereadable = paths.iter().all(|path| path.is_file());
+    let mut motion = Motion::default();
+    let mut recursive = Filters::new(ways, 0.0)?;
+    let mut logs = Vec::new();
+    for path in paths {
+        logs.push(read(path, &all, |step| match step {
+            Step::Sample(sample) => {
+                motion.push(sample);
+                if !rereadable {
+                    recursive.push(sample);
+                }
+            }
+            Step::End => {
+                motion.end_segment();
+                recursive.end_segment();
+            }
+        })?);
+    }
+    let (axes, body) = (motion.about_known_axes(ways.damping), motion.moments_about_known_axes(ways.damping));
+    let mut recursive_damping_per_s = 0.0;
+    if rereadable {
+        recursive_damping_per_s = body.map_or(0.0, |fit| fit.damping_per_s);
+        recursive = Filters::new(ways, recursive_damping_per_s)?;
+        for path in paths {
+            read(path, &all, |step| match step {
+                Step::Sample(sample) => recursive.push(sample),
+                Step::End => recursive.end_segment(),
+            })?;
+        }
+    }
+    let tensor = motion.about_unknown_axes(ways.damping);
+    Ok(Identified {
+        logs,
+        account: *motion.account(),
+        findings: findings(&motion, axes.as_ref(), tensor.as_ref()),
+        axes,
+        body,
+        tensor,
+        recursive: recursive.all.fit(),
+        axisymmetric: recursive.symmetric.map(|filter| filter.fit()),
+        recursive_damping_per_s,
+    })
+}
+
+/// The recursive filters.
+struct Filters {
+    all: Recursive,
+    symmetric: Option<RecursiveAxisymmetric>,
+}
+
+impl Filters {
+    fn new(ways: &Ways, damping_per_s: f64) -> Result<Self, DataError> {
+        if let Some(decay) = ways.decay.filter(|decay| !(decay.is_finite() && *decay > 0.0)) {
+            let reason = format!("{decay} is no decay rate; give a number above 0");
+            return Err(DataError::Option { name: "decay", reason });
+        }
+        let symmetric = ways.symmetry_axis.map(|axis| RecursiveAxisymmetric::new(axis, ways.decay, damping_per_s));
+        let symmetric = symmetric.transpose();
+        let symmetric =
+            symmetric.map_err(|error| DataError::Option { name: "symmetry axis", reason: error.to_string() })?;
+        Ok(Self { all: Recursive::new(ways.decay, damping_per_s), symmetric })
+    }
+
+    fn push(&mut self, sample: &Sample) {
+        self.all.push(sample);
+        if let Some(filter) = &mut self.symmetric {
+            filter.push(sample);
+        }
+    }
+
+    fn end_segment(&mut self) {
+        self.all.end_segment();
+        if let Some(filter) = &mut self.symmetric {
+            filter.end_segment();
+        }
+    }
+}
+
+/// What comes along a log.
+enum Step<'a> {
+    Sample(&'a Sample),
+    /// A segment ends.
+    End,
+}
+
+/// A row as a sample.
+pub(super) fn sample(entry: &Entry) -> Sample {
+    Sample { time_s: entry.time_s, rate_rad_s: entry.rate_rad_s.into() }
+}
+
+fn read(path: &Path, options: &Options, mut each: impl FnMut(Step<'_>)) -> Result<LogAccount, DataError> {
+    let mut log = Log::open(path, options)?;
+    while let Some(entry) = log.next().transpose()? {
+        if entry.begins {
+            each(Step::End);
+        }
+        each(Step::Sample(&sample(&entry)));
+    }
+    each(Step::End);
+    Ok(LogAccount { path: log.path().to_owned(), meaning: log.meaning().clone(), counts: *log.counts() })
+}

@@ -1,0 +1,342 @@
+//! Rows of an MCAP file: of ROS 2 `sensor_msgs/msg/Imu` messages in CDR, or of a recording of ours.
+//!
+//! Read from its beginning to its end, a record at a time. Must not believe a length that a message tells beyond its bytes.
+
+use super::columns::{RateUnit, TimeUnit};
+use super::{DataError, Meaning, Options, Row, Rows, Stamp};
+use crate::record::Layout;
+use crate::sample::{FieldKind, VOID};
+use mcap::McapError;
+use mcap::records::Record;
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// No record of a log is longer, packed or not, bytes.
+const RECORD_BYTES: usize = 128 << 20;
+/// How much is read at once, if no more is asked for, bytes.
+const READ_BYTES: usize = 64 << 10;
+/// What comes before the body of a CDR message, bytes.
+const CDR_HEADER: usize = 4;
+/// The field of our samples that is an angular velocity.
+const OMEGA: &str = "omega_rad_s";
+
+/// An MCAP file that is being read.
+pub struct Mcap {
+    path: PathBuf,
+    file: File,
+    reader: LinearReader,
+    content: Content,
+}
+
+/// What is known of the file so far.
+struct Content {
+    topic: Option<String>,
+    schemas: BTreeMap<u16, (String, Vec<u8>)>,
+    /// The topics that could be meant.
+    topics: Vec<String>,
+    chosen: Option<(u16, Form)>,
+    messages: u64,
+    meaning: Meaning,
+}
+
+/// What the messages of a topic are.
+#[derive(Debug, Clone, Copy)]
+enum Form {
+    /// `sensor_msgs/msg/Imu`
+    Imu,
+    /// A sample of ours: where its fields are, bytes from the start of the body.
+    Own { omega: usize, valid: Option<usize>, generation: Option<usize> },
+}
+
+impl Mcap {
+    /// Whether a file begins as an MCAP file does.
+    pub fn is_begun(start: &[u8]) -> bool {
+        start.starts_with(mcap::MAGIC)
+    }
+
+    /// Reads nothing yet.
+    pub fn new(file: File, path: &Path, options: &Options) -> Self {
+        let reader = LinearReader::new_with_options(
+            LinearReaderOptions::default().with_record_length_limit(RECORD_BYTES).with_prevalidate_chunk_crcs(true),
+        );
+        let meaning = Meaning {
+            time: ("header.stamp".to_owned(), TimeUnit::Nanoseconds),
+            rates: (["x", "y", "z"].map(|axis| format!("angular_velocity.{axis}")), RateUnit::RadiansPerSecond),
+            assumed: Vec::new(),
+        };
+        let content = Content {
+            topic: options.topic.clone(),
+            schemas: BTreeMap::new(),
+            topics: Vec::new(),
+            chosen: None,
+            messages: 0,
+            meaning,
+        };
+        Self { path: path.to_owned(), file, reader, content }
+    }
+
+    fn form(&self, reason: String) -> DataError {
+        DataError::Form { path: self.path.clone(), line: self.content.messages, reason }
+    }
+}
+
+impl Rows for Mcap {
+    fn read(&mut self, row: &mut Row) -> Result<bool, DataError> {
+        loop {
+            let taken = match self.reader.next_event() {
+                None => break,
+                Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
+                    let room = self.reader.insert(wanted.max(READ_BYTES));
+                    match self.file.read(room) {
+                        Ok(count) => {
+                            self.reader.notify_read(count);
+                            Ok(false)
+                        }
+                        Err(source) => return Err(DataError::Read { path: self.path.clone(), source }),
+                    }
+                }
+                Some(Ok(LinearReadEvent::Record { data, opcode })) => match mcap::parse_record(opcode, data) {
+                    Ok(record) => self.content.take(&record, row),
+                    Err(error) => Err(words(&error)),
+                },
+                Some(Err(error)) => Err(words(&error)),
+            };
+            match taken {
+                Ok(true) => return Ok(true),
+                Ok(false) => {}
+                Err(reason) => return Err(self.form(reason)),
+            }
+        }
+        if self.content.chosen.is_some() {
+            return Ok(false);
+        }
+        let columns = self.content.topics.join(", ");
+        let (reason, remedy) = match &self.content.topic {
+            Some(topic) => (format!("no topic with an angular velocity is called `{topic}`"), "name one that there is"),
+            None => ("no topic has sensor_msgs/msg/Imu, or samples of ours".to_owned(), "log one of these, or CSV"),
+        };
+        let remedy = remedy.to_owned();
+        Err(DataError::Column { path: self.path.clone(), reason, remedy, columns })
+    }
+
+    fn meaning(&self) -> &Meaning {
+        &self.content.meaning
+    }
+}
+
+/// What is wrong, and what to do.
+fn words(error: &McapError) -> String {
+    match error {
+        McapError::UnsupportedCompression(kind) => {
+            format!("its chunks are packed with {kind}; pack them with lz4, or not at all")
+        }
+        McapError::UnexpectedEof | McapError::UnexpectedEoc => {
+            "it ends within a record: its recorder was stopped, or the disk was full; recover what there is of it"
+                .to_owned()
+        }
+        other => format!("it is damaged ({other}); recover what there is of it, or log again"),
+    }
+}
+
+impl Content {
+    /// Takes in a record; true if it was a message that gave a row.
+    fn take(&mut self, record: &Record<'_>, row: &mut Row) -> Result<bool, String> {
+        match record {
+            Record::Schema { header, data } => {
+                self.schemas.insert(header.id, (header.name.clone(), data.to_vec()));
+            }
+            Record::Channel(channel) => {
+                let form = self.schemas.get(&channel.schema_id).and_then(|(name, data)| form(name, data));
+                let (Some(form), "cdr") = (form, channel.message_encoding.as_str()) else { return Ok(false) };
+                if self.topics.contains(&channel.topic) {
+                    return Ok(false);
+                }
+                self.topics.push(channel.topic.clone());
+                // The end of a topic's name will do.
+                let wanted = self.topic.as_ref().is_none_or(|topic| {
+                    let rest = channel.topic.strip_suffix(topic.as_str());
+                    rest.is_some_and(|rest| rest.is_empty() || rest.ends_with('/') || topic.starts_with('/'))
+                });
+                if !wanted {
+                    return Ok(false);
+                }
+                if self.chosen.is_some() {
+                    return Err(format!("more than one topic may be meant: {}; name one", self.topics.join(", ")));
+                }
+                self.chosen = Some((channel.id, form));
+                if matches!(form, Form::Own { .. }) {
+                    self.meaning.time.0 = "publish_time".to_owned();
+                    self.meaning.rates.0 = [0, 1, 2].map(|index| format!("{OMEGA}[{index}]"));
+                }
+            }
+            Record::Message { header, data } => {
+                let Some((channel, form)) = self.chosen else { return Ok(false) };
+                if header.channel_id != channel {
+                    return Ok(false);
+                }
+                self.messages += 1;
+                let decoded = match form {
+                    Form::Imu => imu(data),
+                    Form::Own { omega, valid, generation } => own(data, header.publish_time, omega, valid, generation),
+                };
+                let (stamp, rates) = decoded.ok_or("the message is shorter than its type; log again")?;
+                (row.number, row.stamp, row.rate_rad_s) = (self.messages, stamp, rates);
+                row.key.clear();
+                return Ok(true);
+            }
+            _ => {}
+        }
+        Ok(false)
+    }
+}
+
+/// What the messages of a schema are, if there is an angular velocity in them.
+fn form(name: &str, data: &[u8]) -> Option<Form> {
+    if matches!(name, "sensor_msgs/msg/Imu" | "sensor_msgs/Imu") {
+        return Some(Form::Imu);
+    }
+    let layout = Layout::parse(std::str::from_utf8(data).ok()?)?;
+    let field = |name: &str, kind, count| {
+        let found = layout.columns.iter().find(|column| column.name == name)?;
+        (found.kind == kind && found.count == count).then_some(found.offset)
+    };
+    let (valid, generation) = (field("valid", FieldKind::U64, 1), field("generation", FieldKind::U64, 1));
+    Some(Form::Own { omega: field(OMEGA, FieldKind::F64, 3)?, valid, generation })
+}
+
+/// A stamp and three rates.
+type Decoded = (Option<Stamp>, [f64; 3]);
+
+/// A number that is finite, or one that is none.
+fn finite(value: f64) -> f64 {
+    if value.is_finite() { value } else { f64::NAN }
+}
+
+/// Reads `sensor_msgs/msg/Imu`: header (stamp, frame), orientation with covariance, angular velocity.
+fn imu(message: &[u8]) -> Option<Decoded> {
+    let (header, body) = message.split_at_checked(CDR_HEADER)?;
+    let little = header[1] & 1 == 1;
+    let word = |at: usize| {
+        let bytes: [u8; 4] = body.get(at..at.checked_add(4)?)?.try_into().ok()?;
+        Some(if little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
+    };
+    let number = |at: usize| {
+        let bytes: [u8; 8] = body.get(at..at.checked_add(8)?)?.try_into().ok()?;
+        Some(if little { f64::from_le_bytes(bytes) } else { f64::from_be_bytes(bytes) })
+    };
+    let (seconds, nanoseconds, length) = (word(0)?.cast_signed(), word(4)?, word(8)?);
+    let stamp = i64::from(seconds) * 1_000_000_000 + i64::from(nanoseconds);
+    // Numbers of 8 bytes are aligned to 8 within the body.
+    let orientation = 12_usize.checked_add(length as usize)?.checked_next_multiple_of(8)?;
+    let first = orientation.checked_add(8 * (4 + 9))?;
+    let rates = [number(first)?, number(first + 8)?, number(first + 16)?];
+    Some((Some(Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates.map(finite)))
+}
+
+/// Reads a sample of ours. One that stands for none, or whose components are not valid, has no such values.
+fn own(
+    message: &[u8],
+    publish_time: u64,
+    omega: usize,
+    valid: Option<usize>,
+    generation: Option<usize>,
+) -> Option<Decoded> {
+    let body = message.get(CDR_HEADER..)?;
+    let word = |at: usize| Some(u64::from_le_bytes(body.get(at..at.checked_add(8)?)?.try_into().ok()?));
+    let valid = valid.map_or(Some(u64::MAX), word)?;
+    let void = generation.map_or(Some(0), word)? & VOID != 0;
+    let mut rates = [f64::NAN; 3];
+    for (axis, rate) in rates.iter_mut().enumerate() {
+        let value = f64::from_bits(word(omega.checked_add(8 * axis)?)?);
+        if valid & (1 << axis) != 0 {
+            *rate = finite(value);
+        }
+    }
+    let stamp = i64::try_from(publish_time).ok().filter(|_| !void);
+    Some((stamp.map(|stamp| Stamp::whole(stamp, TimeUnit::Nanoseconds)), rates))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Log;
+    use super::*;
+    use mcap::records::MessageHeader;
+
+    fn message(little: bool, seconds: i32, nanoseconds: u32, frame: &str, rates: [f64; 3]) -> Vec<u8> {
+        let word = |value: u32| if little { value.to_le_bytes() } else { value.to_be_bytes() };
+        let number = |value: f64| if little { value.to_le_bytes() } else { value.to_be_bytes() };
+        let mut body = [word(seconds.cast_unsigned()), word(nanoseconds), word(frame.len() as u32 + 1)].concat();
+        body.extend(frame.bytes().chain([0]));
+        body.resize(body.len().next_multiple_of(8), 0);
+        body.extend([9.0; 13].into_iter().chain(rates).chain([7.0; 21]).flat_map(number));
+        [vec![0, u8::from(little), 0, 0], body].concat()
+    }
+
+    fn file(directory: &Path, topics: &[&str], messages: &[(usize, Vec<u8>)]) -> PathBuf {
+        let path = directory.join("imu.mcap");
+        let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Lz4));
+        let mut writer = options.create(std::io::BufWriter::new(File::create(&path).unwrap())).unwrap();
+        let schema = writer.add_schema("sensor_msgs/msg/Imu", "ros2msg", b"").unwrap();
+        let ids: Vec<u16> =
+            topics.iter().map(|topic| writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).unwrap()).collect();
+        for (sequence, (topic, data)) in messages.iter().enumerate() {
+            let header =
+                MessageHeader { channel_id: ids[*topic], sequence: sequence as u32, log_time: 0, publish_time: 0 };
+            writer.write_to_known_channel(&header, data).unwrap();
+        }
+        writer.finish().unwrap();
+        path
+    }
+
+    #[test]
+    fn imu_messages_of_either_byte_order_and_any_frame_are_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let messages = [
+            (0, message(true, 1_763_800_000, 999_999_990, "imu_link", [1.0, 2.0, 3.0])),
+            (1, message(true, 1, 0, "other", [9.0; 3])),
+            (0, message(false, 1_763_800_001, 0, "", [1.5, f64::NAN, 3.5])),
+            (0, message(true, 1_763_800_001, 10, "a", [4.0, 5.0, 6.0])),
+        ];
+        let path = file(directory.path(), &["/imu/data", "/imu/raw"], &messages);
+        let two = Log::open(&path, &Options::default()).err().unwrap().to_string();
+        assert!(two.contains("more than one topic may be meant: /imu/data, /imu/raw; name one"), "{two}");
+        let options = Options { topic: Some("data".to_owned()), ..Options::default() };
+        let mut log = Log::open(&path, &options).unwrap();
+        let entries: Vec<_> = log.by_ref().map(Result::unwrap).collect();
+        assert_eq!(entries.iter().map(|entry| entry.row).collect::<Vec<_>>(), [1, 3]);
+        assert_eq!(entries[1].rate_rad_s, [4.0, 5.0, 6.0]);
+        assert!((entries[1].time_s - 2e-8).abs() < 1e-22, "{}", entries[1].time_s);
+        assert_eq!(log.counts().incomplete, 1);
+        let none = Log::open(&path, &Options { topic: Some("ata".to_owned()), ..Options::default() }).err().unwrap();
+        assert!(none.to_string().contains("is called `ata`; name one that there is"), "{none}");
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_or_with_any_byte_changed_does_not_panic() {
+        let directory = tempfile::tempdir().unwrap();
+        let messages: Vec<_> =
+            (0..20).map(|n| (0, message(true, 1, n * 1000, "imu", [f64::from(n), 2.0, 3.0]))).collect();
+        let path = file(directory.path(), &["/imu"], &messages);
+        let whole = std::fs::read(&path).unwrap();
+        let other = directory.path().join("other.mcap");
+        let count = |bytes: &[u8]| {
+            std::fs::write(&other, bytes).unwrap();
+            let log = Log::open(&other, &Options::default());
+            log.map_or(0, |log| log.filter(Result::is_ok).count())
+        };
+        assert_eq!(count(&whole), 20);
+        for cut in (0..whole.len()).step_by(23) {
+            assert!(count(&whole[..cut]) <= 20);
+            let mut changed = whole.clone();
+            changed[cut] ^= 0x55;
+            assert!(count(&changed) <= 20);
+        }
+        assert!(imu(&messages[0].1[..120]).is_none());
+        let mut long = messages[0].1.clone();
+        long[12..16].copy_from_slice(&u32::MAX.to_le_bytes());
+        assert!(imu(&long).is_none());
+    }
+}

@@ -1,0 +1,312 @@
+//! Rows of a Parquet file: numbers in plain columns, nothing nested. Must not hold more of it than a batch of rows.
+
+use super::columns::{self, Places, TimeUnit};
+use super::{DataError, Meaning, Options, Row, Rows, Stamp};
+use parquet::basic::{LogicalType, TimeUnit as Unit};
+use parquet::column::reader::ColumnReader;
+use parquet::errors::ParquetError;
+use parquet::file::reader::{FileReader, SerializedFileReader};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// So many rows are read at once.
+const BATCH_ROWS: usize = 8192;
+
+/// A Parquet file that is being read.
+pub struct ParquetLog {
+    path: PathBuf,
+    reader: SerializedFileReader<File>,
+    places: Places,
+    /// The next group of rows.
+    group: usize,
+    /// What is read of the group at hand: stamps, then rates, then the key.
+    columns: Vec<Option<Column>>,
+    /// Rows of the batch that were given, and all of it.
+    given: usize,
+    batch: usize,
+    rows: u64,
+}
+
+/// One column of a group of rows, and a batch of it.
+struct Column {
+    name: String,
+    reader: ColumnReader,
+    /// Of a value that may be missing: 0 or this.
+    defined: i16,
+    cells: Vec<Cell>,
+}
+
+/// What stands in a row of a column.
+#[derive(Debug, Clone, PartialEq)]
+enum Cell {
+    None,
+    Whole(i64),
+    Float(f64),
+    Text(Vec<u8>),
+}
+
+impl ParquetLog {
+    /// Whether a file begins as a Parquet file does.
+    pub fn is_begun(start: &[u8]) -> bool {
+        start.starts_with(b"PAR1")
+    }
+
+    /// Reads the schema.
+    pub fn new(file: File, path: &Path, options: &Options) -> Result<Self, DataError> {
+        let form = |error: &ParquetError| form(path, 0, error);
+        let reader = SerializedFileReader::new(file).map_err(|error| form(&error))?;
+        let schema = reader.metadata().file_metadata().schema_descr();
+        let names: Vec<String> = schema.columns().iter().map(|column| column.path().string()).collect();
+        let mut places = columns::find(&names, path, &Options { header: true, ..options.clone() })?;
+        let time = schema.column(places.time);
+        if let (None, Some(LogicalType::Timestamp(about))) = (options.time_unit, time.logical_type_ref()) {
+            // The type says what a name can only hint at.
+            places.meaning.time.1 = match about.unit {
+                Unit::MILLIS => TimeUnit::Milliseconds,
+                Unit::MICROS => TimeUnit::Microseconds,
+                Unit::NANOS => TimeUnit::Nanoseconds,
+            };
+            places.meaning.assumed.retain(|what| *what != "time");
+        }
+        Ok(Self { path: path.to_owned(), reader, places, group: 0, columns: Vec::new(), given: 0, batch: 0, rows: 0 })
+    }
+
+    /// Reads the next batch, of the next group where the last one has ended; false at the end.
+    fn refill(&mut self) -> Result<bool, ParquetError> {
+        loop {
+            let mut count = 0;
+            for column in self.columns.iter_mut().flatten() {
+                count = column.read()?;
+            }
+            if count > 0 {
+                (self.given, self.batch) = (0, count);
+                return Ok(true);
+            }
+            if self.group >= self.reader.num_row_groups() {
+                return Ok(false);
+            }
+            self.begin_group()?;
+        }
+    }
+
+    fn begin_group(&mut self) -> Result<(), ParquetError> {
+        let group = self.reader.get_row_group(self.group)?;
+        let places = &self.places;
+        let wanted = [Some(places.time)].into_iter().chain(places.rates).chain([places.by]);
+        let schema = self.reader.metadata().file_metadata().schema_descr();
+        let mut columns = Vec::new();
+        for index in wanted {
+            let Some(index) = index else {
+                columns.push(None);
+                continue;
+            };
+            let about = schema.column(index);
+            let name = about.path().string();
+            if about.max_rep_level() > 0 {
+                return Err(ParquetError::General(format!("column {name} has lists; give plain numbers")));
+            }
+            let reader = group.get_column_reader(index)?;
+            columns.push(Some(Column { name, reader, defined: about.max_def_level(), cells: Vec::new() }));
+        }
+        self.columns = columns;
+        self.group += 1;
+        Ok(())
+    }
+
+    fn cell_error(&self, column: usize, reason: &str) -> DataError {
+        let found = self.columns[column].as_ref();
+        let text = match found.map(|column| &column.cells[self.given]) {
+            Some(Cell::Text(text)) => String::from_utf8_lossy(&text[..text.len().min(40)]).into_owned(),
+            Some(Cell::Float(value)) => value.to_string(),
+            Some(Cell::Whole(value)) => value.to_string(),
+            Some(Cell::None) | None => String::new(),
+        };
+        let name = found.map_or(String::new(), |column| column.name.clone());
+        let (path, reason) = (self.path.clone(), reason.to_owned());
+        DataError::Cell { path, line: self.rows, column: name, text, reason }
+    }
+
+    fn cell(&self, column: usize) -> &Cell {
+        self.columns.get(column).and_then(Option::as_ref).map_or(&Cell::None, |column| &column.cells[self.given])
+    }
+}
+
+/// A file that cannot be read.
+fn form(path: &Path, row: u64, error: &ParquetError) -> DataError {
+    let reason =
+        format!("it cannot be read as Parquet ({error}); write it again, unpacked or packed with zstd or snappy");
+    DataError::Form { path: path.to_owned(), line: row, reason }
+}
+
+impl Column {
+    /// Reads a batch; returns its rows.
+    fn read(&mut self) -> Result<usize, ParquetError> {
+        let defined = self.defined;
+        macro_rules! read {
+            ($reader:expr, $cell:expr) => {{
+                let (mut levels, mut values) = (Vec::new(), Vec::new());
+                let wanted = (defined > 0).then_some(&mut levels);
+                let (rows, ..) = $reader.read_records(BATCH_ROWS, wanted, None, &mut values)?;
+                let mut values = values.into_iter().map($cell);
+                self.cells.clear();
+                if defined > 0 {
+                    let mut given = |level: &i16| if *level == defined { values.next() } else { None };
+                    self.cells.extend(levels.iter().map(|level| given(level).unwrap_or(Cell::None)));
+                } else {
+                    self.cells.extend(values);
+                }
+                rows.min(self.cells.len())
+            }};
+        }
+        Ok(match &mut self.reader {
+            ColumnReader::Int32ColumnReader(reader) => read!(reader, |value| Cell::Whole(i64::from(value))),
+            ColumnReader::Int64ColumnReader(reader) => read!(reader, Cell::Whole),
+            ColumnReader::FloatColumnReader(reader) => read!(reader, |value| Cell::Float(f64::from(value))),
+            ColumnReader::DoubleColumnReader(reader) => read!(reader, Cell::Float),
+            ColumnReader::BoolColumnReader(reader) => read!(reader, |value| Cell::Whole(i64::from(value))),
+            ColumnReader::ByteArrayColumnReader(reader) => {
+                read!(reader, |value: parquet::data_type::ByteArray| Cell::Text(value.data().to_vec()))
+            }
+            _ => {
+                let reason =
+                    format!("column {} is of a type that is not read; give float, double or integers", self.name);
+                return Err(ParquetError::General(reason));
+            }
+        })
+    }
+}
+
+impl Rows for ParquetLog {
+    fn read(&mut self, row: &mut Row) -> Result<bool, DataError> {
+        if self.given == self.batch && !self.refill().map_err(|error| form(&self.path, self.rows, &error))? {
+            return Ok(false);
+        }
+        self.rows += 1;
+        row.number = self.rows;
+        let unit = self.places.meaning.time.1;
+        row.stamp = match self.cell(0) {
+            Cell::None => None,
+            Cell::Whole(value) if value.unsigned_abs() < 1 << 62 => Some(Stamp::whole(*value, unit)),
+            Cell::Float(value) if value.is_nan() => None,
+            Cell::Float(value) => match Stamp::float(*value, unit) {
+                None => return Err(self.cell_error(0, "is out of the range of time stamps; mend it")),
+                stamp => stamp,
+            },
+            Cell::Whole(_) => return Err(self.cell_error(0, "is out of the range of time stamps; mend it")),
+            Cell::Text(_) => return Err(self.cell_error(0, "is a text; give numbers")),
+        };
+        let rad_s = self.places.meaning.rates.1.rad_s();
+        for axis in 0..3 {
+            row.rate_rad_s[axis] = match self.cell(1 + axis) {
+                Cell::None => f64::NAN,
+                Cell::Whole(value) => *value as f64 * rad_s,
+                Cell::Float(value) if value.is_infinite() => {
+                    return Err(self.cell_error(1 + axis, "is not finite; leave out what is not known"));
+                }
+                Cell::Float(value) => *value * rad_s,
+                Cell::Text(_) => return Err(self.cell_error(1 + axis, "is a text; give numbers")),
+            };
+        }
+        row.key.clear();
+        match self.cell(4) {
+            Cell::None => {}
+            Cell::Whole(value) => row.key.extend_from_slice(value.to_string().as_bytes()),
+            Cell::Float(value) => row.key.extend_from_slice(value.to_string().as_bytes()),
+            Cell::Text(text) => row.key.extend_from_slice(text),
+        }
+        self.given += 1;
+        Ok(true)
+    }
+
+    fn meaning(&self) -> &Meaning {
+        &self.places.meaning
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Log, RateUnit};
+    use super::*;
+    use parquet::basic::Compression;
+    use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, FloatType, Int64Type};
+    use parquet::file::properties::WriterProperties;
+    use parquet::file::writer::SerializedFileWriter;
+    use parquet::schema::parser::parse_message_type;
+    use std::sync::Arc;
+
+    /// Two groups of 10 000 rows at 100 Hz; every tenth value of y is missing.
+    fn file(path: &Path, compression: Compression) {
+        let text = "message log { optional binary throw (UTF8); required int64 stamp (TIMESTAMP(MICROS,true)); \
+                    required double wx; optional float wy; required int64 wz; }";
+        let schema = Arc::new(parse_message_type(text).unwrap());
+        let properties = Arc::new(WriterProperties::builder().set_compression(compression).build());
+        let mut writer = SerializedFileWriter::new(File::create(path).unwrap(), schema, properties).unwrap();
+        for group in 0..2_i64 {
+            let rows = || group * 10_000..(group + 1) * 10_000;
+            let mut into = writer.next_row_group().unwrap();
+            let mut column = into.next_column().unwrap().unwrap();
+            let keys: Vec<ByteArray> = rows().map(|row| format!("t{}", row / 5_000).into_bytes().into()).collect();
+            column.typed::<ByteArrayType>().write_batch(&keys, Some(&vec![1; keys.len()]), None).unwrap();
+            column.close().unwrap();
+            let mut column = into.next_column().unwrap().unwrap();
+            let stamps: Vec<i64> = rows().map(|row| 1_763_800_000_000_000 + 10_000 * row).collect();
+            column.typed::<Int64Type>().write_batch(&stamps, None, None).unwrap();
+            column.close().unwrap();
+            let mut column = into.next_column().unwrap().unwrap();
+            let values: Vec<f64> = rows().map(|row| row as f64).collect();
+            column.typed::<DoubleType>().write_batch(&values, None, None).unwrap();
+            column.close().unwrap();
+            let mut column = into.next_column().unwrap().unwrap();
+            let levels: Vec<i16> = rows().map(|row| i16::from(row % 10 != 0)).collect();
+            let values: Vec<f32> = rows().filter(|row| row % 10 != 0).map(|row| row as f32).collect();
+            column.typed::<FloatType>().write_batch(&values, Some(&levels), None).unwrap();
+            column.close().unwrap();
+            let mut column = into.next_column().unwrap().unwrap();
+            column.typed::<Int64Type>().write_batch(&rows().collect::<Vec<_>>(), None, None).unwrap();
+            column.close().unwrap();
+            into.close().unwrap();
+        }
+        writer.close().unwrap();
+    }
+
+    #[test]
+    fn columns_of_any_numbers_are_read_across_groups_with_what_is_missing() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("log.parquet");
+        for compression in [Compression::UNCOMPRESSED, Compression::SNAPPY] {
+            file(&path, compression);
+            let options = Options {
+                by: Some("throw".to_owned()),
+                rate_unit: Some(RateUnit::RadiansPerSecond),
+                ..Options::default()
+            };
+            let mut log = Log::open(&path, &options).unwrap();
+            let mut count = 0;
+            for entry in log.by_ref() {
+                let entry = entry.unwrap();
+                let row = (entry.row - 1) as f64;
+                assert_eq!(entry.rate_rad_s, [row; 3]);
+                assert!((entry.time_s - row * 0.01).abs() < 1e-9, "{entry:?}");
+                count += 1;
+            }
+            assert_eq!(count, 18_000);
+            let counts = log.counts();
+            assert_eq!((counts.rows, counts.incomplete, counts.segments), (20_000, 2_000, 4));
+            assert!(log.meaning().assumed.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_text_for_a_number_and_a_file_that_is_cut_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("log.parquet");
+        file(&path, Compression::UNCOMPRESSED);
+        let rates = Some(["throw", "wy", "wz"].map(str::to_owned));
+        let refused = Log::open(&path, &Options { rates, ..Options::default() }).err().unwrap().to_string();
+        assert!(refused.contains("column throw: `t0` is a text; give numbers"), "{refused}");
+        let whole = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &whole[..whole.len() / 2]).unwrap();
+        let cut = Log::open(&path, &Options::default()).err().unwrap().to_string();
+        assert!(cut.contains("cannot be read as Parquet"), "{cut}");
+    }
+}

@@ -1,0 +1,113 @@
+//! The estimate beside a measured component: root mean square over the part of each segment in which the first guess is
+//! forgotten. Memory does not grow with a segment. Must not be asked before a segment has ended.
+
+/// Segments of at most so many samples are scored over their second half; longer ones over all but the first half of this.
+const HALVED_SAMPLES: usize = 1 << 16;
+
+/// How well the estimate did in one segment.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct SegmentScore {
+    /// Root mean square of estimate − measured over the second half of the segment, rad/s.
+    pub error_rad_s: f64,
+    /// Root mean square of the measured component over the same samples, rad/s.
+    pub measured_rad_s: f64,
+    /// How many samples these are.
+    pub scored: u64,
+    /// All samples of the segment.
+    pub samples: u64,
+    /// Those to which no step told anything of the hidden component, but for the first.
+    pub unobserved: u64,
+}
+
+/// Sums over a segment.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    error: f64,
+    measured: f64,
+    count: u64,
+}
+
+impl Sums {
+    fn add(&mut self, (error, measured): (f64, f64)) {
+        // Where either is not known there is nothing to compare.
+        if error.is_finite() {
+            self.error += error * error;
+            self.measured += measured * measured;
+            self.count += 1;
+        }
+    }
+}
+
+/// A score in the making: one segment at a time.
+#[derive(Debug, Clone, Default)]
+pub struct Score {
+    /// Error and measured component of each sample so far, as long as it is open which half they are in.
+    open: Vec<(f64, f64)>,
+    sums: Sums,
+    samples: u64,
+    unobserved: u64,
+}
+
+impl Score {
+    /// Takes in a sample: the estimate, what was measured (not a number where it was not), and whether the step told anything.
+    pub fn push(&mut self, estimate_rad_s: f64, measured_rad_s: f64, observed: bool) {
+        let pair = (estimate_rad_s - measured_rad_s, measured_rad_s);
+        self.samples += 1;
+        self.unobserved += u64::from(!observed && self.samples > 1);
+        if self.samples <= HALVED_SAMPLES as u64 {
+            self.open.push(pair);
+        } else {
+            self.close(HALVED_SAMPLES / 2);
+            self.sums.add(pair);
+        }
+    }
+
+    /// Sums up what is open from a place on.
+    fn close(&mut self, from: usize) {
+        self.open.iter().skip(from).for_each(|pair| self.sums.add(*pair));
+        self.open.clear();
+    }
+
+    /// Ends a segment; none if it had no sample.
+    pub fn end_segment(&mut self) -> Option<SegmentScore> {
+        self.close(self.open.len() / 2);
+        let (sums, samples, unobserved) = (self.sums, self.samples, self.unobserved);
+        (self.sums, self.samples, self.unobserved) = (Sums::default(), 0, 0);
+        let mean = |sum: f64| libm::sqrt(sum / sums.count as f64);
+        (samples > 0).then(|| SegmentScore {
+            error_rad_s: mean(sums.error),
+            measured_rad_s: mean(sums.measured),
+            scored: sums.count,
+            samples,
+            unobserved,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_second_half_is_scored_and_what_is_not_known_is_not() {
+        let mut score = Score::default();
+        for (estimate, measured) in [(9.0, 1.0), (9.0, 1.0), (5.0, 2.0), (f64::NAN, 2.0), (2.0, f64::NAN), (0.0, 3.0)] {
+            score.push(estimate, measured, measured > 1.0);
+        }
+        let scored = score.end_segment().unwrap();
+        assert_eq!((scored.scored, scored.samples, scored.unobserved), (1, 6, 2));
+        assert_eq!((scored.error_rad_s, scored.measured_rad_s), (3.0, 3.0));
+        assert!(score.end_segment().is_none());
+    }
+
+    #[test]
+    fn a_long_segment_is_scored_behind_its_start() {
+        let mut score = Score::default();
+        for sample in 0..200_000 {
+            score.push(if sample < HALVED_SAMPLES / 2 { 100.0 } else { 1.5 }, 1.0, true);
+        }
+        let scored = score.end_segment().unwrap();
+        assert_eq!((scored.error_rad_s, scored.scored), (0.5, 200_000 - HALVED_SAMPLES as u64 / 2));
+        assert!(score.open.capacity() <= HALVED_SAMPLES * 2);
+    }
+}

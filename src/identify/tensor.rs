@@ -1,0 +1,282 @@
+//! The whole tensor of inertia, up to its scale, for a sensor that is turned in any way against the body.
+//!
+//! In the sensor's own axes J ω(t) + ∫ω × Jω dt is constant while no torque acts, and J ω + ∫(ω × Jω + c Jω) dt under a damping
+//! torque −c Jω: linear in the six entries of J. In rad/s its deviation from that constant is J⁻¹ times what is left, so the
+//! squares are weighed by J⁻² of the last round; and noise of equal size on all rates enters them by tr(J J⁻² J), to which the
+//! sum is compared. So the smallest of six generalised eigenvalues is sought, again and again: total least squares, which noise
+//! does not pull towards a sphere. Must not be given the noise, nor an alignment.
+
+use super::motion::{FEATURES, Motion, PRODUCTS, Sums, TURNS};
+use super::spread;
+use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, SymmetricEigen, Vector3, Vector6};
+
+/// Rounds of weighing, at most, and the change of J at which they end.
+const ROUNDS: usize = 40;
+const SETTLED: f64 = 1e-9;
+/// A weight is not greater than for a moment of this part of the largest.
+const LEAST_MOMENT: f64 = 1e-3;
+/// Sweeps of the eigenvalue solver, at most.
+const SWEEPS: usize = 200;
+
+/// A linear map from the features to what shall be constant.
+type Row = SMatrix<f64, 3, FEATURES>;
+
+/// The maps of all six elements of a tensor, one below the other.
+type Stack = SMatrix<f64, 18, FEATURES>;
+
+/// What least squares say of a body's tensor of inertia.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TensorFit {
+    /// The principal moments, the largest being 1, each of the axis that stands closest to the sensor's x, y and z. Of a
+    /// wrong model they may be negative.
+    pub moments: Vector3<f64>,
+    /// Standard deviations of these, by resampling; none if there are too few pieces.
+    pub deviation: Option<Vector3<f64>>,
+    /// The principal axes as columns, in the sensor's axes: a rotation. A rate in them is its transpose times the measured one.
+    pub axes: Matrix3<f64>,
+    /// Standard deviation of the direction of each axis, by resampling, rad.
+    pub axes_deviation_rad: Option<Vector3<f64>>,
+    /// Damping by a torque −c Jω, 1/s; zero unless asked for.
+    pub damping_per_s: f64,
+    /// Standard deviation of this, by resampling.
+    pub damping_deviation_per_s: Option<f64>,
+    /// The part of each measured rate's variance about its mean that the motion explains, at most 1.
+    pub r_squared: Vector3<f64>,
+    /// How much worse the next tensor fits: the ratio of the two smallest eigenvalues. Near 1, the motion does not tell.
+    pub distinction: f64,
+}
+
+impl TensorFit {
+    /// How far each principal axis is from the sensor's, rad.
+    pub fn tilt_rad(&self) -> Vector3<f64> {
+        self.axes.diagonal().map(|cosine| libm::acos(cosine.abs().min(1.0)))
+    }
+}
+
+/// A tensor in the making.
+#[derive(Debug, Clone, Copy)]
+struct Solution {
+    /// Of trace 1.
+    tensor: Matrix3<f64>,
+    damping: f64,
+    distinction: f64,
+}
+
+impl Motion {
+    /// What the motion says of the whole tensor; with `damping`, of the air's torque too.
+    ///
+    /// None if there is no piece of a motion, or nothing that a tensor could be found by.
+    pub fn about_unknown_axes(&self, damping: bool) -> Option<TensorFit> {
+        self.tensor(true, damping)
+    }
+
+    /// The moments about the sensor's own axes that fit best together, the largest being 1: those of
+    /// [`about_unknown_axes`](Self::about_unknown_axes) with the tensor diagonal.
+    pub fn moments_about_known_axes(&self, damping: bool) -> Option<TensorFit> {
+        self.tensor(false, damping)
+    }
+
+    fn tensor(&self, whole: bool, damping: bool) -> Option<TensorFit> {
+        let total = self.total();
+        let best = solve(&total, whole, damping)?;
+        let (moments, axes) = principal(&best.tensor)?;
+        // Moments, then directions by their part across the axis, then damping.
+        let spread = spread::over_groups(self, |sums| {
+            let solution = solve(sums, whole, damping)?;
+            let (moments, own) = principal(&solution.tensor)?;
+            let across = axes.transpose() * own;
+            Some(SVector::<f64, 10>::from_fn(|row, _| match row {
+                0..3 => moments[row],
+                3..9 => {
+                    let column = (row - 3) / 2;
+                    across[((column + 1 + row % 2) % 3, column)]
+                }
+                _ => solution.damping,
+            }))
+        });
+        let direction = |spread: &SVector<f64, 10>| {
+            Vector3::from_fn(|column, _| {
+                let (first, second) = (spread[3 + 2 * column], spread[4 + 2 * column]);
+                libm::sqrt(first * first + second * second)
+            })
+        };
+        Some(TensorFit {
+            moments,
+            deviation: spread.map(|spread| spread.fixed_rows::<3>(0).into_owned()),
+            axes,
+            axes_deviation_rad: spread.as_ref().map(direction),
+            damping_per_s: best.damping,
+            damping_deviation_per_s: spread.map(|spread| spread[9]),
+            r_squared: r_squared(&total, &best)?,
+            distinction: best.distinction,
+        })
+    }
+}
+
+/// A basis of symmetric tensors, of unit length: xx, yy, zz, yz, zx, xy.
+fn basis(index: usize) -> Matrix3<f64> {
+    let mut tensor = Matrix3::zeros();
+    if index < 3 {
+        tensor[(index, index)] = 1.0;
+    } else {
+        let (row, column) = ((index - 2) % 3, (index - 1) % 3);
+        tensor[(row, column)] = core::f64::consts::FRAC_1_SQRT_2;
+        tensor[(column, row)] = core::f64::consts::FRAC_1_SQRT_2;
+    }
+    tensor
+}
+
+/// Where the product of two rates stands among the features.
+fn product(first: usize, second: usize) -> usize {
+    if first == second { PRODUCTS + first } else { PRODUCTS + 3 + (3 - first - second) }
+}
+
+/// J ω + ∫ω × Jω, and ∫Jω, as maps of the features.
+fn maps(tensor: &Matrix3<f64>) -> [Row; 2] {
+    let (mut free, mut damped) = (Row::zeros(), Row::zeros());
+    for row in 0..3 {
+        for column in 0..3 {
+            free[(row, column)] = tensor[(row, column)];
+            damped[(row, TURNS + column)] = tensor[(row, column)];
+        }
+        // (ω × Jω)_row = ω_next (Jω)_last − ω_last (Jω)_next.
+        let (next, last) = ((row + 1) % 3, (row + 2) % 3);
+        for column in 0..3 {
+            free[(row, product(next, column))] += tensor[(last, column)];
+            free[(row, product(last, column))] -= tensor[(next, column)];
+        }
+    }
+    [free, damped]
+}
+
+fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
+    let mut scatter = sums.scatter;
+    scatter.fill_lower_triangle_with_upper_triangle();
+    let largest = scatter.diagonal().max();
+    if !(sums.samples > 0 && largest > 0.0 && scatter.iter().all(|entry| entry.is_finite())) {
+        return None;
+    }
+    let unknowns = if whole { 6 } else { 3 };
+    let elements = [0, 1, 2, 3, 4, 5].map(basis);
+    let (mut free, mut damped) = (Stack::zeros(), Stack::zeros());
+    for (index, element) in elements.iter().enumerate() {
+        let [one, other] = maps(element);
+        free.fixed_rows_mut::<3>(3 * index).copy_from(&one);
+        damped.fixed_rows_mut::<3>(3 * index).copy_from(&other);
+    }
+    // All that a round needs of the scatter.
+    let products =
+        [free * scatter * free.transpose(), free * scatter * damped.transpose(), damped * scatter * damped.transpose()];
+    // The sum of weight · block over the block of two elements.
+    let weighed = |product: &SMatrix<f64, 18, 18>, weight: &Matrix3<f64>, p: usize, q: usize| {
+        product.fixed_view::<3, 3>(3 * p, 3 * q).dot(weight)
+    };
+    let mut solution = Solution { tensor: Matrix3::identity() / 3.0, damping: 0.0, distinction: 0.0 };
+    for _ in 0..ROUNDS {
+        let (weight, c) = (weight(&solution.tensor)?, solution.damping);
+        let (mut left, mut right) = (Matrix6::zeros(), Matrix6::zeros());
+        for p in 0..unknowns {
+            for q in 0..unknowns {
+                let [free, first, damped] = [0, 1, 2].map(|kind| weighed(&products[kind], &weight, p, q));
+                let second = weighed(&products[1], &weight, q, p);
+                left[(p, q)] = free + c * (first + second) + c * c * damped;
+                right[(p, q)] = (elements[p] * weight).dot(&elements[q]);
+            }
+        }
+        // What is not asked for stands apart, at an eigenvalue among the others'.
+        let apart = (left.trace(), right.trace());
+        for p in unknowns..6 {
+            (left[(p, p)], right[(p, p)]) = apart;
+        }
+        let (found, distinction) = smallest(&left, &right, unknowns)?;
+        let tensor = (0..6).fold(Matrix3::zeros(), |sum, index| sum + elements[index] * found[index]);
+        let trace = tensor.trace();
+        if trace == 0.0 || !trace.is_finite() {
+            return None;
+        }
+        let (tensor, found) = (tensor / trace, found / trace);
+        let change = (tensor - solution.tensor).amax();
+        let mut damping = 0.0;
+        if with_damping {
+            let sum = |kind: usize| {
+                let terms = (0..36).map(|pair| (pair / 6, pair % 6));
+                terms.map(|(p, q)| found[p] * found[q] * weighed(&products[kind], &weight, p, q)).sum::<f64>()
+            };
+            let square = sum(2);
+            damping = if square > 0.0 { -sum(1) / square } else { 0.0 };
+        }
+        solution = Solution { tensor, damping, distinction };
+        if change < SETTLED && (damping - c).abs() <= SETTLED * (1.0 + c.abs()) {
+            break;
+        }
+    }
+    Some(solution)
+}
+
+/// J⁻² with moments that are not too small, by which what is left is weighed.
+fn weight(tensor: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(*tensor, f64::EPSILON, SWEEPS)?;
+    let least = LEAST_MOMENT * eigenvalues.amax();
+    let inverse = eigenvalues.map(|moment| 1.0 / (moment.max(least) * moment.max(least)));
+    let weight = eigenvectors * Matrix3::from_diagonal(&inverse) * eigenvectors.transpose();
+    let weight = weight / weight.trace();
+    weight.iter().all(|entry| entry.is_finite()).then_some(weight)
+}
+
+/// The x with the smallest x·left·x over x·right·x, and how many times that the next one is; among those that have only the
+/// first `unknowns` entries.
+fn smallest(left: &Matrix6<f64>, right: &Matrix6<f64>, unknowns: usize) -> Option<(Vector6<f64>, f64)> {
+    let lower = Cholesky::new(*right)?.unpack();
+    let inverse = lower.solve_lower_triangular(&Matrix6::identity())?;
+    let scaled = inverse * left * inverse.transpose();
+    let scaled = (scaled + scaled.transpose()) * 0.5;
+    if !scaled.iter().all(|entry| entry.is_finite()) {
+        return None;
+    }
+    let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(scaled, f64::EPSILON, SWEEPS)?;
+    let wanted = |index: usize| eigenvectors.column(index).iter().take(unknowns).map(|x| x * x).sum::<f64>() > 0.5;
+    let smaller = |least: (usize, f64), index: usize| {
+        if eigenvalues[index] < least.1 { (index, eigenvalues[index]) } else { least }
+    };
+    let (best, least) = (0..6).filter(|index| wanted(*index)).fold((0, f64::INFINITY), smaller);
+    let (_, next) = (0..6).filter(|index| wanted(*index) && *index != best).fold((0, f64::INFINITY), smaller);
+    // Rounding may take an eigenvalue of zero below zero.
+    let floor = f64::EPSILON * eigenvalues.amax();
+    let distinction = next.max(floor) / least.max(floor);
+    Some((inverse.transpose() * eigenvectors.column(best), distinction))
+}
+
+/// Principal moments, the largest 1, and axes, each the one closest to a sensor's axis.
+fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+    let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(*tensor, f64::EPSILON, SWEEPS)?;
+    const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+    let aligned = |order: &[usize; 3]| (0..3).map(|axis| eigenvectors[(axis, order[axis])].abs()).sum::<f64>();
+    let order = ORDERS.into_iter().max_by(|first, second| aligned(first).total_cmp(&aligned(second)))?;
+    let mut axes = Matrix3::from_fn(|row, column| eigenvectors[(row, order[column])]);
+    for column in 0..3 {
+        if axes[(column, column)] < 0.0 {
+            axes.column_mut(column).neg_mut();
+        }
+    }
+    if axes.determinant() < 0.0 {
+        // A rotation it must be: the axis that is least aligned is turned round.
+        let column = axes.diagonal().map(f64::abs).imin();
+        axes.column_mut(column).neg_mut();
+    }
+    let moments = Vector3::from_fn(|axis, _| eigenvalues[order[axis]]);
+    let largest = moments.max();
+    (largest > 0.0).then(|| (moments / largest, axes))
+}
+
+/// The part of each rate's variance that is explained.
+fn r_squared(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
+    let mut scatter = sums.scatter;
+    scatter.fill_lower_triangle_with_upper_triangle();
+    let [free, damped] = maps(&solution.tensor);
+    let left = solution.tensor.try_inverse()? * (free + damped * solution.damping);
+    let unexplained = (left * scatter * left.transpose()).diagonal();
+    Some(Vector3::from_fn(|axis, _| {
+        let whole = scatter[(axis, axis)];
+        if whole > 0.0 { 1.0 - unexplained[axis] / whole } else { 0.0 }
+    }))
+}

@@ -1,0 +1,175 @@
+use super::*;
+use crate::model::{Noise, RigidBody};
+use nalgebra::{Matrix3, Rotation3};
+
+/// A body's tumbling as a turned sensor sees it: segments of so many samples at an interval, with damping and noise.
+struct Tumble {
+    moments: [f64; 3],
+    damping_per_s: f64,
+    turn: Rotation3<f64>,
+    noise_rad_s: f64,
+    segments: u64,
+    samples: u32,
+    interval_s: f64,
+    speed_rad_s: f64,
+}
+
+impl Default for Tumble {
+    fn default() -> Self {
+        Self {
+            moments: [0.93, 0.08, 1.0],
+            damping_per_s: 0.0,
+            turn: Rotation3::identity(),
+            noise_rad_s: 0.0,
+            segments: 40,
+            samples: 90,
+            interval_s: 0.01,
+            speed_rad_s: 6.0,
+        }
+    }
+}
+
+impl Tumble {
+    fn motion(&self) -> Motion {
+        let body = RigidBody::new(&Inertia::new(self.moments).unwrap());
+        let mut noise = Noise::new(7, 0, [self.noise_rad_s; 3], [0.0; 3]);
+        let mut start = Noise::new(3, 1, [self.speed_rad_s; 3], [0.0; 3]);
+        let mut motion = Motion::default();
+        for _ in 0..self.segments {
+            let mut rate = start.sample();
+            for tick in 0..self.samples {
+                let time_s = f64::from(tick) * self.interval_s;
+                motion.push(&Sample { time_s, rate_rad_s: self.turn * rate + noise.sample() });
+                let (interval_s, growth) = freed(self.interval_s, self.damping_per_s);
+                rate = body.flow(&rate, &Vector3::zeros(), interval_s) / growth;
+            }
+            motion.end_segment();
+        }
+        motion
+    }
+
+    fn coefficients(&self) -> Vector3<f64> {
+        Inertia::new(self.moments).unwrap().coefficients()
+    }
+}
+
+#[test]
+fn known_axes_are_fitted_within_their_own_deviations() {
+    for (damping_per_s, noise_rad_s) in [(0.0, 0.0), (0.2, 0.0), (0.2, 0.05)] {
+        let tumble = Tumble { damping_per_s, noise_rad_s, ..Tumble::default() };
+        let fit = tumble.motion().about_known_axes(true).unwrap();
+        let deviation = fit.deviation.unwrap();
+        for axis in 0..3 {
+            let error = (fit.coefficients[axis] - tumble.coefficients()[axis]).abs();
+            assert!(error < 4.0 * deviation[axis] + 1e-3, "{damping_per_s} {noise_rad_s}: {fit:?}");
+            assert!((fit.damping_per_s[axis] - damping_per_s).abs() < 0.02, "{fit:?}");
+        }
+        assert!(deviation.max() < 0.01 && fit.r_squared.min() > 0.99 && fit.closure().abs() < 0.01, "{fit:?}");
+    }
+}
+
+#[test]
+fn the_whole_tensor_is_found_behind_any_turn() {
+    for angles in [[0.0, 0.0, 0.0], [0.02, -0.01, 0.015], [0.7, -0.4, 2.5], [3.0, 1.2, -2.0]] {
+        // The last in every direction, the others in one.
+        let all = [(0.0, 0.0), (0.2, 0.0), (0.2, 0.05)];
+        for (damping_per_s, noise_rad_s) in all.into_iter().skip(if angles[0] == 0.7 { 0 } else { 2 }) {
+            let turn = Rotation3::from_euler_angles(angles[0], angles[1], angles[2]);
+            let tumble = Tumble { turn, damping_per_s, noise_rad_s, ..Tumble::default() };
+            let fit = tumble.motion().about_unknown_axes(true).unwrap();
+            let mut found: [f64; 3] = fit.moments.into();
+            found.sort_by(f64::total_cmp);
+            for (found, expected) in found.into_iter().zip([0.08, 0.93, 1.0]) {
+                assert!((found - expected).abs() < 5e-3, "{angles:?} {damping_per_s} {noise_rad_s}: {fit:?}");
+            }
+            assert!((fit.damping_per_s - damping_per_s).abs() < 5e-3, "{fit:?}");
+            assert!((fit.axes.determinant() - 1.0).abs() < 1e-9 && fit.distinction > 10.0, "{fit:?}");
+            // The tensor itself, whatever the order and the signs of its axes.
+            let rebuilt = fit.axes * Matrix3::from_diagonal(&fit.moments) * fit.axes.transpose();
+            let truth = turn * Matrix3::from_diagonal(&Vector3::from(tumble.moments)) * turn.transpose();
+            assert!((rebuilt - truth).amax() < 1e-2, "{angles:?}: {rebuilt} {truth}");
+        }
+    }
+}
+
+#[test]
+fn moments_about_known_axes_are_those_of_one_body() {
+    let tumble = Tumble { damping_per_s: 0.1, noise_rad_s: 0.02, ..Tumble::default() };
+    let fit = tumble.motion().moments_about_known_axes(true).unwrap();
+    assert!((fit.moments - Vector3::from(tumble.moments)).amax() < 3e-3, "{fit:?}");
+    assert_eq!(fit.axes, Matrix3::identity());
+    assert!(fit.deviation.unwrap().max() < 3e-3);
+}
+
+#[test]
+fn noise_does_not_pull_the_tensor_towards_a_sphere() {
+    let tumble = Tumble { moments: [0.6, 0.8, 1.0], noise_rad_s: 0.5, segments: 400, ..Tumble::default() };
+    let fit = tumble.motion().about_unknown_axes(false).unwrap();
+    assert!((fit.moments - Vector3::from(tumble.moments)).amax() < 0.02, "{fit:?}");
+}
+
+#[test]
+fn what_a_log_cannot_tell_is_said() {
+    let found = |tumble: &Tumble| {
+        let motion = tumble.motion();
+        findings(&motion, motion.about_known_axes(true).as_ref(), motion.about_unknown_axes(true).as_ref())
+    };
+    let noisy = Tumble { noise_rad_s: 0.02, ..Tumble::default() };
+    assert_eq!(found(&noisy), [Finding::Scale]);
+    let has = |tumble: &Tumble, wanted: fn(&Finding) -> bool| {
+        let found = found(tumble);
+        assert!(found.iter().any(wanted), "{found:?}");
+        found.iter().for_each(|finding| assert!(!finding.to_string().is_empty()));
+    };
+    has(&Tumble { moments: [1.0; 3], noise_rad_s: 0.02, ..Tumble::default() }, |f| matches!(f, Finding::Sphere));
+    let symmetric = Tumble { moments: [1.0, 1.0, 0.5], noise_rad_s: 0.02, ..Tumble::default() };
+    has(&symmetric, |f| matches!(f, Finding::Symmetric { axis: 2 }));
+    has(&Tumble { damping_per_s: 0.2, ..noisy }, |f| matches!(f, Finding::Damped { .. }));
+    has(&Tumble { damping_per_s: -0.2, noise_rad_s: 0.02, ..Tumble::default() }, |f| {
+        matches!(f, Finding::Driven { .. })
+    });
+    let turned = Rotation3::from_euler_angles(0.2, 0.0, 0.0);
+    has(&Tumble { turn: turned, noise_rad_s: 0.02, ..Tumble::default() }, |f| matches!(f, Finding::Tilted { .. }));
+    has(&Tumble { segments: 1, ..Tumble::default() }, |f| matches!(f, Finding::FewPieces { .. }));
+    has(&Tumble { segments: 1, samples: 8, ..Tumble::default() }, |f| matches!(f, Finding::Short { samples: 8 }));
+    let still = Tumble { speed_rad_s: 1e-6, noise_rad_s: 1e-3, ..Tumble::default() };
+    has(&still, |f| matches!(f, Finding::Unexcited { .. }));
+    has(&still, |f| matches!(f, Finding::Still { .. }));
+    has(&still, Finding::forbids_axes);
+    has(&still, Finding::forbids_tensor);
+}
+
+#[test]
+fn a_spin_about_one_axis_says_nothing_of_the_others() {
+    let mut motion = Motion::default();
+    let mut noise = Noise::new(7, 0, [1e-3; 3], [0.0; 3]);
+    for segment in 0..10 {
+        for tick in 0..100 {
+            let spin = Vector3::new(0.0, 0.0, 3.0 + 0.1 * f64::from(segment));
+            motion.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: spin + noise.sample() });
+        }
+        motion.end_segment();
+    }
+    let found = findings(&motion, motion.about_known_axes(true).as_ref(), motion.about_unknown_axes(true).as_ref());
+    let unknown = |f: &Finding| matches!(f, Finding::Unexcited { .. } | Finding::Indistinct { .. } | Finding::Sphere);
+    assert!(found.iter().any(unknown), "{found:?}");
+}
+
+#[test]
+fn nothing_gives_nothing() {
+    let empty = Motion::default();
+    assert!(empty.about_known_axes(true).is_none() && empty.about_unknown_axes(true).is_none());
+    let rest =
+        [Sample { time_s: 0.0, rate_rad_s: Vector3::zeros() }, Sample { time_s: 1.0, rate_rad_s: Vector3::zeros() }];
+    let motion = Motion::of([&rest[..]; 8]);
+    assert!(motion.about_known_axes(true).is_none() && motion.about_unknown_axes(true).is_none());
+}
+
+#[test]
+fn a_body_too_flat_is_flattened_and_one_far_beyond_refused() {
+    let (inertia, flattened) = nearest_body(&Vector3::new(0.93, 0.08, 1.0)).unwrap();
+    assert_eq!((inertia.moments_kg_m2(), flattened), (Vector3::new(0.93, 0.08, 1.0), false));
+    assert!(nearest_body(&Vector3::new(0.9, 0.08, 1.0)).unwrap().1);
+    assert!(matches!(nearest_body(&Vector3::new(0.5, 0.08, 1.0)), Err(InertiaError::Triangle { axis: 3, .. })));
+    assert!(matches!(nearest_body(&Vector3::new(0.5, -0.1, 1.0)), Err(InertiaError::NotPositive { axis: 2, .. })));
+}

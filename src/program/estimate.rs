@@ -1,0 +1,405 @@
+//! `corotate estimate`: the rate about one axis of a body from a log of the other two.
+
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, tell_log};
+use super::{Exit, fail, harmless, say};
+use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
+use crate::estimate::{FilterKind, SegmentScore};
+use crate::files;
+use crate::model::Inertia;
+use crate::report::{HiddenFacts, HiddenPage};
+use nalgebra::{Matrix3, Vector3};
+use serde_json::{Value, json};
+use std::fmt::Write as _;
+use std::io::{self, BufWriter, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// So many segments are listed one by one.
+const LISTED: usize = 12;
+
+/// Options of `corotate estimate`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// The log: CSV, MCAP or Parquet; - is CSV from the standard input
+    data: PathBuf,
+    #[command(flatten)]
+    log: LogArguments,
+    /// The axis whose rate is not to be read: x, y or z. Where the log has it, it is used for the score alone
+    #[arg(long, value_name = "AXIS", value_parser = axis)]
+    hidden: usize,
+    /// The body: what `corotate identify --json` printed
+    #[arg(long, value_name = "FILE", conflicts_with = "inertia", required_unless_present = "inertia")]
+    body: Option<PathBuf>,
+    /// The body: its principal moments of inertia, kg m2 or any other unit
+    #[arg(long, value_name = "X,Y,Z", value_parser = three)]
+    inertia: Option<Vector3<f64>>,
+    /// Damping by the air, a torque -c I w, 1/s [default: the body's, else 0]
+    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    damping: Option<f64>,
+    /// The principal axes in the sensor's axes, row by row; the axes are columns [default: the body's, else the sensor's]
+    #[arg(long, value_name = "NINE", value_parser = nine, allow_hyphen_values = true)]
+    axes: Option<Matrix3<f64>>,
+    /// The filter
+    #[arg(long, value_enum, default_value_t = Order::First)]
+    filter: Order,
+    /// Its rate, 1/s: how fast errors of the estimate decay [default: chosen from noise and motion, and said]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    decay: Option<f64>,
+    /// Standard deviation of one measured rate for the Kalman filter, rad/s [default: that of the log]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    noise: Option<f64>,
+    /// The first estimate of every segment, rad/s [default: what the first step tells]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    guess: Option<f64>,
+    /// Below this the measured rates tell nothing of the hidden one, rad/s [default: 10 times their noise]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    floor: Option<f64>,
+    /// Write every row with its estimate to this CSV file
+    #[arg(long, value_name = "FILE")]
+    table: Option<PathBuf>,
+    /// Draw reconstructed and measured rate on this page
+    #[arg(long, value_name = "FILE")]
+    page: Option<PathBuf>,
+    /// Print one line of JSON (corotate/estimate/v1)
+    #[arg(long)]
+    json: bool,
+}
+
+/// The filters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Order {
+    /// The papers': errors fall exponentially
+    First,
+    /// Two poles: less noise passes
+    Second,
+    /// Gains that weigh each step by its noise
+    Kalman,
+}
+
+const EXAMPLES: &str = "\
+The score is the root mean square of estimate less measured over the second half of every segment, where the log has the hidden
+rate. Steps that tell nothing of it are counted; the model goes on alone there.
+
+Examples:
+  corotate identify throws.csv --by throw --json > body.json
+  corotate estimate throws.csv --by throw --hidden z --body body.json --table z.csv --page z.html
+  corotate estimate gyro.csv --rates wx,wy,- --hidden z --inertia 1,2,2.5        the log has no such column
+  corotate estimate gyro.csv --hidden y --body body.json --filter kalman";
+
+fn three(text: &str) -> Result<Vector3<f64>, String> {
+    numbers::<3>(text).map(Vector3::from)
+}
+
+fn nine(text: &str) -> Result<Matrix3<f64>, String> {
+    numbers::<9>(text).map(|numbers| Matrix3::from_row_slice(&numbers))
+}
+
+/// What is known of a body.
+struct Body {
+    moments: Vector3<f64>,
+    damping_per_s: f64,
+    axes: Option<Matrix3<f64>>,
+}
+
+/// Estimates.
+pub fn estimate(arguments: &Arguments) -> Exit {
+    let body = match body(arguments) {
+        Ok(body) => body,
+        Err((exit, reason)) => return fail(exit, &reason),
+    };
+    let inertia = match Inertia::new(body.moments.into()) {
+        Ok(inertia) => inertia,
+        Err(error) => return fail(Exit::Usage, &format!("the inertia: {error}")),
+    };
+    let request = Request {
+        axis: arguments.hidden,
+        coefficients: inertia.coefficients(),
+        damping_per_s: arguments.damping.unwrap_or(body.damping_per_s),
+        axes: arguments.axes.or(body.axes),
+        order: match arguments.filter {
+            Order::First => FilterOrder::First,
+            Order::Second => FilterOrder::Second,
+            Order::Kalman => FilterOrder::Kalman,
+        },
+        decay_per_s: arguments.decay,
+        noise_rad_s: arguments.noise,
+        guess_rad_s: arguments.guess,
+        floor_rad_s: arguments.floor,
+    };
+    let outputs = [&arguments.table, &arguments.page];
+    if let Some(path) = outputs.into_iter().flatten().find(|path| is_same(path, &arguments.data)) {
+        return fail(Exit::Usage, &format!("{}: that is the log; name another file to write to", path.display()));
+    }
+    let unwritten = |path: &Option<PathBuf>, error: io::Error| {
+        let path = path.as_deref().unwrap_or(Path::new("")).display();
+        fail(Exit::Failure, &format!("cannot write {path}: {error}; free some room, or name another file"))
+    };
+    let mut page = arguments.page.is_some().then(HiddenPage::default);
+    let mut table = match arguments.table.as_deref().map(Table::begin).transpose() {
+        Ok(table) => table,
+        Err(error) => return unwritten(&arguments.table, error),
+    };
+    let done = estimate_log(&arguments.data, &arguments.log.options(), &request, |row, segment| {
+        if let Some(page) = &mut page {
+            let (told, measured) = (&row.told, row.principal_rad_s[request.axis - 1]);
+            page.push(row.entry.begins, row.entry.time_s, told.rate_rad_s, measured, told.observed);
+        }
+        table.as_mut().map_or(Ok(()), |table| table.row(row, segment, request.axis))
+    });
+    let estimation = match done {
+        Ok(estimation) => estimation,
+        Err(EstimateError::Sink(error)) => return unwritten(&arguments.table, error),
+        Err(error) => return fail(exit(&error), &error),
+    };
+    if let Some(Err(error)) = table.map(Table::end) {
+        return unwritten(&arguments.table, error);
+    }
+    let told = tell(arguments, &request, &estimation);
+    if let (Some(page), Some(path)) = (page, &arguments.page) {
+        let facts = HiddenFacts {
+            title: arguments.data.display().to_string(),
+            axis: AXES[request.axis - 1],
+            lines: told.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
+            segments: &estimation.segments,
+        };
+        if let Err(error) = files::write(path, page.html(&facts).as_bytes()) {
+            return unwritten(&arguments.page, error);
+        }
+    }
+    let text = match arguments.json {
+        true => format!("{}\n", to_json(&request, &estimation)),
+        false => harmless(&told),
+    };
+    say(&text).err().unwrap_or(Exit::Ok)
+}
+
+fn exit(error: &EstimateError) -> Exit {
+    match error {
+        EstimateError::Data(error) => exit_of(error),
+        EstimateError::Sink(_) => Exit::Failure,
+        EstimateError::Setup(_) | EstimateError::Axes | EstimateError::Mixed { .. } | EstimateError::NoRate { .. } => {
+            Exit::Usage
+        }
+    }
+}
+
+/// Whether two paths lead to one file.
+fn is_same(one: &Path, other: &Path) -> bool {
+    let identity = |path: &Path| std::fs::metadata(path).ok().map(|about| (about.dev(), about.ino()));
+    identity(one).is_some_and(|one| Some(one) == identity(other))
+}
+
+/// The body as it was given.
+fn body(arguments: &Arguments) -> Result<Body, (Exit, String)> {
+    let Some(path) = &arguments.body else {
+        let moments = arguments.inertia.unwrap_or_else(Vector3::zeros);
+        return Ok(Body { moments, damping_per_s: 0.0, axes: None });
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        (Exit::Usage, format!("cannot read {}: {error}; name a file that can be read", path.display()))
+    })?;
+    read_body(&text).map_err(|reason| {
+        let remedy = "give what `corotate identify --json` printed";
+        (Exit::Usage, format!("{}: {reason}; {remedy}", path.display()))
+    })
+}
+
+/// The body in what `identify` printed.
+fn read_body(text: &str) -> Result<Body, String> {
+    #[derive(serde::Deserialize)]
+    struct Found {
+        inertia_kg_m2: [f64; 3],
+        damping_per_s: f64,
+        axes: Option<[[f64; 3]; 3]>,
+    }
+    #[derive(serde::Deserialize)]
+    struct Printed {
+        schema: String,
+        body: Option<Found>,
+    }
+    let printed: Printed = serde_json::from_str(text).map_err(|error| format!("it has no body ({error})"))?;
+    if printed.schema != "corotate/identify/v1" {
+        return Err(format!("its schema is `{}`", printed.schema));
+    }
+    let found = printed.body.ok_or("the identification found no body")?;
+    let axes = found.axes.map(|rows| Matrix3::from_fn(|row, column| rows[row][column]));
+    Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, axes })
+}
+
+/// Every row with its estimate, as CSV.
+struct Table {
+    out: BufWriter<std::fs::File>,
+}
+
+impl Table {
+    fn begin(path: &Path) -> io::Result<Self> {
+        let mut out = BufWriter::new(files::create(path)?);
+        writeln!(out, "segment,row,time_s,estimate_rad_s,deviation_rad_s,measured_rad_s,error_rad_s,observed")?;
+        Ok(Self { out })
+    }
+
+    fn row(&mut self, row: &Estimated, segment: &str, axis: usize) -> io::Result<()> {
+        let measured = row.principal_rad_s[axis - 1];
+        let known = |value: f64| if value.is_finite() { format!("{value:?}") } else { String::new() };
+        writeln!(
+            self.out,
+            "{},{},{:?},{},{},{},{},{}",
+            quoted(segment),
+            row.entry.row,
+            row.entry.time_s,
+            known(row.told.rate_rad_s),
+            row.told.deviation_rad_s.map_or(String::new(), known),
+            known(measured),
+            known(row.told.rate_rad_s - measured),
+            u8::from(row.told.observed)
+        )
+    }
+
+    fn end(mut self) -> io::Result<()> {
+        self.out.flush()
+    }
+}
+
+/// A name as a cell.
+fn quoted(name: &str) -> String {
+    if name.contains([',', '"', '\n', '\r']) { format!("\"{}\"", name.replace('"', "\"\"")) } else { name.to_owned() }
+}
+
+/// Median and 90th percentile of what is finite; none of nothing.
+fn percentiles(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
+    let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    // Between neighbours in proportion.
+    let at = |part: f64| {
+        let place = part * last as f64;
+        let (low, rest) = (place as usize, place.fract());
+        sorted[low] + rest * (sorted[(low + 1).min(last)] - sorted[low])
+    };
+    Some([at(0.5), at(0.9)])
+}
+
+/// What all segments say together.
+struct Overall {
+    error_rad_s: [f64; 2],
+    measured_rad_s: f64,
+    part: [f64; 2],
+    scored: usize,
+}
+
+fn overall(segments: &[(String, SegmentScore)]) -> Option<Overall> {
+    let scored: Vec<&SegmentScore> = segments.iter().map(|(_, score)| score).filter(|score| score.scored > 0).collect();
+    Some(Overall {
+        error_rad_s: percentiles(scored.iter().map(|score| score.error_rad_s))?,
+        measured_rad_s: percentiles(scored.iter().map(|score| score.measured_rad_s))?[0],
+        part: percentiles(scored.iter().map(|score| score.error_rad_s / score.measured_rad_s))?,
+        scored: scored.len(),
+    })
+}
+
+fn tell(arguments: &Arguments, request: &Request, estimation: &Estimation) -> String {
+    let mut text = String::new();
+    tell_all(arguments, request, estimation, &mut text).expect("a string takes every text");
+    text
+}
+
+fn tell_all(arguments: &Arguments, request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
+    tell_log(&estimation.log, text)?;
+    let [a1, a2, a3] = request.coefficients.into();
+    let hidden = AXES[request.axis - 1];
+    writeln!(text, "\nthe rate about {hidden}, from the other two, of a body with a = ({a1:.4}, {a2:.4}, {a3:.4})")?;
+    if request.damping_per_s != 0.0 {
+        writeln!(text, "  damping {:.4} 1/s", request.damping_per_s)?;
+    }
+    if request.axes.is_some() {
+        writeln!(text, "  about principal axes that are turned against the sensor's")?;
+    }
+    match estimation.filter {
+        FilterKind::First { decay_per_s } => writeln!(text, "  filter of first order, decay {decay_per_s:.2} 1/s")?,
+        FilterKind::Second { bandwidth_rad_s } => {
+            writeln!(text, "  filter of second order, bandwidth {bandwidth_rad_s:.2} rad/s")?;
+        }
+        FilterKind::Kalman { noise_rad_s, density, .. } => {
+            writeln!(text, "  Kalman filter, noise {noise_rad_s:.2e} rad/s, density {density:.2e} rad2/s3")?;
+        }
+    }
+    if let (true, Some(choice)) = (estimation.chosen, &estimation.choice) {
+        writeln!(
+            text,
+            "  that rate is chosen: noise ({:.1e} rad/s) and model balance at {:.2} 1/s; segments of {:.2} s ask for {:.2} 1/s\n  \
+             to forget their first estimate; --decay sets another",
+            choice.noise_rad_s, choice.balance_per_s, choice.segment_s, choice.forgetting_per_s
+        )?;
+    }
+    let (samples, unobserved) = estimation
+        .segments
+        .iter()
+        .fold((0, 0), |(samples, unobserved), (_, score)| (samples + score.samples, unobserved + score.unobserved));
+    let share = 100.0 * unobserved as f64 / samples.max(1) as f64;
+    let floor = estimation.floor_rad_s;
+    writeln!(
+        text,
+        "  not observable at {unobserved} of {samples} samples ({share:.1} %): the other two below {floor:.2e} rad/s"
+    )?;
+    match overall(&estimation.segments) {
+        Some(overall) => {
+            writeln!(
+                text,
+                "\nrms error over the second half of {} segments: median {:.4}, 90th percentile {:.4} rad/s",
+                overall.scored, overall.error_rad_s[0], overall.error_rad_s[1]
+            )?;
+            writeln!(
+                text,
+                "  of a rate of {:.3} rad/s rms (median): {:.2} % and {:.2} % of each segment's own",
+                overall.measured_rad_s,
+                100.0 * overall.part[0],
+                100.0 * overall.part[1]
+            )?;
+        }
+        None => writeln!(text, "\nno score: the log does not have the rate about {hidden}")?,
+    }
+    if overall(&estimation.segments).is_some() && estimation.segments.len() <= LISTED {
+        for (name, score) in &estimation.segments {
+            let (error, measured) = (score.error_rad_s, score.measured_rad_s);
+            writeln!(text, "  {name}: {error:.4} of {measured:.3} rad/s, {} samples", score.samples)?;
+        }
+    }
+    [&arguments.table, &arguments.page].into_iter().flatten().try_for_each(|path| writeln!(text, "{}", path.display()))
+}
+
+fn to_json(request: &Request, estimation: &Estimation) -> Value {
+    let filter = match estimation.filter {
+        FilterKind::First { decay_per_s } => json!({ "order": "first", "decay_per_s": decay_per_s }),
+        FilterKind::Second { bandwidth_rad_s } => json!({ "order": "second", "bandwidth_rad_s": bandwidth_rad_s }),
+        FilterKind::Kalman { noise_rad_s, density, guess_deviation_rad_s } => json!({
+            "order": "kalman", "noise_rad_s": noise_rad_s, "density_rad2_s3": density,
+            "guess_deviation_rad_s": guess_deviation_rad_s,
+        }),
+    };
+    json!({
+        "schema": "corotate/estimate/v1",
+        "log": log_json(&estimation.log),
+        "hidden_axis": AXES[request.axis - 1],
+        "coefficients": <[f64; 3]>::from(request.coefficients),
+        "damping_per_s": request.damping_per_s,
+        "filter": filter,
+        "floor_rad_s": estimation.floor_rad_s,
+        "rate_chosen": estimation.chosen,
+        "choice": estimation.choice.map(|choice| json!({
+            "decay_per_s": choice.decay_per_s, "balance_per_s": choice.balance_per_s,
+            "forgetting_per_s": choice.forgetting_per_s, "noise_rad_s": choice.noise_rad_s,
+            "drift_rad_s2": choice.drift_rad_s2, "segment_s": choice.segment_s, "interval_s": choice.interval_s,
+        })),
+        "score": overall(&estimation.segments).map(|overall| json!({
+            "segments": overall.scored,
+            "error_rad_s": { "median": overall.error_rad_s[0], "p90": overall.error_rad_s[1] },
+            "measured_rad_s": { "median": overall.measured_rad_s },
+            "part": { "median": overall.part[0], "p90": overall.part[1] },
+        })),
+        "segments": estimation.segments.iter().map(|(name, score)| json!({
+            "name": name, "samples": score.samples, "scored": score.scored, "unobserved": score.unobserved,
+            "error_rad_s": score.error_rad_s, "measured_rad_s": score.measured_rad_s,
+        })).collect::<Vec<_>>(),
+    })
+}

@@ -1,0 +1,337 @@
+//! `corotate identify`: a body's inertia from logs of its angular velocity.
+
+use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
+use super::{Exit, fail, harmless, say};
+use crate::data::{Identified, Ways, identify_logs};
+use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
+use crate::observe::InertiaRatios;
+use nalgebra::{Matrix3, SVector, Vector3};
+use serde_json::{Value, json};
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Options of `corotate identify`.
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Arguments {
+    /// Logs of one body: CSV, MCAP or Parquet; - is CSV from the standard input
+    #[arg(required = true)]
+    data: Vec<PathBuf>,
+    #[command(flatten)]
+    log: LogArguments,
+    /// Which result is the body that is printed last, and that `estimate` takes
+    #[arg(long, value_enum, default_value_t = Method::Axes)]
+    method: Method,
+    /// The body is symmetric about this axis: x, y or z
+    #[arg(long, value_name = "AXIS", value_parser = axis)]
+    symmetry_axis: Option<usize>,
+    /// Fit no torque of the air: the motion is not damped
+    #[arg(long)]
+    no_damping: bool,
+    /// The recursive filter's decay rate, s2/rad3, or 1/rad with --symmetry-axis [default: it forgets nothing]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    decay: Option<f64>,
+    /// Print one line of JSON (corotate/identify/v1)
+    #[arg(long)]
+    json: bool,
+}
+
+/// The ways to a body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Method {
+    /// Least squares, the principal axes being the sensor's
+    Axes,
+    /// Least squares of the whole tensor, with its principal axes
+    Tensor,
+    /// The papers' recursive filter
+    Recursive,
+    /// The same for a body that is symmetric about --symmetry-axis
+    Axisymmetric,
+}
+
+const EXAMPLES: &str = "\
+A free motion tells the ratios of the moments of inertia. All methods are computed and compared; what the log cannot tell is
+said. The log's columns are found by their names, or named. The last line is a body for a scenario.
+
+Examples:
+  corotate identify gyro.csv                                           columns by the names that loggers use
+  corotate identify throws.csv --by throw                              many throws of one body in a file
+  corotate identify a.csv b.csv --time t --rates wx,wy,wz --time-unit ms --rate-unit deg/s
+  corotate identify gyro.csv --method tensor --json > body.json        for corotate estimate --body body.json";
+
+/// A body as it is found.
+struct Body {
+    moments: Vector3<f64>,
+    deviation: Option<Vector3<f64>>,
+    damping_per_s: f64,
+    axes: Option<Matrix3<f64>>,
+}
+
+/// Identifies.
+pub fn identify(arguments: &Arguments) -> Exit {
+    let axisymmetric = arguments.method == Method::Axisymmetric;
+    if axisymmetric && arguments.symmetry_axis.is_none() {
+        return fail(Exit::Usage, &"--method axisymmetric needs the axis; add --symmetry-axis x, y or z");
+    }
+    let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
+    let identified = match identify_logs(&arguments.data, &arguments.log.options(), &ways) {
+        Ok(identified) => identified,
+        Err(error) => return fail(exit_of(&error), &error),
+    };
+    let body = body(arguments, &identified);
+    let text = match arguments.json {
+        true => format!("{}\n", to_json(arguments, &identified, body.as_ref().ok())),
+        false => harmless(&tell(arguments, &identified, body.as_ref().ok())),
+    };
+    if let Err(gone) = say(&text) {
+        return gone;
+    }
+    match body {
+        Ok(_) => Exit::Ok,
+        Err(reason) => fail(Exit::Failure, &reason),
+    }
+}
+
+/// The body of the method that was asked for; why there is none.
+fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> {
+    let forbids = |finding: &&Finding| match arguments.method {
+        Method::Tensor => finding.forbids_tensor(),
+        Method::Axes | Method::Recursive => finding.forbids_axes(),
+        // One axis of spin is enough for its one coefficient.
+        Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
+    };
+    if let Some(finding) = identified.findings.iter().find(forbids) {
+        return Err(format!("the log tells of no body: {finding}"));
+    }
+    let nothing = || "the log tells of no body: it has no motion that can be fitted; see the notes".to_owned();
+    let of_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, String> {
+        let fit = fit.as_ref().ok_or_else(nothing)?;
+        let (moments, deviation) = (fit.moments, fit.deviation);
+        Ok(Body { moments, deviation, damping_per_s: fit.damping_per_s, axes: turned.then_some(fit.axes) })
+    };
+    let damping_per_s = identified.recursive_damping_per_s;
+    let known =
+        |moments: Vector3<f64>| Body { moments: moments / moments.max(), deviation: None, damping_per_s, axes: None };
+    let found: Body = match arguments.method {
+        Method::Axes => of_fit(&identified.body, false)?,
+        Method::Tensor => of_fit(&identified.tensor, true)?,
+        Method::Recursive => {
+            let ratios = InertiaRatios::new(&identified.recursive.coefficients).map_err(|error| error.to_string())?;
+            known(Vector3::new(1.0, ratios.second, ratios.third))
+        }
+        Method::Axisymmetric => {
+            let (Some(fit), Some(axis)) = (&identified.axisymmetric, arguments.symmetry_axis) else {
+                return Err(nothing());
+            };
+            let mut moments = Vector3::repeat(1.0);
+            moments[axis - 1] = 1.0 - fit.coefficients.x;
+            known(moments)
+        }
+    };
+    let (inertia, flattened) =
+        nearest_body(&found.moments).map_err(|error| format!("the moments that fit best are no body's: {error}"))?;
+    let moments = if flattened { inertia.moments_kg_m2() } else { found.moments };
+    Ok(Body { moments, ..found })
+}
+
+fn tell(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> String {
+    let mut text = String::new();
+    tell_all(arguments, identified, body, &mut text).expect("a string takes every text");
+    text
+}
+
+fn tell_all(
+    arguments: &Arguments,
+    identified: &Identified,
+    body: Option<&Body>,
+    text: &mut String,
+) -> std::fmt::Result {
+    identified.logs.iter().try_for_each(|log| tell_log(log, text))?;
+    let account = &identified.account;
+    let (turns, pieces) = (account.turn_rad / std::f64::consts::TAU, account.pieces);
+    writeln!(
+        text,
+        "  {:.1} s of motion, {turns:.1} turns, up to {:.2} rad/s; {pieces} pieces for resampling\n",
+        account.duration_s, account.fastest_rad_s
+    )?;
+    if let Some(fit) = &identified.axes {
+        tell_axes(fit, text)?;
+    }
+    if let Some(fit) = &identified.body {
+        writeln!(text, "one body about the sensor's axes, least squares")?;
+        row("moments, the largest 1", &fit.moments, text)?;
+        deviations(fit.deviation.as_ref(), text)?;
+        damping(fit, text)?;
+    }
+    if let Some(fit) = &identified.tensor {
+        tell_tensor(fit, text)?;
+    }
+    writeln!(text, "the papers' recursive filter{}", words_of(arguments, identified))?;
+    let sensor = identified.axes.map_or(0.0, |fit| fit.residual_rad_s.norm() / 3.0_f64.sqrt());
+    tell_recursive(&identified.recursive, sensor, text)?;
+    if let Ok(ratios) = InertiaRatios::new(&identified.recursive.coefficients) {
+        let moments = Vector3::new(1.0, ratios.second, ratios.third);
+        row("moments, the largest 1", &(moments / moments.max()), text)?;
+        writeln!(text, "  a1 + a2 + a3 + a1 a2 a3            {:>11.4}", ratios.closure)?;
+    }
+    if let (Some(fit), Some(axis)) = (&identified.axisymmetric, arguments.symmetry_axis) {
+        writeln!(text, "the papers' recursive filter, symmetric about {}", AXES[axis - 1])?;
+        tell_recursive(fit, sensor, text)?;
+        writeln!(text, "  moment about it over the other two {:>11.4}", 1.0 - fit.coefficients.x)?;
+    }
+    writeln!(text)?;
+    identified.findings.iter().try_for_each(|finding| writeln!(text, "note: {finding}"))?;
+    match body {
+        Some(body) => {
+            let [x, y, z] = body.moments.into();
+            writeln!(
+                text,
+                "\ninertia_kg_m2 = [{x:.6}, {y:.6}, {z:.6}]   # ratios only; method {}",
+                name(arguments.method)
+            )
+        }
+        None => Ok(()),
+    }
+}
+
+/// What a method is called on the command line.
+fn name(method: Method) -> &'static str {
+    match method {
+        Method::Axes => "axes",
+        Method::Tensor => "tensor",
+        Method::Recursive => "recursive",
+        Method::Axisymmetric => "axisymmetric",
+    }
+}
+
+fn words_of(arguments: &Arguments, identified: &Identified) -> String {
+    let memory = arguments.decay.map_or(", forgetting nothing".to_owned(), |decay| format!(", decay {decay}"));
+    let damping = identified.recursive_damping_per_s;
+    if damping == 0.0 { memory } else { format!("{memory}, damping {damping:.3} 1/s taken as known") }
+}
+
+fn tell_axes(fit: &AxesFit, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "each of the sensor's axes by itself, least squares {:>6}{:>12}{:>12}", "x", "y", "z")?;
+    row("coefficient a", &fit.coefficients, text)?;
+    deviations(fit.deviation.as_ref(), text)?;
+    if fit.damping_per_s != Vector3::zeros() {
+        row("damping, 1/s", &fit.damping_per_s, text)?;
+        deviations(fit.damping_deviation_per_s.as_ref(), text)?;
+    }
+    row("R2, part that is explained", &fit.r_squared, text)?;
+    row("left unexplained, rad/s rms", &fit.residual_rad_s, text)?;
+    writeln!(text, "  a1 + a2 + a3 + a1 a2 a3, 0 of a body {:>11.4}", fit.closure())
+}
+
+fn tell_tensor(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
+    writeln!(text, "the whole tensor, least squares")?;
+    row("moments, the largest 1", &fit.moments, text)?;
+    deviations(fit.deviation.as_ref(), text)?;
+    damping(fit, text)?;
+    for (sensor, letter) in AXES.iter().enumerate() {
+        row(&format!("principal axes, their {letter}"), &fit.axes.row(sensor).transpose(), text)?;
+    }
+    row("off the sensor's axes, degrees", &fit.tilt_rad().map(f64::to_degrees), text)?;
+    deviations(fit.axes_deviation_rad.map(|deviation| deviation.map(f64::to_degrees)).as_ref(), text)?;
+    row("R2, part that is explained", &fit.r_squared, text)
+}
+
+fn damping(fit: &TensorFit, text: &mut String) -> std::fmt::Result {
+    if fit.damping_per_s == 0.0 {
+        return Ok(());
+    }
+    let deviation = fit.damping_deviation_per_s.map_or(String::new(), |one| format!(" (standard deviation {one:.4})"));
+    writeln!(text, "  damping, 1/s                       {:>11.4}{deviation}", fit.damping_per_s)
+}
+
+fn tell_recursive<const N: usize>(fit: &RecursiveFit<N>, noise_rad_s: f64, text: &mut String) -> std::fmt::Result {
+    row("coefficient a", &fit.coefficients, text)?;
+    deviations(fit.deviation_per_rad_s.map(|deviation| deviation * noise_rad_s).as_ref(), text)?;
+    let [used, unexcited, ambiguous] = fit.steps;
+    writeln!(text, "  {used} steps used, {unexcited} without excitation, {ambiguous} too long for the motion")
+}
+
+fn row<const N: usize>(label: &str, values: &SVector<f64, N>, text: &mut String) -> std::fmt::Result {
+    write!(text, "  {label:<34} ")?;
+    values.iter().enumerate().try_for_each(|(column, value)| {
+        let width = if column == 0 { 11 } else { 12 };
+        write!(text, "{value:>width$.4}")
+    })?;
+    writeln!(text)
+}
+
+fn deviations<const N: usize>(values: Option<&SVector<f64, N>>, text: &mut String) -> std::fmt::Result {
+    values.map_or(Ok(()), |values| row("  standard deviation", values, text))
+}
+
+fn to_json(arguments: &Arguments, identified: &Identified, body: Option<&Body>) -> Value {
+    let account = &identified.account;
+    let recursive = |fit: &RecursiveFit<3>| {
+        json!({
+            "coefficients": triple(&fit.coefficients),
+            "deviation_per_rad_s": fit.deviation_per_rad_s.as_ref().map(triple),
+            "excitation": fit.excitation,
+            "steps": { "used": fit.steps[0], "unexcited": fit.steps[1], "ambiguous": fit.steps[2] },
+            "damping_taken_per_s": identified.recursive_damping_per_s,
+        })
+    };
+    json!({
+        "schema": "corotate/identify/v1",
+        "logs": identified.logs.iter().map(log_json).collect::<Vec<_>>(),
+        "motion": {
+            "samples": account.samples, "segments": account.segments, "pieces": account.pieces,
+            "duration_s": account.duration_s, "turn_rad": account.turn_rad, "fastest_rad_s": account.fastest_rad_s,
+        },
+        "axes": identified.axes.as_ref().map(|fit| json!({
+            "coefficients": triple(&fit.coefficients),
+            "deviation": fit.deviation.as_ref().map(triple),
+            "damping_per_s": triple(&fit.damping_per_s),
+            "damping_deviation_per_s": fit.damping_deviation_per_s.as_ref().map(triple),
+            "r_squared": triple(&fit.r_squared),
+            "residual_rad_s": triple(&fit.residual_rad_s),
+            "excitation_rad_s": triple(&fit.excitation_rad_s),
+            "closure": fit.closure(),
+        })),
+        "one_body": identified.body.as_ref().map(tensor_json),
+        "tensor": identified.tensor.as_ref().map(tensor_json),
+        "recursive": recursive(&identified.recursive),
+        "axisymmetric": identified.axisymmetric.map(|fit| json!({
+            "axis": arguments.symmetry_axis,
+            "coefficient": fit.coefficients.x,
+            "deviation_per_rad_s": fit.deviation_per_rad_s.map(|deviation| deviation.x),
+            "excitation_rad": fit.excitation,
+            "steps": { "used": fit.steps[0], "unexcited": fit.steps[1], "ambiguous": fit.steps[2] },
+        })),
+        "findings": identified.findings.iter().map(ToString::to_string).collect::<Vec<_>>(),
+        "body": body.map(|body| json!({
+            "method": name(arguments.method),
+            "inertia_kg_m2": triple(&body.moments),
+            "inertia_deviation": body.deviation.as_ref().map(triple),
+            "damping_per_s": body.damping_per_s,
+            "axes": body.axes.as_ref().map(rows),
+        })),
+    })
+}
+
+fn tensor_json(fit: &TensorFit) -> Value {
+    json!({
+        "moments": triple(&fit.moments),
+        "deviation": fit.deviation.as_ref().map(triple),
+        "axes": rows(&fit.axes),
+        "axes_deviation_rad": fit.axes_deviation_rad.as_ref().map(triple),
+        "tilt_rad": triple(&fit.tilt_rad()),
+        "damping_per_s": fit.damping_per_s,
+        "damping_deviation_per_s": fit.damping_deviation_per_s,
+        "r_squared": triple(&fit.r_squared),
+        "distinction": fit.distinction,
+    })
+}
+
+fn triple(vector: &Vector3<f64>) -> [f64; 3] {
+    (*vector).into()
+}
+
+/// A matrix row by row; its columns are the principal axes.
+fn rows(matrix: &Matrix3<f64>) -> [[f64; 3]; 3] {
+    [0, 1, 2].map(|row| [0, 1, 2].map(|column| matrix[(row, column)]))
+}
