@@ -308,6 +308,8 @@ fn the_newest_run_is_what_commands_take() {
     let report = json(&bench.run(&["report", "--json"]));
     assert_eq!((&report["schema"], &report["page"]), (&"corotate/report/v1".into(), &"runs/named/report.html".into()));
     assert!(bench.path("runs/named/report.html").exists());
+    let over = bench.run(&["watch", "runs/named"]);
+    assert!(over.code == Some(2) && over.stderr.contains("`corotate report runs/named` shows it"), "{over:?}");
     let first = Path::new("runs").join(first);
     let (directory, file) = (first.to_str().unwrap(), first.join("run.mcap"));
     for arguments in

@@ -2,6 +2,7 @@
 
 use super::run::catch_signals;
 use super::{Exit, fail, say};
+use crate::launch::SUMMARY;
 use crate::watch::{Session, WatchError, show, text};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -39,6 +40,13 @@ Examples:
 
 /// Watches until it is enough.
 pub fn watch(arguments: &Arguments) -> Exit {
+    if let Some(run) = arguments.domain.as_deref().filter(|directory| directory.join(SUMMARY).exists()) {
+        let run = run.display();
+        return fail(
+            Exit::Usage,
+            &format!("{run} has the results of a run that is over; `corotate report {run}` shows it"),
+        );
+    }
     let signal = match catch_signals() {
         Ok(signal) => signal,
         Err(error) => return fail(Exit::Failure, &error),

@@ -281,4 +281,7 @@ fn all_mistakes_are_told_at_once_with_their_lines() {
     }
     // What is misspelt is not missing too, and nothing is told twice.
     assert_eq!(done.stderr.lines().count(), 2 * changes.len(), "{done:?}");
+    std::fs::write(bench.path(FILE), with(&with(PAIR, "rig", "\"rigidbody\""), "clock", "7")).unwrap();
+    let done = refused_in(&bench, &["run", FILE]);
+    assert!(done.stderr.contains("did you mean `rigid-body`?") && done.stderr.contains(": clock: "), "{done:?}");
 }

@@ -126,7 +126,8 @@ fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
     std::fs::write(bench.path(FILE), text).unwrap();
     let done = refused_in(&bench, &[&["run", FILE], arguments].concat());
     assert_eq!(done.stdout, "", "{done:?}");
-    let (quotes, lines): (Vec<String>, Vec<String>) = done.stderr.lines().map(str::to_owned).partition(is_quote);
+    let (quotes, lines): (Vec<String>, Vec<String>) =
+        done.stderr.lines().map(str::to_owned).partition(|line: &String| is_quote(line));
     assert!(lines.iter().all(|line| line.starts_with("corotate: ")), "{lines:?}");
     let placed = lines.iter().filter(|line| line.starts_with(&format!("corotate: {FILE}:"))).count();
     assert!(quotes.len() <= placed, "{quotes:?} of {lines:?}");
@@ -135,7 +136,7 @@ fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
 }
 
 /// Whether a line of a message quotes the file's: its number, and what it says.
-fn is_quote(line: &String) -> bool {
+fn is_quote(line: &str) -> bool {
     let number = line.strip_prefix("corotate: ").and_then(|line| line.split_once(" | "));
     number.is_some_and(|(number, _)| number.trim().parse::<usize>().is_ok())
 }
