@@ -109,8 +109,8 @@ impl Scenario {
             Err(error) => {
                 // The rig's own sections are read all the same; of what they say nothing can be judged.
                 let context = Context { tick_s: 1.0 / MAX_TICK_HZ, seed: 0 };
-                let rig = document.text("rig").unwrap_or_default();
-                let own = rig::resolve(rig, &sections, context, &mut checks).err();
+                let read = |rig: &str| rig::resolve(rig, &sections, context, &mut checks).err();
+                let own = document.text("rig").and_then(read);
                 checks.problems.retain(|problem| problem.key == "rig");
                 return Err(error.and(own.into_iter().chain(checks.finish::<()>(None).err())));
             }
