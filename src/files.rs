@@ -2,8 +2,9 @@
 //!
 //! Must not know what the files hold.
 
+use crate::system::random_bits;
 use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, PROC_SUPER_MAGIC};
-use rustix::fs::{fstat, fstatfs, ftruncate, mkdirat, openat, readlinkat, statat, unlinkat};
+use rustix::fs::{fstat, fstatfs, ftruncate, mkdirat, openat, readlinkat, renameat, statat, symlinkat, unlinkat};
 use rustix::io::Errno;
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata};
@@ -310,6 +311,26 @@ pub fn create_directories(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
+/// Makes a link in a directory, or puts it in the place of one, in one step: whoever looks finds the old one or the new one.
+/// Nothing is followed that has the link's name.
+///
+/// # Errors
+/// Those of the system; [`AlreadyExists`](io::ErrorKind::AlreadyExists) where something else than a link has the name.
+pub fn link(directory: &Path, name: &str, target: &Path) -> io::Result<()> {
+    let Directory(directory) = Directory::open(directory)?;
+    match statat(&directory, name, AtFlags::SYMLINK_NOFOLLOW) {
+        Err(Errno::NOENT) => {}
+        about if FileType::from_raw_mode(about?.st_mode) == FileType::Symlink => {}
+        _ => return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{name} is there and is not a link"))),
+    }
+    let beside = format!(".{name}-{:032x}", random_bits()?);
+    symlinkat(target, &directory, &beside)?;
+    renameat(&directory, &beside, &directory, name).map_err(|error| {
+        let _ = unlinkat(&directory, &beside, AtFlags::empty());
+        error.into()
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -392,6 +413,35 @@ mod tests {
         for device in ["/dev/null", "/dev/fd/2"] {
             write(Path::new(device), b"").unwrap();
         }
+    }
+
+    #[test]
+    fn a_link_is_put_in_the_place_of_a_link_and_of_nothing_else() {
+        let directory = tempfile::tempdir().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        for target in ["a", "b"] {
+            fs::create_dir(at(target)).unwrap();
+            link(directory.path(), "latest", Path::new(target)).unwrap();
+            assert_eq!(fs::read_link(at("latest")).unwrap(), Path::new(target));
+        }
+        if root() {
+            // Another user's link is replaced, and what it leads to is left alone.
+            fs::write(at("secret"), b"kept").unwrap();
+            fs::remove_file(at("latest")).unwrap();
+            symlink("secret", at("latest")).unwrap();
+            lchown(at("latest"), Some(NOBODY), None).unwrap();
+            link(directory.path(), "latest", Path::new("a")).unwrap();
+            assert_eq!(fs::read(at("secret")).unwrap(), b"kept");
+            fs::remove_file(at("secret")).unwrap();
+        }
+        fs::remove_file(at("latest")).unwrap();
+        fs::write(at("latest"), b"a file").unwrap();
+        assert_eq!(link(directory.path(), "latest", Path::new("a")).unwrap_err().kind(), io::ErrorKind::AlreadyExists);
+        fs::remove_file(at("latest")).unwrap();
+        fs::create_dir(at("latest")).unwrap();
+        assert!(link(directory.path(), "latest", Path::new("a")).is_err());
+        let left: Vec<_> = fs::read_dir(directory.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left.len(), 3, "{left:?}");
     }
 
     #[test]

@@ -2,17 +2,20 @@
 //!
 //! Must not know what any key means.
 
-use super::{ConfigError, RunId};
+use super::{ConfigError, RunId, Shape};
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::Path;
+use std::sync::OnceLock;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 /// The longest text, bytes. What is longer is no scenario, and need not have an end.
 const MAX_BYTES: u64 = 1 << 20;
+/// The most mistakes that are told at once.
+const MAX_MISTAKES: usize = 20;
 /// The most steps in the key of an override. No key lies so deep.
 const MAX_STEPS: usize = 16;
 /// Every quantity is zero or between these in magnitude, so that no product of a few leaves the floating point's range.
@@ -30,6 +33,8 @@ pub struct Document {
     run: Option<RunId>,
     /// Top-level keys that were split off: as good as known.
     elsewhere: Vec<String>,
+    /// Where a document only asks what is read of it: that.
+    asked: Option<OnceLock<Shape>>,
 }
 
 impl Document {
@@ -38,20 +43,9 @@ impl Document {
     /// # Errors
     /// [`ConfigError::Read`] and [`ConfigError::Syntax`].
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
-        let refuse = |reason: String| ConfigError::Read { path: path.to_owned(), reason };
-        let origin = path.display().to_string();
-        let mut bytes = Vec::new();
-        File::open(path)
-            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
-            .map_err(|error| refuse(error.to_string()))?;
-        if bytes.len() as u64 > MAX_BYTES {
-            return Err(refuse(format!("it is longer than {MAX_BYTES} bytes, which no scenario is")));
-        }
-        let text = std::str::from_utf8(&bytes).map_err(|error| ConfigError::Syntax {
-            place: format!("{origin}:{}", position(&bytes, error.valid_up_to())),
-            reason: "this is not UTF-8 text".to_owned(),
-        })?;
-        Self::parse(text, &origin)
+        let refuse = |error: io::Error| ConfigError::Read { path: path.to_owned(), reason: error.to_string() };
+        let text = File::open(path).map_err(refuse).and_then(|file| read_text(file, path))?;
+        Self::parse(&text, &path.display().to_string())
     }
 
     /// Parses a text; `origin` stands for the file in error messages.
@@ -79,7 +73,7 @@ impl Document {
             places.insert(path, format!("{origin}:{line}"));
         });
         let run = text.lines().next().and_then(RunId::in_comments_of);
-        let document = Self { table, places, origin: origin.to_owned(), run, elsewhere: Vec::new() };
+        let document = Self { table, places, origin: origin.to_owned(), run, elsewhere: Vec::new(), asked: None };
         document.refuse_absurd()?;
         Ok(document)
     }
@@ -94,35 +88,54 @@ impl Document {
     /// # Errors
     /// [`ConfigError::Override`].
     pub fn set(&mut self, argument: &str) -> Result<(), ConfigError> {
-        let refuse = |reason: &str| ConfigError::Override { argument: argument.to_owned(), reason: reason.to_owned() };
-        let (path, text) = argument.split_once('=').ok_or_else(|| refuse("there is no `=`"))?;
-        let value = parse_value(text.trim()).ok_or_else(|| refuse("the value is neither TOML nor a bare word"))?;
+        let refuse = |reason: String| ConfigError::Override { argument: argument.to_owned(), reason };
+        let (path, text) = argument.split_once('=').ok_or_else(|| refuse("there is no `=`".to_owned()))?;
+        self.assign(path, text, format!("--set {argument}")).map_err(refuse)?;
+        self.refuse_absurd()
+    }
+
+    /// Applies an option of its own name, which stands for an override of one key.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`].
+    pub fn set_by_option(&mut self, option: &str, key: &str, text: &str) -> Result<(), ConfigError> {
+        let place = format!("{option} {text}");
+        self.assign(key, text, place.clone()).map_err(|reason| ConfigError::Value {
+            place,
+            key: key.to_owned(),
+            reason: format!("{reason}; give it as a scenario does"),
+        })?;
+        self.refuse_absurd()
+    }
+
+    /// Puts a value, as typed, at a path, as typed, and notes its place; or says what is wrong with them.
+    fn assign(&mut self, path: &str, text: &str, place: String) -> Result<(), String> {
+        let value = parse_value(text.trim()).ok_or("the value is neither TOML nor a bare word")?;
         // Positions in a list also as error messages write them.
         let path = path.trim().replace('[', ".").replace(']', "");
         let steps: Vec<&str> = path.split('.').collect();
         if steps.iter().any(|step| step.is_empty()) {
-            return Err(refuse("the key is empty"));
+            return Err("the key is empty".to_owned());
         }
         if steps.len() > MAX_STEPS {
-            return Err(refuse("no key lies so deep"));
+            return Err("no key lies so deep".to_owned());
         }
-        let key = insert(&mut self.table, &steps, value).map_err(|reason| refuse(&reason))?;
+        let key = insert(&mut self.table, &steps, value)?;
         // Whatever stood below the key is gone, and its places with it.
         self.places.retain(|path, _| !is_below(path, &key));
-        let place = format!("--set {argument}");
         // Tables on the way that were not there before are the override's too.
         for (end, _) in key.match_indices(['.', '[']) {
             self.places.entry(key[..end].to_owned()).or_insert_with(|| place.clone());
         }
         self.places.insert(key, place);
-        self.refuse_absurd()
+        Ok(())
     }
 
     /// Takes the given top-level keys out into a document of their own.
     pub fn split_off(&mut self, keys: &[&str]) -> Self {
         let table = keys.iter().filter_map(|key| self.table.remove_entry(*key)).collect();
         self.elsewhere.extend(keys.iter().map(|key| (*key).to_owned()));
-        Self { table, places: self.places.clone(), origin: self.origin.clone(), run: None, elsewhere: Vec::new() }
+        self.part(table)
     }
 
     /// Takes the keys of a table that are to be taken out into a document of their own, in a table of the same name.
@@ -134,7 +147,24 @@ impl Document {
             out
         });
         let table = Table::from_iter([(table.to_owned(), Value::Table(split))]);
-        Self { table, places: self.places.clone(), origin: self.origin.clone(), run: None, elsewhere: Vec::new() }
+        self.part(table)
+    }
+
+    /// A document of a table that was taken out of this one.
+    fn part(&self, table: Table) -> Self {
+        let (places, origin) = (self.places.clone(), self.origin.clone());
+        Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: None }
+    }
+
+    /// A document that has nothing and notes what is asked of it.
+    pub(crate) fn asking() -> Self {
+        let (table, places, origin) = (Table::new(), BTreeMap::new(), String::new());
+        Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: Some(OnceLock::new()) }
+    }
+
+    /// What the first type reads that was read from a document that asks.
+    pub(crate) fn asked(self) -> Option<Shape> {
+        self.asked?.into_inner()
     }
 
     /// Refuses a list, as `[[key]]` makes one, at top-level keys that hold one table each: serde would take its elements
@@ -161,12 +191,62 @@ impl Document {
     /// Reads the table into a type.
     ///
     /// # Errors
-    /// [`ConfigError::UnknownKey`] and [`ConfigError::Value`], with the place of the key.
+    /// [`ConfigError::UnknownKey`] and [`ConfigError::Value`], with the place of the key; [`ConfigError::Invalid`] where there
+    /// are several mistakes.
     pub fn read_into<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
+        if let Some(asked) = &self.asked {
+            let _ = asked.set(Shape::of::<T>());
+        }
+        self.read_once().map_err(|error| self.with_others::<T>(error))
+    }
+
+    fn read_once<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         serde_path_to_error::deserialize(Value::Table(self.table.clone())).map_err(|error| {
             let (path, message) = (error.path().to_string(), error.inner().message().trim().to_owned());
             self.explain(if path == "." { String::new() } else { path }, &message)
         })
+    }
+
+    /// A mistake with those that are found once it is mended, and so on.
+    fn with_others<T: DeserializeOwned>(&self, first: ConfigError) -> ConfigError {
+        let (shape, mut mended, mut found) = (Shape::of::<T>(), self.clone(), Vec::<ConfigError>::new());
+        let mut next = Some(first);
+        for _ in 0..MAX_MISTAKES {
+            // What could not be mended is met again.
+            let Some(error) = next.take().filter(|error| found.iter().all(|old| !old.is(error))) else { break };
+            if mended.mend(&error, &shape) {
+                next = mended.read_once::<T>().err();
+            }
+            found.push(error);
+        }
+        // What is only misspelt is not missing too.
+        let misspelt: Vec<String> = found.iter().filter_map(ConfigError::meant).collect();
+        let mut found = found.into_iter().filter(|error| error.missing().is_none_or(|key| !misspelt.contains(key)));
+        let first = found.next().expect("a key that is misspelt is a mistake");
+        first.and(found)
+    }
+
+    /// Makes a table that does not have a mistake any more, for the sake of the next one; false where that is not possible.
+    fn mend(&mut self, error: &ConfigError, shape: &Shape) -> bool {
+        let (ConfigError::UnknownKey { key, .. } | ConfigError::Value { key, .. }) = error else { return false };
+        let path = key.replace('[', ".").replace(']', "");
+        let steps: Vec<&str> = path.split('.').collect();
+        let known = steps.iter().try_fold((shape, true), |(shape, _), step| shape.below(step));
+        match known.filter(|(_, required)| *required).and_then(|(shape, _)| shape.example()) {
+            Some(example) => insert(&mut self.table, &steps, example).is_ok(),
+            None => self.remove(&steps).is_some(),
+        }
+    }
+
+    fn remove(&mut self, steps: &[&str]) -> Option<Value> {
+        let (last, parents) = steps.split_last()?;
+        let Some((first, others)) = parents.split_first() else { return self.table.remove(*last) };
+        let place = others.iter().try_fold(self.table.get_mut(*first)?, |place, step| match place {
+            Value::Table(table) => table.get_mut(*step),
+            Value::Array(list) => list.get_mut(step.parse::<usize>().ok()?),
+            _ => None,
+        });
+        place?.as_table_mut()?.remove(*last)
     }
 
     /// The place of a key, or of the nearest table around it, or the file.
@@ -220,6 +300,23 @@ impl Document {
             None => Ok(()),
         }
     }
+}
+
+/// Reads a scenario's text to its end; `origin` stands for the file in error messages.
+///
+/// # Errors
+/// [`ConfigError::Read`], and [`ConfigError::Syntax`] if it is not UTF-8.
+pub fn read_text(reader: impl Read, origin: &Path) -> Result<String, ConfigError> {
+    let refuse = |reason: String| ConfigError::Read { path: origin.to_owned(), reason };
+    let mut bytes = Vec::new();
+    reader.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|error| refuse(error.to_string()))?;
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(refuse(format!("it is longer than {MAX_BYTES} bytes, which no scenario is")));
+    }
+    String::from_utf8(bytes).map_err(|error| ConfigError::Syntax {
+        place: format!("{}:{}", origin.display(), position(error.as_bytes(), error.utf8_error().valid_up_to())),
+        reason: "this is not UTF-8 text".to_owned(),
+    })
 }
 
 /// The word and what is known instead of it, from a message as "unknown field `a`, expected `b` or `c`".

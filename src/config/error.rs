@@ -6,7 +6,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or print one with `corotate init rigid-pair`", shown(&path.display().to_string()))]
+    #[error("{}: cannot be read: {reason}; give the path of a scenario file, or a name that `corotate init --list` tells", shown(&path.display().to_string()))]
     Read {
         /// The path as given.
         path: PathBuf,
@@ -53,12 +53,58 @@ pub enum ConfigError {
         /// What is wrong with it.
         reason: String,
     },
-    /// Values that are well-formed but make no sense, all of them at once.
+    /// Several mistakes, all of them at once; or values that are well-formed but make no sense.
     #[error("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
     Invalid {
         /// One entry per finding, at least one.
         problems: Vec<Problem>,
     },
+}
+
+impl ConfigError {
+    /// This mistake and others, if there are some, told at once. What is no mistake of a key stands alone.
+    pub(super) fn and(self, others: impl IntoIterator<Item = Self>) -> Self {
+        let others: Vec<Problem> =
+            others.into_iter().filter_map(|other| other.into_problems().ok()).flatten().collect();
+        if others.is_empty() {
+            return self;
+        }
+        match self.into_problems() {
+            Ok(problems) => Self::Invalid { problems: [problems, others].concat() },
+            Err(error) => error,
+        }
+    }
+
+    /// Whether it is the same mistake.
+    pub(super) fn is(&self, other: &Self) -> bool {
+        self.to_string() == other.to_string()
+    }
+
+    /// The key that is missing, if that is the mistake.
+    pub(super) fn missing(&self) -> Option<&String> {
+        match self {
+            Self::Value { key, reason, .. } => reason.starts_with("is missing").then_some(key),
+            _ => None,
+        }
+    }
+
+    /// The key that was probably meant by one that is unknown.
+    pub(super) fn meant(&self) -> Option<String> {
+        let Self::UnknownKey { key, remedy, .. } = self else { return None };
+        let meant = remedy.strip_prefix("did you mean `")?.strip_suffix("`?")?;
+        Some(key.rsplit_once('.').map_or(meant.to_owned(), |(table, _)| format!("{table}.{meant}")))
+    }
+
+    fn into_problems(self) -> Result<Vec<Problem>, Self> {
+        match self {
+            Self::UnknownKey { place, key, remedy } => {
+                Ok(vec![Problem { place, key, reason: format!("unknown key; {remedy}") }])
+            }
+            Self::Value { place, key, reason } => Ok(vec![Problem { place, key, reason }]),
+            Self::Invalid { problems } => Ok(problems),
+            error => Err(error),
+        }
+    }
 }
 
 /// One value that makes no sense.

@@ -9,16 +9,20 @@ mod fault;
 mod raw;
 mod run_id;
 mod scenario;
+mod schema;
+mod shape;
 mod watchdog;
 
 pub use accept::Accept;
-pub use document::Document;
+pub use document::{Document, read_text};
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
 pub(crate) use fault::{Fields, fields};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use run_id::{NoRunId, RunId};
 pub use scenario::{Checks, Scenario};
+pub use schema::schema;
+pub(crate) use shape::{Key, Shape};
 
 pub(crate) use document::nearest;
 

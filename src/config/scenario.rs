@@ -77,7 +77,7 @@ impl Scenario {
     /// # Errors
     /// [`ConfigError`], with the place, the reason and the remedy.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        Self::build(Document::read(path)?, overrides)
+        Self::changed(Document::read(path)?, overrides)
     }
 
     /// The same from a text; `origin` stands for the file in error messages.
@@ -85,23 +85,43 @@ impl Scenario {
     /// # Errors
     /// [`ConfigError`].
     pub fn parse(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        Self::build(Document::parse(text, origin)?, overrides)
+        Self::changed(Document::parse(text, origin)?, overrides)
     }
 
-    fn build(mut document: Document, overrides: &[String]) -> Result<Self, ConfigError> {
-        for argument in overrides {
-            document.set(argument)?;
-        }
+    fn changed(mut document: Document, overrides: &[String]) -> Result<Self, ConfigError> {
+        overrides.iter().try_for_each(|argument| document.set(argument))?;
+        Self::of(document)
+    }
+
+    /// The same from a document, with whatever was changed in it.
+    ///
+    /// # Errors
+    /// [`ConfigError`].
+    pub fn of(mut document: Document) -> Result<Self, ConfigError> {
         document.refuse_lists(&[&rig::tables()[..], &TABLES].concat())?;
         let sections = document.split_off(&rig::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
-        let raw: Raw = document.read_into()?;
         let mut checks = Checks::new(&document);
+        let raw: Raw = match document.read_into() {
+            Ok(raw) => raw,
+            Err(error) => {
+                // The rig's own sections are read all the same; of what they say nothing can be judged.
+                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, seed: 0 };
+                let read = |rig: &str| rig::resolve(rig, &sections, context, &mut checks).err();
+                let own = document.text("rig").and_then(read);
+                checks.problems.retain(|problem| problem.key == "rig");
+                return Err(error.and(own.into_iter().chain(checks.finish::<()>(None).err())));
+            }
+        };
         check_common(&raw, &mut checks);
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
-        let (rig, rig_table) = rig::resolve(&raw.rig, &sections, Context { tick_s, seed: raw.seed }, &mut checks)?;
+        let context = Context { tick_s, seed: raw.seed };
+        let (rig, rig_table) = match rig::resolve(&raw.rig, &sections, context, &mut checks) {
+            Ok(resolved) => resolved,
+            Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
+        };
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         // Nothing is concluded from a length or a tick that is refused.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
@@ -195,7 +215,7 @@ pub struct Checks<'a> {
 }
 
 impl<'a> Checks<'a> {
-    fn new(document: &'a Document) -> Self {
+    pub(crate) fn new(document: &'a Document) -> Self {
         Self { document, problems: Vec::new() }
     }
 

@@ -3,15 +3,21 @@
 //! All files lie below a root, so that a test can be a machine. Must not write, but for opening what must be writable.
 
 use super::Check;
-use crate::config::Scenario;
+use crate::config::{Realtime, Scenario};
 use crate::runtime::{RoleId, shared_memory_bytes};
 use rustix::fs::statvfs;
 use std::fs::OpenOptions;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Bits of the effective capabilities.
 const CAP_IPC_LOCK: u64 = 1 << 14;
 const CAP_SYS_NICE: u64 = 1 << 23;
+/// Lines of /proc/self/limits.
+const PRIORITY_LIMIT: &str = "Max realtime priority";
+const LOCKED_LIMIT: &str = "Max locked memory";
+/// What keeps idle cores from sleeping deeply while it is held open.
+const IDLE_DEVICE: &str = "dev/cpu_dma_latency";
 /// A limit on locked memory below this is not safe: see `runtime/privileges.rs`.
 const ENOUGH_LOCKED: u64 = 256 << 20;
 /// The part of a period that real-time tasks may use, at the least.
@@ -77,6 +83,38 @@ impl Machine {
         ]
     }
 
+    /// What a run in real time asks for and will not be granted, in words, and the one command that grants it to the shell in
+    /// which it is typed; none if nothing is known to be lacking.
+    pub fn ungranted(&self, asked: &Realtime) -> Option<(String, String)> {
+        let below = |capability, title, needed: u64| {
+            !self.capable(capability) && matches!(self.limit(title), Some(Some(limit)) if limit < needed)
+        };
+        let (mut lacking, mut limits, mut commands) = (Vec::new(), String::new(), Vec::new());
+        if asked.priority > 0 && below(CAP_SYS_NICE, PRIORITY_LIMIT, asked.priority.unsigned_abs().into()) {
+            lacking.push(format!("SCHED_FIFO {}", asked.priority));
+            limits += " --rtprio=99";
+        }
+        if asked.lock_memory && below(CAP_IPC_LOCK, LOCKED_LIMIT, ENOUGH_LOCKED) {
+            lacking.push("locked memory".to_owned());
+            limits += " --memlock=unlimited";
+        }
+        if !limits.is_empty() {
+            // The limits of the shell are those of what it starts.
+            commands.push(format!("prlimit --pid $${limits}"));
+        }
+        let idle = OpenOptions::new().write(true).open(self.root.join(IDLE_DEVICE));
+        if asked.low_latency_idle && idle.is_err_and(|error| error.kind() == ErrorKind::PermissionDenied) {
+            lacking.push("low-latency idle".to_owned());
+            commands.push(format!("chmod o+w /{IDLE_DEVICE}"));
+        }
+        let command = match commands.as_slice() {
+            [] => return None,
+            [one] => format!("sudo {one}"),
+            all => format!("sudo sh -c \"{}\"", all.join("; ")),
+        };
+        Some((lacking.join(", "), command))
+    }
+
     /// A file's text without blanks around it; none if it is empty, missing or closed to us.
     fn read(&self, path: &str) -> Option<String> {
         let bytes = std::fs::read(self.root.join(path)).ok()?;
@@ -138,7 +176,7 @@ impl Machine {
         if self.capable(CAP_SYS_NICE) {
             return Check::ok(name, "none (CAP_SYS_NICE)");
         }
-        match self.limit("Max realtime priority") {
+        match self.limit(PRIORITY_LIMIT) {
             Some(None) => Check::ok(name, "none"),
             Some(Some(limit)) if limit >= asked.unsigned_abs().into() => Check::ok(name, limit.to_string()),
             Some(Some(limit)) => Check::bad(name, format!("{limit}, and SCHED_FIFO {asked} is asked for"), remedy),
@@ -153,7 +191,7 @@ impl Machine {
         if self.capable(CAP_IPC_LOCK) {
             return Check::ok(name, "none (CAP_IPC_LOCK)");
         }
-        match self.limit("Max locked memory") {
+        match self.limit(LOCKED_LIMIT) {
             Some(None) => Check::ok(name, "none"),
             Some(Some(limit)) if limit >= ENOUGH_LOCKED => Check::ok(name, format!("{} KiB", limit >> 10)),
             Some(Some(limit)) => {
@@ -183,7 +221,7 @@ impl Machine {
         let name = "cpu_dma_latency";
         let remedy = "allow this user to write /dev/cpu_dma_latency: else cores sleep deeply and wake late";
         // Nothing is asked for until something is written.
-        match OpenOptions::new().write(true).open(self.root.join("dev/cpu_dma_latency")) {
+        match OpenOptions::new().write(true).open(self.root.join(IDLE_DEVICE)) {
             Ok(_) => Check::ok(name, "writable"),
             Err(error) => Check::warn(name, format!("not writable: {error}"), remedy),
         }
@@ -306,6 +344,26 @@ mod tests {
         for name in ["kernel preemption", "rtprio limit", "clock source", "cpu_dma_latency", "real-time throttling"] {
             assert_eq!(verdict(name), Verdict::Warn, "{name}");
         }
+    }
+
+    #[test]
+    fn what_is_not_granted_is_told_with_one_command() {
+        let ungranted = |priority: &str, locked: &str, capabilities: &str| {
+            let status = format!("CapEff:\t{capabilities}\n");
+            let (_root, machine) =
+                machine(&[("proc/self/limits", &limits(priority, locked)), ("proc/self/status", &status)]);
+            machine.ungranted(&Realtime::default())
+        };
+        let (lacking, command) = ungranted("0", "8388608", "0000000000000000").unwrap();
+        assert_eq!(lacking, "SCHED_FIFO 80, locked memory");
+        assert_eq!(command, "sudo prlimit --pid $$ --rtprio=99 --memlock=unlimited");
+        let (lacking, command) = ungranted("80", "8388608", "0000000000000000").unwrap();
+        assert_eq!((&*lacking, &*command), ("locked memory", "sudo prlimit --pid $$ --memlock=unlimited"));
+        assert_eq!(ungranted("80", "unlimited", "0000000000000000"), None);
+        assert_eq!(ungranted("0", "8388608", "0000000000804000"), None, "by capabilities");
+        let (_root, machine) = machine(&[("proc/self/limits", &limits("0", "8388608"))]);
+        let modest = Realtime { priority: 0, lock_memory: false, ..Realtime::default() };
+        assert_eq!(machine.ungranted(&modest), None, "it is not asked for");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::identify::{Sample, freed};
 use crate::observe::{
     Filter, HiddenRate, HiddenRateError, Increment, Interval, InvariantFilter, KalmanFilter, Observation, RateSample,
-    SecondOrderFilter, Regressor,
+    Regressor, SecondOrderFilter,
 };
 use nalgebra::{Vector1, Vector3};
 

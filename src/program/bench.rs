@@ -2,7 +2,8 @@
 
 use super::role::die_with;
 use super::run::{catch_signals, make_directory};
-use super::{Exit, fail, load, print, scenarios};
+use super::scenario::load;
+use super::{Exit, fail, print, scenarios};
 use crate::bench::{Bench, BenchError, Results, Row, run, serve_peer, table, write_results};
 use indicatif::ProgressBar;
 use std::cell::RefCell;
@@ -115,7 +116,7 @@ pub fn peer(arguments: &PeerArguments) -> Exit {
         return exit;
     }
     let PeerArguments { domain, observer, .. } = arguments;
-    match load(None, &[]).and_then(|scenario| serve_peer(domain, &scenario, *observer)) {
+    match load(None, []).and_then(|scenario| serve_peer(domain, &scenario, *observer)) {
         Ok(()) => Exit::Ok,
         Err(reason) => fail(Exit::Failure, &reason),
     }

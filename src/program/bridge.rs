@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 /// Options of `corotate bridge`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
     #[arg(long, value_name = "PATH")]
@@ -33,8 +33,8 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Example:
-  corotate run pair.toml --external follower
-  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR      with the DIR that the run prints";
+  corotate run pair.toml --external follower      prints DIR
+  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;

@@ -1,5 +1,6 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
+use super::scenario::{Change, load};
 use super::{Exit, fail, say};
 use crate::analysis::{Claim, apart, claims, digits};
 use crate::config::Scenario;
@@ -8,10 +9,10 @@ use std::path::{Path, PathBuf};
 
 /// Options of `corotate check`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Scenario files
-    #[arg(required = true)]
+    /// Shipped scenarios' names, files (x.toml, ./x), or - for stdin
+    #[arg(required = true, value_name = "SCENARIO")]
     files: Vec<PathBuf>,
     /// Override any key of the scenarios
     #[arg(long, value_name = "KEY=VALUE")]
@@ -23,15 +24,17 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate check pair.toml                  the scenario with every default, and what may be claimed of its loop
-  corotate check --json pair.toml           those claims for programs
-  corotate check config/*.toml > /dev/null  are they all valid? exit code 2 if one is not";
+  corotate check pair.toml         the scenario with every default, and what
+                                   may be claimed of its loop
+  corotate check --json pair.toml  those claims for programs
+  corotate check config/*.toml > /dev/null
+                                   are they all valid? exit code 2 if not";
 
 /// Checks scenarios; all of them, even if one fails.
 pub fn check(arguments: &Arguments) -> Exit {
     let mut exit = Exit::Ok;
     for path in &arguments.files {
-        match Scenario::load(path, &arguments.set) {
+        match load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument))) {
             Ok(scenario) => {
                 let text = if arguments.json { json(path, &scenario) } else { tell(path, &scenario) };
                 if let Err(gone) = say(&text) {

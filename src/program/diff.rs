@@ -1,19 +1,19 @@
 //! `corotate diff`: two recordings beside each other.
 
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, say};
-use crate::record::{Comparison, Tolerances, diff as compare};
+use super::{Exit, fail, harmless, latest, say};
+use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
 use std::fmt::Write;
 use std::path::PathBuf;
 
 /// Options of `corotate diff`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// A recording
+    /// A run's directory, or a recording
     a: PathBuf,
-    /// Another
-    b: PathBuf,
+    /// Another [default: runs/latest]
+    b: Option<PathBuf>,
     /// So much may numbers differ, in the field's own unit
     #[arg(long, value_name = "X", default_value_t = 0.0)]
     absolute: f64,
@@ -23,14 +23,22 @@ pub struct Arguments {
     /// Go on with what there is of a recording that is not complete
     #[arg(long)]
     accept_incomplete: bool,
+    /// Print one JSON object on stdout (corotate/diff/v1)
+    #[arg(long)]
+    json: bool,
 }
 
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/diff/v1";
+
 const EXAMPLES: &str = "\
-Values are compared at ticks that both recordings have; times and generations are not. Exit code 3 if they differ.
+Values are compared at ticks that both recordings have; times and generations
+are not. Exit code 3 if they differ.
 
 Examples:
-  corotate diff before/run.mcap after/run.mcap      bit for bit
-  corotate diff a.mcap b.mcap --absolute 1e-9       numbers within 1e-9 rad/s, rad/s2, ...";
+  corotate diff runs/before        that run and the newest one, bit for bit
+  corotate diff a/run.mcap b/run.mcap --absolute 1e-9
+                                   numbers within 1e-9 rad/s, rad/s2, ...";
 
 /// Compares.
 pub fn diff(arguments: &Arguments) -> Exit {
@@ -41,14 +49,20 @@ pub fn diff(arguments: &Arguments) -> Exit {
     if let Some((name, value)) = bad {
         return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
     }
+    let files = latest::recording(Some(&arguments.a)).and_then(|a| Ok([a, latest::recording(arguments.b.as_deref())?]));
+    let files = match files {
+        Ok(files) => files,
+        Err(reason) => return fail(Exit::Usage, &reason),
+    };
     let open = |file| open(file, arguments.accept_incomplete);
-    let both = open(&arguments.a).and_then(|a| Ok((a, open(&arguments.b)?)));
+    let both = open(&files[0]).and_then(|a| Ok((a, open(&files[1])?)));
     let (a, b) = match both {
         Ok(both) => both,
         Err(error) => return fail(exit_of(&error), &error),
     };
+    let words = |comparison| if arguments.json { json(&files, comparison) } else { harmless(&table(comparison)) };
     match compare(&a, &b, tolerances) {
-        Ok(comparison) => match say(&harmless(&table(&comparison))) {
+        Ok(comparison) => match say(&words(&comparison)) {
             Ok(()) => {
                 let exit = if comparison.same() { Exit::Ok } else { Exit::NotAccepted };
                 exit_with(&a, exit_with(&b, exit))
@@ -57,6 +71,38 @@ pub fn diff(arguments: &Arguments) -> Exit {
         },
         Err(error) => fail(exit_of(&error), &error),
     }
+}
+
+/// All of it for programs. A number that is not finite is null.
+fn json(files: &[PathBuf; 2], comparison: &Comparison) -> String {
+    let value = |first: &ValueDiff| serde_json::json!({ "tick": first.tick, "field": first.field, "a": first.values[0], "b": first.values[1] });
+    let signal = |signal: &SignalDiff| {
+        let max = signal
+            .max
+            .as_ref()
+            .map(|(max, field, tick)| serde_json::json!({ "difference": max, "field": field, "tick": tick }));
+        serde_json::json!({
+            "signal": signal.name,
+            "same": signal.same(),
+            "compared_ticks": signal.compared,
+            "only_a_ticks": signal.only[0],
+            "only_b_ticks": signal.only[1],
+            "beyond": signal.beyond,
+            "first": signal.first.as_ref().map(value),
+            "max": max,
+            "rms": signal.rms,
+        })
+    };
+    let object = serde_json::json!({
+        "schema": SCHEMA,
+        "a": files[0].display().to_string(),
+        "b": files[1].display().to_string(),
+        "same": comparison.same(),
+        "signals": comparison.signals.iter().map(signal).collect::<Vec<_>>(),
+        "only_a": comparison.only[0],
+        "only_b": comparison.only[1],
+    });
+    format!("{object}\n")
 }
 
 fn table(comparison: &Comparison) -> String {

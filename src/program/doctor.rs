@@ -1,6 +1,7 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
-use super::{Exit, fail, load, say};
+use super::scenario::load;
+use super::{Exit, fail, say};
 use crate::bus::domain::{DomainError, domains, remove_dead_domains};
 use crate::config::Scenario;
 use crate::doctor::{Demand, Diagnosis, Lateness, Machine, leftovers, measure};
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Options of `corotate doctor`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The scenario that the machine is to be fit for; without one, the first that ships with the program
     file: Option<PathBuf>,
@@ -29,13 +30,16 @@ const EXAMPLES: &str = "\
 Exit codes: 0 fit, 3 not fit: some line is bad
 
 Examples:
-  corotate doctor                        every line with what to do about it, after ten seconds of sleeping
-  corotate doctor fast.toml --seconds 60 for that scenario's tick, cores and memory, measured for a minute
-  corotate doctor --clean --json         remove leftovers of dead runs, and tell programs";
+  corotate doctor                  every line with what to do about it, after
+                                   ten seconds of sleeping
+  corotate doctor fast.toml --seconds 60
+                                   for that scenario's tick, cores and memory,
+                                   measured for a minute
+  corotate doctor --clean --json   remove what dead runs left; for programs";
 
 /// Examines the machine.
 pub fn doctor(arguments: &Arguments) -> Exit {
-    let scenario = match load(arguments.file.as_deref(), &[]) {
+    let scenario = match load(arguments.file.as_deref(), []) {
         Ok(scenario) => scenario,
         Err(error) => return fail(Exit::Usage, &error),
     };

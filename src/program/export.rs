@@ -1,15 +1,15 @@
 //! `corotate export`: a recording as tables.
 
-use super::{Exit, fail, record, say};
+use super::{Exit, fail, latest, record, say};
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 
 /// Options of `corotate export`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES, group = clap::ArgGroup::new("forms").required(true).multiple(true))]
+#[command(after_long_help = EXAMPLES, group = clap::ArgGroup::new("forms").required(true).multiple(true))]
 pub struct Arguments {
-    /// The recording
-    file: PathBuf,
+    /// A run's directory, or a recording [default: runs/latest]
+    run: Option<PathBuf>,
     /// Write one CSV file per signal into this directory
     #[arg(long, value_name = "DIR", group = "forms")]
     csv: Option<PathBuf>,
@@ -19,16 +19,22 @@ pub struct Arguments {
     /// Go on with what there is of a recording that is not complete
     #[arg(long)]
     accept_incomplete: bool,
+    /// Print the files written as one JSON object (corotate/export/v1)
+    #[arg(long)]
+    json: bool,
 }
 
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/export/v1";
+
 const EXAMPLES: &str = "\
-Every sample is a row: time in the run in s, when it was received in ns, and every element of every field. Numbers read back
-to the same bits.
+Every sample is a row: time in the run in s, when it was received in ns, and
+every element of every field. Numbers read back to the same bits.
 
 Examples:
-  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --csv tables
+  corotate export --csv tables     the newest run here
   head -2 tables/leader.estimate.csv
-  corotate export runs/20261121T150000Z-rigid-pair/run.mcap --parquet tables";
+  corotate export runs/20261121T150000Z-rigid-pair --parquet tables";
 
 /// What there is to say to whoever asks a program for Parquet that was built without.
 const REFUSAL: &str =
@@ -39,14 +45,25 @@ pub fn export(arguments: &Arguments) -> Exit {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
         return fail(Exit::Usage, &REFUSAL);
     }
-    let recording = match record::open(&arguments.file, arguments.accept_incomplete) {
+    let file = match latest::recording(arguments.run.as_deref()) {
+        Ok(file) => file,
+        Err(reason) => return fail(Exit::Usage, &reason),
+    };
+    let recording = match record::open(&file, arguments.accept_incomplete) {
         Ok(recording) => recording,
         Err(error) => return fail(record::exit_of(&error), &error),
     };
     match write(arguments, &recording) {
         Ok(files) => {
-            let lines: String = files.iter().map(|path| format!("{}\n", path.display())).collect();
-            say(&lines).err().unwrap_or(record::exit_with(&recording, Exit::Ok))
+            let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+            let text = if arguments.json {
+                let object =
+                    serde_json::json!({ "schema": SCHEMA, "file": file.display().to_string(), "tables": names });
+                format!("{object}\n")
+            } else {
+                names.iter().map(|name| format!("{name}\n")).collect()
+            };
+            say(&text).err().unwrap_or(record::exit_with(&recording, Exit::Ok))
         }
         Err(error) => fail(exit_of(&error), &error),
     }

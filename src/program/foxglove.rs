@@ -9,7 +9,7 @@ pub const ADDRESS: &str = "127.0.0.1:8765";
 
 /// Options of `corotate foxglove`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The run's domain [default: the newest run of this user]
     #[arg(value_name = "DIR")]
@@ -27,10 +27,14 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate run rigid-pair.toml --foxglove        from the first tick on; in Foxglove open the connection
-                                                 \"Foxglove WebSocket\", ws://localhost:8765
-  corotate run & corotate foxglove               the newest run of this user, from now on; Ctrl-C ends it in order
-  corotate foxglove --address 0.0.0.0:9000       for other machines too: whoever reaches that port sees everything";
+  corotate run rigid-pair --foxglove
+                                   from the first tick on; in Foxglove open
+                                   \"Foxglove WebSocket\", ws://localhost:8765
+  corotate run & corotate foxglove the newest run of this user, from now on;
+                                   Ctrl-C ends it in order
+  corotate foxglove --address 0.0.0.0:9000
+                                   for other machines too: whoever reaches
+                                   that port sees everything";
 
 /// Where to listen, as it is typed.
 pub fn address(text: &str) -> Result<SocketAddr, String> {

@@ -1,21 +1,48 @@
-//! `corotate init`: print a shipped scenario.
+//! `corotate init`: print a shipped scenario, or the list of them.
 
+use super::scenario::{title, unknown};
 use super::{Exit, fail, say, scenarios};
+
+/// Layout version of the list.
+const SCHEMA: &str = "corotate/scenarios/v1";
 
 /// Options of `corotate init`.
 #[derive(clap::Args)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Name of a scenario that ships with the program; a name that is none lists them all
-    name: String,
+    /// Name of a scenario that ships with the program
+    #[arg(required_unless_present = "list")]
+    name: Option<String>,
+    /// List the scenarios that ship with the program, a line each
+    #[arg(long, conflicts_with = "name")]
+    list: bool,
+    /// Print the list as one JSON object (corotate/scenarios/v1)
+    #[arg(long, requires = "list")]
+    json: bool,
 }
 
-/// Prints a scenario.
+const EXAMPLES: &str = "\
+Examples:
+  corotate init --list                     what there is
+  corotate init rigid-pair > pair.toml     a scenario with every key explained";
+
+/// Prints a scenario, or the list.
 pub fn init(arguments: &Arguments) -> Exit {
-    match scenarios().iter().find(|(name, _)| *name == arguments.name) {
+    let Some(name) = &arguments.name else {
+        return say(&list(arguments.json)).map_or_else(|exit| exit, |()| Exit::Ok);
+    };
+    match scenarios().iter().find(|(known, _)| known == name) {
         Some((_, text)) => say(text).map_or_else(|exit| exit, |()| Exit::Ok),
-        None => {
-            let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
-            fail(Exit::Usage, &format!("there is no scenario `{}`; there are: {}", arguments.name, known.join(", ")))
-        }
+        None => fail(Exit::Usage, &unknown(name)),
     }
+}
+
+fn list(json: bool) -> String {
+    if json {
+        let entry = |(name, text): &(&str, &str)| serde_json::json!({ "name": name, "title": title(text) });
+        let entries: Vec<_> = scenarios().iter().map(entry).collect();
+        return format!("{}\n", serde_json::json!({ "schema": SCHEMA, "scenarios": entries }));
+    }
+    let width = scenarios().iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    scenarios().iter().map(|(name, text)| format!("{name:<width$}  {}\n", title(text))).collect()
 }

@@ -9,28 +9,34 @@
 mod bench;
 mod bridge;
 mod check;
+mod color;
 mod data;
 mod diff;
 mod doctor;
 mod estimate;
 mod export;
 mod foxglove;
+mod help;
 mod identify;
 mod init;
+mod latest;
 mod new;
 mod record;
 mod replay;
 mod report;
 mod role;
 mod run;
+mod scenario;
+mod schema;
 mod seat;
 mod watch;
 
 use crate::bench::Row;
 use crate::bus::domain::Domain;
-use crate::config::Scenario;
 use crate::rig::{Rig, RigKind, register};
-use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{FromArgMatches, Parser, Subcommand};
+use color::When;
+use help::WIDTH;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::fs::File;
 use std::io::{self, Write};
@@ -41,43 +47,23 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 /// Bodies move together although not everything about them can be measured.
-///
-/// Without a command: runs the first scenario that ships with the program.
 #[derive(Parser)]
-#[command(version, max_term_width = 100, after_help = EXIT_CODES)]
+#[command(term_width = WIDTH)]
 struct Arguments {
     #[command(subcommand)]
     command: Option<Command>,
+    /// When to colour what is printed; NO_COLOR is heeded
+    #[arg(long, global = true, value_name = "WHEN", default_value = "auto", value_enum, hide_short_help = true)]
+    color: When,
 }
-
-const EXIT_CODES: &str = "\
-Exit codes: 0 ok, 1 failure while running, 2 usage or configuration, 3 acceptance criteria not met,
-            4 a process died or hung, 5 required privilege not granted, 128+n ended in order by signal n
-
-Examples:
-  corotate                                       the shipped scenario rigid-pair
-  corotate init rigid-trio > trio.toml           a commented scenario to start from
-  corotate new thermostat                        a crate with a rig of your own, that runs
-  corotate check trio.toml                       validate it, print what may be claimed of its loop
-  corotate run trio.toml --clock lockstep        as fast as the machine goes, the same bits
-  corotate run trio.toml --external follower-a   wait for hardware, or a program of your own, in its seat
-  corotate seat trio.toml follower-a             what that program must know, as JSON
-  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR
-                                                 a device as the follower of a run --external follower
-  corotate report runs/20261121T150000Z-rigid-pair
-                                                 the run as one page, report.html
-  corotate watch                                 a screen on the newest run
-  corotate run trio.toml --foxglove              live in Foxglove too, at ws://localhost:8765
-  corotate doctor                                is this machine fit for real time, and what to do about it
-  corotate bench chain hop                       what the chain and a hop cost here, beside their floors";
 
 #[derive(Subcommand)]
 enum Command {
     /// Run a scenario to its end and tell how it went
     Run(run::Arguments),
-    /// Validate scenarios; print each as resolved, with what may be claimed of its loop
+    /// Validate scenarios; print what may be claimed of their loops
     Check(check::Arguments),
-    /// Print a commented scenario to start from
+    /// Print a commented scenario to start from, or list them
     Init(init::Arguments),
     /// Write a crate with a rig of your own to start from
     New(new::Arguments),
@@ -93,7 +79,7 @@ enum Command {
     Bridge(bridge::Arguments),
     /// Record every sample of a running loop to a file
     Record(record::Arguments),
-    /// Feed a recording to the live roles and compare what they say, bit for bit
+    /// Feed a recording to the live roles, and compare bit for bit
     Replay(replay::Arguments),
     /// Compare two recordings
     Diff(diff::Arguments),
@@ -109,10 +95,16 @@ enum Command {
     Identify(identify::Arguments),
     /// Find the rate about one axis in a log of the other two
     Estimate(Box<estimate::Arguments>),
-    /// Tell whether this machine is fit for real time, and what to do about it
+    /// Tell whether this machine is fit for real time, and what to do
     Doctor(doctor::Arguments),
     /// Measure what everything costs beside its floors, on this machine
     Bench(bench::Arguments),
+    /// Print a JSON Schema of scenarios, for editors
+    Schema(schema::Arguments),
+    /// Print the completions for a shell
+    Completions(help::CompletionsArguments),
+    /// Write the manual pages into a directory
+    Man(help::ManArguments),
     /// Take the other end of a hop that is measured
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
@@ -237,8 +229,9 @@ impl Program {
         self
     }
 
-    /// Adds a scenario that ships with the program, by its name and its text: `init` prints it, and the first one runs where
-    /// no file is named.
+    /// Adds a scenario that ships with the program, by its name and its text: the name stands for it wherever a scenario is
+    /// taken, `init` prints it, and the first one runs where none is named. The first line of the text, a comment, is what
+    /// `init --list` says of it.
     #[must_use]
     pub fn scenario(mut self, name: &'static str, text: &'static str) -> Self {
         self.scenarios.push((name, text));
@@ -251,11 +244,10 @@ impl Program {
     /// If a scenario was read before: the rigs are known from then on.
     pub fn main(self) -> ExitCode {
         self.begin();
-        let version = concat!("with corotate ", env!("CARGO_PKG_VERSION"));
-        let line = Arguments::command().name(name());
-        let mut line = if name() == env!("CARGO_PKG_NAME") { line } else { line.version(version) };
-        let command = Arguments::from_arg_matches_mut(&mut line.get_matches_mut());
-        let command = command.unwrap_or_else(|error| error.exit()).command;
+        let mut line = help::line();
+        let arguments = Arguments::from_arg_matches_mut(&mut line.get_matches_mut());
+        let Arguments { command, color } = arguments.unwrap_or_else(|error| error.exit());
+        color::choose(color);
         // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
         let exit = std::panic::catch_unwind(|| obey(command))
             .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
@@ -294,16 +286,6 @@ static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 /// The scenarios that ship with this program.
 fn scenarios() -> &'static [(&'static str, &'static str)] {
     SCENARIOS.get().map_or(&[], Vec::as_slice)
-}
-
-/// A scenario from its file, or the program's first.
-fn load(file: Option<&Path>, overrides: &[String]) -> Result<Scenario, String> {
-    let loaded = match (file, scenarios().first()) {
-        (Some(path), _) => Scenario::load(path, overrides),
-        (None, Some((name, text))) => Scenario::parse(text, &format!("{name}.toml"), overrides),
-        (None, None) => return Err("this program has no scenario of its own; name a scenario file".to_owned()),
-    };
-    loaded.map_err(|error| error.to_string())
 }
 
 /// How this program is called: by the name of its file.
@@ -354,6 +336,9 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Estimate(arguments)) => estimate::estimate(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments, crate::bench::ROWS),
+        Some(Command::Schema(arguments)) => schema::schema(&arguments),
+        Some(Command::Completions(arguments)) => help::completions(&arguments),
+        Some(Command::Man(arguments)) => help::man(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),
     }

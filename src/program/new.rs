@@ -18,7 +18,7 @@ const TAKEN: [&str; 4] = ["corotate", "test", "core", "std"];
 
 /// Options of `corotate new`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// What the crate, its rig and its scenario are called: 2 to 32 of a-z, 0-9 and -
     name: String,
@@ -30,7 +30,8 @@ pub struct Arguments {
 const EXAMPLES: &str = "\
 Example:
   corotate new thermostat && cd thermostat && cargo test
-                       a crate with a rig of its own, that runs; then make the rig yours (docs/your-own-rig.md)";
+                                   a crate with a rig of its own, that runs;
+                                   make the rig yours (docs/your-own-rig.md)";
 
 /// Writes the crate.
 pub fn new(arguments: &Arguments) -> Exit {

@@ -2,30 +2,40 @@
 
 use super::role::{die_with, terminated_by_signals};
 use super::{Exit, fail, remark, say};
+use crate::bus::domain::newest_run;
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use crate::watch::WatchError;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Options of `corotate record`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain, a directory: `corotate run --external ROLE` prints it while it waits for that role
+    /// The run's domain [default: the newest run of this user]
     #[arg(long, value_name = "DIR")]
-    domain: PathBuf,
+    domain: Option<PathBuf>,
     /// The file to write
     #[arg(long, value_name = "FILE", default_value = "run.mcap")]
     out: PathBuf,
     /// Die with this process (the launcher gives its own id)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
+    /// Print what was recorded as one JSON object (corotate/record/v1)
+    #[arg(long)]
+    json: bool,
 }
+
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/record/v1";
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate run --record                             record a run from its first tick to its last
-  corotate record --domain $XDG_RUNTIME_DIR/corotate/<id> --out part.mcap
-                                                    record a run that is under way, from now on; Ctrl-C ends it in order";
+  corotate run --record            record a run from its first tick to its last
+  corotate record --out part.mcap  the newest run that is under way, from now
+                                   on; Ctrl-C ends the recording in order
+  corotate record --domain $XDG_RUNTIME_DIR/corotate/<id>
+                                   the run in that domain: `run -v` tells it";
 
 /// Records to the end of the run.
 pub fn record(arguments: &Arguments) -> Exit {
@@ -36,17 +46,26 @@ pub fn record(arguments: &Arguments) -> Exit {
         Ok(terminated) => terminated,
         Err(exit) => return exit,
     };
-    let seat = RecorderSeat { domain: arguments.domain.clone(), file: arguments.out.clone() };
+    let domain = match arguments.domain.clone().map_or_else(newest_run, |domain| Ok(Some(domain))) {
+        Ok(Some(domain)) => domain,
+        Ok(None) => return fail(Exit::Usage, &WatchError::NoRun),
+        Err(error) => return fail(Exit::Usage, &error),
+    };
+    let seat = RecorderSeat { domain, file: arguments.out.clone() };
     match run_recorder(&seat, &terminated) {
-        Ok(report) => told(&report, arguments.parent.is_some()),
+        Ok(report) => told(&report, arguments),
         Err(error) => fail(exit_of(&error), &error),
     }
 }
 
-fn told(report: &RecordingReport, child: bool) -> Exit {
+fn told(report: &RecordingReport, arguments: &Arguments) -> Exit {
     let part = if report.whole { "" } else { ", from the midst of the run on" };
-    let text = format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes);
-    if let (false, Err(exit)) = (child, say(&text)) {
+    let text = if arguments.json {
+        format!("{}\n", serde_json::json!({ "schema": SCHEMA, "recording": report }))
+    } else {
+        format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes)
+    };
+    if let (None, Err(exit)) = (arguments.parent, say(&text)) {
         return exit;
     }
     report.problem.as_ref().map_or(Exit::Ok, |problem| fail(Exit::Failure, problem))

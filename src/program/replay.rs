@@ -1,20 +1,20 @@
 //! `corotate replay`: a recording through the live roles.
 
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, say};
+use super::{Exit, fail, harmless, latest, say};
 use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
 use crate::runtime::RoleId;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 /// Options of `corotate replay`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The recording
-    file: PathBuf,
+    /// A run's directory, or a recording [default: runs/latest]
+    run: Option<PathBuf>,
     /// observer, controller, a body's name, or all
     #[arg(long, value_name = "ROLE", default_value = "all")]
     role: String,
@@ -24,27 +24,40 @@ pub struct Arguments {
     /// Go on with what there is of a recording that is not complete
     #[arg(long)]
     accept_incomplete: bool,
+    /// Print one JSON object on stdout (corotate/replay/v1)
+    #[arg(long)]
+    json: bool,
 }
 
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/replay/v1";
+
 const EXAMPLES: &str = "\
-Each role gets the inputs that it had, and misses what it missed; everything that it publishes but the time of sending is
-compared with what was recorded. Exit code 3 if anything differs. What cannot be told is said.
+Each role gets the inputs that it had, and misses what it missed; everything
+that it publishes but the time of sending is compared with what was recorded.
+Exit code 3 if anything differs. What cannot be told is said.
 
 Examples:
-  corotate replay runs/20261121T150000Z-rigid-pair/run.mcap
+  corotate replay                  the newest run here, every role
+  corotate replay runs/20261121T150000Z-rigid-pair
   corotate replay run.mcap --role observer --processes";
 
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Exit {
-    let recording = match open(&arguments.file, arguments.accept_incomplete) {
+    let file = match latest::recording(arguments.run.as_deref()) {
+        Ok(file) => file,
+        Err(reason) => return fail(Exit::Usage, &reason),
+    };
+    let recording = match open(&file, arguments.accept_incomplete) {
         Ok(recording) => recording,
         Err(error) => return fail(exit_of(&error), &error),
     };
     match attempt(arguments, &recording) {
         Ok(replays) => {
-            let text: String = replays.iter().map(words).collect();
+            let words = || harmless(&replays.iter().map(words).collect::<String>());
+            let text = if arguments.json { json(&file, &replays) } else { words() };
             let differs = replays.iter().any(|replay| replay.difference.is_some());
-            match say(&harmless(&text)) {
+            match say(&text) {
                 Err(exit) => exit,
                 Ok(()) => exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }),
             }
@@ -87,6 +100,36 @@ fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {
             reason: format!("--role {name}: there is no such role; this recording has: {known}, all"),
         }
     })
+}
+
+/// All of it for programs.
+fn json(file: &Path, replays: &[RoleReplay]) -> String {
+    let role = |replay: &RoleReplay| {
+        let RoleReplay { role, ticks, lives, samples, difference, limit } = replay;
+        let difference = difference.as_ref().map(|first| {
+            serde_json::json!({
+                "tick": first.tick,
+                "service": first.service,
+                "field": first.field,
+                "recorded": first.recorded,
+                "replayed": first.replayed,
+            })
+        });
+        let limit = limit.as_ref().map(|limit| serde_json::json!({ "tick": limit.tick, "reason": limit.reason }));
+        serde_json::json!({
+            "role": role,
+            "ticks": ticks,
+            "lives": lives,
+            "samples": samples,
+            "same": difference.is_none(),
+            "difference": difference,
+            "limit": limit,
+        })
+    };
+    let same = replays.iter().all(|replay| replay.difference.is_none());
+    let roles: Vec<_> = replays.iter().map(role).collect();
+    let file = file.display().to_string();
+    format!("{}\n", serde_json::json!({ "schema": SCHEMA, "file": file, "same": same, "roles": roles }))
 }
 
 /// One role's replay for people.

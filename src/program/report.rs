@@ -1,50 +1,98 @@
 //! `corotate report`: a run, or a recording, as one page.
 
 use super::record;
-use super::{Exit, fail, remark, say};
+use super::{Exit, fail, latest, remark, say};
 use crate::report::{ReportError, report as compose};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use std::{fs, io};
 
 /// Options of `corotate report`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The directory of a run, or a recording
-    source: PathBuf,
+    /// A run's directory, or a recording [default: runs/latest]
+    run: Option<PathBuf>,
     /// The page to write [default: report.html in that directory, or beside the recording]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Show the page in a browser (xdg-open)
+    #[arg(long)]
+    open: bool,
+    /// Print where the page is as one JSON object (corotate/report/v1)
+    #[arg(long)]
+    json: bool,
 }
 
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/report/v1";
+/// How long a program that opens a page may take to say that it cannot.
+const OPENING: Duration = Duration::from_secs(2);
+
 const EXAMPLES: &str = "\
-The page needs no network and no script; it is light or dark as the reader's screen is, and prints. Motion, errors over time
-and lateness over time are drawn from the recording; without one the page has the rest and says so.
+The page needs no network and no script; it is light or dark as the reader's
+screen is, and prints. Motion, errors over time and lateness over time are drawn
+from the recording; without one the page has the rest and says so.
 
 Examples:
-  corotate run config/rigid-pair.toml --record --out runs/pair
-  corotate report runs/pair                                  runs/pair/report.html
-  corotate report runs/pair/run.mcap --out motion.html       the recording alone";
+  corotate run rigid-pair --record --out runs/pair
+  corotate report --open           the newest run here, in a browser
+  corotate report runs/pair        runs/pair/report.html
+  corotate report runs/pair/run.mcap --out motion.html
+                                   the recording alone";
 
 /// Makes the page.
 pub fn report(arguments: &Arguments) -> Exit {
-    let source = &arguments.source;
-    let directory = if source.is_dir() { source } else { source.parent().unwrap_or(Path::new("")) };
+    let source = match latest::run(arguments.run.as_deref()) {
+        Ok(source) => source,
+        Err(reason) => return fail(Exit::Usage, &reason),
+    };
+    let directory = if source.is_dir() { &source } else { source.parent().unwrap_or(Path::new("")) };
     let out = arguments.out.clone().unwrap_or_else(|| directory.join("report.html"));
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner().with_message(format!("reading {}", source.display()));
     spinner.enable_steady_tick(Duration::from_millis(100));
-    let composed = compose(source);
+    let composed = compose(&source);
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
         report.remarks().iter().for_each(|text| remark(text));
         report.write(&out).map(|()| if report.is_damaged() { Exit::Failure } else { Exit::Ok })
     });
     match written {
-        Ok(exit) => say(&format!("{}\n", out.display())).err().unwrap_or(exit),
+        Ok(exit) => say(&words(arguments.json, &out)).and_then(|()| show(arguments.open, &out)).err().unwrap_or(exit),
         Err(error) => fail(exit_of(&error), &error),
     }
+}
+
+fn words(json: bool, out: &Path) -> String {
+    let page = out.display().to_string();
+    if json { format!("{}\n", serde_json::json!({ "schema": SCHEMA, "page": page })) } else { page + "\n" }
+}
+
+/// Shows the page, if that is asked for, in whatever this desktop opens pages with.
+fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
+    let open = || -> io::Result<()> {
+        let mut opener = Command::new("xdg-open")
+            .arg(fs::canonicalize(page)?)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()?;
+        // A browser that it becomes stays; one that is not there is told at once.
+        let end = Instant::now() + OPENING;
+        while Instant::now() < end {
+            match opener.try_wait()? {
+                Some(status) if status.success() => return Ok(()),
+                Some(status) => return Err(io::Error::other(status.to_string())),
+                None => std::thread::sleep(Duration::from_millis(20)),
+            }
+        }
+        Ok(())
+    };
+    let failed = |error| fail(Exit::Failure, &format!("xdg-open: {error}; open {} in a browser", page.display()));
+    if wanted { open().map_err(failed) } else { Ok(()) }
 }
 
 fn exit_of(error: &ReportError) -> Exit {

@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 /// Options of every role.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The run's domain, as `corotate run --external ROLE` prints it
     #[arg(long, value_name = "DIR")]
@@ -23,11 +23,12 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Example:
-  corotate run pair.toml --external ROLE    prints the line to type for that role, with its domain";
+  corotate run pair.toml --external ROLE
+                                   prints the line to type, with the domain";
 
 /// Options of `corotate plant`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct PlantArguments {
     /// The body's name
     #[arg(long, value_name = "NAME")]

@@ -1,7 +1,10 @@
 //! `corotate run`: one scenario from file to verdict.
 
-use super::{Exit, fail, foxglove, load, name, print, scenarios};
+use super::color::{Color, paint};
+use super::scenario::{Change, load, stem};
+use super::{Exit, fail, foxglove, latest, name, print, remark};
 use crate::config::{ClockKind, RunId, Scenario};
+use crate::doctor::Machine;
 use crate::files;
 use crate::launch::{
     Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
@@ -18,12 +21,13 @@ use std::sync::atomic::AtomicUsize;
 
 /// Options of `corotate run`.
 #[derive(clap::Args, Default)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Scenario file; without one, the first that ships with the program
+    /// A shipped scenario's name, a file (x.toml, ./x), or - for stdin
+    #[arg(value_name = "SCENARIO")]
     file: Option<PathBuf>,
-    /// What drives the ticks: realtime, lockstep or in-process
-    #[arg(long, value_name = "CLOCK")]
+    /// What drives the ticks
+    #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep", "in-process"])]
     clock: Option<String>,
     /// Length of the run, s
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
@@ -31,59 +35,77 @@ pub struct Arguments {
     /// Ticks per second, Hz
     #[arg(long, value_name = "HZ", allow_negative_numbers = true)]
     tick_hz: Option<String>,
-    /// Override any key of the scenario, as leader.measured_axes=[1,3] or follower.0.name=chaser
+    /// Override a key, as leader.measured_axes=[1,3]
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Directory for the results [default: runs/<utc>-<name>]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Do not run without every privilege that the scenario asks for
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     require_rt: bool,
-    /// Do not start this role; somebody else will, in the domain that is printed
+    /// Do not start this role: wait for somebody else to
     #[arg(long, value_name = "ROLE")]
     external: Vec<String>,
-    /// Write the verdict to this file as JUnit XML, one test case per criterion
-    #[arg(long, value_name = "FILE")]
+    /// Write the verdict as JUnit XML, one test case per criterion
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
     junit: Option<PathBuf>,
-    /// Record every sample to run.mcap in the directory for the results
+    /// Record every sample to run.mcap beside the results
     #[arg(long)]
     record: bool,
     /// Show every signal live on a Foxglove WebSocket, at IP:PORT; without ADDR at 127.0.0.1:8765
-    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
+    #[arg(long, hide_short_help = true, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
     foxglove: Option<SocketAddr>,
-    /// Print the summary as one JSON object on stdout, everything else on stderr
+    /// Print the summary as JSON, all else on stderr
     #[arg(long)]
     json: bool,
+    /// Print nothing but errors and the last line
+    #[arg(short, long, conflicts_with = "verbose")]
+    quiet: bool,
+    /// Tell on stderr where the run is, and its phases
+    #[arg(short, long)]
+    verbose: bool,
 }
 
 const EXAMPLES: &str = "\
+A name always means the scenario that ships with the program, as
+`corotate init --list` tells them; a file in this directory is meant by ./NAME
+or NAME.toml. runs/latest leads to the newest run in runs/.
+
+The last line is PASS if every criterion of [accept] that was judged holds, FAIL
+if one does not or the run was not sound, NOT JUDGED if nothing could be held
+against a criterion. It ends the table on stdout; with --json it is on stderr.
+A run that could not begin has an error instead.
+
 Examples:
-  corotate run pair.toml                             four processes in real time; a table, and runs/<utc>-<name>/
-  corotate run pair.toml --clock lockstep            as fast as the machine goes, the same bits
+  corotate run rigid-trio          a scenario that ships with the program
+  corotate run pair.toml           a file: four processes in real time; a table,
+                                   and runs/<utc>-<name>/
+  corotate init rigid-pair | corotate run - --clock lockstep
+                                   as fast as the machine goes, the same bits
   corotate run pair.toml --record --set follower.0.initial_rate_rad_s=[1,0,0]
-                                                     every sample to run.mcap, with another start
-  corotate run pair.toml --external follower         wait for hardware in the follower's seat
+                                   every sample to run.mcap, another start
+  corotate run pair.toml --external follower
+                                   wait for hardware in the follower's seat
   corotate run pair.toml --junit verdict.xml --require-rt
-                                                     as a test, on a machine that grants real time";
+                                   as a test, where real time is granted";
 
 impl Arguments {
-    fn overrides(&self) -> Vec<String> {
-        let named = [("clock", &self.clock), ("duration_s", &self.duration), ("tick_hz", &self.tick_hz)];
-        let named = named.into_iter().filter_map(|(key, value)| value.as_ref().map(|value| format!("{key}={value}")));
-        let record = self.record.then(|| "record=true".to_owned());
-        self.set.iter().cloned().chain(named).chain(record).collect()
-    }
-
-    /// What to call the run where the scenario's name is not known.
-    fn stem(&self) -> String {
-        let stem = self.file.as_deref().and_then(Path::file_stem);
-        let shipped = || scenarios().first().map_or(name(), |(name, _)| name).to_owned();
-        stem.map_or_else(shipped, |stem| stem.to_string_lossy().into_owned())
+    fn changes(&self) -> impl Iterator<Item = Change<'_>> {
+        let named = [
+            ("--clock", "clock", &self.clock),
+            ("--duration", "duration_s", &self.duration),
+            ("--tick-hz", "tick_hz", &self.tick_hz),
+        ];
+        let named = named
+            .into_iter()
+            .filter_map(|(option, key, value)| value.as_deref().map(|value| Change::Option(option, key, value)));
+        let record = self.record.then_some(Change::Option("--record", "record", "true"));
+        self.set.iter().map(|argument| Change::Set(argument)).chain(named).chain(record)
     }
 
     fn scenario(&self) -> Result<Scenario, Failure> {
-        let loaded = load(self.file.as_deref(), &self.overrides());
+        let loaded = load(self.file.as_deref(), self.changes());
         let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
@@ -126,7 +148,7 @@ pub fn run(arguments: &Arguments) -> Exit {
         }
     };
     let loaded = arguments.scenario().map(|scenario| Scenario { run: Some(run), ..scenario });
-    let name = loaded.as_ref().map_or_else(|_| arguments.stem(), |scenario| scenario.name.clone());
+    let name = loaded.as_ref().map_or_else(|_| stem(arguments.file.as_deref()), |scenario| scenario.name.clone());
     let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, ended));
     // Whoever reads the file finds no older verdict, however this run ends.
     if let Err(exit) = write_verdict(Err("the run did not come to an end")) {
@@ -136,7 +158,10 @@ pub fn run(arguments: &Arguments) -> Exit {
     let told = ended.as_ref().map(|(summary, _)| summary);
     let written = write_verdict(told.map_err(|failure| failure.reason.as_str()));
     let exit = match told {
-        Ok(summary) => verdict(summary),
+        Ok(summary) => {
+            let verdict = Verdict::of(summary);
+            verdict.tell(arguments.json).map_or_else(|error| fail(Exit::Failure, &error), |()| verdict.exit)
+        }
         Err(failure) => fail(failure.exit, &failure.reason),
     };
     match (written, exit) {
@@ -169,7 +194,11 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
         .map_err(|error| broken(format!("cannot find this program's own file: {error}; {}", remedy(&error))))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
-    let mut screen = Screen { bar: None, asked: false, fleets };
+    let mut screen = Screen { bar: None, asked: false, fleets, level: Level::of(arguments), told: String::new() };
+    screen.tell_verbose(format_args!("results go to {}", directory.display()));
+    if scenario.clock == ClockKind::Realtime && screen.level > Level::Quiet {
+        tell_ungranted(scenario);
+    }
     let outcome = crate::launch::run(
         scenario,
         &mut Launch {
@@ -188,39 +217,104 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
     written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
+    if let Err(error) = latest::point(&directory) {
+        remark(&format!("runs/latest does not lead to this run: {error}; name {} instead", directory.display()));
+    }
     reported.map_err(broken)?;
     Ok((summary, outcome))
 }
 
+/// Tells in a line what the machine will not grant, and the command that changes it: before the run, because its deadlines are
+/// missed for it.
+fn tell_ungranted(scenario: &Scenario) {
+    if let Some((lacking, command)) = Machine::at(Path::new("/")).ungranted(&scenario.realtime) {
+        remark(&format!("not granted: {lacking}; this shell is granted it by `{command}`"));
+    }
+}
+
 fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
-    let text = format!("{}results in {}\n", table(summary), directory.display());
+    let text =
+        if arguments.quiet { String::new() } else { format!("{}results in {}\n", table(summary), directory.display()) };
     if arguments.json {
-        tell(text.trim_end());
+        text.lines().for_each(tell);
         print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
         print(&text)
     }
 }
 
-fn verdict(summary: &Summary) -> Exit {
-    if !summary.books.balanced {
-        return fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
+/// What a run that came to an end is judged: its exit code, and its last line.
+struct Verdict {
+    exit: Exit,
+    word: (&'static str, Color),
+    reason: String,
+}
+
+impl Verdict {
+    fn new(exit: Exit, word: (&'static str, Color), reason: impl Into<String>) -> Self {
+        Self { exit, word, reason: reason.into() }
     }
-    if summary.incidents.iter().any(|incident| incident.action == Action::Stopped) {
-        return Exit::ProcessLost;
+
+    /// Judges a run, and says on stderr what is wrong with it.
+    fn of(summary: &Summary) -> Self {
+        if !summary.books.balanced {
+            let exit = fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
+            return Self::new(exit, FAIL, "the books do not balance");
+        }
+        if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
+            return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost", stopped.role));
+        }
+        if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
+            let exit = fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+            return Self::new(exit, FAIL, "the recording is not complete");
+        }
+        let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
+        for criterion in &broken {
+            let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
+            remark(&format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
+        }
+        let ended = (summary.signal != 0).then(|| format!("ended in order by signal {}", summary.signal));
+        ended.iter().for_each(|ended| remark(ended));
+        let signal = (summary.signal != 0).then_some(Exit::Signal(summary.signal));
+        match summary.accepted {
+            Some(true) => {
+                let held = summary.criteria.iter().filter(|criterion| criterion.holds == Some(true)).count();
+                let left = match summary.criteria.len() - held {
+                    0 => String::new(),
+                    left => format!(", {left} not judged"),
+                };
+                Self::new(signal.unwrap_or(Exit::Ok), PASS, format!("{}{left}", counted(held, "holds", "hold")))
+            }
+            Some(false) => {
+                let reason = format!("{} of {} not met", broken.len(), counted(summary.criteria.len(), "", ""));
+                Self::new(signal.unwrap_or(Exit::NotAccepted), FAIL, reason)
+            }
+            None => {
+                let reason = summary.verdict.strip_prefix("not judged: ").unwrap_or(&summary.verdict);
+                Self::new(signal.unwrap_or(Exit::Ok), NOT_JUDGED, ended.as_deref().unwrap_or(reason))
+            }
+        }
     }
-    if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
-        return fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+
+    /// Prints the last line where the table is.
+    fn tell(&self, json: bool) -> Result<(), String> {
+        let (word, color) = self.word;
+        if json {
+            tell(format_args!("{}: {}", paint(word, color, &io::stderr()), self.reason));
+            return Ok(());
+        }
+        print(&format!("{}: {}\n", paint(word, color, &io::stdout()), self.reason))
     }
-    if summary.signal != 0 {
-        tell(format_args!("corotate: ended in order by signal {}", summary.signal));
-        return Exit::Signal(summary.signal);
-    }
-    for criterion in summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)) {
-        let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
-        fail(Exit::NotAccepted, &format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
-    }
-    if summary.accepted == Some(false) { Exit::NotAccepted } else { Exit::Ok }
+}
+
+const PASS: (&str, Color) = ("PASS", Color::Green);
+const FAIL: (&str, Color) = ("FAIL", Color::Red);
+const NOT_JUDGED: (&str, Color) = ("NOT JUDGED", Color::Yellow);
+
+/// So many criteria, with the verb that goes with the number.
+fn counted(count: usize, one: &str, many: &str) -> String {
+    let text = if count == 1 { format!("1 criterion {one}") } else { format!("{count} criteria {many}") };
+    text.trim_end().to_owned()
 }
 
 /// The exit code of a run, or a replay, that failed.
@@ -262,7 +356,7 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
     if let Some(path) = given {
         return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
     }
-    let runs = Path::new("runs");
+    let runs = Path::new(latest::RUNS);
     files::create_directories(runs).map_err(|error| named(runs, error))?;
     let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
     for attempt in 1..=DIRECTORIES {
@@ -275,17 +369,43 @@ pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp
     Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
 }
 
-/// Progress on a terminal; silence elsewhere, but for what a person must do.
+/// How much is said of a run while it goes on.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Level {
+    /// Nothing.
+    Quiet,
+    /// Progress on a terminal, and what a person must do.
+    Usual,
+    /// Where it is, and each of its phases.
+    Verbose,
+}
+
+impl Level {
+    fn of(arguments: &Arguments) -> Self {
+        match arguments {
+            Arguments { quiet: true, .. } => Self::Quiet,
+            Arguments { verbose: true, .. } => Self::Verbose,
+            _ => Self::Usual,
+        }
+    }
+}
+
+/// Progress on a terminal; silence elsewhere, but for what a person must do, or asked to be told.
 struct Screen {
     bar: Option<ProgressBar>,
     asked: bool,
     /// The bodies that are many, and that no device can be.
     fleets: Vec<String>,
+    level: Level,
+    /// What was told last of the phases.
+    told: String,
 }
 
 impl Screen {
     fn show(&mut self, progress: &Progress<'_>) {
+        self.tell_phase(progress);
         match progress {
+            _ if self.level == Level::Quiet => {}
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
@@ -304,6 +424,25 @@ impl Screen {
                 bar.set_position(*tick);
                 bar.set_message(if metric.is_nan() { "-".to_owned() } else { format!("{metric:.2e}") });
             }
+        }
+    }
+
+    /// Tells each phase of a run once, to whoever wants to know.
+    fn tell_phase(&mut self, progress: &Progress<'_>) {
+        let phase = match progress {
+            Progress::Waiting { domain, .. } => format!("the run's domain is {}", domain.display()),
+            Progress::Running { last_tick, .. } => format!("ticks 0 to {last_tick} run"),
+            Progress::External(_) => return,
+        };
+        if phase != self.told {
+            self.tell_verbose(format_args!("{phase}"));
+            self.told = phase;
+        }
+    }
+
+    fn tell_verbose(&self, words: std::fmt::Arguments<'_>) {
+        if self.level == Level::Verbose {
+            remark(&words);
         }
     }
 

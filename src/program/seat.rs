@@ -1,33 +1,36 @@
 //! `corotate seat`: what a foreign program must know to take a role's seat.
 
+use super::scenario::{Change, load};
 use super::{Exit, fail, say};
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::runtime::{RoleError, RoleId, describe_seat, join_run};
 use crate::system::tell;
 use std::path::PathBuf;
 
 /// Options of `corotate seat`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Scenario file
+    /// A shipped scenario's name, a file (x.toml, ./x), or - for stdin
+    #[arg(value_name = "SCENARIO")]
     file: PathBuf,
     /// The role: a body's name, observer or controller
     role: String,
-    /// What drives the ticks: realtime or lockstep
-    #[arg(long, value_name = "CLOCK")]
+    /// What drives the ticks
+    #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep"])]
     clock: Option<String>,
     /// Override any key of the scenario
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// The domain of a run that waits for the role; FILE is then DIR/scenario.toml
+    /// The domain of a run that waits for the role; SCENARIO is then DIR/scenario.toml
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
 }
 
 const EXAMPLES: &str = "\
 Example:
-  corotate seat pair.toml follower          services, samples and fields of the follower's seat";
+  corotate seat pair.toml follower
+                                   services, samples and fields of that seat";
 
 /// Prints a seat.
 pub fn seat(arguments: &Arguments) -> Exit {
@@ -35,9 +38,9 @@ pub fn seat(arguments: &Arguments) -> Exit {
 }
 
 fn describe(arguments: &Arguments) -> Result<(), Exit> {
-    let clock = arguments.clock.iter().map(|clock| format!("clock={clock}"));
-    let overrides: Vec<String> = arguments.set.iter().cloned().chain(clock).collect();
-    let scenario = Scenario::load(&arguments.file, &overrides).map_err(|error| fail(Exit::Usage, &error))?;
+    let clock = arguments.clock.iter().map(|clock| Change::Option("--clock", "clock", clock));
+    let changes = arguments.set.iter().map(|argument| Change::Set(argument)).chain(clock);
+    let scenario = load(Some(&arguments.file), changes).map_err(|error| fail(Exit::Usage, &error))?;
     if scenario.clock == ClockKind::InProcess {
         return Err(fail(Exit::Usage, &"one process has no seats for others; give --clock realtime or lockstep"));
     }

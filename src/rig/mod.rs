@@ -15,7 +15,7 @@ pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
 pub use registry::{RigKind, register, shipped};
-pub(crate) use registry::{resolve, sections, tables};
+pub(crate) use registry::{resolve, sections, shapes, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
 pub use simple::{Bounded, Difference, SimpleRig};
 

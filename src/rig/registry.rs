@@ -3,7 +3,7 @@
 //! Must not know more of a rig than how it is named, which tables are its own, and how it is made of them.
 
 use super::{AnyRig, Context, OrbitRig, Rig, RigidBodyRig};
-use crate::config::{Checks, ConfigError, Document, nearest};
+use crate::config::{Checks, ConfigError, Document, Key, Shape, nearest};
 use std::sync::OnceLock;
 
 /// A rig that scenarios may name.
@@ -54,6 +54,21 @@ pub(crate) fn tables() -> Vec<&'static str> {
 /// The same, and those that hold a list of tables.
 pub(crate) fn sections() -> Vec<&'static str> {
     tables().into_iter().chain(kinds().iter().flat_map(|kind| kind.lists).copied()).collect()
+}
+
+/// The keys of a scenario that are a rig's own, by the rig's name, as the types read them that the rig makes of them.
+pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
+    let of = |kind: &RigKind, name: &'static str| {
+        let sections = Document::asking();
+        // It is refused, having asked.
+        let _ = (kind.resolve)(name, &sections, Context { tick_s: 1e-3, seed: 1 }, &mut Checks::new(&sections));
+        let unknown = |name: &&'static str| Key { name, required: false, shape: Shape::Any(None) };
+        match sections.asked() {
+            Some(Shape::Table { keys, .. }) => (name, keys),
+            _ => (name, kind.tables.iter().chain(kind.lists).map(unknown).collect()),
+        }
+    };
+    kinds().iter().flat_map(|kind| kind.names.iter().map(move |name| of(kind, name))).collect()
 }
 
 /// Resolves the rig's own sections of a scenario. The rig is absent if `checks` noted a problem with it.

@@ -126,10 +126,19 @@ fn refused(text: impl AsRef<[u8]>, arguments: &[&str]) -> Vec<String> {
     std::fs::write(bench.path(FILE), text).unwrap();
     let done = refused_in(&bench, &[&["run", FILE], arguments].concat());
     assert_eq!(done.stdout, "", "{done:?}");
-    let lines: Vec<String> = done.stderr.lines().map(str::to_owned).collect();
+    let (quotes, lines): (Vec<String>, Vec<String>) =
+        done.stderr.lines().map(str::to_owned).partition(|line: &String| is_quote(line));
     assert!(lines.iter().all(|line| line.starts_with("corotate: ")), "{lines:?}");
+    let placed = lines.iter().filter(|line| line.starts_with(&format!("corotate: {FILE}:"))).count();
+    assert!(quotes.len() <= placed, "{quotes:?} of {lines:?}");
     assert!(lines.len() <= 3, "one fault, {} findings: {lines:?}", lines.len());
     lines
+}
+
+/// Whether a line of a message quotes the file's: its number, and what it says.
+fn is_quote(line: &str) -> bool {
+    let number = line.strip_prefix("corotate: ").and_then(|line| line.split_once(" | "));
+    number.is_some_and(|(number, _)| number.trim().parse::<usize>().is_ok())
 }
 
 /// Asserts that one of the lines says all of this.

@@ -1,7 +1,9 @@
 //! Texts that are no scenario: types, names, tables and syntax.
 
+use super::common::Bench;
 use super::{
-    FILE, PAIR, assert_refused, assert_says, keys, line, line_of, place, refused, replace, split, with, without_table,
+    FILE, PAIR, assert_refused, assert_says, keys, line, line_of, place, refused, refused_in, replace, split, with,
+    without_table,
 };
 
 #[test]
@@ -95,7 +97,12 @@ fn a_key_or_table_that_is_missing_is_asked_for() {
         assert_refused(&without_table(table), table, &["is missing"]);
     }
     for empty in ["", "\n\n", "# nothing but a comment\n"] {
-        assert_refused(empty, "name", &["is missing", "add it"]);
+        let bench = Bench::new();
+        std::fs::write(bench.path(FILE), empty).unwrap();
+        let done = refused_in(&bench, &["run", FILE]);
+        let told =
+            ["name", "rig", "tick_hz", "duration_s"].map(|key| format!("corotate: {FILE}: {key}: is missing; add it"));
+        assert_eq!(done.stderr.lines().collect::<Vec<_>>(), told);
     }
 }
 

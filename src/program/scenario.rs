@@ -1,0 +1,124 @@
+//! Which scenario a command means: one that ships with the program by its name, a file by its path, or standard input.
+//!
+//! Must not judge what it reads: [`crate::config`] does.
+
+use super::{name, scenarios};
+use crate::config::{ConfigError, Document, Scenario, nearest, read_text};
+use std::borrow::Cow;
+use std::fs::File;
+use std::io;
+use std::path::Path;
+
+/// Standard input, as a command line names it.
+const STANDARD_INPUT: &str = "-";
+/// Standard input, as errors name it.
+const STDIN: &str = "stdin";
+
+/// The most of a line that is quoted, characters.
+const MAX_QUOTED: usize = 120;
+
+/// A change of a scenario that the command line asks for.
+pub enum Change<'a> {
+    /// `--set KEY=VALUE`.
+    Set(&'a str),
+    /// An option of its own, with its name, its key and its value as typed.
+    Option(&'static str, &'static str, &'a str),
+}
+
+impl Change<'_> {
+    fn apply(&self, document: &mut Document) -> Result<(), ConfigError> {
+        match self {
+            Self::Set(argument) => document.set(argument),
+            Self::Option(option, key, value) => document.set_by_option(option, key, value),
+        }
+    }
+}
+
+/// The scenario that is meant, with changes; the program's first where none is named.
+pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'a>>) -> Result<Scenario, String> {
+    let (text, origin) = text(given)?;
+    let resolved = Document::parse(&text, &origin).and_then(|mut document| {
+        changes.into_iter().try_for_each(|change| change.apply(&mut document))?;
+        Scenario::of(document)
+    });
+    resolved.map_err(|error| quoting(&error.to_string(), &origin, &text))
+}
+
+/// The text of the scenario that is meant, and what errors call it.
+fn text(given: Option<&Path>) -> Result<(Cow<'static, str>, String), String> {
+    let shipped = |name: &str| {
+        let (_, text) = scenarios().iter().find(|(known, _)| *known == name).ok_or_else(|| unknown(name))?;
+        Ok((Cow::Borrowed(*text), format!("{name}.toml")))
+    };
+    let read = |text: Result<String, ConfigError>, origin: &Path| match text {
+        Ok(text) => Ok((Cow::Owned(text), origin.display().to_string())),
+        Err(error) => Err(error.to_string()),
+    };
+    let refuse = |path: &Path, error: io::Error| ConfigError::Read { path: path.to_owned(), reason: error.to_string() };
+    match (given, given.and_then(name_in)) {
+        (None, _) => shipped(first().ok_or("this program has no scenario of its own; name a scenario file")?),
+        (Some(_), Some(STANDARD_INPUT)) => read(read_text(io::stdin().lock(), Path::new(STDIN)), Path::new(STDIN)),
+        (Some(_), Some(name)) => shipped(name),
+        (Some(path), None) => {
+            let file = File::open(path).map_err(|error| refuse(path, error));
+            read(file.and_then(|file| read_text(file, path)), path)
+        }
+    }
+}
+
+/// What errors say, and below each the line of the text that it is about.
+fn quoting(errors: &str, origin: &str, text: &str) -> String {
+    let quote = |error: &str| {
+        let (number, _) = error.strip_prefix(origin)?.strip_prefix(':')?.split_once(':')?;
+        let number: usize = number.parse().ok()?;
+        let line: String = text.lines().nth(number.checked_sub(1)?)?.chars().take(MAX_QUOTED).collect();
+        Some(format!("{error}\n{number:>4} | {}", line.trim_end()))
+    };
+    let lines = errors.lines().map(|error| quote(error).unwrap_or_else(|| error.to_owned()));
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+/// What is given, unless it is a file's path: a file of a shipped scenario's name must not change what that name means.
+fn name_in(given: &Path) -> Option<&str> {
+    given.to_str().filter(|text| !text.contains('/') && !text.ends_with(".toml"))
+}
+
+fn first() -> Option<&'static str> {
+    scenarios().first().map(|(name, _)| *name)
+}
+
+/// What to call a scenario that could not be read.
+pub fn stem(given: Option<&Path>) -> String {
+    match given {
+        None => first().unwrap_or(name()).to_owned(),
+        Some(path) if path == Path::new(STANDARD_INPUT) => STDIN.to_owned(),
+        Some(path) => path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+    }
+}
+
+/// What to say of a name that no scenario has.
+pub fn unknown(name: &str) -> String {
+    let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
+    let remedy = nearest(name, &known);
+    format!("there is no scenario `{name}`; {remedy} A file is given by its path, as ./{name} or {name}.toml")
+}
+
+/// What a scenario is, in a line: the first of its text, if that is a comment.
+pub fn title(text: &str) -> &str {
+    text.lines().next().and_then(|line| line.strip_prefix('#')).unwrap_or_default().trim()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_line_that_an_error_is_about_is_quoted() {
+        let text = "a = 1\nb = 2   \n";
+        let told =
+            quoting("x.toml:2: b: wrong\n--set c=1: c: wrong\nx.toml:1:5: bad\nx.toml: d: is missing", "x.toml", text);
+        let expected = "x.toml:2: b: wrong\n   2 | b = 2\n--set c=1: c: wrong\nx.toml:1:5: bad\n   1 | a = 1\nx.toml: d: is missing";
+        assert_eq!(told, expected);
+        assert_eq!(quoting("x.toml:99: b", "x.toml", text), "x.toml:99: b");
+    }
+}
