@@ -52,7 +52,7 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
         }
         for node in &mut nodes {
             if node.poll(RunCondition::Inputs { up_to: scenario.last_tick }).unwrap() == Poll::Executed {
-                node.settle().unwrap();
+                node.finish_tick().unwrap();
             }
         }
         // Only what the roles themselves say: a foreign estimate or command may be anything.
