@@ -122,7 +122,7 @@ fn results_that_cannot_be_written_are_told_and_still_shown() {
         let done = running.wait();
         assert_eq!(done.code, Some(1), "{file}: {done:?}");
         assert!(done.stderr.contains(file) && done.stderr.contains("No space left"), "{file}: {done:?}");
-        assert!(done.stdout.contains("books balance"), "{file}: {done:?}");
+        assert!(done.stdout.contains("counters balance"), "{file}: {done:?}");
         bench.assert_clean(&[]);
     }
     let bench = Bench::new();
@@ -139,7 +139,7 @@ fn results_that_cannot_be_written_are_told_and_still_shown() {
     std::fs::remove_dir_all(bench.path("out")).unwrap();
     let done = running.wait();
     assert_eq!(done.code, Some(1), "{done:?}");
-    assert!(done.stderr.contains("cannot write the results") && done.stdout.contains("books balance"), "{done:?}");
+    assert!(done.stderr.contains("cannot write the results") && done.stdout.contains("counters balance"), "{done:?}");
 }
 
 #[test]

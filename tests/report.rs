@@ -144,7 +144,7 @@ fn a_recorded_run_of_bodies_is_shown_whole() {
     let motion = text(section(&page, "motion"));
     assert!(motion.contains("10001 ticks are drawn in columns of 8"), "{motion}");
     assert!(text(section(&page, "errors")).contains("loop: exp(−4.0"));
-    assert!(text(section(&page, "books")).contains("The books balance."));
+    assert!(text(section(&page, "books")).contains("The counters balance."));
 }
 
 #[test]

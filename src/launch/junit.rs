@@ -101,7 +101,7 @@ fn cases(summary: &Summary) -> Vec<Case> {
     };
     let books = match summary.books.balanced {
         true => Verdict::Passed,
-        false => Verdict::Failed(format!("the books do not balance: {}", summary.books.problems.join("; "))),
+        false => Verdict::Failed(format!("the counters do not balance: {}", summary.books.problems.join("; "))),
     };
     let criteria = summary.criteria.iter().map(|criterion| Case::new(&criterion.name, judge(criterion)));
     [Case::new("run", run), Case::new("books", books)].into_iter().chain(criteria).collect()

@@ -134,7 +134,7 @@ pub struct Accounting {
     /// Per role.
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
-    pub links: Vec<LinkBook>,
+    pub links: Vec<LinkCounters>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
     /// Samples received and not believed, all links together.
@@ -145,7 +145,7 @@ pub struct Accounting {
 
 /// One reading end beside its writing end. Of a writer that keeps no counters nothing is known but what its reader met.
 #[derive(Debug, Serialize)]
-pub struct LinkBook {
+pub struct LinkCounters {
     /// The service.
     pub service: String,
     /// The reading role.
@@ -291,7 +291,7 @@ impl Accounting {
             let in_flight =
                 written.is_some_and(|(writer, written)| lost.contains(writer) && read.last_tick > written.last_tick);
             let written = written.map(|(_, written)| *written);
-            links.push(LinkBook::new(&report.role, written, in_flight, read, scenario, &mut problems));
+            links.push(LinkCounters::new(&report.role, written, in_flight, read, scenario, &mut problems));
         }
         Self {
             balanced: problems.is_empty(),
@@ -307,7 +307,7 @@ impl Accounting {
     }
 }
 
-impl LinkBook {
+impl LinkCounters {
     fn new(
         reader: &str,
         written: Option<&LinkWritten>,

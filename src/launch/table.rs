@@ -1,6 +1,6 @@
 //! The end of a run on the screen.
 
-use super::outcome::{LinkBook, State};
+use super::outcome::{LinkCounters, State};
 use super::{Incident, Summary};
 use crate::analysis::digits;
 use crate::serial::LineCounters;
@@ -21,8 +21,10 @@ pub fn table(summary: &Summary) -> String {
         summary.tick_hz,
         summary.last_tick + 1
     );
-    for (role, host) in &summary.hosted {
-        let _ = writeln!(text, "one process: the {role} is in the {host}'s");
+    let mut processes = BTreeMap::<&str, Vec<&str>>::new();
+    summary.hosted.iter().for_each(|(role, host)| processes.entry(host).or_default().push(role));
+    for (host, roles) in processes {
+        let _ = writeln!(text, "one process: {}, {host}", roles.join(", "));
     }
     for note in &summary.notes {
         let _ = writeln!(text, "note: {note}");
@@ -152,7 +154,7 @@ fn books(summary: &Summary, text: &mut String) {
     let executed: u64 = books.roles.values().map(|ticks| ticks.executed).sum();
     let _ = writeln!(
         text,
-        "\nbooks {}: {executed} ticks executed by {} roles, {} missed or starved; {} of {} ticks scored",
+        "\ncounters {}: {executed} ticks executed by {} roles, {} missed or starved; {} of {} ticks scored",
         if books.balanced { "balance" } else { "DO NOT BALANCE" },
         books.roles.len(),
         books.missed_ticks,
@@ -165,9 +167,9 @@ fn books(summary: &Summary, text: &mut String) {
     if books.rejected_samples > 0 {
         let _ = writeln!(text, "{} samples rejected by their readers", books.rejected_samples);
     }
-    let met = |link: &&LinkBook| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
+    let met = |link: &&LinkCounters| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
     for link in books.links.iter().filter(met) {
-        let LinkBook { service, reader, received, rejected, stale, void, .. } = link;
+        let LinkCounters { service, reader, received, rejected, stale, void, .. } = link;
         let _ = write!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void.1);
         let _ = match link.published {
             Some(_) => writeln!(text),

@@ -258,8 +258,8 @@ impl Verdict {
     /// Judges a run, and says on stderr what is wrong with it.
     fn of(summary: &Summary) -> Self {
         if !summary.books.balanced {
-            let exit = fail(Exit::Failure, &"the books do not balance: samples or ticks are unaccounted for");
-            return Self::new(exit, FAIL, "the books do not balance");
+            let exit = fail(Exit::Failure, &"the counters do not balance: samples or ticks are unaccounted for");
+            return Self::new(exit, FAIL, "the counters do not balance");
         }
         if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
             return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost", stopped.role));

@@ -178,7 +178,7 @@ pub fn books(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
     if let Some(books) = source.summary.as_ref().map(|summary| &summary.books) {
-        let balance = if books.balanced { "The books balance." } else { "THE BOOKS DO NOT BALANCE." };
+        let balance = if books.balanced { "The counters balance." } else { "THE COUNTERS DO NOT BALANCE." };
         let scripted = !faults(source).is_empty() || books.injected_faults > 0;
         let acted = format!("; scripted faults acted {} times", books.injected_faults);
         blocks.push(Block::Text(format!(
