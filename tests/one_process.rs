@@ -88,11 +88,10 @@ fn in_real_time_the_bits_are_the_same_up_to_the_first_missed_tick_and_all_roles_
             let executed = live["books"]["roles"][role]["executed"].as_u64().unwrap();
             for stage in told {
                 let found = stages.iter().find(|found| found["role"] == role && found["stage"] == *stage);
-                let count = found.unwrap_or_else(|| panic!("{out} {role} {stage}"))["count"].as_u64().unwrap();
-                assert!(
-                    count > 0 && (count <= 2001 || *stage == "lateness"),
-                    "{out} {role} {stage}: {count} of {executed}"
-                );
+                // Where a loaded machine let nothing come in time there is nothing to be told.
+                let count = found.map_or(0, |found| found["count"].as_u64().unwrap());
+                let most = if ["baseline", "lateness"].contains(stage) { 2001 } else { executed };
+                assert!(count <= most && (count > 0 || executed < 2001), "{out} {role} {stage}: {count} of {executed}");
             }
         }
         let asked = |role: &str| live["privileges"].as_array().unwrap().iter().any(|grant| grant["role"] == role);

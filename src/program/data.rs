@@ -8,28 +8,28 @@ use std::fmt::Write;
 #[derive(clap::Args)]
 pub struct LogArguments {
     /// The topic of an MCAP file, or the end of its name [default: the only one with an angular velocity]
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, value_name = "TOPIC", hide_short_help = true)]
     topic: Option<String>,
     /// The column of time stamps [default: the one that is called so]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", hide_short_help = true)]
     time: Option<String>,
     /// The columns of the rates about x, y and z; a - for one that is not there [default: those that are called so]
     #[arg(long, value_name = "X,Y,Z", value_parser = three_names)]
     rates: Option<Names>,
     /// The unit of the stamps: s, ms, us or ns [default: what the column's name says, else s]
-    #[arg(long, value_name = "UNIT", value_parser = time_unit)]
+    #[arg(long, value_name = "UNIT", value_parser = time_unit, hide_short_help = true)]
     time_unit: Option<TimeUnit>,
     /// The unit of the rates: rad/s or deg/s [default: what the columns' names say, else rad/s]
-    #[arg(long, value_name = "UNIT", value_parser = rate_unit)]
+    #[arg(long, value_name = "UNIT", value_parser = rate_unit, hide_short_help = true)]
     rate_unit: Option<RateUnit>,
     /// A new value in this column begins a new segment: another throw, another run
     #[arg(long, value_name = "NAME")]
     by: Option<String>,
     /// A longer pause begins a new segment, s [default: 5 usual intervals]
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, hide_short_help = true)]
     gap: Option<f64>,
     /// The first row has no names; columns are then named by number, from 1
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     no_header: bool,
 }
 

@@ -19,7 +19,7 @@ const LISTED: usize = 12;
 
 /// Options of `corotate estimate`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The log: CSV, MCAP or Parquet; - is CSV from the standard input
     data: PathBuf,
@@ -35,25 +35,25 @@ pub struct Arguments {
     #[arg(long, value_name = "X,Y,Z", value_parser = three)]
     inertia: Option<Vector3<f64>>,
     /// Damping by the air, a torque -c I w, 1/s [default: the body's, else 0]
-    #[arg(long, value_name = "C", allow_negative_numbers = true)]
+    #[arg(long, value_name = "C", allow_negative_numbers = true, hide_short_help = true)]
     damping: Option<f64>,
     /// The principal axes in the sensor's axes, row by row; the axes are columns [default: the body's, else the sensor's]
-    #[arg(long, value_name = "NINE", value_parser = nine, allow_hyphen_values = true)]
+    #[arg(long, value_name = "NINE", value_parser = nine, allow_hyphen_values = true, hide_short_help = true)]
     axes: Option<Matrix3<f64>>,
     /// The filter
-    #[arg(long, value_enum, default_value_t = Order::First)]
+    #[arg(long, value_enum, default_value_t = Order::First, hide_short_help = true)]
     filter: Order,
     /// Its rate, 1/s: how fast errors of the estimate decay [default: chosen from noise and motion, and said]
     #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
     decay: Option<f64>,
     /// Standard deviation of one measured rate for the Kalman filter, rad/s [default: that of the log]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     noise: Option<f64>,
     /// The first estimate of every segment, rad/s [default: what the first step tells]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     guess: Option<f64>,
     /// Below this the measured rates tell nothing of the hidden one, rad/s [default: 10 times their noise]
-    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true)]
+    #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     floor: Option<f64>,
     /// Write every row with its estimate to this CSV file
     #[arg(long, value_name = "FILE")]

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 
 /// Options of `corotate identify`.
 #[derive(clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// Logs of one body: CSV, MCAP or Parquet; - is CSV from the standard input
     #[arg(required = true)]
@@ -23,13 +23,13 @@ pub struct Arguments {
     #[arg(long, value_enum, default_value_t = Method::Axes)]
     method: Method,
     /// The body is symmetric about this axis: x, y or z
-    #[arg(long, value_name = "AXIS", value_parser = axis)]
+    #[arg(long, value_name = "AXIS", value_parser = axis, hide_short_help = true)]
     symmetry_axis: Option<usize>,
     /// Fit no torque of the air: the motion is not damped
     #[arg(long)]
     no_damping: bool,
     /// The recursive filter's decay rate, s2/rad3, or 1/rad with --symmetry-axis [default: it forgets nothing]
-    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true, hide_short_help = true)]
     decay: Option<f64>,
     /// Print one line of JSON (corotate/identify/v1)
     #[arg(long)]
