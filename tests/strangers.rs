@@ -205,7 +205,7 @@ fn results_are_written_through_no_link_of_another_user() {
         ("directory", words(&["export", &recording, "--csv", &at("open/directory")])),
         ("file", words(&["report", &ours, "--out", &at("open/file")])),
         ("directory", words(&["report", &ours, "--out", &at("open/directory/page.html")])),
-        ("directory", words(&["bench", "step", "--quick", "--out", &at("open/directory")])),
+        ("directory", words(&["bench", "tick", "--quick", "--out", &at("open/directory")])),
     ] {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let done = bench.run(&arguments);

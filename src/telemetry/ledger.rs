@@ -3,6 +3,7 @@
 //! There is one record, kept twice. A commit writes the copy that is not current and makes it current by a single store, so
 //! whoever looks, and whenever the writer dies, there is one whole record. Must not know what is in it.
 
+use super::handover;
 use crate::shared::SharedWords;
 use crate::state::Words;
 use rustix::fs::{FlockOperation, flock};
@@ -11,7 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Why a ledger could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -55,7 +56,8 @@ struct Memory {
     words: Storage,
     /// Where the words are, unless they die with this process.
     path: Option<PathBuf>,
-    record: OnceCell<Record>,
+    /// The two copies of the record.
+    record: OnceCell<Storage>,
 }
 
 #[derive(Debug)]
@@ -204,19 +206,19 @@ impl Ledger {
                 Some(path) => Storage::shared(&path, 2 * words)?,
                 None => Storage::private(2 * words),
             };
-            let _ = self.memory.record.set(Record { storage, words });
+            let _ = self.memory.record.set(storage);
             self.word(Self::LENGTH).store(words as u64, Ordering::Relaxed);
         }
         Ok(())
     }
 
     /// The record that is there, for whoever only reads: whatever its length is said to be, nothing is made.
-    fn open_record(&self) -> Option<&Record> {
+    fn open_record(&self) -> Option<&Storage> {
         let words = self.word(Self::LENGTH).load(Ordering::Relaxed) as usize;
         if self.memory.record.get().is_none() && words > 0 {
             let storage = Storage::Shared(SharedWords::existing(&self.record_path()?).ok()?);
             let whole = words.checked_mul(2) == Some(storage.words().len());
-            whole.then(|| self.memory.record.set(Record { storage, words }));
+            whole.then(|| self.memory.record.set(storage));
         }
         self.memory.record.get()
     }
@@ -230,47 +232,17 @@ impl Ledger {
     #[inline]
     pub fn commit(&self, write: impl FnOnce(&mut Store<'_>)) {
         let Some(record) = self.memory.record.get() else { return };
-        let commits = self.word(Self::COMMITS).load(Ordering::Relaxed) + 1;
-        // Readers that still read the copy which is written now must see by the count that it was replaced: the store of the
-        // last commit is not to be seen after the stores of this one.
-        fence(Ordering::Release);
-        let mut store = Store { words: record.copy(commits), at: 0 };
-        write(&mut store);
-        debug_assert_eq!(store.at, record.words, "a state always takes as many words");
-        // Whoever sees the count sees the copy.
-        self.word(Self::COMMITS).store(commits, Ordering::Release);
+        handover::commit(self.word(Self::COMMITS), record.words(), |words| {
+            let mut store = Store { words, at: 0 };
+            write(&mut store);
+            debug_assert_eq!(store.at, words.len(), "a state always takes as many words");
+        });
     }
 
     /// The last record that was committed; none before the first, or where none can be read.
     pub fn record(&self) -> Option<Vec<u64>> {
         let record = self.open_record()?;
-        for _ in 0..Self::TRIES {
-            let commits = self.word(Self::COMMITS).load(Ordering::Acquire);
-            if commits == 0 {
-                return None;
-            }
-            let copy = record.copy(commits).iter().map(|word| word.load(Ordering::Relaxed)).collect();
-            fence(Ordering::Acquire);
-            if self.word(Self::COMMITS).load(Ordering::Relaxed) == commits {
-                return Some(copy);
-            }
-        }
-        None
-    }
-}
-
-/// The two copies of a record.
-#[derive(Debug)]
-struct Record {
-    storage: Storage,
-    words: usize,
-}
-
-impl Record {
-    #[inline]
-    fn copy(&self, commits: u64) -> &[AtomicU64] {
-        let begin = if commits.is_multiple_of(2) { 0 } else { self.words };
-        &self.storage.words()[begin..begin + self.words]
+        handover::record(self.word(Self::COMMITS), record.words(), Self::TRIES)
     }
 }
 
@@ -301,9 +273,10 @@ pub struct Slots {
 }
 
 impl Slots {
+    /// All of them.
     #[inline]
     #[allow(unsafe_code)]
-    fn words(&self) -> &[AtomicU64] {
+    pub(crate) fn words(&self) -> &[AtomicU64] {
         // SAFETY: the words lie in `_memory`, which is neither moved nor freed nor written but through atomics as long as
         // `self` lives.
         unsafe { self.words.as_ref() }

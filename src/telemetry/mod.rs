@@ -4,14 +4,21 @@
 
 mod books;
 mod export;
+mod handover;
 mod hash;
 mod host;
 mod latency;
 mod ledger;
 mod report;
 
+/// What [`handover`] is made of.
+mod atomic {
+    pub use std::sync::atomic::{AtomicU64, Ordering, fence};
+}
+
 pub use books::{ReadCounters, TickCounters, WriteCounters};
 pub use export::{write_hgrm, write_hlog};
+pub(crate) use handover::{find, keep};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};

@@ -3,8 +3,8 @@
 //! What was on its way between two processes that die together is lost with them, and in lockstep nobody goes on without it:
 //! the successor of the reader finds it here. Must not be looked at otherwise: the link is the way.
 
-use crate::telemetry::{Ledger, Slots};
-use std::sync::atomic::{Ordering, fence};
+use crate::telemetry::{Ledger, Slots, find, keep};
+use std::sync::atomic::AtomicU64;
 
 /// So many samples in the ledger of their writer, each in the place of the one that many ticks before it. Beside the words of
 /// a sample there is its tick + 1, or 0 while they are written.
@@ -27,32 +27,20 @@ impl Kept {
         (ticks > 0 && ledger.is_shared()).then_some(Self { slots, ticks, length })
     }
 
-    fn begin(&self, tick: u64) -> usize {
-        (tick % self.ticks) as usize * (1 + self.length)
+    #[inline]
+    fn place(&self, tick: u64) -> &[AtomicU64] {
+        let begin = (tick % self.ticks) as usize * (1 + self.length);
+        &self.slots.words()[begin..=begin + self.length]
     }
 
     /// Keeps what is sent for a tick.
     #[inline]
     pub fn keep(&self, tick: u64, words: impl Iterator<Item = u64>) {
-        let begin = self.begin(tick);
-        self.slots.set(begin, 0);
-        // Whoever sees one of the words that follow sees that the one before is gone.
-        fence(Ordering::Release);
-        (begin + 1..).zip(words.take(self.length)).for_each(|(index, word)| self.slots.set(index, word));
-        fence(Ordering::Release);
-        self.slots.set(begin, tick + 1);
+        keep(self.place(tick), tick, words);
     }
 
     /// Copies what was sent for a tick; false if it is not kept, and then the words are of no use.
     pub fn find(&self, tick: u64, words: &mut [u64]) -> bool {
-        let begin = self.begin(tick);
-        let kept = || self.slots.get(begin) == tick + 1;
-        if !kept() {
-            return false;
-        }
-        fence(Ordering::Acquire);
-        (begin + 1..).zip(words).for_each(|(index, word)| *word = self.slots.get(index));
-        fence(Ordering::Acquire);
-        kept()
+        find(self.place(tick), tick, words)
     }
 }

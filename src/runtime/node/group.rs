@@ -77,11 +77,10 @@ impl GroupNode {
                 condition => condition,
             };
             while member.node.next_tick() <= tick {
+                // Who catches up executes several ticks here, and a link holds one sample at a time.
+                member.finish_tick()?;
                 match member.node.poll(condition)? {
-                    Poll::Executed => {
-                        member.finish_tick()?;
-                        member.executed = true;
-                    }
+                    Poll::Executed => member.executed = true,
                     Poll::Missed => {}
                     Poll::Waiting => break,
                 }
@@ -94,6 +93,9 @@ impl GroupNode {
         }
         if complete || condition == RunCondition::Overdue {
             self.open = None;
+        }
+        // Where only the missing sample could start a later tick, one sleeps on it: a spin here would starve its writer.
+        if complete || self.open.is_none() && self.next_tick() > tick {
             return Ok(Poll::Executed);
         }
         self.finish_tick()?;
@@ -241,6 +243,23 @@ mod tests {
         node.refresh().unwrap();
         if node.poll(RunCondition::Inputs { up_to }).unwrap() == Poll::Executed {
             node.finish_tick().unwrap();
+        }
+    }
+
+    /// A leader that says nothing may need the very core that they run on.
+    #[test]
+    fn whoever_waits_for_what_is_long_overdue_sleeps() {
+        let (name, text) = SHIPPED[0];
+        let overrides = ["clock=realtime", "duration_s=0.1", "accept={}"].map(str::to_owned);
+        let scenario = &Scenario::parse(text, name, &overrides).unwrap();
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = enter(&domain, scenario);
+        let books = GROUP.map(|role| private_ledger(scenario, role));
+        let mut both = open(scenario, &bus, &books);
+        both.start(Grid { epoch_ns: monotonic_ns(), period_ns: scenario.period_ns }, 0).unwrap();
+        for condition in [RunCondition::Arrived, RunCondition::Overdue, RunCondition::Overdue] {
+            assert_eq!((both.poll(condition).unwrap(), both.next_tick()), (Poll::Waiting, 0), "{condition:?}");
+            assert!(both.sleep(monotonic_ns()).unwrap(), "there is an input to sleep on");
         }
     }
 
