@@ -221,7 +221,7 @@ impl MessageSink for Channels {
         channel: Channel,
         _sequence: u32,
         due_ns: u64,
-        _received_ns: u64,
+        _logged_ns: u64,
         body: &[u8],
     ) -> Result<(), RecordError> {
         let channel = &self.channels[usize::from(channel)];

@@ -173,3 +173,103 @@ fn what_cannot_be_done_is_refused_with_place_reason_and_remedy() {
     assert!(empty.stderr.contains("tells of no body"), "{empty:?}");
     assert_eq!(run(&bench, &[&["estimate", "good.csv", "--hidden", "z"], &body[..]].concat()).code, Some(0));
 }
+
+fn hash(summary: &Value) -> &Value {
+    &summary["state"]["hash"]
+}
+
+/// The same motion by every clock, recorded and replayed; the hidden axis is scored against the log's own.
+#[test]
+fn a_leader_repeats_a_log_under_every_clock_with_the_same_bits() {
+    let bench = Bench::new();
+    let one = bench.summary("recorded-leader", &["--clock", "in-process", "--out", "one"]);
+    assert_eq!(one["verdict"], "accepted", "{one:#}");
+    let lockstep = bench.summary("recorded-leader", &["--clock", "lockstep", "--record", "--out", "lockstep"]);
+    assert_eq!((hash(&lockstep), &lockstep["score"]), (hash(&one), &one["score"]));
+    run(&bench, &["replay", "lockstep"]);
+    let live = bench.summary("recorded-leader", &["--clock", "realtime", "--set", "accept={}", "--out", "live"]);
+    let hashes = |directory: &str| std::fs::read_to_string(bench.path(directory).join("hashes.txt")).unwrap();
+    let clean = live["state"]["clean_ticks"].as_u64().unwrap() as usize;
+    let [expected, seen] = [hashes("one"), hashes("live")];
+    let ticks = |text: &str| text.lines().skip(1).take(clean).map(str::to_owned).collect::<Vec<_>>();
+    assert_eq!(ticks(&seen), ticks(&expected));
+    // What was resolved names the log for good.
+    let again = bench.path("one/scenario.toml");
+    let again = bench.run(&["run", again.to_str().unwrap(), "--json"]);
+    assert_eq!(hash(&json(&again)), hash(&one), "{again:?}");
+}
+
+#[test]
+fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("throws.csv"), throws(3, &Rotation3::identity())).unwrap();
+    let template = run(&bench, &["init", "recorded-leader"]).stdout;
+    let scenario = template.replace("tumbling-throw.csv", "throws.csv");
+    std::fs::create_dir(bench.path("bench")).unwrap();
+    std::fs::rename(bench.path("throws.csv"), bench.path("bench/throws.csv")).unwrap();
+    // A file is looked for beside the scenario that names it, wherever that is read from.
+    std::fs::write(bench.path("bench/own.toml"), &scenario).unwrap();
+    let base = ["run", "bench/own.toml", "--clock=in-process", "--json", "--set=accept={}"];
+    let with = |more: &[&str]| bench.run(&[&base[..], more].concat());
+    let segment = ["--set", "leader.playback.by=throw", "--set", "leader.playback.segment=t1"];
+    let line = |key: &str| 1 + scenario.lines().position(|line| line.starts_with(key)).unwrap();
+    let (data, duration) = (line("data ="), line("duration_s"));
+    for (more, words) in [
+        (&segment[..2], "has 3 segments; name one with leader.playback.segment, one of: t0, t1, t2".to_owned()),
+        (
+            &segment,
+            format!("bench/own.toml:{duration}: duration_s: 1.5 s is longer than the motion of leader.data, 0.89 s"),
+        ),
+        (&["--set=leader.data=none.csv"], "leader.data: cannot read".to_owned()),
+        (&["--set=leader.playback.rates=['a','b','c']"], format!("bench/own.toml:{data}: leader.data: ")),
+        (&["--set=leader.initial_rate_rad_s=[1,2,3]"], "remove one of them".to_owned()),
+        (&["--set=leader.playback.at_ned=repeat"], "did you mean `at_end`?".to_owned()),
+        (&["--set=leader.playback.hash='0'"], "is not what it was".to_owned()),
+    ] {
+        let more = if more.len() == 1 { [&segment[..], &["--duration=0.5"], more].concat() } else { more.to_vec() };
+        let refused = with(&more);
+        assert_eq!(refused.code, Some(2), "{more:?}: {refused:?}");
+        assert!(refused.stderr.contains(&words), "{more:?}: {words}: {}", refused.stderr);
+    }
+    let once = with(&[&segment[..], &["--duration=0.8", "--out=once"]].concat());
+    assert_eq!(once.code, Some(0), "{once:?}");
+    let repeated = with(&[&segment[..], &["--set=leader.playback.at_end=repeat", "--duration=3"]].concat());
+    assert_eq!((repeated.code, &json(&repeated)["books"]["missed_ticks"]), (Some(0), &0.into()), "{repeated:?}");
+    // Whoever changes the log is told by what was resolved before.
+    let log = std::fs::read_to_string(bench.path("bench/throws.csv")).unwrap();
+    std::fs::write(bench.path("bench/throws.csv"), log.replace("t1,0,", "t1,0,1")).unwrap();
+    let changed = bench.run(&["check", "once/scenario.toml"]);
+    assert!(changed.code == Some(2) && changed.stderr.contains("is not what it was"), "{changed:?}");
+}
+
+#[cfg(feature = "parquet")]
+#[test]
+fn a_table_as_parquet_says_what_the_one_as_csv_says() {
+    let bench = Bench::new();
+    std::fs::write(bench.path("throws.csv"), throws(3, &Rotation3::identity())).unwrap();
+    let arguments = ["estimate", "throws.csv", "--by", "throw", "--hidden", "z", "--inertia", "0.93,0.08,1", "--table"];
+    for table in ["z.csv", "z.parquet"] {
+        run(&bench, &[&arguments[..], &[table]].concat());
+    }
+    use parquet::file::reader::{FileReader, SerializedFileReader};
+    let reader = SerializedFileReader::new(std::fs::File::open(bench.path("z.parquet")).unwrap()).unwrap();
+    let text = std::fs::read_to_string(bench.path("z.csv")).unwrap();
+    let mut lines = text.lines();
+    let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+    let mut rows = 0;
+    for (row, line) in reader.get_row_iter(None).unwrap().map(Result::unwrap).zip(lines.by_ref()) {
+        let columns: Vec<(String, String)> =
+            row.get_column_iter().map(|(name, value)| (name.clone(), value.to_string())).collect();
+        assert_eq!(columns.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), names);
+        for ((name, value), cell) in columns.iter().zip(line.split(',')) {
+            let same = match name.as_str() {
+                "segment" => value.trim_matches('"') == cell,
+                _ if cell.is_empty() => value == "NaN",
+                _ => value.parse::<f64>().unwrap() == cell.parse::<f64>().unwrap(),
+            };
+            assert!(same, "{name}: {value} and {cell}");
+        }
+        rows += 1;
+    }
+    assert_eq!((rows, lines.next()), (270, None));
+}

@@ -249,6 +249,11 @@ impl Document {
         place?.as_table_mut()?.remove(*last)
     }
 
+    /// Where the files are that it names: beside its own.
+    pub(super) fn directory(&self) -> &Path {
+        Path::new(&self.origin).parent().unwrap_or(Path::new(""))
+    }
+
     /// The place of a key, or of the nearest table around it, or the file.
     pub fn place(&self, key: &str) -> String {
         let mut path = key;

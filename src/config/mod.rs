@@ -27,7 +27,7 @@ pub(crate) use shape::{Key, Shape};
 pub(crate) use document::nearest;
 
 /// The scenarios that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 12] = [
+pub const SHIPPED: [(&str, &str); 13] = [
     ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
     ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
     ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
@@ -37,6 +37,7 @@ pub const SHIPPED: [(&str, &str); 12] = [
     ("inertia", include_str!("../../config/inertia.toml")),
     ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
     ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("recorded-leader", include_str!("../../config/recorded-leader.toml")),
     ("faults", include_str!("../../config/faults.toml")),
     ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
     ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),

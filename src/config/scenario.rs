@@ -8,7 +8,7 @@ use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The slowest tick: a period must lie well within what a latency histogram holds.
 const MIN_TICK_HZ: f64 = 0.1;
@@ -106,7 +106,7 @@ impl Scenario {
             Ok(raw) => raw,
             Err(error) => {
                 // The rig's own sections are read all the same; of what they say nothing can be judged.
-                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, seed: 0 };
+                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0 };
                 let read = |rig: &str| rig::resolve(rig, &sections, context, &mut checks).err();
                 let own = document.text("rig").and_then(read);
                 checks.problems.retain(|problem| problem.key == "rig");
@@ -117,7 +117,7 @@ impl Scenario {
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
-        let context = Context { tick_s, seed: raw.seed };
+        let context = Context { tick_s, duration_s: raw.duration_s, seed: raw.seed };
         let (rig, rig_table) = match rig::resolve(&raw.rig, &sections, context, &mut checks) {
             Ok(resolved) => resolved,
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
@@ -223,6 +223,11 @@ impl<'a> Checks<'a> {
     pub fn refuse(&mut self, key: &str, reason: impl Into<String>) {
         let place = self.document.place(key);
         self.problems.push(Problem { place, key: key.to_owned(), reason: reason.into() });
+    }
+
+    /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
+    pub fn file(&self, key: &str, name: &str) -> PathBuf {
+        if self.document.place(key).starts_with("--set") { name.into() } else { self.document.directory().join(name) }
     }
 
     /// Notes it unless `holds`.

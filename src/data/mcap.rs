@@ -131,7 +131,8 @@ impl Rows for Mcap {
 fn words(error: &McapError) -> String {
     match error {
         McapError::UnsupportedCompression(kind) => {
-            format!("its chunks are packed with {kind}; pack them with lz4, or not at all")
+            let with = if cfg!(feature = "parquet") { "" } else { "build this program with `--features parquet`, or " };
+            format!("its chunks are packed with {kind}; {with}pack them with lz4, or not at all")
         }
         McapError::UnexpectedEof | McapError::UnexpectedEoc => {
             "it ends within a record: its recorder was stopped, or the disk was full; recover what there is of it"
@@ -276,8 +277,17 @@ mod tests {
     }
 
     fn file(directory: &Path, topics: &[&str], messages: &[(usize, Vec<u8>)]) -> PathBuf {
+        packed_file(directory, topics, messages, Some(mcap::Compression::Lz4))
+    }
+
+    fn packed_file(
+        directory: &Path,
+        topics: &[&str],
+        messages: &[(usize, Vec<u8>)],
+        compression: Option<mcap::Compression>,
+    ) -> PathBuf {
         let path = directory.join("imu.mcap");
-        let options = mcap::WriteOptions::new().compression(Some(mcap::Compression::Lz4));
+        let options = mcap::WriteOptions::new().compression(compression);
         let mut writer = options.create(std::io::BufWriter::new(File::create(&path).unwrap())).unwrap();
         let schema = writer.add_schema("sensor_msgs/msg/Imu", "ros2msg", b"").unwrap();
         let ids: Vec<u16> =
@@ -312,6 +322,23 @@ mod tests {
         assert_eq!(log.counts().incomplete, 1);
         let none = Log::open(&path, &Options { topic: Some("ata".to_owned()), ..Options::default() }).err().unwrap();
         assert!(none.to_string().contains("is called `ata`; name one that there is"), "{none}");
+    }
+
+    /// As ROS 2 writes by default, and as it does where it is told to be small.
+    #[test]
+    fn chunks_may_be_packed_or_not() {
+        let directory = tempfile::tempdir().unwrap();
+        let messages: Vec<_> =
+            (0..9).map(|n| (0, message(true, 1, n * 1000, "imu", [f64::from(n), 2.0, 3.0]))).collect();
+        #[cfg(feature = "parquet")]
+        let zstd = [Some(mcap::Compression::Zstd)];
+        #[cfg(not(feature = "parquet"))]
+        let zstd = [];
+        for compression in [None].into_iter().chain(zstd) {
+            let path = packed_file(directory.path(), &["/imu"], &messages, compression);
+            let log = Log::open(&path, &Options::default()).unwrap();
+            assert_eq!(log.map(Result::unwrap).count(), 9);
+        }
     }
 
     #[test]

@@ -6,7 +6,10 @@ use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, es
 use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;
 use crate::model::Inertia;
+#[cfg(feature = "parquet")]
+use crate::record::RowGroups;
 use crate::report::{HiddenFacts, HiddenPage};
+use crate::sample::FieldKind;
 use nalgebra::{Matrix3, Vector3};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -14,6 +17,9 @@ use std::io::{self, BufWriter, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+/// So many rows of a Parquet table wait for their group.
+#[cfg(feature = "parquet")]
+const ROWS_PER_GROUP: usize = 1 << 17;
 /// So many segments are listed one by one.
 const LISTED: usize = 12;
 
@@ -55,7 +61,7 @@ pub struct Arguments {
     /// Below this the measured rates tell nothing of the hidden one, rad/s [default: 10 times their noise]
     #[arg(long, value_name = "RAD/S", allow_negative_numbers = true, hide_short_help = true)]
     floor: Option<f64>,
-    /// Write every row with its estimate to this CSV file
+    /// Write every row with its estimate to this file: Parquet if its name ends so, else CSV
     #[arg(long, value_name = "FILE")]
     table: Option<PathBuf>,
     /// Draw reconstructed and measured rate on this page
@@ -130,6 +136,9 @@ pub fn estimate(arguments: &Arguments) -> Exit {
     let outputs = [&arguments.table, &arguments.page];
     if let Some(path) = outputs.into_iter().flatten().find(|path| is_same(path, &arguments.data)) {
         return fail(Exit::Usage, &format!("{}: that is the log; name another file to write to", path.display()));
+    }
+    if cfg!(not(feature = "parquet")) && arguments.table.as_deref().is_some_and(is_parquet) {
+        return fail(Exit::Usage, &"--table: this program writes no Parquet; build it with `--features parquet`");
     }
     let unwritten = |path: &Option<PathBuf>, error: io::Error| {
         let path = path.as_deref().unwrap_or(Path::new("")).display();
@@ -227,38 +236,87 @@ fn read_body(text: &str) -> Result<Body, String> {
     Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, axes })
 }
 
-/// Every row with its estimate, as CSV.
-struct Table {
-    out: BufWriter<std::fs::File>,
+/// What tables have beside the segment's name.
+const COLUMNS: [(&str, FieldKind); 7] = [
+    ("row", FieldKind::U64),
+    ("time_s", FieldKind::F64),
+    ("estimate_rad_s", FieldKind::F64),
+    ("deviation_rad_s", FieldKind::F64),
+    ("measured_rad_s", FieldKind::F64),
+    ("error_rad_s", FieldKind::F64),
+    ("observed", FieldKind::U64),
+];
+
+/// Every row with its estimate.
+enum Table {
+    Csv(BufWriter<std::fs::File>),
+    #[cfg(feature = "parquet")]
+    Parquet(Box<RowGroups>),
 }
 
 impl Table {
     fn begin(path: &Path) -> io::Result<Self> {
+        if is_parquet(path) {
+            return Self::begin_parquet(path);
+        }
         let mut out = BufWriter::new(files::create(path)?);
-        writeln!(out, "segment,row,time_s,estimate_rad_s,deviation_rad_s,measured_rad_s,error_rad_s,observed")?;
-        Ok(Self { out })
+        let names = COLUMNS.map(|(name, _)| name).join(",");
+        writeln!(out, "segment,{names}")?;
+        Ok(Self::Csv(out))
+    }
+
+    #[cfg(feature = "parquet")]
+    fn begin_parquet(path: &Path) -> io::Result<Self> {
+        let (file, columns) = (files::create(path)?, COLUMNS.map(|(name, kind)| (name.to_owned(), kind)).to_vec());
+        let about = vec![("version", env!("CARGO_PKG_VERSION").to_owned())];
+        RowGroups::begin(file, "estimate", Some("segment"), columns, about, ROWS_PER_GROUP)
+            .map(|groups| Self::Parquet(Box::new(groups)))
+    }
+
+    /// Refused before anything is read.
+    #[cfg(not(feature = "parquet"))]
+    fn begin_parquet(_path: &Path) -> io::Result<Self> {
+        Err(io::ErrorKind::Unsupported.into())
     }
 
     fn row(&mut self, row: &Estimated, segment: &str, axis: usize) -> io::Result<()> {
         let measured = row.principal_rad_s[axis - 1];
-        let known = |value: f64| if value.is_finite() { format!("{value:?}") } else { String::new() };
-        writeln!(
-            self.out,
-            "{},{},{:?},{},{},{},{},{}",
-            quoted(segment),
-            row.entry.row,
+        let numbers = [
             row.entry.time_s,
-            known(row.told.rate_rad_s),
-            row.told.deviation_rad_s.map_or(String::new(), known),
-            known(measured),
-            known(row.told.rate_rad_s - measured),
-            u8::from(row.told.observed)
-        )
+            row.told.rate_rad_s,
+            row.told.deviation_rad_s.unwrap_or(f64::NAN),
+            measured,
+            row.told.rate_rad_s - measured,
+        ];
+        let observed = u64::from(row.told.observed);
+        match self {
+            Self::Csv(out) => {
+                write!(out, "{},{}", quoted(segment), row.entry.row)?;
+                for value in numbers {
+                    if value.is_finite() { write!(out, ",{value:?}")? } else { write!(out, ",")? }
+                }
+                writeln!(out, ",{observed}")
+            }
+            #[cfg(feature = "parquet")]
+            Self::Parquet(groups) => {
+                let [time, estimate, deviation, measured, error] = numbers.map(f64::to_bits);
+                groups.row(Some(segment), &[row.entry.row, time, estimate, deviation, measured, error, observed])
+            }
+        }
     }
 
-    fn end(mut self) -> io::Result<()> {
-        self.out.flush()
+    fn end(self) -> io::Result<()> {
+        match self {
+            Self::Csv(mut out) => out.flush(),
+            #[cfg(feature = "parquet")]
+            Self::Parquet(groups) => groups.end(),
+        }
     }
+}
+
+/// Whether a table of this name is one as Parquet.
+fn is_parquet(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("parquet"))
 }
 
 /// A name as a cell.

@@ -6,6 +6,8 @@
 mod csv;
 #[cfg(feature = "parquet")]
 mod parquet;
+#[cfg(feature = "parquet")]
+pub(crate) use parquet::RowGroups;
 
 use super::RecordError;
 use super::layout::Layout;

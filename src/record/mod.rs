@@ -28,6 +28,8 @@ mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
 #[cfg(feature = "parquet")]
+pub(crate) use export::RowGroups;
+#[cfg(feature = "parquet")]
 pub use export::export_parquet;
 pub use export::{ExportError, export_csv};
 pub use layout::{Column, Layout, topic_of};

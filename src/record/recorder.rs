@@ -156,9 +156,7 @@ impl Recorder {
     /// [`RecordError`]; the file can be [finished](Self::finish) then.
     pub fn poll(&mut self) -> Result<u64, RecordError> {
         let taken = self.taps.drain(&mut self.writer)?;
-        if taken == 0 {
-            self.writer.turn(monotonic_ns())?;
-        }
+        self.writer.turn(monotonic_ns())?;
         Ok(taken)
     }
 

@@ -31,7 +31,7 @@ pub trait MessageSink {
         about: BTreeMap<String, String>,
     ) -> Result<Channel, RecordError>;
 
-    /// Takes one sample as it is. Times are ns.
+    /// Takes one sample as it is. Times are ns: when its tick was due, and where players put it.
     ///
     /// # Errors
     /// [`RecordError::Full`] if there is no room for it. [`RecordError::Write`].
@@ -40,7 +40,7 @@ pub trait MessageSink {
         channel: Channel,
         sequence: u32,
         due_ns: u64,
-        received_ns: u64,
+        logged_ns: u64,
         body: &[u8],
     ) -> Result<(), RecordError>;
 }
@@ -121,7 +121,9 @@ impl Tap {
                 (false, false) => desk.last_tick,
             };
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
-            desk.sink.message(self.channel, stamp.tick as u32, due_ns, now_ns, body)?;
+            // Only real time has another time than that of the ticks.
+            let logged_ns = if desk.realtime { now_ns } else { due_ns };
+            desk.sink.message(self.channel, stamp.tick as u32, due_ns, logged_ns, body)?;
             self.counters.enter(&stamp, due);
             taken += 1;
         }

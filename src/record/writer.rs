@@ -8,6 +8,7 @@
 use super::RecordError;
 use super::layout::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 use super::taps::{Channel, MessageSink};
+use crate::clock::monotonic_ns;
 use crate::files;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions};
@@ -191,21 +192,21 @@ impl MessageSink for Writer {
         channel_id: Channel,
         sequence: u32,
         due_ns: u64,
-        received_ns: u64,
+        logged_ns: u64,
         body: &[u8],
     ) -> Result<(), RecordError> {
         if self.began_ns.is_none() {
             self.reserve(body.len())?;
-            self.began_ns = Some(received_ns);
+            self.began_ns = Some(monotonic_ns());
         }
         frame(body, &mut self.frame);
         self.pending += self.frame.len() + MESSAGE_OVERHEAD;
-        let header = MessageHeader { channel_id, sequence, log_time: received_ns, publish_time: due_ns };
+        let header = MessageHeader { channel_id, sequence, log_time: logged_ns, publish_time: due_ns };
         let frame = std::mem::take(&mut self.frame);
         let written = self.attempt(|mcap| mcap.write_to_known_channel(&header, &frame));
         self.frame = frame;
         written?;
-        self.turn(received_ns)
+        if self.pending >= CHUNK_BYTES { self.close_chunk() } else { Ok(()) }
     }
 }
 

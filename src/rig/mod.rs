@@ -294,6 +294,8 @@ fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut taken: imp
 pub struct Context {
     /// The period h, s.
     pub tick_s: f64,
+    /// How long a run is, s.
+    pub duration_s: f64,
     /// The seed of all randomness.
     pub seed: u64,
 }

@@ -61,7 +61,12 @@ pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
     let of = |kind: &RigKind, name: &'static str| {
         let sections = Document::asking();
         // It is refused, having asked.
-        let _ = (kind.resolve)(name, &sections, Context { tick_s: 1e-3, seed: 1 }, &mut Checks::new(&sections));
+        let _ = (kind.resolve)(
+            name,
+            &sections,
+            Context { tick_s: 1e-3, duration_s: 1.0, seed: 1 },
+            &mut Checks::new(&sections),
+        );
         let unknown = |name: &&'static str| Key { name, required: false, shape: Shape::Any(None) };
         match sections.asked() {
             Some(Shape::Table { keys, .. }) => (name, keys),

@@ -6,7 +6,7 @@ use super::{Table, columns};
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
-use parquet::data_type::{DoubleType, Int64Type};
+use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, Int64Type};
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterVersion};
@@ -22,8 +22,30 @@ const WAITING_BYTES: usize = 64 << 20;
 /// cannot be kept in memory.
 pub const COLUMNS_MAX: usize = 1 << 14;
 
-pub struct Parquet {
+/// The table of a signal.
+pub struct Parquet(RowGroups);
+
+impl Table for Parquet {
+    const EXTENSION: &'static str = "parquet";
+
+    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
+        let (name, about) = (&signal.layout.type_name, about(recording, signal));
+        RowGroups::begin(file, name, None, columns(&signal.layout), about, rows_per_group(recording)).map(Self)
+    }
+
+    fn row(&mut self, bits: &[u64]) -> io::Result<()> {
+        self.0.row(None, bits)
+    }
+
+    fn end(self) -> io::Result<()> {
+        self.0.end()
+    }
+}
+
+/// Rows of numbers, and of a text before them where that is asked for, written a group at a time.
+pub struct RowGroups {
     writer: SerializedFileWriter<File>,
+    texts: Option<Vec<ByteArray>>,
     columns: Vec<Waiting>,
     rows_per_group: usize,
 }
@@ -34,32 +56,38 @@ struct Waiting {
     bits: Vec<u64>,
 }
 
-impl Table for Parquet {
-    const EXTENSION: &'static str = "parquet";
-
-    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
-        let columns = columns(&signal.layout);
-        let schema = schema(&signal.layout.type_name, &columns).map_err(bare)?;
-        let properties = Arc::new(properties(recording, signal));
-        let writer = SerializedFileWriter::new(file, schema, properties).map_err(bare)?;
-        let rows_per_group = rows_per_group(recording);
+impl RowGroups {
+    /// A file of these columns, `text` the first if there is one, with what is to be known `about` it.
+    pub fn begin(
+        file: File,
+        name: &str,
+        text: Option<&str>,
+        columns: Vec<(String, FieldKind)>,
+        about: Vec<(&str, String)>,
+        rows_per_group: usize,
+    ) -> io::Result<Self> {
+        let schema = schema(name, text, &columns).map_err(bare)?;
+        let writer = SerializedFileWriter::new(file, schema, Arc::new(properties(about))).map_err(bare)?;
         let waiting = |(_, kind)| Waiting { kind, bits: Vec::with_capacity(rows_per_group) };
         let columns = columns.into_iter().map(waiting).collect();
-        Ok(Self { writer, columns, rows_per_group })
+        Ok(Self { writer, texts: text.map(|_| Vec::new()), columns, rows_per_group })
     }
 
-    fn row(&mut self, bits: &[u64]) -> io::Result<()> {
+    /// Adds a row.
+    pub fn row(&mut self, text: Option<&str>, bits: &[u64]) -> io::Result<()> {
+        if let Some(texts) = &mut self.texts {
+            texts.push(text.unwrap_or_default().into());
+        }
         self.columns.iter_mut().zip(bits).for_each(|(column, word)| column.bits.push(*word));
         if self.waiting() < self.rows_per_group { Ok(()) } else { self.write_group().map_err(bare) }
     }
 
-    fn end(mut self) -> io::Result<()> {
+    /// Writes what waits, and the end.
+    pub fn end(mut self) -> io::Result<()> {
         let rest = if self.waiting() == 0 { Ok(()) } else { self.write_group() };
         rest.and_then(|()| self.writer.close()).map(drop).map_err(bare)
     }
-}
 
-impl Parquet {
     /// How many rows wait.
     fn waiting(&self) -> usize {
         self.columns.first().map_or(0, |column| column.bits.len())
@@ -67,6 +95,13 @@ impl Parquet {
 
     fn write_group(&mut self) -> Result<(), ParquetError> {
         let mut group = self.writer.next_row_group()?;
+        if let Some(texts) = &mut self.texts
+            && let Some(mut column) = group.next_column()?
+        {
+            column.typed::<ByteArrayType>().write_batch(texts, None, None)?;
+            column.close()?;
+            texts.clear();
+        }
         for Waiting { kind, bits } in &mut self.columns {
             // The schema was made of these columns.
             let Some(mut column) = group.next_column()? else { break };
@@ -87,7 +122,7 @@ fn rows_per_group(recording: &Recording) -> usize {
     (WAITING_BYTES / row_bytes.sum::<usize>()).max(1)
 }
 
-fn schema(name: &str, columns: &[(String, FieldKind)]) -> Result<TypePtr, ParquetError> {
+fn schema(name: &str, text: Option<&str>, columns: &[(String, FieldKind)]) -> Result<TypePtr, ParquetError> {
     let field = |(name, kind): &(String, FieldKind)| {
         let of = match kind {
             FieldKind::U64 => {
@@ -98,13 +133,17 @@ fn schema(name: &str, columns: &[(String, FieldKind)]) -> Result<TypePtr, Parque
         };
         of.with_repetition(Repetition::REQUIRED).build().map(Arc::new)
     };
-    let fields = columns.iter().map(field).collect::<Result<_, _>>()?;
+    let text = text.map(|name| {
+        let of = Type::primitive_type_builder(name, Physical::BYTE_ARRAY).with_logical_type(Some(LogicalType::String));
+        of.with_repetition(Repetition::REQUIRED).build().map(Arc::new)
+    });
+    let fields = text.into_iter().chain(columns.iter().map(field)).collect::<Result<_, _>>()?;
     Type::group_type_builder(name).with_fields(fields).build().map(Arc::new)
 }
 
-fn properties(recording: &Recording, signal: &SignalInfo) -> WriterProperties {
+fn about(recording: &Recording, signal: &SignalInfo) -> Vec<(&'static str, String)> {
     let run = recording.info();
-    let about = [
+    vec![
         ("service", signal.service.clone()),
         ("type", signal.layout.type_name.clone()),
         ("scenario_name", run.scenario_name.clone()),
@@ -112,7 +151,10 @@ fn properties(recording: &Recording, signal: &SignalInfo) -> WriterProperties {
         ("seed", run.seed.to_string()),
         ("version", run.version.clone()),
         ("revision", run.revision.clone()),
-    ];
+    ]
+}
+
+fn properties(about: Vec<(&str, String)>) -> WriterProperties {
     let about = about.into_iter().map(|(key, value)| KeyValue::new(format!("corotate.{key}"), value));
     WriterProperties::builder()
         .set_key_value_metadata(Some(about.collect()))

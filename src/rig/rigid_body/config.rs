@@ -1,6 +1,7 @@
 //! The sections of a scenario that belong to this rig: as typed, with their checks.
 
 use super::limits::RawLimits;
+use super::playback::RawPlayback;
 use crate::config::Checks;
 use crate::rig::check_name;
 use nalgebra::Vector3;
@@ -28,7 +29,13 @@ pub(super) struct Raw {
 #[serde(deny_unknown_fields)]
 pub(super) struct RawLeader {
     pub inertia_kg_m2: [f64; 3],
-    pub initial_rate_rad_s: [f64; 3],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub initial_rate_rad_s: Option<[f64; 3]>,
+    /// A log whose motion it repeats.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub data: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub playback: Option<RawPlayback>,
     pub measured_axes: Vec<usize>,
     #[serde(default)]
     pub noise_rad_s: [f64; 3],
@@ -36,6 +43,13 @@ pub(super) struct RawLeader {
     pub bias_rad_s: [f64; 3],
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub outage: Vec<RawOutage>,
+}
+
+impl RawLeader {
+    /// Where it begins, rad/s.
+    pub fn initial(&self) -> Vector3<f64> {
+        self.initial_rate_rad_s.unwrap_or_default().into()
+    }
 }
 
 /// A gyro that is dead from one tick to another.
@@ -168,6 +182,7 @@ pub(super) enum Coefficients {
 pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     check_followers(&raw.follower, checks);
     check_noise(checks, "leader", &raw.leader.noise_rad_s);
+    check_motion(&raw.leader, checks);
     check_observer(&raw.observer, checks);
     check_fleets(raw, checks);
     match (&raw.controller, raw.follower.is_empty()) {
@@ -183,6 +198,21 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
         }
         (None, true) => {}
     }
+}
+
+/// The leader moves by its own dynamics or by a log.
+fn check_motion(leader: &RawLeader, checks: &mut Checks<'_>) {
+    match (leader.initial_rate_rad_s, &leader.data) {
+        (None, None) => checks.refuse("leader.initial_rate_rad_s", "is missing; add it, or leader.data with a log"),
+        (Some(_), Some(_)) => checks.refuse(
+            "leader.initial_rate_rad_s",
+            "has no meaning where leader.data tells the motion; remove one of them",
+        ),
+        _ => {}
+    }
+    checks.require(leader.playback.is_none() || leader.data.is_some(), "leader.playback", || {
+        "says how a log is read, and there is none; add leader.data".to_owned()
+    });
 }
 
 fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {

@@ -116,7 +116,7 @@ impl Limits {
 
     /// What a body's measured rates can be.
     pub fn bounds(&self, body: &Sensed, tick_s: f64) -> Bounds<3> {
-        let free = body.coefficients * (self.rate_rad_s * self.rate_rad_s);
+        let free = body.recorded_rad_s2.unwrap_or(body.coefficients * (self.rate_rad_s * self.rate_rad_s));
         let driven = if body.driven.is_some() {
             body.factor.map(|factor| self.acceleration_rad_s2 / factor)
         } else {
@@ -163,6 +163,8 @@ pub(super) struct Sensed {
     /// Of the sensors, rad/s.
     pub deviation: Vector3<f64>,
     pub bias: Vector3<f64>,
+    /// How fast it changes, if it repeats a recorded motion, rad/s².
+    pub recorded_rad_s2: Option<Vector3<f64>>,
 }
 
 impl Sensed {
@@ -300,7 +302,14 @@ mod tests {
     fn sensed(driven: bool) -> Sensed {
         let zero = Vector3::zeros();
         let driven = driven.then(|| RigidBody::with_coefficients(Vector3::new(-0.5, 0.5, 0.2)));
-        Sensed { coefficients: Vector3::repeat(0.5), factor: Vector3::repeat(2.0), driven, deviation: zero, bias: zero }
+        Sensed {
+            coefficients: Vector3::repeat(0.5),
+            factor: Vector3::repeat(2.0),
+            driven,
+            deviation: zero,
+            bias: zero,
+            recorded_rad_s2: None,
+        }
     }
 
     fn measurement(tick: u64, rate: f64) -> RateMeasurement {

@@ -11,6 +11,7 @@ mod learner;
 mod limits;
 mod observer;
 mod plant;
+mod playback;
 mod resolve;
 
 pub use fleet::RateFleet;
@@ -34,6 +35,8 @@ use limits::{Limits, Sensed};
 use nalgebra::{Vector1, Vector3};
 use observer::ALL;
 use plant::Outage;
+use playback::Playback;
+use std::sync::Arc;
 
 /// The farthest that a body may turn in one tick, rad: at half a turn nobody can tell it from its complement.
 const MAX_TURN_RAD: f64 = 3.0;
@@ -52,6 +55,8 @@ pub struct RigidBodyRig {
     /// Bit i set: the leader's component i has a gyro.
     measured: u64,
     outages: Vec<Outage>,
+    /// The motion that the leader repeats instead of moving by itself.
+    playback: Option<Arc<Playback>>,
     /// The component that the observer supplies, 1 to 3.
     supplied_axis: Option<usize>,
     observer: ObserverDesign,
@@ -98,7 +103,10 @@ impl RigidBodyRig {
     }
 
     fn rate_bound_rad_s(&self) -> f64 {
-        self.inertia.rate_bound_rad_s(&self.initial_rates[0])
+        match &self.playback {
+            Some(playback) => playback.bounds().0,
+            None => self.inertia.rate_bound_rad_s(&self.initial_rates[0]),
+        }
     }
 
     fn check_tick(&self, checks: &mut Checks<'_>) {
@@ -161,6 +169,7 @@ impl RigidBodyRig {
             driven: self.bodies[index].driven.then(|| self.moved(index)),
             deviation: self.deviations_rad_s[index],
             bias: self.biases_rad_s[index],
+            recorded_rad_s2: self.playback.as_ref().filter(|_| index == 0).map(|playback| playback.bounds().1),
         }
     }
 
@@ -175,6 +184,10 @@ impl RigidBodyRig {
 
     fn certify(&self) -> Option<Certificate> {
         let controller = self.controller?;
+        // It is about leaders that move freely.
+        if self.playback.is_some() {
+            return None;
+        }
         // The papers' conditions are about the papers' filter.
         let decay_rate_per_s = match &self.observer {
             ObserverDesign::Hidden { filter: FilterDesign::First([decay]), .. } => *decay,
@@ -287,6 +300,8 @@ impl Rig for RigidBodyRig {
             measured: if index == 0 { self.measured } else { ALL },
             noise: self.noise[index].clone(),
             outages: if index == 0 { self.outages.clone() } else { Vec::new() },
+            playback: self.playback.clone().filter(|_| index == 0),
+            played_s: 0.0,
         }
     }
 
@@ -390,6 +405,10 @@ impl Rig for RigidBodyRig {
     }
 
     fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
+        // What is proven and computed of a loop is about a leader that moves freely.
+        if self.playback.is_some() {
+            return None;
+        }
         let mut rig = Self {
             bodies: pair(&self.bodies, index),
             initial_rates: pair(&self.initial_rates, index),

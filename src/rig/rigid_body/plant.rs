@@ -1,10 +1,12 @@
 //! A rigid body with its rate gyros and its torquers.
 
+use super::playback::Playback;
 use crate::model::{Noise, RigidBody};
 use crate::role::Body;
 use crate::sample::{RateCommand, RateMeasurement, RateTruth};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
+use std::sync::Arc;
 
 /// A gyro that is dead for a while.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,6 +32,9 @@ pub struct RatePlant {
     pub(super) measured: u64,
     pub(super) noise: Noise<3>,
     pub(super) outages: Vec<Outage>,
+    /// What it repeats instead of moving by itself, and how far it is, s.
+    pub(super) playback: Option<Arc<Playback>>,
+    pub(super) played_s: f64,
 }
 
 impl RatePlant {
@@ -44,7 +49,7 @@ impl RatePlant {
     }
 }
 
-persist_fields!(RatePlant, rate, asked, noise);
+persist_fields!(RatePlant, rate, asked, noise, played_s);
 
 impl Body for RatePlant {
     type Truth = RateTruth;
@@ -81,6 +86,12 @@ impl Body for RatePlant {
     }
 
     fn flow(&mut self, dt_s: f64) {
-        self.rate = self.body.flow(&self.rate, &self.acceleration(), dt_s);
+        self.rate = match &self.playback {
+            Some(playback) => {
+                self.played_s += dt_s;
+                playback.at(self.played_s)
+            }
+            None => self.body.flow(&self.rate, &self.acceleration(), dt_s),
+        };
     }
 }

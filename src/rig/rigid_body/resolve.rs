@@ -6,12 +6,14 @@ use super::config::{self, Coefficients, IdentifierDecay, Kind, Raw, RawLeader, R
 use super::identifier::Identifier;
 use super::limits::{Circumstances, Limits};
 use super::plant::Outage;
+use super::playback::{self, Playback};
 use super::{ControllerDesign, ObserverDesign, RigidBodyRig, learner};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
 use crate::rig::{BodyInfo, Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::{Matrix3, Vector1, Vector3};
+use std::sync::Arc;
 
 /// Part of the leader's rate by which rounding may move the estimate of the hidden component. With fewer than three digits it
 /// is no estimate; a floor between that and the usual one is told with the loop's claim.
@@ -23,14 +25,19 @@ pub(super) fn resolve(
     context: Context,
     checks: &mut Checks<'_>,
 ) -> Result<(Option<RigidBodyRig>, toml::Table), ConfigError> {
-    let raw: Raw = sections.read_into()?;
-    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    let mut raw: Raw = sections.read_into()?;
     config::check(&raw, checks);
+    let mut notes = Vec::new();
+    let playback = load_playback(&mut raw.leader, context, &mut notes, checks);
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    if raw.leader.data.is_some() {
+        let Some(playback) = &playback else { return Ok((None, table)) };
+        raw.leader.initial_rate_rad_s = Some(playback.at(0.0).into());
+    }
     let supplied_axis = config::hidden_axis(&raw, checks);
     let outages = resolve_outages(&raw, context.tick_s, checks);
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
     let Some(inertia) = inertia else { return Ok((None, table)) };
-    let mut notes = Vec::new();
     let observer = design_observer(&raw, &inertia, supplied_axis, context.tick_s, &mut notes, checks);
     let Some(observer) = observer else { return Ok((None, table)) };
     let mut rig = RigidBodyRig {
@@ -38,7 +45,7 @@ pub(super) fn resolve(
         inertia,
         spreads: vec![Vector3::zeros()],
         seed: context.seed,
-        initial_rates: vec![raw.leader.initial_rate_rad_s.into()],
+        initial_rates: vec![raw.leader.initial()],
         inertia_factors: vec![Vector3::repeat(1.0)],
         measured: (0..3).filter(|i| raw.leader.measured_axes.contains(&(i + 1))).fold(0, |bits, i| bits | 1 << i),
         outages,
@@ -48,7 +55,13 @@ pub(super) fn resolve(
         noise: vec![noise(context, 0, raw.leader.noise_rad_s, raw.leader.bias_rad_s)],
         deviations_rad_s: vec![raw.leader.noise_rad_s.into()],
         biases_rad_s: vec![raw.leader.bias_rad_s.into()],
-        limits: design_limits(&raw, &inertia, supplied_axis, checks),
+        limits: design_limits(
+            &raw,
+            leader_bound_rad_s(&raw.leader, &inertia, playback.as_deref()),
+            supplied_axis,
+            checks,
+        ),
+        playback,
         notes,
         tick_s: context.tick_s,
         certificate: None,
@@ -110,16 +123,56 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
     outages
 }
 
-fn design_limits(raw: &Raw, inertia: &Inertia, hidden: Option<usize>, checks: &mut Checks<'_>) -> Limits {
+/// A bound on the leader's rate, rad/s.
+fn leader_bound_rad_s(leader: &RawLeader, inertia: &Inertia, playback: Option<&Playback>) -> f64 {
+    playback.map_or_else(|| inertia.rate_bound_rad_s(&leader.initial()), |playback| playback.bounds().0)
+}
+
+/// The motion that the leader repeats, if it repeats one; its file and its samples are named in the scenario from here on.
+fn load_playback(
+    leader: &mut RawLeader,
+    context: Context,
+    notes: &mut Vec<String>,
+    checks: &mut Checks<'_>,
+) -> Option<Arc<Playback>> {
+    let path = playback::locate(checks.file("leader.data", leader.data.as_ref()?));
+    let mut raw = leader.playback.take().unwrap_or_default();
+    leader.data = Some(path.display().to_string());
+    let playback = checks.accept("leader.data", raw.load(&path))?;
+    let (samples, longest_s) = playback.sampling();
+    checks.require(playback.repeats() || context.duration_s <= playback.length_s(), "duration_s", || {
+        format!(
+            "{} s is longer than the motion of leader.data, {} s; lower it, or give leader.playback.at_end = \"repeat\"",
+            context.duration_s,
+            playback.length_s()
+        )
+    });
+    notes.push(format!(
+        "leader.data: the motion of {samples} samples over {:.6} s, at most {longest_s:.6} s apart, joined by cubics (Hermite)",
+        playback.length_s()
+    ));
+    if let Some(error) = playback.coarse_error_rad_s() {
+        notes.push(format!(
+            "leader.data: through every second sample the cubics miss the others by at most {error:.3e} rad/s, noise included; \
+             through all samples the motion between them is missed by about an eighth of that"
+        ));
+    }
+    raw.hash = Some(playback.hash());
+    leader.playback = Some(raw);
+    Some(Arc::new(playback))
+}
+
+fn design_limits(raw: &Raw, leader_rad_s: f64, hidden: Option<usize>, checks: &mut Checks<'_>) -> Limits {
     let fastest =
         |rates: &mut dyn Iterator<Item = [f64; 3]>| rates.map(|rate| Vector3::from(rate).norm()).fold(0.0, f64::max);
-    let noisy = raw.leader.noise_rad_s != [0.0; 3] || raw.observer.decay_rate_per_s.is_none();
+    let recorded = raw.leader.data.is_some();
+    let noisy = raw.leader.noise_rad_s != [0.0; 3] || recorded || raw.observer.decay_rate_per_s.is_none();
     let gain_per_s = raw.controller.as_ref().map_or(0.0, |controller| Vector3::from(controller.gain_per_s).amax());
     let about = Circumstances {
-        leader_rad_s: inertia.rate_bound_rad_s(&raw.leader.initial_rate_rad_s.into()),
+        leader_rad_s,
         follower_rad_s: fastest(&mut raw.follower.iter().map(|follower| follower.fastest().into())),
         guess_error_rad_s: hidden
-            .map_or(0.0, |axis| (raw.observer.initial_guess_rad_s - raw.leader.initial_rate_rad_s[axis - 1]).abs()),
+            .map_or(0.0, |axis| (raw.observer.initial_guess_rad_s - raw.leader.initial()[axis - 1]).abs()),
         transient_rad_s: raw.observer.initial_guess_rad_s.abs()
             + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
         // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.
@@ -145,7 +198,7 @@ fn design_observer(
     if let Some(axis) = supplied_axis {
         // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
         let relation = checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
-        check_digits(&relation, inertia, &raw.leader.initial_rate_rad_s.into(), tick_s, checks);
+        check_digits(&relation, inertia, &raw.leader.initial(), tick_s, checks);
     }
     let filter = FilterDesign::resolve(
         checks,
@@ -254,7 +307,7 @@ fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_
     if !(1..=3).contains(&axis) {
         return;
     }
-    let (spin_rad_s, moments) = (leader.initial_rate_rad_s[axis - 1], inertia.moments_kg_m2());
+    let (spin_rad_s, moments) = (leader.initial()[axis - 1], inertia.moments_kg_m2());
     checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
         format!(
             "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
