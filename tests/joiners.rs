@@ -98,12 +98,17 @@ fn rests(pid: &str) -> Option<bool> {
 
 /// Waits for a joiner under strace, telling it to leave if it stays: once it has had nothing to do for half a second, however
 /// long a loaded machine takes until then.
-fn await_left(joiner: &Joiner, running: Running) -> Done {
+fn await_left(joiner: &Joiner, mut running: Running) -> Done {
     if joiner.stays {
         let children = format!("/proc/{0}/task/{0}/children", running.pid());
-        let child = await_some(|| match std::fs::read_to_string(&children) {
-            Ok(text) => text.split_whitespace().next().map(|pid| Some(pid.to_owned())),
-            Err(_) => Some(None),
+        // Before the joiner, strace has children of its own, by which it learns what this machine can trace.
+        let is_joiner = |pid: &&str| {
+            std::fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name.trim_end() != "strace")
+        };
+        let child = await_some(|| {
+            let text = std::fs::read_to_string(&children).unwrap_or_default();
+            let found = text.split_whitespace().find(is_joiner).map(|pid| Some(pid.to_owned()));
+            found.or_else(|| running.has_ended().then_some(None))
         });
         let (mut rested, end) = (0_u32, Instant::now() + Duration::from_secs(60));
         while rested < 50 && Instant::now() < end {

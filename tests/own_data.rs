@@ -204,7 +204,8 @@ fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
     let bench = Bench::new();
     std::fs::write(bench.path("throws.csv"), throws(3, &Rotation3::identity())).unwrap();
     let template = run(&bench, &["init", "recorded-leader"]).stdout;
-    let scenario = template.replace("tumbling-throw.csv", "throws.csv");
+    let scenario =
+        template.replace("tumbling-throw.csv", "throws.csv").replace("at_end = \"repeat\"", "at_end = \"refuse\"");
     std::fs::create_dir(bench.path("bench")).unwrap();
     std::fs::rename(bench.path("throws.csv"), bench.path("bench/throws.csv")).unwrap();
     // A file is looked for beside the scenario that names it, wherever that is read from.
@@ -237,9 +238,27 @@ fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
     assert_eq!((repeated.code, &json(&repeated)["books"]["missed_ticks"]), (Some(0), &0.into()), "{repeated:?}");
     // Whoever changes the log is told by what was resolved before.
     let log = std::fs::read_to_string(bench.path("bench/throws.csv")).unwrap();
-    std::fs::write(bench.path("bench/throws.csv"), log.replace("t1,0,", "t1,0,1")).unwrap();
+    std::fs::write(bench.path("bench/throws.csv"), log.replace("t1,10,", "t1,11,")).unwrap();
     let changed = bench.run(&["check", "once/scenario.toml"]);
     assert!(changed.code == Some(2) && changed.stderr.contains("is not what it was"), "{changed:?}");
+}
+
+/// What a run has published is a log like any other: its truth has all axes, its measurement lacks the hidden one.
+#[test]
+fn a_recording_of_ours_is_read_as_a_log() {
+    let bench = Bench::new();
+    bench.summary("rigid-pair", &["--clock", "in-process", "--record", "--out", "run"]);
+    let about = ["estimate", "run/run.mcap", "--hidden", "z", "--inertia", "1,2,2.5", "--json", "--topic"];
+    let [truth, measured] = ["leader/truth", "leader/measurement"].map(|topic| {
+        let done = run(&bench, &[&about[..], &[topic]].concat());
+        json(&done)
+    });
+    assert_eq!((&truth["log"]["counts"]["used"], &truth["segments"][0]["samples"]), (&10_001.into(), &10_001.into()));
+    let error = truth["score"]["error_rad_s"]["median"].as_f64().unwrap();
+    assert!(error < 1e-6, "{truth:#}");
+    assert!(measured["score"].is_null() && measured["log"]["counts"]["used"] == 10_001, "{measured:#}");
+    let several = bench.run(&about[..about.len() - 1]);
+    assert!(several.code == Some(2) && several.stderr.contains("more than one topic may be meant"), "{several:?}");
 }
 
 #[cfg(feature = "parquet")]

@@ -61,13 +61,14 @@ fn summary(directory: &Path) -> Value {
 
 /// The page needs nothing beside it, and every picture is one.
 fn check_page(html: &str) {
-    for outside in ["http:", "https:", "//", "<script", "@import", "url("] {
+    for outside in ["http:", "https:", "//", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
     }
     for not_drawn in ["NaN", "inf"] {
         assert!(!html.contains(&format!("\"{not_drawn}")) && !html.contains(&format!(" {not_drawn}\"")), "{not_drawn}");
     }
     let page = parse(html);
+    assert_eq!(page.descendants().filter(|node| node.has_tag_name("script")).count(), 1, "its own");
     for node in page.descendants().filter(|node| node.has_tag_name("a") || node.has_tag_name("use")) {
         let target = node.attribute("href").unwrap().strip_prefix('#').unwrap();
         assert!(page.descendants().any(|node| node.attribute("id") == Some(target)), "{target}");
@@ -87,14 +88,14 @@ fn check_page(html: &str) {
     }
 }
 
-/// What the verdict says is what summary.json says, to the last digit.
+/// What the verdict says is what summary.json says, in three digits.
 fn check_verdict(page: &Document<'_>, summary: &Value) {
     let told = rows(section(page, "verdict"));
     let criteria = summary["criteria"].as_array().unwrap();
     assert_eq!(told.len(), criteria.len() + 1, "a head, and a row for each");
     for (row, criterion) in told[1..].iter().zip(criteria) {
         assert_eq!(row[0], criterion["name"].as_str().unwrap());
-        assert_eq!(row[1].parse::<f64>().unwrap().to_bits(), criterion["value"].as_f64().unwrap().to_bits(), "{row:?}");
+        assert_eq!(row[1], format!("{:.2e}", criterion["value"].as_f64().unwrap()), "{row:?}");
         assert_eq!(row[2].parse::<f64>().unwrap(), criterion["limit"].as_f64().unwrap());
         assert_eq!(row[3].contains("holds"), criterion["holds"].as_bool().unwrap());
     }
@@ -182,16 +183,30 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
     check_page(&html);
     let (page, summary) = (parse(&html), summary(&directory));
     check_verdict(&page, &summary);
-    let marks = page.descendants().find(|node| node.attribute("id") == Some("marks")).unwrap();
+    let by_id = |id: &str| page.descendants().find(|node| node.attribute("id") == Some(id)).unwrap();
+    let marks = by_id("marks-half");
     let marked = |class: &str| marks.descendants().filter(|node| node.attribute("class") == Some(class)).count();
-    assert_eq!((marked("fault"), marked("incident"), marked("flag")), (12, 1, 1));
+    assert_eq!((marked("fault"), marked("incident")), (12, 1));
+    assert_eq!(by_id("names-half").descendants().filter(|node| node.attribute("class") == Some("flag")).count(), 1);
+    // Above the picture that is as wide as the page every one of them is named, and no name lies over another.
+    let names: Vec<Node<'_, '_>> = by_id("names-whole").children().collect();
+    let told: Vec<String> = names.iter().map(|node| text(*node)).collect();
+    assert!(names.len() == 13 && told.contains(&"▾ observer restarted".to_owned()), "{told:?}");
+    let number = |node: &Node<'_, '_>, name: &str| node.attribute(name).unwrap().parse::<f64>().unwrap();
+    for (index, one) in names.iter().enumerate() {
+        for other in &names[..index] {
+            let length = 5.0 * text(*other).chars().count() as f64;
+            let apart = number(one, "y") != number(other, "y") || number(other, "x") + length < number(one, "x");
+            assert!(apart, "{} and {}", text(*one), text(*other));
+        }
+    }
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 1);
     let missing = marks.descendants().find(|node| node.attribute("class") == Some("missing")).unwrap();
     assert!(missing.attribute("d").unwrap().contains('M'), "ticks without a sample");
     let over_time =
         |node: &Node<'_, '_>| node.attribute("aria-label").is_some_and(|label| label.ends_with("over time"));
     for picture in page.descendants().filter(over_time) {
-        assert!(picture.children().any(|node| node.attribute("href") == Some("#marks")));
+        assert!(picture.descendants().any(|node| node.attribute("href").is_some_and(|id| id.starts_with("#marks-"))));
     }
     let events = rows(section(&page, "events"));
     assert!(events.iter().any(|row| row[3..] == ["noise-burst", "observer"]), "{events:?}");
@@ -206,7 +221,7 @@ fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
     let html = page(&bench, &directory);
     check_page(&html);
     let (document, summary) = (parse(&html), summary(&directory));
-    let marks = document.descendants().find(|node| node.attribute("id") == Some("marks")).unwrap();
+    let marks = document.descendants().find(|node| node.attribute("id") == Some("marks-half")).unwrap();
     let bands = marks.descendants().filter(|node| node.attribute("class") == Some("unseen"));
     let widths: Vec<f64> = bands.map(|band| band.attribute("width").unwrap().parse().unwrap()).collect();
     // A quarter of the axis is the loss; at one tick the motion told nothing.
@@ -397,7 +412,6 @@ fn nothing_of_a_file_is_read_as_markup() {
     let html = page(&bench, &directory);
     check_page(&html);
     let page = parse(&html);
-    assert!(page.descendants().all(|node| !node.has_tag_name("script")));
     assert!(text(section(&page, "machine")).contains("<script>alert"));
 }
 
@@ -493,4 +507,93 @@ fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
     assert!(metrics[1][3].parse::<f64>().unwrap() > 4.4, "{metrics:?}");
     let first = section(&page, "motion").descendants().find(|node| node.has_tag_name("svg")).unwrap();
     assert!(text(first).contains('5'), "the axis reaches the spike");
+}
+
+/// What an identifier learns, what noisy sensors say, and any field by its name.
+#[test]
+fn coefficients_measurements_and_fields_on_demand_are_drawn() {
+    let bench = Bench::new();
+    let labels = |html: &str| -> Vec<String> {
+        let page = parse(html);
+        page.descendants().filter_map(|node| node.attribute("aria-label")).map(str::to_owned).collect()
+    };
+    let learner = page(&bench, &run(&bench, "inertia", &["--duration", "1", "--set", "accept={}"]));
+    assert_eq!(labels(&learner).iter().filter(|label| label.starts_with("coefficient a")).count(), 3, "{learner}");
+    let known = page(&bench, &run(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]));
+    assert!(!labels(&known).iter().any(|label| label.starts_with("coefficient")) && !known.contains(">measured<"));
+    let noisy = run(&bench, "noisy-pair", &["--duration", "1", "--set", "accept={}"]);
+    // Two of the three axes have a gyro.
+    assert_eq!(page(&bench, &noisy).matches("data-label=\"measured\"").count(), 2);
+    let shown = ["--show", "follower/command.acceleration_rad_s2", "--show", "leader/estimate.omega_rad_s[2]"];
+    assert_eq!(report(&bench, &noisy, &shown).code, Some(0));
+    let html = std::fs::read_to_string(noisy.join("report.html")).unwrap();
+    check_page(&html);
+    let fields = section(&parse(&html), "fields").descendants().filter(|node| node.has_tag_name("figure")).count();
+    assert_eq!((fields, html.matches("acceleration_rad_s2[2]").count() > 0), (2, true));
+    let unknown = report(&bench, &noisy, &["--show", "leader/estimate.omega"]);
+    assert_eq!(unknown.code, Some(2), "{unknown:?}");
+    assert!(
+        unknown.stderr.contains("no field `leader/estimate.omega`; it has: ")
+            && unknown.stderr.contains("leader/truth.omega_rad_s")
+    );
+}
+
+/// For papers: each with its colours in place, readable by what knows no page.
+#[test]
+fn every_figure_is_a_picture_of_its_own() {
+    let bench = Bench::new();
+    let directory = run(&bench, "faults", &[]);
+    let done = report(&bench, &directory, &["--figures", "figures"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let html = std::fs::read_to_string(directory.join("report.html")).unwrap();
+    let figures = files(&bench.path("figures"));
+    assert_eq!(figures.len(), html.matches("<figure>").count());
+    for path in figures {
+        let svg = std::fs::read_to_string(&path).unwrap();
+        let picture = Document::parse(&svg).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        assert_eq!(picture.root_element().tag_name().namespace(), Some("http://www.w3.org/2000/svg"));
+        assert!(!svg.contains("var(") && svg.contains(".line"), "{}", path.display());
+    }
+}
+
+/// Moves a pointer over the first picture over time and drags it over a part; what comes of it is told in the title.
+const READER: &str = r#"<script>
+const svg = document.querySelector("svg.time"), box = svg.getBoundingClientRect();
+const at = (kind, part) => svg.dispatchEvent(new PointerEvent(kind, { clientX: box.left + part * box.width, clientY: box.top + box.height / 2, bubbles: true }));
+at("pointermove", 0.5);
+const told = svg.parentNode.querySelector(".readout").textContent;
+at("pointerdown", 0.4); at("pointermove", 0.5); at("pointerup", 0.6);
+const ticks = [...svg.querySelectorAll("g.ticks text")].map((text) => text.textContent).join(" ");
+const other = [...document.querySelectorAll("svg.time")].at(-1).querySelector("svg.plot").getAttribute("viewBox");
+svg.dispatchEvent(new MouseEvent("dblclick"));
+const back = [...document.querySelectorAll("svg.plot")].every((plot) => plot.getAttribute("viewBox").startsWith("64 "));
+document.title = [told, ticks, !other.startsWith("64 ") && back, svg.querySelectorAll("g.ticks text").length].join("|");
+</script></body>"#;
+
+#[test]
+fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely() {
+    let Some(browser) = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
+        std::process::Command::new(name).arg("--version").output().is_ok_and(|output| output.status.success())
+    }) else {
+        return common::skipped("the page in a browser", "there is no chromium (Debian: apt install chromium)");
+    };
+    let bench = Bench::new();
+    let html = page(&bench, &run(&bench, "rigid-pair", &[]));
+    let path = bench.path("read.html");
+    std::fs::write(&path, html.replace("</body>", READER)).unwrap();
+    let profile = format!("--user-data-dir={}", bench.path("profile").display());
+    let url = format!("file://{}", path.display());
+    let options =
+        ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"];
+    let dumped =
+        std::process::Command::new(browser).args(options).args([&profile, "--dump-dom", &url]).output().unwrap();
+    let dom = String::from_utf8_lossy(&dumped.stdout);
+    let title = dom.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next()).unwrap_or_default();
+    let parts: Vec<&str> = title.split('|').collect();
+    let [told, ticks, same, all] = parts[..] else { panic!("{title}: {}", String::from_utf8_lossy(&dumped.stderr)) };
+    // The middle of the picture is a little before the middle of its axis, by the margins.
+    assert!(told.starts_with("t = 4.6") && told.contains("; leader: ") && told.contains("; observer: "), "{told}");
+    let closer: Vec<f64> = ticks.split(' ').map(|tick| tick.parse().unwrap()).collect();
+    assert!(closer.len() > 3 && closer[0] > 3.0 && closer[closer.len() - 1] < 6.5, "{ticks}");
+    assert_eq!((same, all), ("true", "6"), "all pictures together, there and back");
 }

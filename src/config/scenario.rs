@@ -117,7 +117,8 @@ impl Scenario {
         let period_ns = (1e9 / raw.tick_hz).round() as u64;
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
-        let context = Context { tick_s, duration_s: raw.duration_s, seed: raw.seed };
+        let length_s = if length_possible(&raw) { raw.duration_s } else { 0.0 };
+        let context = Context { tick_s, duration_s: length_s, seed: raw.seed };
         let (rig, rig_table) = match rig::resolve(&raw.rig, &sections, context, &mut checks) {
             Ok(resolved) => resolved,
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),

@@ -18,6 +18,12 @@ pub struct Arguments {
     /// The page to write [default: report.html in that directory, or beside the recording]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Show this field too, such as leader/estimate.omega_rad_s or one element of it, …[2]; again for more
+    #[arg(long, value_name = "FIELD")]
+    show: Vec<String>,
+    /// Write every figure as a picture of its own (SVG) to this directory
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
     /// Show the page in a browser (xdg-open)
     #[arg(long)]
     open: bool,
@@ -32,8 +38,8 @@ const SCHEMA: &str = "corotate/report/v1";
 const OPENING: Duration = Duration::from_secs(2);
 
 const EXAMPLES: &str = "\
-The page needs no network and no script; it is light or dark as the reader's
-screen is, and prints. Motion, errors over time and lateness over time are drawn
+The page needs no network; it is light or dark as the reader's screen is, and
+prints. In pictures over time, drag to look at a part, double click for all. Motion, errors over time and lateness over time are drawn
 from the recording; without one the page has the rest and says so.
 
 Examples:
@@ -54,10 +60,11 @@ pub fn report(arguments: &Arguments) -> Exit {
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner().with_message(format!("reading {}", source.display()));
     spinner.enable_steady_tick(Duration::from_millis(100));
-    let composed = compose(&source);
+    let composed = compose(&source, &arguments.show);
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
         report.remarks().iter().for_each(|text| remark(text));
+        arguments.figures.iter().try_for_each(|directory| report.write_figures(directory))?;
         report.write(&out).map(|()| if report.is_damaged() { Exit::Failure } else { Exit::Ok })
     });
     match written {
@@ -104,6 +111,7 @@ fn exit_of(error: &ReportError) -> Exit {
         | ReportError::Summary { .. }
         | ReportError::Latency { .. }
         | ReportError::TwoRuns { .. }
+        | ReportError::Field { .. }
         | ReportError::Scenario(_) => Exit::Usage,
     }
 }

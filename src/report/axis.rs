@@ -6,6 +6,12 @@ const TIME_LABELS: f64 = 10.0;
 /// Of a logarithmic axis no more than so many decades below its top are shown.
 const DECADES: f64 = 36.0;
 
+/// Values that differ by less than this part of them are told by what they differ by.
+const SAME: f64 = 1e-3;
+/// From here to there values are told without an exponent.
+const SMALL: f64 = 1e-2;
+const LARGE: f64 = 1e5;
+
 /// An axis.
 #[derive(Debug, Clone)]
 pub struct Axis {
@@ -22,13 +28,26 @@ impl Axis {
     /// A linear axis from one value to another.
     pub fn linear(label: &str, low: f64, high: f64) -> Self {
         let (low, high) = widened(low, high);
-        Self { label: label.to_owned(), low, high, logarithmic: false, ticks: linear_ticks(low, high, LABELS) }
+        Self::marked(label, low, high, LABELS)
     }
 
     /// The time in the run up to its end, s.
     pub fn time(end_s: f64) -> Self {
-        let axis = Self::linear("time in the run, s", 0.0, end_s);
-        Self { ticks: linear_ticks(axis.low, axis.high, TIME_LABELS), ..axis }
+        let (low, high) = widened(0.0, end_s);
+        Self::marked("time in the run, s", low, high, TIME_LABELS)
+    }
+
+    /// The time in the run from its first tick to its end on a logarithmic axis, s.
+    pub fn log_time(tick_s: f64, end_s: f64) -> Self {
+        let mut axis = Self::decades("time in the run, s, logarithmic", (tick_s, end_s));
+        (axis.low, axis.high) = (tick_s.log10(), end_s.log10());
+        axis.ticks.retain(|(value, _)| (tick_s..=end_s).contains(value));
+        axis
+    }
+
+    fn marked(label: &str, low: f64, high: f64, labels: f64) -> Self {
+        let (label, ticks) = linear_ticks(label, low, high, labels);
+        Self { label, low, high, logarithmic: false, ticks }
     }
 
     /// A linear axis with some room on either side of the values.
@@ -85,6 +104,16 @@ impl Axis {
         ((value - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
     }
 
+    /// Its ends: values, or their logarithms to base 10.
+    pub fn ends(&self) -> [f64; 2] {
+        [self.low, self.high]
+    }
+
+    /// Whether equal ratios have equal distances.
+    pub fn is_logarithmic(&self) -> bool {
+        self.logarithmic
+    }
+
     /// The least value on it.
     pub fn foot(&self) -> f64 {
         if self.logarithmic { 10_f64.powf(self.low) } else { self.low }
@@ -99,26 +128,51 @@ fn widened(low: f64, high: f64) -> (f64, f64) {
     if high - low < least { (low - least, high + least) } else { (low, high) }
 }
 
-fn linear_ticks(low: f64, high: f64, labels: f64) -> Vec<(f64, String)> {
+/// Ticks at round values, with labels of few digits: what all of them have in common stands in the name of the axis.
+fn linear_ticks(name: &str, low: f64, high: f64, labels: f64) -> (String, Vec<(f64, String)>) {
     let raw = (high - low) / (labels - 1.0);
     let decade = 10_f64.powf(raw.log10().floor());
     let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * decade).into_iter().find(|step| *step >= raw).unwrap_or(raw);
     let (first, last) = ((low / step - 1e-9).ceil(), (high / step + 1e-9).floor());
     let count = (last - first).clamp(0.0, 2.0 * labels) as usize;
-    let label = |value: f64| {
-        let largest = low.abs().max(high.abs());
-        if !(1e-3..1e6).contains(&largest) {
-            return if value == 0.0 { "0".to_owned() } else { format!("{:.2e}", value).replace('-', "−") };
-        }
-        let digits = (-step.log10().floor()).max(0.0) as usize;
-        format!("{value:.digits$}").replace('-', "−")
-    };
     let value = |n: usize| {
         let value = (first + n as f64) * step;
         // No label says −0.
         if value.abs() < 1e-9 * step { 0.0 } else { value }
     };
-    (0..=count).map(|n| (value(n), label(value(n)))).collect()
+    let values: Vec<f64> = (0..=count).map(value).collect();
+    let largest = low.abs().max(high.abs());
+    let coarse = 10.0 * step;
+    let offset = if high - low < SAME * largest { ((low + high) / 2.0 / coarse).round() * coarse } else { 0.0 };
+    let farthest = values.iter().map(|value| (value - offset).abs()).fold(0.0, f64::max);
+    let plain = farthest == 0.0 || (SMALL..LARGE).contains(&farthest);
+    let exponent = if plain { 0 } else { farthest.log10().floor() as i32 };
+    let unit = 10_f64.powi(exponent);
+    let digits = decimals(step / unit);
+    let label = |value: f64| {
+        let shown = (value - offset) / unit;
+        let shown = if shown.abs() < 1e-9 * (step / unit) { 0.0 } else { shown };
+        format!("{shown:.digits$}").replace('-', "−")
+    };
+    let (what, measured_in) = name.rsplit_once(", ").unwrap_or((name, ""));
+    let mut title = what.to_owned();
+    if offset != 0.0 {
+        let sign = if offset < 0.0 { '+' } else { '−' };
+        let digits = decimals(coarse);
+        let text = format!("{:.digits$}", offset.abs());
+        let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+        title = format!("{title} {sign} {text}");
+    }
+    let scale = if exponent == 0 { String::new() } else { power_of_ten(exponent) };
+    let measured_in =
+        [scale.as_str(), measured_in].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(" ");
+    let title = if measured_in.is_empty() { title } else { format!("{title}, {measured_in}") };
+    (title, values.into_iter().map(|value| (value, label(value))).collect())
+}
+
+/// How many decimals tell multiples of a step apart.
+fn decimals(step: f64) -> usize {
+    (-(step.log10() + 1e-9).floor()).max(0.0) as usize
 }
 
 /// 0.01 to 1000 as they are, the others with an exponent.
@@ -151,6 +205,27 @@ mod tests {
         assert_eq!(labels(&Axis::linear("w", -0.31, 0.62)), ["−0.2", "0.0", "0.2", "0.4", "0.6"]);
         assert_eq!(labels(&Axis::decades("e", (3e-5, 0.7))), ["10⁻⁵", "10⁻⁴", "10⁻³", "0.01", "0.1", "1"]);
         assert_eq!(labels(&Axis::percentiles(20_000.0))[..5], ["0 %", "90 %", "99 %", "99.9 %", "99.99 %"]);
+    }
+
+    /// A signal that is constant, or all but, or of rounding alone.
+    #[test]
+    fn labels_are_short_and_the_name_says_what_they_lack() {
+        let named = |low, high| {
+            let axis = Axis::linear("ω1, rad/s", low, high);
+            let (label, labels) = (axis.label.clone(), labels(&axis).join(" "));
+            (label, labels)
+        };
+        assert_eq!(named(-1e-15, 1e-15), ("ω1, 10⁻¹⁶ rad/s".into(), "−10 −8 −6 −4 −2 0 2 4 6 8 10".into()));
+        assert_eq!(named(0.5, 0.5 + 1e-6), ("ω1 − 0.5, 10⁻⁷ rad/s".into(), "0 2 4 6 8 10".into()));
+        assert_eq!(named(2e6, 2.1e6).0, "ω1, 10⁶ rad/s");
+        assert_eq!(named(1.0, 1.0).0, "ω1 − 1, 10⁻⁹ rad/s");
+        assert_eq!(Axis::linear("share", -3.0001, -3.0).label, "share + 3, 10⁻⁵");
+        let values = [0.0, 1e-300, 1e-30, -1e-15, 3e-7, 0.877, 0.877 + 1e-9, -0.877, 12345.6, -7.7e12, 1e30];
+        for (low, high) in values.into_iter().flat_map(|low| values.map(|high| (low, high))) {
+            for (_, label) in Axis::around("x, m", (low, high)).ticks {
+                assert!(label.chars().count() <= 8, "{low} {high}: {label}");
+            }
+        }
     }
 
     #[test]

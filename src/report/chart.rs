@@ -8,12 +8,17 @@ use super::columns::{Column, Columns, Corners, Extremes};
 use super::html::escape;
 use std::fmt::Write;
 
-/// All pictures over time have this size and these margins, so that one drawing of the marks serves all.
+/// Pictures over time have one of two sizes, each with these margins, so that one drawing of the marks serves all of a size.
 const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 250.0;
 const LEFT: f64 = 64.0;
 const RIGHT: f64 = 22.0;
 const TOP: f64 = 18.0;
+/// A picture as wide as the page, and what is named above it: a row of names, and the width of a letter in it.
+const WIDE: f64 = 1200.0;
+const WIDE_HEIGHT: f64 = 400.0;
+const ROW: f64 = 12.0;
+const LETTER: f64 = 5.6;
 const BOTTOM: f64 = 42.0;
 /// Side of a picture of a plane.
 const SQUARE: f64 = 420.0;
@@ -38,6 +43,8 @@ pub struct Line {
 pub struct Picture {
     /// The SVG.
     pub svg: String,
+    /// What it is called.
+    pub title: String,
     /// Class and label of every line.
     pub legend: Vec<(&'static str, String)>,
 }
@@ -45,10 +52,10 @@ pub struct Picture {
 /// What is marked on every time axis, by time in s.
 #[derive(Debug, Clone, Default)]
 pub struct Marks {
-    /// From when to when a scripted fault may act, and its number.
-    pub faults: Vec<(f64, f64, usize)>,
-    /// When a role failed.
-    pub incidents: Vec<f64>,
+    /// From when to when a scripted fault may act, its number, and what it is.
+    pub faults: Vec<(f64, f64, usize, String)>,
+    /// When a role failed, and which.
+    pub incidents: Vec<(f64, String)>,
     /// From when to when samples are missing.
     pub missing: Vec<(f64, f64)>,
     /// From when to when an estimate lacked something.
@@ -102,20 +109,47 @@ pub fn range<'a>(all: impl IntoIterator<Item = &'a Columns<Extremes>>, positive:
 }
 
 /// Where a picture's axes lie.
+#[derive(Debug, Clone, Copy)]
 struct Frame {
     width: f64,
     height: f64,
+    top: f64,
+}
+
+/// Marks are drawn once in each size that pictures over time have.
+#[derive(Debug, Clone, Copy)]
+pub enum Size {
+    /// Two beside each other.
+    Half,
+    /// As wide as the page, with so many rows of names above it.
+    Whole(usize),
+}
+
+impl Size {
+    fn frame(self) -> Frame {
+        match self {
+            Self::Half => Frame::TIME,
+            Self::Whole(rows) => {
+                let top = TOP + rows as f64 * ROW;
+                Frame { width: WIDE, height: WIDE_HEIGHT + top, top }
+            }
+        }
+    }
+
+    fn name(self) -> &'static str {
+        if matches!(self, Self::Half) { "half" } else { "whole" }
+    }
 }
 
 impl Frame {
-    const TIME: Self = Self { width: WIDTH, height: HEIGHT };
+    const TIME: Self = Self { width: WIDTH, height: HEIGHT, top: TOP };
 
     fn x(&self, axis: &Axis, value: f64) -> f64 {
         LEFT + axis.place(value) * (self.width - LEFT - RIGHT)
     }
 
     fn y(&self, axis: &Axis, value: f64) -> f64 {
-        self.foot() - axis.place(value) * (self.foot() - TOP)
+        self.foot() - axis.place(value) * (self.foot() - self.top)
     }
 
     fn foot(&self) -> f64 {
@@ -127,15 +161,29 @@ impl Frame {
         format!("<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\">")
     }
 
+    /// Opens a picture whose lines a reader may look at closely: where its axes lie, and from what to what they go.
+    fn open_over_time(&self, title: &str, x: &Axis, y: &Axis) -> String {
+        let ([x0, x1], [y0, y1], title) = (x.ends(), y.ends(), escape(title));
+        let (w, h, top, plot_w, plot_h) = (self.width, self.height, self.top, self.plot_width(), self.plot_height());
+        let scale = if y.is_logarithmic() { "log" } else { "linear" };
+        format!(
+            "<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\" class=\"time\" \
+             data-plot=\"{LEFT} {top} {plot_w} {plot_h}\" data-x=\"{x0} {x1}\" data-y=\"{y0} {y1}\" data-scale=\"{scale}\">"
+        )
+    }
+
+    fn plot_width(&self) -> f64 {
+        self.width - LEFT - RIGHT
+    }
+
+    fn plot_height(&self) -> f64 {
+        self.foot() - self.top
+    }
+
     /// Grid, labels and frame.
     fn axes(&self, x: &Axis, y: &Axis, svg: &mut String) {
-        let (right, foot) = (self.width - RIGHT, self.foot());
-        for (value, label) in &x.ticks {
-            let at = self.x(x, *value);
-            let _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {TOP}V{foot}\"/>");
-            let (below, label) = (foot + 15.0, escape(label));
-            let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        }
+        self.time_axis(x, svg);
+        let (top, right, foot) = (self.top, self.width - RIGHT, self.foot());
         for (value, label) in &y.ticks {
             let at = self.y(y, *value);
             let _ = write!(svg, "<path class=\"grid\" d=\"M{LEFT} {at:.1}H{right}\"/>");
@@ -144,23 +192,44 @@ impl Frame {
         }
         let (middle, below, label) = ((LEFT + right) / 2.0, self.height - 8.0, escape(&x.label));
         let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        self.name(&y.label, svg);
-        self.frame(svg);
-    }
-
-    /// The name of the upright axis.
-    fn name(&self, label: &str, svg: &mut String) {
-        let (middle, label) = ((TOP + self.foot()) / 2.0, escape(label));
+        // The name of the upright axis.
+        let (middle, label) = ((top + foot) / 2.0, escape(&y.label));
         let turn = format!("rotate(-90 14 {middle})");
         let _ = write!(
             svg,
             "<text class=\"name\" x=\"14\" y=\"{middle}\" text-anchor=\"middle\" transform=\"{turn}\">{label}</text>"
         );
+        self.frame(svg);
+    }
+
+    /// The grid of the level axis, with its labels.
+    fn time_axis(&self, x: &Axis, svg: &mut String) {
+        let (top, foot) = (self.top, self.foot());
+        svg.push_str("<g class=\"ticks\">");
+        for (value, label) in &x.ticks {
+            let at = self.x(x, *value);
+            let _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {top}V{foot}\"/>");
+            let (below, label) = (foot + 15.0, escape(label));
+            let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
+        }
+        svg.push_str("</g>");
     }
 
     fn frame(&self, svg: &mut String) {
-        let (width, height) = (self.width - LEFT - RIGHT, self.foot() - TOP);
-        let _ = write!(svg, "<rect class=\"frame\" x=\"{LEFT}\" y=\"{TOP}\" width=\"{width}\" height=\"{height}\"/>");
+        let (top, width, height) = (self.top, self.plot_width(), self.plot_height());
+        let _ = write!(svg, "<rect class=\"frame\" x=\"{LEFT}\" y=\"{top}\" width=\"{width}\" height=\"{height}\"/>");
+    }
+
+    /// Draws lines and marks in a window of their own, which cuts off what lies beyond the axes.
+    fn window(&self, draw: impl FnOnce(&mut String), svg: &mut String) {
+        let (top, width, height) = (self.top, self.plot_width(), self.plot_height());
+        let _ = write!(
+            svg,
+            "<svg class=\"plot\" x=\"{LEFT}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" \
+             viewBox=\"{LEFT} {top} {width} {height}\" preserveAspectRatio=\"none\">"
+        );
+        draw(svg);
+        svg.push_str("</svg>");
     }
 
     fn line(&self, line: &Line, x: &Axis, y: &Axis, svg: &mut String) {
@@ -180,7 +249,8 @@ impl Frame {
                 path.push_str("h.1");
             }
         }
-        let _ = write!(svg, "<path class=\"line {}\" d=\"{path}\"/>", line.class);
+        let (class, label) = (line.class, escape(&line.label));
+        let _ = write!(svg, "<path class=\"line {class}\" data-label=\"{label}\" d=\"{path}\"/>");
         if let (true, Some(first)) = (line.dot, line.parts.first().and_then(|part| part.first())) {
             let (at_x, at_y, class) = (self.x(x, first.0), self.y(y, first.1), line.class);
             let _ = write!(svg, "<circle class=\"dot {class}\" cx=\"{at_x:.1}\" cy=\"{at_y:.1}\" r=\"4\"/>");
@@ -194,14 +264,35 @@ fn legend(lines: &[Line]) -> Vec<(&'static str, String)> {
 
 /// Lines over time, with the marks.
 pub fn over_time(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
-    let mut picture = plain(title, x, y, lines);
-    picture.svg.insert_str(picture.svg.len() - "</svg>".len(), "<use href=\"#marks\"/>");
-    picture
+    over_time_in(Size::Half, title, x, y, lines)
+}
+
+/// The same in any size.
+pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
+    let (frame, name) = (size.frame(), size.name());
+    let mut svg = frame.open_over_time(title, x, y);
+    frame.axes(x, y, &mut svg);
+    frame.window(
+        |svg| {
+            let _ = write!(svg, "<use href=\"#marks-{name}\"/>");
+            lines.iter().for_each(|line| frame.line(line, x, y, svg));
+        },
+        &mut svg,
+    );
+    let _ = write!(svg, "<use class=\"names\" href=\"#names-{name}\"/></svg>");
+    Picture { svg, legend: legend(lines), title: title.to_owned() }
 }
 
 /// Lines over any axis.
 pub fn plain(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
-    draw(&Frame::TIME, title, x, y, lines)
+    plain_in(Size::Half, title, x, y, lines)
+}
+
+/// The same in any size.
+pub fn plain_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
+    // Without the rows of names, which are those of linear time.
+    let frame = if let Size::Whole(_) = size { Size::Whole(0).frame() } else { size.frame() };
+    draw(&frame, title, x, y, lines)
 }
 
 fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
@@ -209,7 +300,7 @@ fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Pictu
     frame.axes(x, y, &mut svg);
     lines.iter().for_each(|line| frame.line(line, x, y, &mut svg));
     svg.push_str("</svg>");
-    Picture { svg, legend: legend(lines) }
+    Picture { svg, legend: legend(lines), title: title.to_owned() }
 }
 
 /// Paths in a plane, both axes of one scale.
@@ -227,7 +318,7 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
         let middle = (low[i] + high[i]) / 2.0;
         Axis::linear(names[i], middle - half, middle + half)
     };
-    let frame = Frame { width: SQUARE + LEFT + RIGHT, height: SQUARE + TOP + BOTTOM };
+    let frame = Frame { width: SQUARE + LEFT + RIGHT, height: SQUARE + TOP + BOTTOM, top: TOP };
     let (x, y) = (axis(0), axis(1));
     let mut picture = draw(&frame, title, &x, &y, lines);
     if centre {
@@ -239,27 +330,54 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
     picture
 }
 
-/// The marks of all pictures over time, to be drawn once and used by each.
-pub fn marks(x: &Axis, marks: &Marks) -> String {
-    let frame = Frame::TIME;
-    let (foot, mut svg) =
-        (frame.foot(), String::from("<svg class=\"defs\" width=\"0\" height=\"0\"><defs><g id=\"marks\">"));
-    for (from, to) in &marks.unseen {
+/// The marks of all pictures over time, to be drawn once in either size and used by each; and the larger size, with a row for
+/// every name that finds no room in those above it.
+pub fn marks(x: &Axis, marks: &Marks) -> (String, Size) {
+    let (rows, names) = names(x, marks);
+    let whole = Size::Whole(rows);
+    let mut svg = String::from("<svg class=\"defs\" width=\"0\" height=\"0\"><defs>");
+    marks_in(Size::Half, x, marks, &mut svg);
+    numbers(x, marks, &mut svg);
+    marks_in(whole, x, marks, &mut svg);
+    let _ = write!(svg, "<g id=\"names-whole\">{names}</g></defs></svg>");
+    (svg, whole)
+}
+
+fn marks_in(size: Size, x: &Axis, marks: &Marks, svg: &mut String) {
+    let (frame, name) = (size.frame(), size.name());
+    let (top, foot, height) = (frame.top, frame.foot(), frame.plot_height());
+    let _ = write!(svg, "<g id=\"marks-{name}\">");
+    let faults = marks.faults.iter().map(|(from, to, ..)| ("fault", from, to));
+    let bands = marks.unseen.iter().map(|(from, to)| ("unseen", from, to)).chain(faults);
+    for (class, from, to) in bands {
         let (from, to) = (frame.x(x, *from), frame.x(x, *to));
-        let (width, height) = ((to - from).max(1.5), foot - TOP);
+        let width = (to - from).max(1.5);
         let _ = write!(
             svg,
-            "<rect class=\"unseen\" x=\"{from:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{height}\"/>"
+            "<rect class=\"{class}\" x=\"{from:.1}\" y=\"{top}\" width=\"{width:.1}\" height=\"{height}\"/>"
         );
     }
-    let mut labelled = f64::NEG_INFINITY;
-    for (from, to, number) in &marks.faults {
+    for (time, _) in &marks.incidents {
+        let at = frame.x(x, *time);
+        let _ = write!(svg, "<path class=\"incident\" d=\"M{at:.1} {top}V{foot}\"/>");
+    }
+    let mut rug = String::new();
+    for (from, to) in &marks.missing {
         let (from, to) = (frame.x(x, *from), frame.x(x, *to));
-        let (width, height) = ((to - from).max(1.5), foot - TOP);
-        let _ =
-            write!(svg, "<rect class=\"fault\" x=\"{from:.1}\" y=\"{TOP}\" width=\"{width:.1}\" height=\"{height}\"/>");
+        let _ = write!(rug, "M{from:.1} {:.1}h{:.1}", foot - 3.0, (to - from).max(1.0));
+    }
+    let _ = write!(svg, "<path class=\"missing\" d=\"{rug}\"/></g>");
+}
+
+/// The numbers of faults above a small picture, as far as there is room, and a flag for every incident.
+fn numbers(x: &Axis, marks: &Marks, svg: &mut String) {
+    let frame = Frame::TIME;
+    svg.push_str("<g id=\"names-half\">");
+    let mut labelled = f64::NEG_INFINITY;
+    for (from, to, number, _) in &marks.faults {
+        let (from, to) = (frame.x(x, *from), frame.x(x, *to));
         if from > labelled + 15.0 {
-            let (at, above) = (from + width / 2.0, TOP - 5.0);
+            let (at, above) = ((from + to) / 2.0, TOP - 5.0);
             let _ = write!(
                 svg,
                 "<text class=\"number\" x=\"{at:.1}\" y=\"{above}\" text-anchor=\"middle\">{number}</text>"
@@ -267,18 +385,38 @@ pub fn marks(x: &Axis, marks: &Marks) -> String {
             labelled = from;
         }
     }
-    for time in &marks.incidents {
-        let at = frame.x(x, *time);
-        let _ = write!(svg, "<path class=\"incident\" d=\"M{at:.1} {TOP}V{foot}\"/>");
-        let _ = write!(svg, "<path class=\"flag\" d=\"M{at:.1} {TOP}l-5 -9h10z\"/>");
+    for (time, _) in &marks.incidents {
+        let _ = write!(svg, "<path class=\"flag\" d=\"M{:.1} {TOP}l-5 -9h10z\"/>", frame.x(x, *time));
     }
-    let mut rug = String::new();
-    for (from, to) in &marks.missing {
-        let (from, to) = (frame.x(x, *from), frame.x(x, *to));
-        let _ = write!(rug, "M{from:.1} {:.1}h{:.1}", foot - 3.0, (to - from).max(1.0));
+    svg.push_str("</g>");
+}
+
+/// What every fault and every incident is, above a large picture, each in the lowest row that has room; and how many rows.
+fn names(x: &Axis, marks: &Marks) -> (usize, String) {
+    let frame = Frame { width: WIDE, height: WIDE_HEIGHT, top: TOP };
+    let faults = marks.faults.iter().map(|(from, _, number, what)| (*from, "number", format!("{number} {what}")));
+    let incidents = marks.incidents.iter().map(|(time, what)| (*time, "number bad", format!("▾ {what}")));
+    let mut all: Vec<(f64, &str, String)> = faults.chain(incidents).collect();
+    all.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let mut ends: Vec<f64> = Vec::new();
+    let placed: Vec<(f64, usize)> = all
+        .iter()
+        .map(|(time, _, text)| {
+            let length = text.chars().count() as f64 * LETTER;
+            let at = frame.x(x, *time).min(WIDE - length);
+            let row = ends.iter().position(|end| *end < at).unwrap_or(ends.len());
+            ends.resize(ends.len().max(row + 1), 0.0);
+            ends[row] = at + length;
+            (at, row)
+        })
+        .collect();
+    let (rows, mut svg) = (ends.len(), String::new());
+    let foot = TOP + rows as f64 * ROW - 5.0;
+    for ((_, class, text), (at, row)) in all.iter().zip(placed) {
+        let (above, text) = (foot - row as f64 * ROW, escape(text));
+        let _ = write!(svg, "<text class=\"{class}\" x=\"{at:.1}\" y=\"{above}\">{text}</text>");
     }
-    let _ = write!(svg, "<path class=\"missing\" d=\"{rug}\"/></g></defs></svg>");
-    svg
+    (rows, svg)
 }
 
 /// Rows of shades over time; `shade` gives 0 to 1 for a column, none where there is nothing.
@@ -310,15 +448,12 @@ pub fn strip<C: Column>(
     for (index, path) in shades.iter().enumerate().filter(|(_, path)| !path.is_empty()) {
         let _ = write!(svg, "<path class=\"shade{index}\" d=\"{path}\"/>");
     }
-    for (value, label) in &x.ticks {
-        let (at, below, label) = (frame.x(x, *value), frame.foot() + 15.0, escape(label));
-        let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-    }
+    frame.time_axis(x, &mut svg);
     let (middle, below, label) = ((LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 8.0, escape(&x.label));
     let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
     frame.frame(&mut svg);
-    svg.push_str("<use href=\"#marks\"/></svg>");
-    Picture { svg, legend: Vec::new() }
+    svg.push_str("<use href=\"#marks-half\"/><use href=\"#names-half\"/></svg>");
+    Picture { svg, legend: Vec::new(), title: title.to_owned() }
 }
 
 #[cfg(test)]

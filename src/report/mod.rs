@@ -98,6 +98,14 @@ pub enum ReportError {
     /// The recording cannot be used.
     #[error(transparent)]
     Record(#[from] RecordError),
+    /// There is no such field.
+    #[error("the recording shows no field `{name}`; it has: {known}")]
+    Field {
+        /// As given.
+        name: String,
+        /// Those there are.
+        known: String,
+    },
     /// The run to compare with failed.
     #[error("the same motion with full state, for comparison, failed: {reason}")]
     Counterpart {
@@ -122,6 +130,7 @@ fn named(run: Option<RunId>) -> String {
 #[derive(Debug)]
 pub struct Report {
     html: String,
+    figures: Vec<(String, String)>,
     remarks: Vec<String>,
     damaged: bool,
 }
@@ -142,6 +151,27 @@ impl Report {
         &self.remarks
     }
 
+    /// Its figures, each a picture (SVG) that needs no page: name of a file, and text.
+    pub fn figures(&self) -> &[(String, String)] {
+        &self.figures
+    }
+
+    /// Writes every figure to a file of its own in a directory.
+    ///
+    /// # Errors
+    /// [`ReportError::Write`].
+    pub fn write_figures(&self, directory: &Path) -> Result<(), ReportError> {
+        let failed = |path: &Path| {
+            let path = path.to_owned();
+            |source| ReportError::Write { path, source }
+        };
+        crate::files::create_directories(directory).map_err(failed(directory))?;
+        self.figures.iter().try_for_each(|(name, svg)| {
+            let path = directory.join(name);
+            crate::files::write(&path, svg.as_bytes()).map_err(failed(&path))
+        })
+    }
+
     /// Writes the page.
     ///
     /// # Errors
@@ -152,13 +182,14 @@ impl Report {
     }
 }
 
-/// Makes a page of a run's directory, or of a recording alone.
+/// Makes a page of a run's directory, or of a recording alone, with the fields that are `shown` by name, such as
+/// `leader/estimate.omega_rad_s` or `leader/estimate.omega_rad_s[2]`.
 ///
 /// # Errors
 /// [`ReportError`].
-pub fn report(path: &Path) -> Result<Report, ReportError> {
+pub fn report(path: &Path, shown: &[String]) -> Result<Report, ReportError> {
     let source = Source::open(path)?;
-    let model = model::model(&source)?;
+    let model = model::model(&source, shown)?;
     let damaged = source.recording.as_ref().is_some_and(|recording| recording.damage().is_some());
-    Ok(Report { html: page::page(&model), remarks: model.remarks, damaged })
+    Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged })
 }

@@ -4,6 +4,7 @@ use super::ReportError;
 use super::axis::Axis;
 use super::chart::{Marks, Picture, marks};
 use super::counterpart::counterpart;
+use super::pictures::Frames;
 use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
@@ -61,8 +62,8 @@ pub enum Block {
     Details(String, String),
 }
 
-/// Draws up a report.
-pub fn model(source: &Source) -> Result<Model, ReportError> {
+/// Draws up a report, with the fields that are asked for by name.
+pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     let mut remarks = source.missing.clone();
     let traces = match (&source.recording, &source.scenario) {
         (Some(recording), Some(scenario)) => Some(trace(recording, scenario)?),
@@ -75,10 +76,11 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
         remarks.push(format!("the recording is not complete: {missing}"));
     }
     let (time, events) = times(source, traces.as_ref());
+    let (marks, whole) = marks(&time, &events);
     let mut sections = vec![tables::verdict(source, traces.as_ref())];
     if let Some(traces) = &traces {
         let full = source.scenario.as_ref().map_or(Ok(None), counterpart)?;
-        sections.extend(pictures::sections(source, traces, full.as_ref(), &time));
+        sections.extend(pictures::sections(source, traces, full.as_ref(), &Frames { time: &time, whole }, shown)?);
     }
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {
@@ -95,7 +97,7 @@ pub fn model(source: &Source) -> Result<Model, ReportError> {
     let (title, subtitle) = headings(source);
     let unjudged = ("not judged: there is no summary".to_owned(), None);
     let verdict = source.summary.as_ref().map_or(unjudged, |summary| (summary.verdict.clone(), summary.accepted));
-    Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks: marks(&time, &events), sections })
+    Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks, sections })
 }
 
 fn headings(source: &Source) -> (String, String) {
@@ -129,7 +131,8 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let faults = tables::faults(source).into_iter().filter(|fault| fault.from_tick <= last);
     let span = |fault: tables::FaultRow| {
         let to = fault.from_tick.saturating_add(fault.ticks).min(last);
-        (fault.from_tick as f64 * tick_s, to as f64 * tick_s, fault.number)
+        let what = format!("{} {}", fault.kind, fault.role);
+        (fault.from_tick as f64 * tick_s, to as f64 * tick_s, fault.number, what)
     };
     let incidents = source.summary.iter().flat_map(|summary| &summary.incidents);
     let (missing, _) = traces.map_or_else(Default::default, Traces::missing);
@@ -138,7 +141,9 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let marks = Marks {
         unseen: merged(unseen.collect()).into_iter().map(seconds).collect(),
         faults: faults.map(span).collect(),
-        incidents: incidents.map(|incident| incident.tick as f64 * tick_s).collect(),
+        incidents: incidents
+            .map(|incident| (incident.tick as f64 * tick_s, format!("{} {}", incident.role, incident.action)))
+            .collect(),
         missing: missing.iter().map(|(from, to)| (*from as f64 * tick_s, *to as f64 * tick_s)).collect(),
     };
     (time, marks)

@@ -1,4 +1,5 @@
-//! The page: a report's content as HTML that is well-formed XML too, with its style inside. No script, no address.
+//! The page: a report's content as HTML that is well-formed XML too, with its style inside and a script by which pictures over
+//! time are looked at closely; without it nothing is missing. No address.
 
 use super::chart::Picture;
 use super::html::escape;
@@ -7,6 +8,7 @@ use crate::launch::GENERATOR;
 use std::fmt::Write;
 
 const STYLE: &str = include_str!("page.css");
+const SCRIPT: &str = include_str!("page.js");
 
 /// Writes the page.
 pub fn page(model: &Model) -> String {
@@ -24,9 +26,40 @@ pub fn page(model: &Model) -> String {
     );
     header(model, &mut html);
     model.sections.iter().for_each(|part| section(part, &mut html));
-    html.push_str("</main>\n</body>\n</html>\n");
+    let _ = write!(html, "</main>\n<script>/*<![CDATA[*/\n{SCRIPT}/*]]>*/</script>\n</body>\n</html>\n");
     html
 }
+
+/// Every figure as a picture of its own: name of a file, and SVG that looks as on a white page.
+pub fn figures(model: &Model) -> Vec<(String, String)> {
+    let style = plain_style();
+    let blocks = model.sections.iter().flat_map(|section| &section.blocks);
+    let pictures =
+        blocks.filter_map(|block| if let Block::Figures(figures) = block { Some(figures) } else { None }).flatten();
+    let of = |(index, (picture, _)): (usize, &(Picture, String))| {
+        let letters = picture.title.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
+        let name = letters.collect::<String>().split('-').filter(|word| !word.is_empty()).collect::<Vec<_>>().join("-");
+        let svg = picture.svg.replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1);
+        let inside = svg.find('>').map_or(0, |end| end + 1);
+        let svg = format!("{}<style>{style}</style>{}{}", &svg[..inside], model.marks, &svg[inside..]);
+        (format!("{:02}-{}.svg", index + 1, name.to_lowercase()), svg)
+    };
+    pictures.enumerate().map(of).collect()
+}
+
+/// The style of pictures with its colours in their places: what draws for paper knows no variables.
+fn plain_style() -> String {
+    let (light, rest) = STYLE.split_once('}').unwrap_or_default();
+    let colours = light.split("--").skip(1).filter_map(|entry| entry.split_once(':'));
+    let colours: Vec<(&str, &str)> =
+        colours.map(|(name, value)| (name.trim(), value.trim().trim_end_matches(';').trim())).collect();
+    let from = rest.find(PICTURES).unwrap_or(0);
+    let pictures = rest[from..].split("@media").next().unwrap_or_default();
+    colours.iter().fold(pictures.to_owned(), |style, (name, value)| style.replace(&format!("var(--{name})"), value))
+}
+
+/// Where the style of pictures begins.
+const PICTURES: &str = "/* Pictures. */";
 
 fn header(model: &Model, html: &mut String) {
     let (word, good) = &model.verdict;
@@ -65,7 +98,8 @@ fn block(block: &Block, html: &mut String) {
         Block::Table { caption, head, rows } if !rows.is_empty() => table(caption, head, rows, html),
         Block::Table { .. } => {}
         Block::Figures(figures) => {
-            html.push_str("<div class=\"figures\">\n");
+            let wide = if figures.len() == 1 { " alone" } else { "" };
+            let _ = writeln!(html, "<div class=\"figures{wide}\">");
             figures.iter().for_each(|(picture, caption)| figure(picture, caption, html));
             html.push_str("</div>\n");
         }

@@ -1,11 +1,12 @@
 //! Which pictures the samples of a run give: motion, errors, V, and how late what was sent.
 
+use super::ReportError;
 use super::axis::Axis;
-use super::chart::{Line, Picture, SHADES, over_time, plane, range, strip};
+use super::chart::{Line, Picture, SHADES, Size, over_time, over_time_in, plain_in, plane, range, strip};
 use super::columns::{Columns, Extremes};
 use super::model::{Block, Section};
 use super::source::Source;
-use super::traces::{BODIES_SHOWN, MetricTrace, Traces};
+use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces};
 use crate::analysis::{claims, digits};
 use crate::config::Scenario;
 use crate::rig;
@@ -27,12 +28,29 @@ const COMPARED: &str = "with full state (computed here)";
 
 type Figures = Vec<(Picture, String)>;
 
-/// The sections that the samples give, of this run and of the one that it is compared with.
-pub fn sections(source: &Source, traces: &Traces, full: Option<&Traces>, time: &Axis) -> Vec<Section> {
-    let Some(scenario) = &source.scenario else { return Vec::new() };
-    let tick_s = scenario.tick_s();
-    let mut sections = vec![motion(scenario, traces, full, time)];
-    sections.push(errors(source, scenario, traces, time));
+/// What all pictures over time share: their axis, and the size of those that are as wide as the page.
+pub struct Frames<'a> {
+    pub time: &'a Axis,
+    pub whole: Size,
+}
+
+/// The sections that the samples give, of this run and of the one that it is compared with, and the fields `shown` by name.
+pub fn sections(
+    source: &Source,
+    traces: &Traces,
+    full: Option<&Traces>,
+    frames: &Frames<'_>,
+    shown: &[String],
+) -> Result<Vec<Section>, ReportError> {
+    let Some(scenario) = &source.scenario else { return Ok(Vec::new()) };
+    let (tick_s, time) = (scenario.tick_s(), frames.time);
+    let mut sections = Vec::new();
+    if !shown.is_empty() {
+        let figures = shown.iter().map(|name| field(name, traces, frames, tick_s)).collect::<Result<_, _>>()?;
+        sections.push(Section { id: "fields", title: "Fields", blocks: vec![Block::Figures(figures)] });
+    }
+    sections.push(motion(scenario, traces, full, time));
+    sections.push(errors(source, scenario, traces, frames));
     let pictures = scenario.rig.pictures().into_iter();
     let certificate: Figures = pictures
         .filter_map(|picture| if let rig::Picture::Lyapunov(of) = picture { Some(of) } else { None })
@@ -42,7 +60,27 @@ pub fn sections(source: &Source, traces: &Traces, full: Option<&Traces>, time: &
         let blocks = vec![Block::Figures(certificate)];
         sections.push(Section { id: "lyapunov", title: "V and its bound", blocks });
     }
-    sections
+    Ok(sections)
+}
+
+/// A field by its name, as `leader/estimate.omega_rad_s` or, one element of it, `leader/estimate.omega_rad_s[2]`.
+fn field(name: &str, traces: &Traces, frames: &Frames<'_>, tick_s: f64) -> Result<(Picture, String), ReportError> {
+    let whole = |(body, signal, field, _): &Key| format!("{body}/{signal}.{field}");
+    let asked = |key: &&Key| whole(key) == name || format!("{}[{}]", whole(key), key.3) == name;
+    let lines: Vec<(&Key, &Columns<Extremes>)> = traces.values.iter().filter(|(key, _)| asked(key)).collect();
+    let Some((key, _)) = lines.first() else {
+        let mut known: Vec<String> = traces.values.keys().map(whole).collect();
+        known.dedup();
+        return Err(ReportError::Field { name: name.to_owned(), known: known.join(", ") });
+    };
+    let y = Axis::around(&key.2.clone(), range(lines.iter().map(|(_, columns)| *columns), false));
+    let line = |(place, (key, columns)): (usize, &(&Key, &Columns<Extremes>))| {
+        let label = format!("{}[{}]", key.2, key.3);
+        Line::of(COMPONENTS[place % COMPONENTS.len()], &label, columns, tick_s)
+    };
+    let lines: Vec<Line> = lines.iter().enumerate().map(line).collect();
+    let caption = format!("{}; the last part of a field's name is its unit.", name);
+    Ok((over_time_in(frames.whole, name, frames.time, &y, &lines), caption))
 }
 
 fn motion(scenario: &Scenario, traces: &Traces, full: Option<&Traces>, time: &Axis) -> Section {
@@ -145,9 +183,26 @@ fn graph(
     let own = own.map(|columns| line(own_classes[0], own_label, columns));
     let seen = traces.get(first, "estimate", of.field, of.element);
     let seen = seen.map(|columns| line(own_classes[1], "observer", columns));
-    let (columns, lines) = present(followers.chain([compared, own, seen]));
+    // What the sensors said, where that is not the truth.
+    let measured = traces.get(first, "measurement", of.field, of.element);
+    let truth = own.as_ref().map(|(columns, _)| *columns);
+    let noisy = measured.filter(|measured| truth.is_some_and(|truth| !same(measured, truth)));
+    let noisy = noisy.map(|columns| line("grey d0 thin", "measured", columns));
+    // What is known from the beginning and never learned is no motion.
+    let learned = seen
+        .as_ref()
+        .is_none_or(|(columns, _)| truth.is_some() || range([*columns], false).0 < range([*columns], false).1);
+    if !learned {
+        return None;
+    }
+    let (columns, lines) = present([noisy].into_iter().chain(followers).chain([compared, own, seen]));
     let y = Axis::around(&of.axis, range(columns, false));
     (!lines.is_empty()).then(|| (over_time(&of.title, time, &y, &lines), of.caption.clone()))
+}
+
+/// Whether one signal is the other wherever both are known.
+fn same(one: &Columns<Extremes>, other: &Columns<Extremes>) -> bool {
+    one.iter().zip(other.iter()).all(|((_, one), (_, other))| one.is_empty() || one == other)
 }
 
 /// What the actuators of each driven body applied.
@@ -170,8 +225,8 @@ fn inputs(of: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figure
     figures
 }
 
-fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) -> Section {
-    let tick_s = scenario.tick_s();
+fn errors(source: &Source, scenario: &Scenario, traces: &Traces, frames: &Frames<'_>) -> Section {
+    let (tick_s, time) = (scenario.tick_s(), frames.time);
     let told = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
     let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(told).collect();
     let (low, high) = range(shown.iter().map(|metric| &metric.values), true);
@@ -179,14 +234,24 @@ fn errors(source: &Source, scenario: &Scenario, traces: &Traces, time: &Axis) ->
     let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * tick_s);
     let of = |(metric, class): (&&MetricTrace, &'static str)| Line::of(class, metric.name, &metric.values, tick_s);
     let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS).map(of).collect();
-    lines.extend(falling(scenario, &shown, y.foot(), end_s));
     lines.extend(limits(scenario, &shown, end_s));
+    let mut early = lines.clone();
+    lines.extend(falling(scenario, &shown, y.foot(), end_s));
     let caption = "Errors on a logarithmic axis, every tick scored as the launcher scores it. The straight lines fall at the \
                    rate of the sampled loop, where one is claimed, and at the observer's, from the first error on: what is \
                    claimed is the rate of fall once the error is small, not the constant before it. Zeros are drawn at the foot.";
-    let picture = over_time("errors over time, logarithmic", time, &y, &lines);
-    let figure = Block::Figures(vec![(picture, caption.to_owned())]);
-    let blocks = unseen(traces).into_iter().chain([figure, rescored(source, traces)]).collect();
+    let picture = over_time_in(frames.whole, "errors over time, logarithmic", time, &y, &lines);
+    let mut figures = vec![Block::Figures(vec![(picture, caption.to_owned())])];
+    if end_s > tick_s {
+        // What begins at tick 0 is drawn from the first tick on.
+        let later = |(at, value): &(f64, f64)| (at.max(tick_s), *value);
+        early.iter_mut().flat_map(|line| &mut line.parts).for_each(|part| *part = part.iter().map(later).collect());
+        let (title, time) = ("errors over the logarithm of time", Axis::log_time(tick_s, end_s));
+        let caption =
+            "The same over the logarithm of time, from the first tick on: what happens at the beginning has room.";
+        figures.push(Block::Figures(vec![(plain_in(frames.whole, title, &time, &y, &early), caption.to_owned())]));
+    }
+    let blocks = unseen(traces).into_iter().chain(figures).chain([rescored(source, traces)]).collect();
     Section { id: "errors", title: "Synchronisation and estimation error", blocks }
 }
 

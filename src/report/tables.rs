@@ -62,7 +62,8 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     if let Some(summary) = &source.summary {
         let row = |criterion: &super::summary::Criterion| {
-            let value = criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:e}"));
+            let value =
+                criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:.2e}"));
             vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), held(criterion.holds).to_owned()]
         };
         let rows: Vec<_> = summary.criteria.iter().map(row).collect();

@@ -7,7 +7,7 @@ use super::columns::{Columns, Corners, Count, Extremes};
 use crate::config::Scenario;
 use crate::launch::lyapunov_floor;
 use crate::record::{Column, RecordError, Recording, SignalInfo};
-use crate::rig::{Command, Estimate, FleetTruth, Picture, Plane, Rig, Truth};
+use crate::rig::{Command, Estimate, FleetTruth, Measurement, Picture, Plane, Rig, Truth};
 use crate::role::Guard;
 use crate::sample::{FieldKind, Message, Sample, Stamp, VOID, status};
 use std::collections::BTreeMap;
@@ -93,6 +93,7 @@ struct Signal<R: Rig> {
 enum Kind<R: Rig> {
     Truth,
     FleetTruth,
+    Measurement(R::MeasurementGuard),
     Estimate(R::EstimateGuard),
     Command(R::CommandGuard),
     Other,
@@ -103,6 +104,8 @@ struct Field {
     count: usize,
     /// Elements of one component: one for each body.
     bodies: usize,
+    /// Where the word is whose bits tell which elements are measured, if they can be missing.
+    valid: Option<usize>,
     traces: Vec<(Key, Columns<Extremes>)>,
 }
 
@@ -229,6 +232,10 @@ impl<R: Rig> Tracer<R> {
                 let words = sample.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect();
                 self.keep(tick, |pending| pending.truths[body] = Some(TruthSample::Fleet(words)));
             }
+            Kind::Measurement(guard) => {
+                let measurement: Measurement<R> = bytemuck::pod_read_unaligned(sample);
+                return guard.accepts(&measurement);
+            }
             Kind::Estimate(guard) => {
                 let estimate: Estimate<R> = bytemuck::pod_read_unaligned(sample);
                 if !guard.accepts(&estimate) {
@@ -343,6 +350,9 @@ impl<R: Rig> Signal<R> {
             ("truth", Some(_), Some(bodies)) if size == 8 * FleetTruth::<R>::length(bodies) => {
                 (Kind::FleetTruth, "truth")
             }
+            ("measurement", Some(body), None) if size == size_of::<Measurement<R>>() => {
+                (Kind::Measurement(rig.measurement_guard(body, false)), "measurement")
+            }
             ("estimate", Some(0), _) if size == size_of::<Estimate<R>>() => {
                 (Kind::Estimate(rig.estimate_guard()), "estimate")
             }
@@ -355,7 +365,13 @@ impl<R: Rig> Signal<R> {
         let shown = !matches!(kind, Kind::Other) && body <= BODIES_SHOWN;
         let columns = info.layout.columns.iter().skip(Stamp::FIELDS.len());
         let columns = columns.filter(|column| shown && column.kind == FieldKind::F64);
-        let fields = columns.map(|column| Field::new(column, info, name, fleet.unwrap_or(1))).collect();
+        // The first field has the components that sensors may lack.
+        let valid = info.layout.columns.iter().find(|column| column.name == "valid" && name == "measurement");
+        let field = |(place, column): (usize, &Column)| {
+            let valid = valid.filter(|_| place == 0 && column.count == R::AXES).map(|valid| valid.offset);
+            Field { valid, ..Field::new(column, info, name, fleet.unwrap_or(1)) }
+        };
+        let fields = columns.enumerate().map(field).collect();
         Self { kind, body, role: role(info, traces), last: None, fields }
     }
 }
@@ -378,7 +394,7 @@ impl Field {
         let bodies = bodies.max(1);
         let key = |element| (info.body.clone(), signal, column.name.clone(), element);
         let traces = (0..column.count / bodies).map(|element| (key(element), Columns::default())).collect();
-        Self { offset: column.offset, count: column.count, bodies, traces }
+        Self { offset: column.offset, count: column.count, bodies, valid: None, traces }
     }
 
     fn is(&self, name: &str) -> bool {
@@ -391,8 +407,9 @@ impl Field {
 
     fn take(&mut self, tick: u64, sample: &[u8]) {
         let bodies = self.bodies;
+        let valid = self.valid.map_or(u64::MAX, |offset| bytemuck::pod_read_unaligned(&sample[offset..][..8]));
         for component in 0..self.traces.len() {
-            for body in 0..bodies {
+            for body in (0..bodies).filter(|_| valid >> component.min(63) & 1 == 1) {
                 let value = self.value(sample, component * bodies + body);
                 self.traces[component].1.at(tick).take(value);
             }

@@ -454,6 +454,15 @@ impl Rig for RigidBodyRig {
                 caption: format!("Angular velocity ω{axis} in the body's axes."),
             })
         };
+        let coefficient = |axis: usize| {
+            Picture::Graph(Graph {
+                title: format!("coefficient a{axis} over time"),
+                field: "coefficients",
+                element: axis - 1,
+                axis: format!("a{axis}"),
+                caption: format!("The coefficient a{axis} of [D](2) as it is learned."),
+            })
+        };
         let inputs =
             Inputs { field: "applied_rad_s2", axis: "control acceleration, rad/s²", components: &["u1", "u2", "u3"] };
         vec![
@@ -466,6 +475,9 @@ impl Rig for RigidBodyRig {
             graph(1),
             graph(2),
             graph(3),
+            coefficient(1),
+            coefficient(2),
+            coefficient(3),
             Picture::Inputs(inputs),
             Picture::Lyapunov(Lyapunov {
                 field: "lyapunov_rad2_s2",

@@ -90,8 +90,42 @@ struct Knot {
 #[derive(Debug)]
 pub(super) struct Playback {
     knots: Vec<Knot>,
+    /// How many samples there are, also of those that are not kept.
+    count: usize,
+    /// When it is over, or begins again, s.
+    end_s: f64,
     repeats: bool,
     hash: u64,
+}
+
+/// The samples of a motion as they are read.
+struct Motion {
+    samples: Vec<(f64, Vector3<f64>)>,
+    keep_s: f64,
+    begin_s: f64,
+    end_s: f64,
+    count: usize,
+    hash: Xxh3Default,
+}
+
+impl Motion {
+    /// None yet; those that are needed up to a time are kept.
+    fn new(keep_s: f64) -> Self {
+        Self { samples: Vec::new(), keep_s, begin_s: 0.0, end_s: 0.0, count: 0, hash: Xxh3Default::new() }
+    }
+
+    fn add(&mut self, time_s: f64, rate: Vector3<f64>) {
+        if self.count == 0 {
+            self.begin_s = time_s;
+        }
+        (self.count, self.end_s) = (self.count + 1, time_s - self.begin_s);
+        [self.end_s, rate.x, rate.y, rate.z].iter().for_each(|value| self.hash.update(&value.to_bits().to_le_bytes()));
+        // The slope at the sample behind the end takes one more.
+        let behind = self.samples.iter().rev().take(2).filter(|(time_s, _)| *time_s > self.keep_s).count();
+        if behind < 2 {
+            self.samples.push((self.end_s, rate));
+        }
+    }
 }
 
 /// So many names of segments are told.
@@ -123,8 +157,9 @@ impl RawPlayback {
         if defect < ROTATION && axes.determinant() > 0.0 { Ok(axes.transpose()) } else { Err(PlaybackError::Axes) }
     }
 
-    /// Reads the motion in a file, or in a log that ships with the program if there is no such file.
-    pub fn load(&self, path: &Path) -> Result<Playback, PlaybackError> {
+    /// Reads the motion in a file, or in a log that ships with the program if there is no such file. A log may be larger than
+    /// memory: unless it is repeated, nothing is kept of it that is not played in `duration_s`.
+    pub fn load(&self, path: &Path, duration_s: f64) -> Result<Playback, PlaybackError> {
         let (options, own) = (self.options()?, self.rotation()?);
         let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
         let shipped = SHIPPED.iter().find(|(shipped, _)| *shipped == name && !path.exists());
@@ -132,7 +167,8 @@ impl RawPlayback {
             Some((name, text)) => Log::from_csv(text.as_bytes(), name.as_ref(), &options)?,
             None => Log::open(path, &options)?,
         };
-        let (mut names, mut samples): (Vec<String>, Vec<(f64, Vector3<f64>)>) = (Vec::new(), Vec::new());
+        let (mut names, mut motion) =
+            (Vec::new(), Motion::new(if self.at_end == AtEnd::Repeat { f64::INFINITY } else { duration_s }));
         while let Some(entry) = log.next() {
             let entry = entry?;
             if entry.begins {
@@ -140,7 +176,7 @@ impl RawPlayback {
             }
             let asked = self.segment.as_ref().map_or(names.len() == 1, |segment| names.last() == Some(segment));
             if asked {
-                samples.push((entry.time_s, own * Vector3::from(entry.rate_rad_s)));
+                motion.add(entry.time_s, own * Vector3::from(entry.rate_rad_s));
             }
         }
         let path = log.path().display().to_string();
@@ -149,13 +185,13 @@ impl RawPlayback {
             None if names.len() > 1 => {
                 return Err(PlaybackError::Several { path, segments: names.len(), names: told() });
             }
-            Some(segment) if samples.is_empty() => {
+            Some(segment) if motion.count == 0 => {
                 return Err(PlaybackError::NoSegment { path, segment: segment.clone(), names: told() });
             }
-            _ if samples.len() < 2 => return Err(PlaybackError::Short { path, samples: samples.len() }),
+            _ if motion.count < 2 => return Err(PlaybackError::Short { path, samples: motion.count }),
             _ => {}
         }
-        let playback = Playback::new(&samples, self.at_end == AtEnd::Repeat);
+        let playback = Playback::new(motion, self.at_end == AtEnd::Repeat);
         match &self.hash {
             Some(hash) if *hash != playback.hash() => Err(PlaybackError::Changed { path, found: playback.hash() }),
             _ => Ok(playback),
@@ -173,22 +209,19 @@ pub(super) fn locate(path: PathBuf) -> PathBuf {
 }
 
 impl Playback {
-    /// The motion through these samples, at least two at rising times, which begins at the first. The slope at a sample is that
+    /// The motion through at least two samples at rising times, which begins at the first. The slope at a sample is that
     /// of the parabola through it and its neighbours.
-    fn new(samples: &[(f64, Vector3<f64>)], repeats: bool) -> Self {
-        let mut hash = Xxh3Default::new();
-        for (time_s, rate) in samples {
-            [*time_s, rate.x, rate.y, rate.z].iter().for_each(|value| hash.update(&value.to_bits().to_le_bytes()));
-        }
-        let begin_s = samples[0].0;
-        let mut samples: Vec<(f64, Vector3<f64>)> =
-            samples.iter().map(|(time_s, rate)| (time_s - begin_s, *rate)).collect();
+    fn new(motion: Motion, repeats: bool) -> Self {
+        let Motion { samples, count, mut end_s, hash, .. } = motion;
+        let mut knots = joined(&samples);
         if repeats {
             let mut intervals: Vec<f64> = samples.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
             intervals.sort_by(f64::total_cmp);
-            samples.push((samples[samples.len() - 1].0 + intervals[intervals.len() / 2], samples[0].1));
+            end_s += intervals[intervals.len() / 2];
+            // The motion itself is the same as if it were not repeated.
+            knots.push(Knot { time_s: end_s, ..knots[0] });
         }
-        Self { knots: joined(&samples), repeats, hash: hash.digest() }
+        Self { knots, count, end_s, repeats, hash: hash.digest() }
     }
 
     /// The samples' identity.
@@ -198,13 +231,13 @@ impl Playback {
 
     /// How long it is, s: after that it begins again, or there is nothing.
     pub fn length_s(&self) -> f64 {
-        self.knots[self.knots.len() - 1].time_s
+        self.end_s
     }
 
-    /// How many samples it has, and their largest distance, s.
+    /// How many samples it has, and the largest distance of those that are played, s.
     pub fn sampling(&self) -> (usize, f64) {
         let longest_s = self.knots.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).fold(0.0, f64::max);
-        (self.knots.len() - usize::from(self.repeats), longest_s)
+        (self.count, longest_s)
     }
 
     /// Whether it begins again at its end.
@@ -294,6 +327,12 @@ mod tests {
         (0..count).map(|index| (5.0 + time(index), wave(time(index)))).collect()
     }
 
+    fn through(samples: &[(f64, Vector3<f64>)], repeats: bool) -> Playback {
+        let mut motion = Motion::new(f64::INFINITY);
+        samples.iter().for_each(|(time_s, rate)| motion.add(*time_s, *rate));
+        Playback::new(motion, repeats)
+    }
+
     fn worst(playback: &Playback, until_s: f64) -> f64 {
         (0..2000)
             .map(|i| until_s * f64::from(i) / 2000.0)
@@ -303,11 +342,11 @@ mod tests {
 
     #[test]
     fn samples_are_met_and_the_error_between_them_falls_with_their_distance() {
-        let fine = Playback::new(&sampled(0.01, 201), false);
+        let fine = through(&sampled(0.01, 201), false);
         for (time_s, rate) in sampled(0.01, 201) {
             assert!((fine.at(time_s - 5.0) - rate).norm() < 1e-12);
         }
-        let coarse = Playback::new(&sampled(0.02, 101), false);
+        let coarse = through(&sampled(0.02, 101), false);
         let [fine_error, coarse_error] = [worst(&fine, 2.0), worst(&coarse, 2.0)];
         assert!(fine_error < coarse_error / 6.0, "{fine_error} {coarse_error}: of third order at least");
         let told = fine.coarse_error_rad_s().unwrap();
@@ -316,7 +355,7 @@ mod tests {
 
     #[test]
     fn its_bounds_hold_everywhere() {
-        let playback = Playback::new(&sampled(0.05, 40), true);
+        let playback = through(&sampled(0.05, 40), true);
         let (rate, slope) = playback.bounds();
         let step_s = 1e-4;
         for tick in 0..60_000 {
@@ -329,12 +368,12 @@ mod tests {
     #[test]
     fn it_ends_or_begins_again() {
         let samples = [(1.0, Vector3::x()), (2.0, Vector3::y()), (3.0, Vector3::z())];
-        let once = Playback::new(&samples, false);
+        let once = through(&samples, false);
         assert_eq!(
             (once.length_s(), once.at(0.0), once.at(2.0), once.at(9.0)),
             (2.0, Vector3::x(), Vector3::z(), Vector3::z())
         );
-        let again = Playback::new(&samples, true);
+        let again = through(&samples, true);
         assert_eq!((again.length_s(), again.sampling()), (3.0, (3, 1.0)));
         assert_eq!((again.at(2.0), again.at(3.0), again.at(4.0)), (Vector3::z(), Vector3::x(), Vector3::y()));
     }
@@ -343,7 +382,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("log.csv");
         std::fs::write(&path, text).unwrap();
-        raw.load(&path)
+        raw.load(&path, 10.0)
+    }
+
+    #[test]
+    fn what_is_not_played_is_not_kept_and_yet_counted() {
+        let mut motion = Motion::new(0.5);
+        sampled(0.01, 1001).iter().for_each(|(time_s, rate)| motion.add(*time_s, *rate));
+        assert_eq!(motion.samples.len(), 53);
+        let (part, whole) = (Playback::new(motion, false), through(&sampled(0.01, 1001), false));
+        assert_eq!((part.length_s(), part.sampling().0, part.hash()), (whole.length_s(), 1001, whole.hash()));
+        assert!((0..=500).map(|tick| f64::from(tick) * 1e-3).all(|time_s| part.at(time_s) == whole.at(time_s)));
     }
 
     #[test]

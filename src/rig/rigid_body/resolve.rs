@@ -138,7 +138,7 @@ fn load_playback(
     let path = playback::locate(checks.file("leader.data", leader.data.as_ref()?));
     let mut raw = leader.playback.take().unwrap_or_default();
     leader.data = Some(path.display().to_string());
-    let playback = checks.accept("leader.data", raw.load(&path))?;
+    let playback = checks.accept("leader.data", raw.load(&path, context.duration_s))?;
     let (samples, longest_s) = playback.sampling();
     checks.require(playback.repeats() || context.duration_s <= playback.length_s(), "duration_s", || {
         format!(

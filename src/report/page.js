@@ -1,0 +1,91 @@
+/* Pictures over time: a cursor with the values under it, and a closer look at a part of the time, in all of them at once. */
+/* Drag to look at a part; double click to see all again. Without this script the page is whole. */
+"use strict";
+(() => {
+  const SVG = document.querySelector("svg").namespaceURI;
+  const numbers = (text) => text.split(" ").map(Number);
+  const charts = [...document.querySelectorAll("svg.time")].map((svg) => {
+    const [left, top, width, height] = numbers(svg.dataset.plot);
+    const plot = svg.querySelector("svg.plot");
+    const lines = [...plot.querySelectorAll("path.line")].filter((path) => path.dataset.label).map((path) => ({
+      label: path.dataset.label,
+      points: path.getAttribute("d").split(/[ML]/).slice(1).map((at) => numbers(at.split("h")[0])),
+    }));
+    const readout = document.createElement("span");
+    readout.className = "readout";
+    svg.parentNode.querySelector("figcaption").append(readout);
+    return { svg, plot, left, top, width, height, lines, readout, time: numbers(svg.dataset.x), value: numbers(svg.dataset.y),
+      logarithmic: svg.dataset.scale === "log", names: svg.querySelector("use.names"), ticks: svg.querySelector("g.ticks"),
+      all: svg.querySelector("g.ticks").innerHTML };
+  });
+  /* What is seen of the time, as parts of it. */
+  let seen = [0, 1];
+  const element = (name, attributes, text) => {
+    const made = document.createElementNS(SVG, name);
+    Object.entries(attributes).forEach(([key, value]) => made.setAttribute(key, value));
+    made.textContent = text || "";
+    return made;
+  };
+  const show = (from, to) => {
+    seen = [from, to];
+    for (const chart of charts) {
+      const { plot, left, top, width, height, ticks, names, time } = chart;
+      plot.setAttribute("viewBox", `${left + from * width} ${top} ${(to - from) * width} ${height}`);
+      if (names) names.style.display = from > 0 || to < 1 ? "none" : "";
+      if (from === 0 && to === 1) { ticks.innerHTML = chart.all; continue; }
+      const [low, high] = [from, to].map((part) => time[0] + part * (time[1] - time[0]));
+      const raw = (high - low) / 8, decade = 10 ** Math.floor(Math.log10(raw));
+      const step = [1, 2, 5, 10].map((m) => m * decade).find((step) => step >= raw);
+      const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+      ticks.replaceChildren();
+      for (let n = Math.ceil(low / step); n * step <= high; n += 1) {
+        const x = left + width * (n * step - low) / (high - low);
+        ticks.append(element("path", { class: "grid", d: `M${x} ${top}V${top + height}` }));
+        ticks.append(element("text", { x, y: top + height + 15, "text-anchor": "middle" }, (n * step).toFixed(digits)));
+      }
+    }
+  };
+  /* Where a pointer is, as a part of the width of a plot. */
+  const part = ({ svg, left, width }, event) => {
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+    return Math.min(1, Math.max(0, (at.x - left) / width));
+  };
+  const point = (chart, at) => {
+    const { left, top, width, height, lines, time, value, logarithmic } = chart;
+    const whole = seen[0] + at * (seen[1] - seen[0]), x = left + whole * width;
+    const told = (y) => {
+      const between = value[0] + (1 - (y - top) / height) * (value[1] - value[0]);
+      return (logarithmic ? 10 ** between : between).toPrecision(3);
+    };
+    const texts = lines.map(({ label, points }) => {
+      /* Lines that go back, as the extremes of a column do, have several values at a time. */
+      const nearest = Math.min(...points.map(([px]) => Math.abs(px - x)));
+      if (!(nearest <= width / 100)) return "";
+      const values = points.filter(([px]) => Math.abs(px - x) <= nearest + 0.05).map(([, y]) => told(y));
+      const ends = [...new Set([values[0], values.at(-1)])];
+      return `${label}: ${ends.join(" to ")}`;
+    });
+    const now = time[0] + whole * (time[1] - time[0]);
+    chart.readout.textContent = [`t = ${now.toPrecision(4)} s`, ...texts.filter(Boolean)].join("; ");
+  };
+  for (const chart of charts) {
+    const { svg, left, top, width, height } = chart;
+    const cursor = element("path", { class: "cursor" });
+    svg.append(cursor);
+    let begun = null;
+    const move = (event) => {
+      const at = part(chart, event), from = begun === null ? at : begun;
+      cursor.setAttribute("d", `M${left + at * width} ${top}v${height}` + (from === at ? "" : `M${left + from * width} ${top}v${height}`));
+      point(chart, at);
+    };
+    svg.addEventListener("pointerdown", (event) => { begun = part(chart, event); });
+    svg.addEventListener("pointermove", move);
+    svg.addEventListener("pointerleave", () => { begun = null; cursor.setAttribute("d", ""); chart.readout.textContent = ""; });
+    svg.addEventListener("pointerup", (event) => {
+      const [from, to] = [begun === null ? 0 : begun, part(chart, event)].sort((one, other) => one - other);
+      if (begun !== null && to - from > 0.01) show(...[from, to].map((at) => seen[0] + at * (seen[1] - seen[0])));
+      begun = null;
+    });
+    svg.addEventListener("dblclick", () => show(0, 1));
+  }
+})();
