@@ -146,7 +146,7 @@ fn linear_ticks(name: &str, low: f64, high: f64, labels: f64) -> (String, Vec<(f
     let offset = if high - low < SAME * largest { ((low + high) / 2.0 / coarse).round() * coarse } else { 0.0 };
     let farthest = values.iter().map(|value| (value - offset).abs()).fold(0.0, f64::max);
     let plain = farthest == 0.0 || (SMALL..LARGE).contains(&farthest);
-    let exponent = if plain { 0 } else { farthest.log10().floor() as i32 };
+    let exponent = if plain { 0 } else { (farthest.log10() + 1e-6).floor() as i32 };
     let unit = 10_f64.powi(exponent);
     let digits = decimals(step / unit);
     let label = |value: f64| {
@@ -215,11 +215,11 @@ mod tests {
             let (label, labels) = (axis.label.clone(), labels(&axis).join(" "));
             (label, labels)
         };
-        assert_eq!(named(-1e-15, 1e-15), ("ω1, 10⁻¹⁶ rad/s".into(), "−10 −8 −6 −4 −2 0 2 4 6 8 10".into()));
-        assert_eq!(named(0.5, 0.5 + 1e-6), ("ω1 − 0.5, 10⁻⁷ rad/s".into(), "0 2 4 6 8 10".into()));
+        assert_eq!(named(-1e-15, 1e-15), ("ω1, 10⁻¹⁵ rad/s".into(), "−1.0 −0.5 0.0 0.5 1.0".into()));
+        assert_eq!(named(0.5, 0.5 + 1e-6), ("ω1 − 0.5, 10⁻⁶ rad/s".into(), "0.0 0.2 0.4 0.6 0.8 1.0".into()));
         assert_eq!(named(2e6, 2.1e6).0, "ω1, 10⁶ rad/s");
         assert_eq!(named(1.0, 1.0).0, "ω1 − 1, 10⁻⁹ rad/s");
-        assert_eq!(Axis::linear("share", -3.0001, -3.0).label, "share + 3, 10⁻⁵");
+        assert_eq!(Axis::linear("share", -3.0001, -3.0).label, "share + 3, 10⁻⁴");
         let values = [0.0, 1e-300, 1e-30, -1e-15, 3e-7, 0.877, 0.877 + 1e-9, -0.877, 12345.6, -7.7e12, 1e30];
         for (low, high) in values.into_iter().flat_map(|low| values.map(|high| (low, high))) {
             for (_, label) in Axis::around("x, m", (low, high)).ticks {
