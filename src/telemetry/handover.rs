@@ -12,10 +12,9 @@ fn copy(copies: &[AtomicU64], commits: u64) -> &[AtomicU64] {
     if commits.is_multiple_of(2) { even } else { odd }
 }
 
-/// Writes the copy that is not current, and makes it current by a single store.
+/// Writes the copy that is not current, and makes it current by a single store: the `next` commit, counted from 1.
 #[inline]
-pub fn commit(commits: &AtomicU64, copies: &[AtomicU64], write: impl FnOnce(&[AtomicU64])) {
-    let next = commits.load(Ordering::Relaxed) + 1;
+pub fn commit(commits: &AtomicU64, next: u64, copies: &[AtomicU64], write: impl FnOnce(&[AtomicU64])) {
     // Readers that still read the copy which is written now must see by the count that it was replaced: the store of the last
     // commit is not to be seen after the stores of this one.
     fence(Ordering::Release);

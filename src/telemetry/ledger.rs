@@ -232,7 +232,8 @@ impl Ledger {
     #[inline]
     pub fn commit(&self, write: impl FnOnce(&mut Store<'_>)) {
         let Some(record) = self.memory.record.get() else { return };
-        handover::commit(self.word(Self::COMMITS), record.words(), |words| {
+        let commits = self.word(Self::COMMITS);
+        handover::commit(commits, commits.load(Ordering::Relaxed) + 1, record.words(), |words| {
             let mut store = Store { words, at: 0 };
             write(&mut store);
             debug_assert_eq!(store.at, words.len(), "a state always takes as many words");
