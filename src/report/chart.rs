@@ -49,6 +49,13 @@ pub struct Picture {
     pub legend: Vec<(&'static str, String)>,
 }
 
+impl Picture {
+    /// Whether it is made to be as wide as the page.
+    pub fn is_wide(&self) -> bool {
+        self.svg.starts_with(&format!("<svg viewBox=\"0 0 {WIDE} "))
+    }
+}
+
 /// What is marked on every time axis, by time in s.
 #[derive(Debug, Clone, Default)]
 pub struct Marks {

@@ -98,7 +98,7 @@ fn block(block: &Block, html: &mut String) {
         Block::Table { caption, head, rows } if !rows.is_empty() => table(caption, head, rows, html),
         Block::Table { .. } => {}
         Block::Figures(figures) => {
-            let wide = if figures.len() == 1 { " alone" } else { "" };
+            let wide = if figures.iter().all(|(picture, _)| picture.is_wide()) { " wide" } else { "" };
             let _ = writeln!(html, "<div class=\"figures{wide}\">");
             figures.iter().for_each(|(picture, caption)| figure(picture, caption, html));
             html.push_str("</div>\n");
