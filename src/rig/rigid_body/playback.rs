@@ -271,7 +271,9 @@ impl Playback {
     /// By how much the motion through every second sample misses the others, at the most, rad/s: with samples twice as far
     /// apart. That of all samples misses what lies between them by about an eighth of that, the noise aside.
     pub fn coarse_error_rad_s(&self) -> Option<f64> {
-        let samples: Vec<(f64, Vector3<f64>)> = self.knots.iter().map(|knot| (knot.time_s, knot.rate)).collect();
+        // The knot by which it is repeated is no sample.
+        let own = &self.knots[..self.knots.len() - usize::from(self.repeats)];
+        let samples: Vec<(f64, Vector3<f64>)> = own.iter().map(|knot| (knot.time_s, knot.rate)).collect();
         let kept: Vec<_> = samples.iter().step_by(2).copied().collect();
         if kept.len() < 3 {
             return None;

@@ -153,8 +153,7 @@ fn load_playback(
     ));
     if let Some(error) = playback.coarse_error_rad_s() {
         notes.push(format!(
-            "leader.data: through every second sample the cubics miss the others by at most {error:.3e} rad/s, noise included; \
-             through all samples the motion between them is missed by about an eighth of that"
+            "leader.data: through every second sample the cubics miss the others by at most {error:.3e} rad/s, noise included"
         ));
     }
     raw.hash = Some(playback.hash());
