@@ -60,16 +60,8 @@ fn repeat(kind: &str, passes: u64) {
     // At 1 kHz a pass is a second.
     let overrides = ["clock=in-process", "accept={}", &format!("duration_s={passes}")].map(str::to_owned);
     let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &overrides).expect("shipped scenarios are valid");
-    let mut launch = Launch {
-        program: PathBuf::new(),
-        external: Vec::new(),
-        record: None,
-        foxglove: None,
-        require_realtime: false,
-        signal: &AtomicUsize::new(0),
-        progress: &mut |_| {},
-    };
-    run(&scenario, &mut launch).expect("a run in one thread needs nothing that could fail");
+    run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {}))
+        .expect("a run in one thread needs nothing that could fail");
 }
 
 fn path() -> PathBuf {

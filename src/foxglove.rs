@@ -5,7 +5,7 @@
 //!
 //! Must not be waited for by any role, nor take anything from a client. Who is slow, this process or a client, loses messages.
 
-use crate::bus::domain::{Domain, newest_run};
+use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
@@ -13,7 +13,9 @@ use crate::config::Scenario;
 use crate::record::{
     Channel, Layout, MESSAGE_ENCODING, MessageSink, RecordError, SCHEMA_ENCODING, Taps, frame, topic_of,
 };
-use crate::runtime::{RoleError, depths, join, join_at_low_priority, topic, with_realtime_priority, write_whole};
+use crate::runtime::{
+    RoleError, depths, join, join_at_low_priority, run_under_way, topic, with_realtime_priority, write_whole,
+};
 use crate::sample::{Phase, Schedule};
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle};
 use std::collections::BTreeMap;
@@ -36,7 +38,7 @@ const WAITING_BYTES: usize = 16 << 20;
 /// What to show, and where.
 #[derive(Debug, Clone)]
 pub struct FoxgloveSeat {
-    /// The domain's directory; none is that of the newest run of this user.
+    /// The domain's directory, or that of the run's results; none is that of the newest run of this user.
     pub domain: Option<PathBuf>,
     /// Where to listen; at port 0 the system chooses one.
     pub address: SocketAddr,
@@ -90,10 +92,7 @@ pub enum FoxgloveError {
 /// # Errors
 /// [`FoxgloveError`].
 pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
-    let root = match &seat.domain {
-        Some(root) => root.clone(),
-        None => newest_run().map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?,
-    };
+    let root = run_under_way(seat.domain.as_deref()).map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?;
     let (domain, scenario) = join(&root)?;
     let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;

@@ -19,16 +19,8 @@ fn record(bench: &Bench, name: &str, duration_s: &str) -> PathBuf {
     let overrides = ["clock=in-process".to_owned(), format!("duration_s={duration_s}"), "accept={}".to_owned()];
     let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &overrides).unwrap();
     let file = bench.path(name);
-    let launch = &mut Launch {
-        program: PathBuf::new(),
-        external: Vec::new(),
-        record: Some(file.clone()),
-        foxglove: None,
-        require_realtime: false,
-        signal: &AtomicUsize::new(0),
-        progress: &mut |_| {},
-    };
-    run(&scenario, launch).unwrap();
+    run(&scenario, &mut Launch { record: Some(file.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) })
+        .unwrap();
     file
 }
 

@@ -9,7 +9,6 @@ use corotate::launch::{Launch, Summary, run};
 use corotate::role::DOUBTS;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -47,16 +46,7 @@ struct Disturbed {
 impl Disturbed {
     /// Runs a scenario in this thread.
     fn run(scenario: &Scenario) -> Self {
-        let mut launch = Launch {
-            program: PathBuf::new(),
-            external: Vec::new(),
-            record: None,
-            foxglove: None,
-            require_realtime: false,
-            signal: &AtomicUsize::new(0),
-            progress: &mut |_| {},
-        };
-        let outcome = run(scenario, &mut launch).unwrap();
+        let outcome = run(scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).unwrap();
         let summary = serde_json::to_value(Summary::new(scenario, &outcome, jiff::Timestamp::UNIX_EPOCH)).unwrap();
         let metric = &summary["score"]["metrics"][0];
         let number = |key: &str| metric[key].as_f64().unwrap_or(f64::INFINITY);

@@ -435,8 +435,8 @@ fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
     bench.await_role("controller");
     let domains = bench.domains();
     let (domain, lock) = (domains[0].to_str().unwrap(), domains[0].with_extension("lock"));
-    // It looks once as it joins.
-    let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=2+"];
+    // It looks twice as it joins.
+    let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=3+"];
     let done =
         bench.start_program(Path::new("strace"), &[&fails[..], &[PROGRAM, "watch", domain, "--once", "1"]].concat());
     let done = done.wait();

@@ -538,6 +538,48 @@ fn coefficients_measurements_and_fields_on_demand_are_drawn() {
     );
 }
 
+/// Two runs over each other: the first difference is the one that `diff` finds, and is marked on every time axis.
+#[test]
+fn two_runs_are_shown_over_each_other() {
+    let bench = Bench::new();
+    let (plain, faulted) = (run(&bench, "rigid-pair", &[]), bench.path("other"));
+    let other = ["run", "rigid-pair", "--clock", "in-process", "--record", "--out", faulted.to_str().unwrap()];
+    let fault = ["--set", r#"fault=[{kind="drop",role="observer",from_tick=4000,ticks=5}]"#];
+    assert!(matches!(bench.run(&[&other[..], &fault].concat()).code, Some(0 | 3)));
+    let pair = |b: &Path| {
+        let done = report(&bench, &plain, &[b.to_str().unwrap(), "--show", "leader/estimate.omega_rad_s"]);
+        assert_eq!((done.code, done.stdout.as_str()), (Some(0), "comparison.html\n"), "{done:?}");
+        std::fs::read_to_string(bench.path("comparison.html")).unwrap()
+    };
+    let html = pair(&faulted);
+    check_page(&html);
+    let page = parse(&html);
+    assert_eq!(sections(&page), ["verdict", "differences", "fields", "errors", "motion"]);
+    let done = bench.run(&["diff", plain.to_str().unwrap(), faulted.to_str().unwrap(), "--json"]);
+    let differences: Value = serde_json::from_str(&done.stdout).unwrap();
+    let firsts = differences["signals"].as_array().unwrap().iter().filter_map(|s| s["first"]["tick"].as_u64());
+    let first = firsts.min().unwrap();
+    let words = text(section(&page, "differences"));
+    assert!((4000..4010).contains(&first) && words.contains(&format!("at tick {first} ")), "{first}: {words}");
+    assert!(html.contains("first difference</text>") && html.contains("leader, A") && html.contains("leader, B"));
+    // A run and itself.
+    let same = pair(&plain);
+    assert!(same.contains("✓ no value differs") && !same.contains("first difference</text>"));
+    // Without recordings there is what was told.
+    assert_eq!(bench.run(&["run", "rigid-pair", "--clock", "in-process", "--out", "bare"]).code, Some(0));
+    let bare = pair_without_fields(&bench, &plain, &bench.path("bare"));
+    assert!(bare.contains("Samples are compared where both runs were recorded"), "{bare}");
+    // Another rig has other signals.
+    let orbit = run(&bench, "orbit-hold", &[]);
+    assert!(pair_without_fields(&bench, &plain, &orbit).contains("orbit-hold"));
+}
+
+fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
+    let done = report(bench, a, &[b.to_str().unwrap(), "--out", "pair.html"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    std::fs::read_to_string(bench.path("pair.html")).unwrap()
+}
+
 /// For papers: each with its colours in place, readable by what knows no page.
 #[test]
 fn every_figure_is_a_picture_of_its_own() {
@@ -546,8 +588,16 @@ fn every_figure_is_a_picture_of_its_own() {
     let done = report(&bench, &directory, &["--figures", "figures"]);
     assert_eq!(done.code, Some(0), "{done:?}");
     let html = std::fs::read_to_string(directory.join("report.html")).unwrap();
-    let figures = files(&bench.path("figures"));
+    let (figures, prints): (Vec<_>, Vec<_>) =
+        files(&bench.path("figures")).into_iter().partition(|path| path.extension().is_some_and(|kind| kind == "svg"));
     assert_eq!(figures.len(), html.matches("<figure>").count());
+    assert_eq!(prints.len(), if cfg!(feature = "pdf") { figures.len() } else { 0 });
+    for path in prints {
+        let pdf = std::fs::read(&path).unwrap();
+        // With letters: a font is in it.
+        let has = |text: &[u8]| pdf.windows(text.len()).any(|part| part == text);
+        assert!(pdf.starts_with(b"%PDF-") && has(b"/FontFile") && has(b"%%EOF"), "{}", path.display());
+    }
     for path in figures {
         let svg = std::fs::read_to_string(&path).unwrap();
         let picture = Document::parse(&svg).unwrap_or_else(|error| panic!("{}: {error}", path.display()));

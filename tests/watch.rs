@@ -244,6 +244,34 @@ fn one_screen_can_be_had_without_a_terminal() {
     bench.assert_clean(&[domain]);
 }
 
+/// Of two runs the one whose results go to the directory that is named; its domain is nobody's business.
+#[test]
+fn a_run_is_found_by_the_directory_of_its_results() {
+    let bench = Bench::new();
+    let start = |out: &str, hz: &str| {
+        let quiet = ["--tick-hz", hz, "--duration", "600", "--set", "accept={}", "--set", "limits={}"];
+        bench.start(&[&["run", "rigid-pair", "--out", out][..], &quiet].concat())
+    };
+    let runs = [start("slow", "100"), start("other", "200")];
+    for (out, ticks) in [("slow", 60_000), ("other", 120_000)] {
+        // It may not be there yet.
+        let told: serde_json::Value = await_some(|| {
+            let done = bench.run(&["watch", out, "--once", "0.5", "--json"]);
+            (done.code == Some(0)).then(|| serde_json::from_str(&done.stdout).unwrap())
+        });
+        assert_eq!((&told["schema"], &told["last_tick"]), (&"corotate/watch/v1".into(), &ticks.into()), "{told}");
+        let (roles, errors) = (told["roles"].as_array().unwrap(), told["errors"].as_object().unwrap());
+        assert!(roles.len() == 4 && roles.iter().all(|role| role["tick"].is_u64()), "{told}");
+        assert!(errors.contains_key("sync_error_rad_s") && !told["signals"].as_object().unwrap().is_empty(), "{told}");
+    }
+    for run in runs {
+        run.signal(15);
+        assert_eq!(run.wait().code, Some(128 + 15));
+    }
+    let over = bench.run(&["watch", "slow"]);
+    assert!(over.code == Some(2) && over.stderr.contains("corotate report slow"), "{over:?}");
+}
+
 #[test]
 fn without_a_run_there_is_nothing_to_watch() {
     let bench = Bench::new();

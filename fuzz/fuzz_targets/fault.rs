@@ -6,7 +6,6 @@ use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, run};
 use libfuzzer_sys::fuzz_target;
 use std::fmt::Write;
-use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
 
 const KINDS: [&str; 12] = [
@@ -84,16 +83,7 @@ fuzz_target!(|tables: Vec<Table>| {
             let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
             // As text: what is not a number is unequal to itself.
             assert_eq!(format!("{:?}", again.faults), format!("{:?}", scenario.faults));
-            let launch = &mut Launch {
-                program: PathBuf::new(),
-                external: Vec::new(),
-                record: None,
-                foxglove: None,
-                require_realtime: false,
-                signal: &AtomicUsize::new(0),
-                progress: &mut |_| {},
-            };
-            let outcome = run(&scenario, launch).expect("a run in one thread comes to its end");
+            let outcome = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).expect("a run in one thread comes to its end");
             assert!(outcome.reports.len() == 4 && outcome.problems.is_empty(), "{:?}", outcome.problems);
         }
         Err(error) => assert!(!error.to_string().is_empty()),

@@ -28,16 +28,7 @@ impl Bench {
         let short = ["clock=in-process", "duration_s=0.02", "accept={}"].map(str::to_owned);
         let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).expect("it is shipped");
         let path = directory.path().join("whole.mcap");
-        let launch = &mut Launch {
-            program: path.clone(),
-            external: Vec::new(),
-            record: Some(path.clone()),
-            foxglove: None,
-            require_realtime: false,
-            signal: &AtomicUsize::new(0),
-            progress: &mut |_| {},
-        };
-        run(&scenario, launch).expect("it runs");
+        run(&scenario, &mut Launch { record: Some(path.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) }).expect("it runs");
         Self { whole: std::fs::read(path).expect("it was recorded"), directory }
     }
 

@@ -190,9 +190,7 @@ impl Bench<'_> {
         signal: &AtomicUsize,
         progress: &mut dyn FnMut(&Progress<'_>),
     ) -> Result<Outcome, BenchError> {
-        let (program, external) = (self.program.clone(), Vec::new());
-        let (record, foxglove, require_realtime) = (None, None, false);
-        let mut launch = Launch { program, external, record, foxglove, require_realtime, signal, progress };
+        let mut launch = Launch { program: self.program.clone(), ..Launch::new(signal, progress) };
         let outcome = launch::run(scenario, &mut launch)?;
         self.interrupted()?;
         Ok(outcome)

@@ -325,14 +325,6 @@ pub fn domains() -> Result<Vec<Found>, DomainError> {
     Ok(private_base()?.map_or(Vec::new(), |base| found(&base)))
 }
 
-/// The domain of the newest run of this user that is under way.
-///
-/// # Errors
-/// [`DomainError::Privacy`].
-pub fn newest_run() -> Result<Option<PathBuf>, DomainError> {
-    Ok(domains()?.into_iter().find(|found| found.alive).map(|found| found.root))
-}
-
 fn found(base: &Path) -> Vec<Found> {
     let find = |path: PathBuf| {
         let made = fs::metadata(&path).and_then(|lock| lock.modified()).ok();

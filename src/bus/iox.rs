@@ -282,6 +282,10 @@ pub(super) fn enter(root: &std::path::Path, domain: &Domain, name: &str) -> Resu
 
 impl Bus for IoxBus {
     const REPEATS: bool = true;
+
+    fn is_gone(&self) -> bool {
+        !self.domain.exists()
+    }
     type Writer<S: Sample> = IoxWriter<S>;
     type Reader<S: Sample> = IoxReader<S>;
     type FleetWriter<L: FleetLayout> = IoxFleetWriter<L>;

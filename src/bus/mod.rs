@@ -93,6 +93,11 @@ pub trait Bus {
     /// Whether a reader that is opened anew may get samples again that its predecessor had.
     const REPEATS: bool;
 
+    /// Whether the run that it belongs to is gone, with all that its signals lay in. Not for every tick: the system is asked.
+    fn is_gone(&self) -> bool {
+        false
+    }
+
     /// The writing end.
     type Writer<S: Sample>: Write<S>;
     /// The reading end.

@@ -120,15 +120,8 @@ mod tests {
 
     fn outcome(scenario: &Scenario, direct: bool, signal: usize) -> Option<Outcome> {
         let signal = AtomicUsize::new(signal);
-        let mut launch = Launch {
-            program: std::path::PathBuf::new(),
-            external: Vec::new(),
-            record: None,
-            foxglove: None,
-            require_realtime: false,
-            signal: &signal,
-            progress: &mut |_| {},
-        };
+        let mut progress = |_: &Progress<'_>| {};
+        let mut launch = Launch::new(&signal, &mut progress);
         match direct {
             true => scenario.rig.face().direct(scenario, &mut launch),
             false => Some(run_nodes(scenario, &mut launch).unwrap()),

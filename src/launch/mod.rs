@@ -53,6 +53,8 @@ pub struct Launch<'a> {
     pub external: Vec<String>,
     /// The file to record every sample to.
     pub record: Option<PathBuf>,
+    /// The directory that its results will be written to, by its whole path: whoever looks for the run finds it by that.
+    pub results: Option<PathBuf>,
     /// Where to show the run on a Foxglove WebSocket; not in one thread, and only by a program that was built with it.
     pub foxglove: Option<SocketAddr>,
     /// Refuse to run without every privilege that was asked for.
@@ -61,6 +63,23 @@ pub struct Launch<'a> {
     pub signal: &'a AtomicUsize,
     /// Called now and then.
     pub progress: &'a mut dyn FnMut(&Progress<'_>),
+}
+
+impl<'a> Launch<'a> {
+    /// What a run needs at the least, to be added to by whoever wants more. In one thread no program is needed; elsewhere
+    /// [`program`](Self::program) is to be named.
+    pub fn new(signal: &'a AtomicUsize, progress: &'a mut dyn FnMut(&Progress<'_>)) -> Self {
+        Self {
+            program: PathBuf::new(),
+            external: Vec::new(),
+            record: None,
+            results: None,
+            foxglove: None,
+            require_realtime: false,
+            signal,
+            progress,
+        }
+    }
 }
 
 /// How far a run is.

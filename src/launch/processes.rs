@@ -17,8 +17,8 @@ use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::record::RECORDER;
 use crate::runtime::{
-    Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, scenario_path, seat_path,
-    shared_memory_bytes, topic, write_whole,
+    Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, results_path, scenario_path,
+    seat_path, shared_memory_bytes, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::system::tell;
@@ -27,6 +27,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::fmt;
 use std::os::fd::AsFd;
+use std::os::unix::ffi::OsStrExt;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -59,6 +60,10 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let domain = owned.domain();
     let path = scenario_path(domain);
     write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    if let Some(results) = &launch.results {
+        let path = results_path(domain.root());
+        write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    }
     describe_seats(scenario, launch, domain)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = Janitor::start(&launch.program, domain, startup_limit)?;

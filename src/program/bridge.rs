@@ -1,7 +1,7 @@
 //! `corotate bridge`: a device behind a serial line, in a follower's seat.
 
 use super::role::{die_with, terminated_by_signals};
-use super::{Exit, fail};
+use super::{Exit, fail, say};
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, RoleError, run_bridge};
 use crate::system::tell;
@@ -26,10 +26,16 @@ pub struct Arguments {
     /// How long a device that is silent or gone is waited for, s
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     patience: f64,
+    /// Print the line's counters at the end as one JSON object (corotate/bridge/v1)
+    #[arg(long)]
+    json: bool,
     /// Die with this process
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
 }
+
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/bridge/v1";
 
 const EXAMPLES: &str = "\
 Example:
@@ -59,8 +65,13 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
     };
     let welcomed = |device: &str| tell(format_args!("{} on {}: {device}", seat.body, seat.path.display()));
     let counters = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
-    if let Some(counters) = counters {
-        tell(line_words(&seat.body, &counters));
+    match counters {
+        Some(counters) if arguments.json => {
+            let object = serde_json::json!({ "schema": SCHEMA, "body": seat.body, "line": counters });
+            say(&format!("{object}\n"))?;
+        }
+        Some(counters) => tell(line_words(&seat.body, &counters)),
+        None => {}
     }
     Ok(Exit::Ok)
 }

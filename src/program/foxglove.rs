@@ -11,7 +11,7 @@ pub const ADDRESS: &str = "127.0.0.1:8765";
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain [default: the newest run of this user]
+    /// The run: the directory that its results go to, or its domain [default: the newest run of this user]
     #[arg(value_name = "DIR")]
     domain: Option<PathBuf>,
     /// Where to listen, as IP:PORT; at port 0 the system chooses one, and it is printed

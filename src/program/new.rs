@@ -25,7 +25,13 @@ pub struct Arguments {
     /// Where to write it [default: ./NAME]
     #[arg(long, value_name = "DIR")]
     path: Option<PathBuf>,
+    /// Print where the crate is as one JSON object (corotate/new/v1)
+    #[arg(long)]
+    json: bool,
 }
+
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/new/v1";
 
 const EXAMPLES: &str = "\
 Example:
@@ -49,13 +55,16 @@ pub fn new(arguments: &Arguments) -> Exit {
         return fail(Exit::Usage, &format!("{path} is there already and is not empty; name another with --path"));
     }
     match write_all(&directory, name) {
-        Ok(()) => say(&told(&directory)).map_or_else(|exit| exit, |()| Exit::Ok),
+        Ok(()) => say(&told(&directory, arguments.json)).map_or_else(|exit| exit, |()| Exit::Ok),
         Err(error) => fail(Exit::Failure, &format!("{}: {error}; name another with --path", directory.display())),
     }
 }
 
-fn told(directory: &Path) -> String {
+fn told(directory: &Path, json: bool) -> String {
     let path = directory.display();
+    if json {
+        return format!("{}\n", serde_json::json!({ "schema": SCHEMA, "crate": path.to_string() }));
+    }
     format!("{path}: a crate with a rig of its own\n  cd {path}\n  cargo test\n  cargo run --release\n")
 }
 

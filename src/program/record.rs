@@ -2,8 +2,8 @@
 
 use super::role::{die_with, terminated_by_signals};
 use super::{Exit, fail, remark, say};
-use crate::bus::domain::newest_run;
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
+use crate::runtime::run_under_way;
 use crate::watch::WatchError;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain [default: the newest run of this user]
+    /// The run: the directory that its results go to, or its domain [default: the newest run of this user]
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
     /// The file to write
@@ -34,8 +34,8 @@ Examples:
   corotate run --record            record a run from its first tick to its last
   corotate record --out part.mcap  the newest run that is under way, from now
                                    on; Ctrl-C ends the recording in order
-  corotate record --domain $XDG_RUNTIME_DIR/corotate/<id>
-                                   the run in that domain: `run -v` tells it";
+  corotate record --domain runs/pair
+                                   the run that `run --out runs/pair` began";
 
 /// Records to the end of the run.
 pub fn record(arguments: &Arguments) -> Exit {
@@ -46,7 +46,7 @@ pub fn record(arguments: &Arguments) -> Exit {
         Ok(terminated) => terminated,
         Err(exit) => return exit,
     };
-    let domain = match arguments.domain.clone().map_or_else(newest_run, |domain| Ok(Some(domain))) {
+    let domain = match run_under_way(arguments.domain.as_deref()) {
         Ok(Some(domain)) => domain,
         Ok(None) => return fail(Exit::Usage, &WatchError::NoRun),
         Err(error) => return fail(Exit::Usage, &error),

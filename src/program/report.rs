@@ -1,8 +1,8 @@
-//! `corotate report`: a run, or a recording, as one page.
+//! `corotate report`: a run, or a recording, as one page; or two over each other.
 
 use super::record;
 use super::{Exit, fail, latest, remark, say};
-use crate::report::{ReportError, report as compose};
+use crate::report::{ReportError, report as compose, report_pair};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -15,13 +15,15 @@ use std::{fs, io};
 pub struct Arguments {
     /// A run's directory, or a recording [default: runs/latest]
     run: Option<PathBuf>,
-    /// The page to write [default: report.html in that directory, or beside the recording]
+    /// Another, to be drawn over the first: the page shows both, and where they differ first
+    other: Option<PathBuf>,
+    /// The page to write [default: report.html in that directory, or beside the recording; of two runs, comparison.html here]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Show this field too, such as leader/estimate.omega_rad_s or one element of it, …[2]; again for more
     #[arg(long, value_name = "FIELD")]
     show: Vec<String>,
-    /// Write every figure as a picture of its own (SVG) to this directory
+    /// Write every figure as a picture of its own to this directory: SVG, and PDF if built with it
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show the page in a browser (xdg-open)
@@ -47,7 +49,9 @@ Examples:
   corotate report --open           the newest run here, in a browser
   corotate report runs/pair        runs/pair/report.html
   corotate report runs/pair/run.mcap --out motion.html
-                                   the recording alone";
+                                   the recording alone
+  corotate report runs/before runs/after
+                                   both over each other, in comparison.html";
 
 /// Makes the page.
 pub fn report(arguments: &Arguments) -> Exit {
@@ -56,11 +60,15 @@ pub fn report(arguments: &Arguments) -> Exit {
         Err(reason) => return fail(Exit::Usage, &reason),
     };
     let directory = if source.is_dir() { &source } else { source.parent().unwrap_or(Path::new("")) };
-    let out = arguments.out.clone().unwrap_or_else(|| directory.join("report.html"));
+    let page = if arguments.other.is_some() { "comparison.html".into() } else { directory.join("report.html") };
+    let out = arguments.out.clone().unwrap_or(page);
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner().with_message(format!("reading {}", source.display()));
     spinner.enable_steady_tick(Duration::from_millis(100));
-    let composed = compose(&source, &arguments.show);
+    let composed = match &arguments.other {
+        None => compose(&source, &arguments.show),
+        Some(other) => report_pair(&source, other, &arguments.show),
+    };
     spinner.finish_and_clear();
     let written = composed.and_then(|report| {
         report.remarks().iter().for_each(|text| remark(text));
@@ -105,7 +113,10 @@ fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
 fn exit_of(error: &ReportError) -> Exit {
     match error {
         ReportError::Record(error) => record::exit_of(error),
-        ReportError::Read { .. } | ReportError::Write { .. } | ReportError::Counterpart { .. } => Exit::Failure,
+        ReportError::Read { .. }
+        | ReportError::Write { .. }
+        | ReportError::Counterpart { .. }
+        | ReportError::Pdf { .. } => Exit::Failure,
         ReportError::Nothing { .. }
         | ReportError::NoRun { .. }
         | ReportError::Summary { .. }

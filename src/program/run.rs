@@ -205,6 +205,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
             program,
             external: arguments.external.clone(),
             record: scenario.record.then(|| directory.join("run.mcap")),
+            results: std::fs::canonicalize(&directory).ok(),
             foxglove: arguments.foxglove,
             require_realtime: arguments.require_rt,
             signal: &signal,

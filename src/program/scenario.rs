@@ -100,7 +100,8 @@ pub fn stem(given: Option<&Path>) -> String {
 pub fn unknown(name: &str) -> String {
     let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
-    format!("there is no scenario `{name}`; {remedy} A file is given by its path, as ./{name} or {name}.toml")
+    let end = if remedy.ends_with('?') { "" } else { "." };
+    format!("there is no scenario `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml")
 }
 
 /// What a scenario is, in a line: the first of its text, if that is a comment.

@@ -3,7 +3,9 @@
 use super::run::catch_signals;
 use super::{Exit, fail, say};
 use crate::launch::SUMMARY;
-use crate::watch::{Session, WatchError, show, text};
+use crate::sample::RoleState;
+use crate::watch::{Model, RoleLine, Session, WatchError, show, text};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -11,13 +13,19 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain [default: the newest run of this user]
+    /// The run: the directory that its results go to, or its domain [default: the newest run of this user]
     #[arg(value_name = "DIR")]
     domain: Option<PathBuf>,
     /// Watch for so long, s [default: 2], print one screen of 80 by 24, leave
     #[arg(long, value_name = "S", num_args = 0..=1, default_missing_value = "2", value_parser = seconds)]
     once: Option<f64>,
+    /// Print what the screen shows as one JSON object (corotate/watch/v1), with --once
+    #[arg(long, requires = "once")]
+    json: bool,
 }
+
+/// Layout version of the JSON.
+const SCHEMA: &str = "corotate/watch/v1";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse().ok().filter(|seconds| (0.1..=86_400.0).contains(seconds));
@@ -33,8 +41,7 @@ in-sent from when the sample that it waits for was sent; median/99 % of the last
 
 Examples:
   corotate run & corotate watch    the newest run of this user
-  corotate watch $XDG_RUNTIME_DIR/corotate/<id>
-                                   the run in that domain
+  corotate watch runs/pair         the run that `run --out runs/pair` began
   corotate watch --once 5 > screen.txt
                                    one screen as text, after five seconds";
 
@@ -63,7 +70,7 @@ fn attempt(arguments: &Arguments, signal: &AtomicUsize) -> Result<Exit, WatchErr
         None => show(&mut session, signal)?,
         Some(seconds) => {
             session.follow((seconds * 1e9) as u64, || signal.load(Ordering::Relaxed) != 0)?;
-            if let Err(exit) = say(&text(&session.model, 80, 24)) {
+            if let Err(exit) = say(&if arguments.json { json(&session.model) } else { text(&session.model, 80, 24) }) {
                 return Ok(exit);
             }
         }
@@ -72,6 +79,39 @@ fn attempt(arguments: &Arguments, signal: &AtomicUsize) -> Result<Exit, WatchErr
         0 => Exit::Ok,
         number => Exit::Signal(number),
     })
+}
+
+/// What the screen shows, for programs. A number that is not finite is null.
+fn json(model: &Model) -> String {
+    let role = |role: &RoleLine| {
+        let state = RoleState::NAMES.into_iter().find(|(_, state)| *state == role.state).map(|(name, _)| name);
+        let latency = |window: Option<[f64; 2]>| window.map(|[p50, p99]| serde_json::json!({ "p50": p50, "p99": p99 }));
+        serde_json::json!({
+            "role": role.name,
+            "state": state,
+            "life": role.generation,
+            "tick": role.tick,
+            "rate_hz": role.rate.per_s(),
+            "missed": role.missed,
+            "due_sent_us": latency(role.lateness.percentiles_us()),
+            "in_sent_us": latency(role.step.percentiles_us()),
+        })
+    };
+    let fields = |fields: &[(String, String)]| fields.iter().cloned().collect::<BTreeMap<_, _>>();
+    let object = serde_json::json!({
+        "schema": SCHEMA,
+        "scenario": model.scenario,
+        "clock": model.clock,
+        "domain": model.domain,
+        "tick": model.tick,
+        "last_tick": model.last_tick,
+        "ended": model.ended,
+        "roles": model.roles.iter().map(role).collect::<Vec<_>>(),
+        "errors": model.series.iter().map(|series| (&series.name, series.last)).collect::<BTreeMap<_, _>>(),
+        "events": model.events.iter().map(|event| serde_json::json!({ "tick": event.tick, "text": event.text })).collect::<Vec<_>>(),
+        "signals": model.signals.iter().map(|signal| (&signal.name, fields(&signal.fields))).collect::<BTreeMap<_, _>>(),
+    });
+    format!("{object}\n")
 }
 
 fn exit_of(error: &WatchError) -> Exit {

@@ -48,10 +48,11 @@ pub struct RecorderSeat {
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join(&seat.domain)?;
     // Not nice to ordinary processes: it must not lose samples because something is being compiled.
-    let (_bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
+    let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
-    let ended = follow(&mut recorder, &mut line, credit_ticks, terminated);
+    let ended =
+        follow(&mut recorder, &mut line, credit_ticks, &|| terminated.load(Ordering::Relaxed) || !domain.exists());
     with_realtime_priority(|| recorder.leave());
     let report = recorder.finish(&books(&domain, &scenario), ended.as_ref().err());
     let path = report_path(domain.root(), RECORDER);
@@ -59,6 +60,8 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     // The launcher is gone, and its domain with it, if this fails: the report is printed as well.
     let _ = write_whole(&path, &text);
     let _ = line.say(RoleState::Done, u64::MAX);
+    drop((line, bus));
+    domain.forget();
     Ok(report)
 }
 
@@ -70,12 +73,13 @@ fn open(seat: &RecorderSeat, domain: &Domain, scenario: &Scenario) -> Result<(Io
     Ok((bus, line, recorder))
 }
 
-/// Takes samples from the first tick to the last.
+/// Takes samples from the first tick to the last, or until it is to `end`: a run that ended while this joined it has said its
+/// last word to others.
 fn follow(
     recorder: &mut Recorder,
     line: &mut Line,
     credit_ticks: Option<u64>,
-    terminated: &AtomicBool,
+    end: &dyn Fn() -> bool,
 ) -> Result<(), RecordError> {
     let (mut backoff, mut whole) = (Backoff::default(), false);
     loop {
@@ -90,7 +94,7 @@ fn follow(
                 break;
             }
             Phase::Stop => return Ok(()),
-            _ if terminated.load(Ordering::Relaxed) => return Ok(()),
+            _ if end() => return Ok(()),
             _ => sleep_until(monotonic_ns() + LOOK_NS / 5),
         }
     }
@@ -98,11 +102,12 @@ fn follow(
     loop {
         let taken = recorder.poll()?;
         let (now_ns, next_tick) = (monotonic_ns(), recorder.next_tick());
-        if now_ns >= next_word_ns || credit_ticks.is_some_and(|ticks| next_tick >= said + ticks) {
+        let time_for_a_word = now_ns >= next_word_ns;
+        if time_for_a_word || credit_ticks.is_some_and(|ticks| next_tick >= said + ticks) {
             line.say(RoleState::Running, next_tick)?;
             (said, next_word_ns) = (next_tick, now_ns + WORD_NS);
         }
-        if terminated.load(Ordering::Relaxed) || Phase::from_number(line.hear()?.phase) == Phase::Stop {
+        if time_for_a_word && end() || Phase::from_number(line.hear()?.phase) == Phase::Stop {
             break;
         }
         match (credit_ticks.is_some(), taken) {
@@ -112,14 +117,14 @@ fn follow(
             (true, _) => backoff = Backoff::default(),
         }
     }
-    drain(recorder, terminated)
+    drain(recorder, end)
 }
 
 /// Takes what roles that are ending still send.
-fn drain(recorder: &mut Recorder, terminated: &AtomicBool) -> Result<(), RecordError> {
+fn drain(recorder: &mut Recorder, end: &dyn Fn() -> bool) -> Result<(), RecordError> {
     let stopped_ns = monotonic_ns();
     let mut quiet_since_ns = stopped_ns;
-    while !terminated.load(Ordering::Relaxed) {
+    while !end() {
         let (taken, now_ns) = (recorder.poll()?, monotonic_ns());
         if taken > 0 {
             quiet_since_ns = now_ns;

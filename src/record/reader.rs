@@ -45,11 +45,8 @@ const RECORD_HEAD: usize = 9;
 /// let overrides = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
 /// let scenario = Scenario::parse(SHIPPED[0].1, "rigid-pair.toml", &overrides)?;
 /// let signal = AtomicUsize::new(0);
-/// # let mut launch = Launch {
-/// #     program: std::env::current_exe()?, external: Vec::new(), record: Some(file.clone()), foxglove: None,
-/// #     require_realtime: false, signal: &signal, progress: &mut |_| {},
-/// # };
-/// run(&scenario, &mut launch)?; // with `record: Some(file)` in its `Launch`, as `corotate run --record` does
+/// let mut progress = |_: &corotate::launch::Progress<'_>| {};
+/// run(&scenario, &mut Launch { record: Some(file.clone()), ..Launch::new(&signal, &mut progress) })?;
 ///
 /// let recording = Recording::open(&file)?;
 /// recording.require_whole()?;

@@ -50,6 +50,30 @@ pub struct Picture {
 }
 
 impl Picture {
+    /// The picture with its legend below it: on a page that is the caption's.
+    pub fn alone(&self) -> String {
+        const KEY: f64 = 34.0;
+        const LEGEND_LETTER: f64 = 6.9;
+        const LEGEND_ROW: f64 = 18.0;
+        let size = self.svg.split('"').nth(1).unwrap_or_default();
+        let numbers: Vec<f64> = size.split(' ').filter_map(|number| number.parse().ok()).collect();
+        let [_, _, width, height] = numbers[..] else { return self.svg.clone() };
+        let (mut x, mut y, mut keys) = (LEFT, height + LEGEND_ROW / 2.0, String::new());
+        for (class, label) in &self.legend {
+            let advance = KEY + 24.0 + LEGEND_LETTER * label.chars().count() as f64;
+            if x > LEFT && x + advance > width {
+                (x, y) = (LEFT, y + LEGEND_ROW);
+            }
+            let (end, text_x, text_y, label) = (x + KEY, x + KEY + 6.0, y + 4.0, escape(label));
+            let _ = write!(keys, "<path class=\"line {class}\" d=\"M{x:.1} {y}H{end:.1}\"/>");
+            let _ = write!(keys, "<text x=\"{text_x:.1}\" y=\"{text_y}\">{label}</text>");
+            x += advance;
+        }
+        let whole = if keys.is_empty() { height } else { y + LEGEND_ROW };
+        let inside = self.svg.strip_suffix("</svg>").unwrap_or(&self.svg);
+        format!("{}{keys}</svg>", inside.replacen(size, &format!("0 0 {width} {whole}"), 1))
+    }
+
     /// Whether it is made to be as wide as the page.
     pub fn is_wide(&self) -> bool {
         self.svg.starts_with(&format!("<svg viewBox=\"0 0 {WIDE} "))

@@ -24,15 +24,7 @@ pub fn counterpart(scenario: &Scenario) -> Result<Option<Traces>, ReportError> {
     let scenario = Scenario::parse(&scenario.to_toml(), "the run that this one is compared with", &overrides)?;
     let directory = tempfile::tempdir().map_err(|error| failed(&error))?;
     let file = directory.path().join("run.mcap");
-    let launch = &mut Launch {
-        program: std::path::PathBuf::new(),
-        external: Vec::new(),
-        record: Some(file.clone()),
-        foxglove: None,
-        require_realtime: false,
-        signal: &AtomicUsize::new(0),
-        progress: &mut |_| {},
-    };
-    run(&scenario, launch).map_err(|error| failed(&error))?;
+    run(&scenario, &mut Launch { record: Some(file.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) })
+        .map_err(|error| failed(&error))?;
     Ok(Some(trace(&Recording::open(&file)?, &scenario)?))
 }

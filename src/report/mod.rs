@@ -10,10 +10,12 @@
 //! | `counterpart` | the run that an orbit's is compared with |
 //! | `percentiles` | latency distributions as curves |
 //! | `model` | what is shown, in which order |
+//! | `pair` | the same for two runs over each other |
 //! | `pictures` | which pictures the samples give |
 //! | `tables` | the tables of the summary |
 //! | `axis`, `chart` | pictures as SVG |
 //! | `html`, `page` | the page |
+//! | `pdf` | figures as PDF, with the feature |
 //!
 //! Must not judge a run: verdicts are those of its summary. Must not leave out silently: what is missing is said.
 
@@ -25,6 +27,9 @@ mod hidden;
 mod html;
 mod model;
 mod page;
+mod pair;
+#[cfg(feature = "pdf")]
+mod pdf;
 mod percentiles;
 mod pictures;
 mod source;
@@ -112,6 +117,14 @@ pub enum ReportError {
         /// Why.
         reason: String,
     },
+    /// A figure cannot be made a PDF.
+    #[error("{figure} cannot be made a PDF: {reason}")]
+    Pdf {
+        /// Its name.
+        figure: String,
+        /// Why.
+        reason: String,
+    },
     /// The page cannot be written.
     #[error("cannot write {}: {source}; name another file with --out", path.display())]
     Write {
@@ -151,25 +164,33 @@ impl Report {
         &self.remarks
     }
 
-    /// Its figures, each a picture (SVG) that needs no page: name of a file, and text.
+    /// Its figures, each a picture (SVG) that needs no page: name and text.
     pub fn figures(&self) -> &[(String, String)] {
         &self.figures
     }
 
-    /// Writes every figure to a file of its own in a directory.
+    /// Writes every figure to a file of its own in a directory; with the feature `pdf` also as PDF.
     ///
     /// # Errors
-    /// [`ReportError::Write`].
+    /// [`ReportError::Write`], [`ReportError::Pdf`].
     pub fn write_figures(&self, directory: &Path) -> Result<(), ReportError> {
         let failed = |path: &Path| {
             let path = path.to_owned();
             |source| ReportError::Write { path, source }
         };
         crate::files::create_directories(directory).map_err(failed(directory))?;
-        self.figures.iter().try_for_each(|(name, svg)| {
+        let write = |name: &str, bytes: &[u8]| {
             let path = directory.join(name);
-            crate::files::write(&path, svg.as_bytes()).map_err(failed(&path))
-        })
+            crate::files::write(&path, bytes).map_err(failed(&path))
+        };
+        #[cfg(feature = "pdf")]
+        let printer = pdf::Printer::new()?;
+        for (name, svg) in &self.figures {
+            write(&format!("{name}.svg"), svg.as_bytes())?;
+            #[cfg(feature = "pdf")]
+            write(&format!("{name}.pdf"), &printer.print(name, svg)?)?;
+        }
+        Ok(())
     }
 
     /// Writes the page.
@@ -191,5 +212,16 @@ pub fn report(path: &Path, shown: &[String]) -> Result<Report, ReportError> {
     let source = Source::open(path)?;
     let model = model::model(&source, shown)?;
     let damaged = source.recording.as_ref().is_some_and(|recording| recording.damage().is_some());
+    Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged })
+}
+
+/// Makes a page of two runs over each other, with the fields that are `shown` by name.
+///
+/// # Errors
+/// [`ReportError`].
+pub fn report_pair(a: &Path, b: &Path, shown: &[String]) -> Result<Report, ReportError> {
+    let (a, b) = (Source::open(a)?, Source::open(b)?);
+    let model = pair::model(&a, &b, shown)?;
+    let damaged = [&a, &b].iter().filter_map(|source| source.recording.as_ref()).any(|r| r.damage().is_some());
     Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged })
 }

@@ -84,7 +84,7 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     }
     let latencies = percentiles::pictures(&source.curves);
     if !latencies.is_empty() {
-        sections.push(latency_section(source, latencies));
+        sections.push(latency_section(latencies, tables::latencies(source)));
     }
     if let Some(traces) = &traces {
         sections.push(pictures::lateness(source, traces, &time));
@@ -160,9 +160,10 @@ fn merged(mut spans: Vec<(u64, u64)>) -> Vec<(u64, u64)> {
     spans
 }
 
-fn latency_section(source: &Source, latencies: Vec<(String, String, Picture)>) -> Section {
+/// Distributions of latencies, and their figures.
+pub fn latency_section(latencies: Vec<(String, String, Picture)>, figures_of: Block) -> Section {
     let figures = latencies.into_iter().map(|(stage, what, picture)| (picture, format!("{stage}: {what}"))).collect();
     let text = "Every value is counted, none is removed; the end of a curve is its largest value.".to_owned();
-    let blocks = vec![Block::Text(text), Block::Figures(figures), tables::latencies(source)];
+    let blocks = vec![Block::Text(text), Block::Figures(figures), figures_of];
     Section { id: "latency", title: "Latency", blocks }
 }

@@ -30,7 +30,7 @@ pub fn page(model: &Model) -> String {
     html
 }
 
-/// Every figure as a picture of its own: name of a file, and SVG that looks as on a white page.
+/// Every figure as a picture of its own: name, and SVG that looks as on a white page.
 pub fn figures(model: &Model) -> Vec<(String, String)> {
     let style = plain_style();
     let blocks = model.sections.iter().flat_map(|section| &section.blocks);
@@ -39,10 +39,10 @@ pub fn figures(model: &Model) -> Vec<(String, String)> {
     let of = |(index, (picture, _)): (usize, &(Picture, String))| {
         let letters = picture.title.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
         let name = letters.collect::<String>().split('-').filter(|word| !word.is_empty()).collect::<Vec<_>>().join("-");
-        let svg = picture.svg.replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1);
+        let svg = picture.alone().replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1);
         let inside = svg.find('>').map_or(0, |end| end + 1);
         let svg = format!("{}<style>{style}</style>{}{}", &svg[..inside], model.marks, &svg[inside..]);
-        (format!("{:02}-{}.svg", index + 1, name.to_lowercase()), svg)
+        (format!("{:02}-{}", index + 1, name.to_lowercase()), svg)
     };
     pictures.enumerate().map(of).collect()
 }

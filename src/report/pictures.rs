@@ -12,7 +12,7 @@ use crate::config::Scenario;
 use crate::rig;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
-const ERROR_FLOOR: f64 = 1e-18;
+pub const ERROR_FLOOR: f64 = 1e-18;
 /// V below this is drawn at the foot: the square of that.
 const LYAPUNOV_FLOOR: f64 = 1e-34;
 /// Colour and dash pattern of the driven bodies.
@@ -65,15 +65,11 @@ pub fn sections(
 
 /// A field by its name, as `leader/estimate.omega_rad_s` or, one element of it, `leader/estimate.omega_rad_s[2]`.
 fn field(name: &str, traces: &Traces, frames: &Frames<'_>, tick_s: f64) -> Result<(Picture, String), ReportError> {
-    let whole = |(body, signal, field, _): &Key| format!("{body}/{signal}.{field}");
-    let asked = |key: &&Key| whole(key) == name || format!("{}[{}]", whole(key), key.3) == name;
-    let lines: Vec<(&Key, &Columns<Extremes>)> = traces.values.iter().filter(|(key, _)| asked(key)).collect();
+    let lines: Vec<(&Key, &Columns<Extremes>)> = traces.named(name).collect();
     let Some((key, _)) = lines.first() else {
-        let mut known: Vec<String> = traces.values.keys().map(whole).collect();
-        known.dedup();
-        return Err(ReportError::Field { name: name.to_owned(), known: known.join(", ") });
+        return Err(ReportError::Field { name: name.to_owned(), known: traces.names() });
     };
-    let y = Axis::around(&key.2.clone(), range(lines.iter().map(|(_, columns)| *columns), false));
+    let y = Axis::around(&key.2, range(lines.iter().map(|(_, columns)| *columns), false));
     let line = |(place, (key, columns)): (usize, &(&Key, &Columns<Extremes>))| {
         let label = format!("{}[{}]", key.2, key.3);
         Line::of(COMPONENTS[place % COMPONENTS.len()], &label, columns, tick_s)

@@ -417,10 +417,28 @@ impl Field {
     }
 }
 
+fn whole_name((body, signal, field, _): &Key) -> String {
+    format!("{body}/{signal}.{field}")
+}
+
 impl Traces {
     /// An element of a field.
     pub fn get(&self, body: &str, signal: &'static str, field: &str, element: usize) -> Option<&Columns<Extremes>> {
         self.values.get(&(body.to_owned(), signal, field.to_owned(), element))
+    }
+
+    /// The elements of a field that is asked for by name, as `leader/estimate.omega_rad_s` or, one of them,
+    /// `leader/estimate.omega_rad_s[2]`.
+    pub fn named<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (&'a Key, &'a Columns<Extremes>)> {
+        let asked = move |key: &Key| whole_name(key) == name || format!("{}[{}]", whole_name(key), key.3) == name;
+        self.values.iter().filter(move |(key, _)| asked(key))
+    }
+
+    /// The names of all fields.
+    pub fn names(&self) -> String {
+        let mut names: Vec<String> = self.values.keys().map(whole_name).collect();
+        names.dedup();
+        names.join(", ")
     }
 
     /// From when to when a status said that something was not seen, in ticks, and at how many.

@@ -12,6 +12,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How often a role looks at the schedule and says how it is, ns.
 const TURN_NS: u64 = 20_000_000;
+/// Between two looks whether the run is still there, ns.
+const GONE_NS: u64 = 1_000_000_000;
 /// How long a role naps between two looks where there is no input that it could sleep on, ns.
 const NAP_NS: u64 = 50_000;
 /// How long a role sleeps on the notifier of the input that it lacks before it looks around, ns.
@@ -43,22 +45,27 @@ pub struct Heartbeat<B: Bus> {
 
 /// A process's line to the launcher, with the heartbeat of each of its roles.
 pub struct Control<'a, B: Bus> {
+    bus: &'a B,
     schedule: B::Reader<Schedule>,
     heartbeats: Vec<Heartbeat<B>>,
     denied: u64,
     terminated: &'a AtomicBool,
+    /// Whether the run was gone when that was looked at last, and when it will be again, ns.
+    gone: bool,
+    next_look_ns: u64,
 }
 
 impl<'a, B: Bus> Control<'a, B> {
     /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
     /// that asks the process to end.
     pub fn new(
+        bus: &'a B,
         schedule: B::Reader<Schedule>,
         heartbeats: Vec<Heartbeat<B>>,
         denied: u64,
         terminated: &'a AtomicBool,
     ) -> Self {
-        Self { schedule, heartbeats, denied, terminated }
+        Self { bus, schedule, heartbeats, denied, terminated, gone: false, next_look_ns: 0 }
     }
 
     /// Whether nobody has had these seats before.
@@ -101,7 +108,18 @@ impl<'a, B: Bus> Control<'a, B> {
     /// # Errors
     /// [`BusError::Receive`].
     pub fn stopped(&mut self) -> Result<bool, BusError> {
-        Ok(self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop)
+        let told = self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop;
+        Ok(told || self.gone())
+    }
+
+    /// Whether nobody is left who could give a word: a launcher that was killed gives none.
+    fn gone(&mut self) -> bool {
+        let now_ns = monotonic_ns();
+        if now_ns >= self.next_look_ns {
+            self.next_look_ns = now_ns + GONE_NS;
+            self.gone = self.bus.is_gone();
+        }
+        self.gone
     }
 }
 

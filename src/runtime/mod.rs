@@ -29,7 +29,7 @@ pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, with_realtime_priority,
 };
 pub use process::{RoleError, RoleSeat, Service, run_role, serve};
-pub(crate) use process::{join, open_ledger, report_path, scenario_path, write_whole};
+pub(crate) use process::{join, open_ledger, report_path, results_path, run_under_way, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

@@ -8,7 +8,7 @@ use super::hooks::{self, Failpoint};
 use super::node::{self, NodeError, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
 use super::privileges::Privileges;
 use super::{depths, privileges, window_ticks};
-use crate::bus::domain::{Domain, DomainError};
+use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
@@ -18,6 +18,7 @@ use crate::sample::{Phase, RoleState, Schedule};
 use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use std::io;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -103,6 +104,9 @@ pub enum RoleError {
         /// How long the role waited, s.
         waited_s: f64,
     },
+    /// The run is gone, and nobody is left to report to.
+    #[error("the run is gone: its launcher was killed, or ended without waiting for this role; start it again")]
+    Gone,
     /// The report could not be written.
     #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
     Report {
@@ -121,6 +125,29 @@ pub fn scenario_path(domain: &Domain) -> PathBuf {
 /// The file in a domain's directory that a role leaves its report in.
 pub fn report_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.report.json"))
+}
+
+/// The file in a domain's directory that says where the run's results will be: a path, and nothing else.
+pub fn results_path(root: &Path) -> PathBuf {
+    root.join("results")
+}
+
+/// The domain of the run that is meant: of the newest that is under way; or of the one whose results go to the directory that is
+/// given; or that directory itself.
+///
+/// # Errors
+/// [`DomainError::Privacy`].
+pub fn run_under_way(given: Option<&Path>) -> Result<Option<PathBuf>, DomainError> {
+    if let Some(given) = given.filter(|given| Domain::join(given).is_ok()) {
+        return Ok(Some(given.to_owned()));
+    }
+    let mut running = domains()?.into_iter().filter(|found| found.alive).map(|found| found.root);
+    let Some(given) = given else { return Ok(running.next()) };
+    let directory = std::fs::canonicalize(given).unwrap_or_else(|_| given.to_owned());
+    let meant = |root: &PathBuf| {
+        std::fs::read(results_path(root)).is_ok_and(|results| results == directory.as_os_str().as_bytes())
+    };
+    Ok(Some(running.find(meant).unwrap_or_else(|| given.to_owned())))
 }
 
 /// Takes a role's seat in a run and serves it to the end. `terminated` is set by a signal that asks the process to end.
@@ -176,10 +203,13 @@ pub(super) fn in_domain(
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
     let build = |occupant| node::build(scenario, occupant, &bus, &ledger);
     let service = Service { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
-    serve(service, occupant, build, |report| {
+    let served = serve(service, occupant, build, |report| {
         reported(report);
         write_report(domain, report)
-    })
+    });
+    drop(bus);
+    domain.forget();
+    served
 }
 
 /// A role's ledger in a domain, to be read.
@@ -248,6 +278,7 @@ pub fn serve<B: Bus + 'static>(
     let mut node = build(occupant)?;
     node.restore()?;
     let mut control = Control::<B>::new(
+        bus,
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         heartbeats,
         privileges.grants.iter().filter(|grant| !grant.granted).count() as u64,
@@ -262,6 +293,9 @@ pub fn serve<B: Bus + 'static>(
     node.finish()?;
     if scenario.clock == ClockKind::Realtime {
         privileges::release();
+    }
+    if bus.is_gone() {
+        return Err(RoleError::Gone);
     }
     for (of, ledger) in &books {
         // What was asked of the machine is the seat's own, and what was measured before the ticks the leader's.

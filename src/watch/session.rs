@@ -5,12 +5,12 @@
 use super::WatchError;
 use super::feed::{Feed, LOOK_NS};
 use super::model::Model;
-use crate::bus::domain::{Domain, newest_run};
+use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
-use crate::runtime::{RoleError, depths, join, join_at_low_priority, topic, with_realtime_priority};
+use crate::runtime::{RoleError, depths, join, join_at_low_priority, run_under_way, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -45,15 +45,12 @@ impl Joined {
 }
 
 impl Session {
-    /// Joins the run in that domain, or the newest of this user.
+    /// Joins the run in that domain, or with its results in that directory, or the newest of this user.
     ///
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
-        let root = match directory {
-            Some(root) => root.to_owned(),
-            None => newest_run()?.ok_or(WatchError::NoRun)?,
-        };
+        let root = run_under_way(directory)?.ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let (domain, scenario) = insist(end_ns, || join(&root))?;
         let mut model = Model {

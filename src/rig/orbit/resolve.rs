@@ -159,38 +159,19 @@ pub(super) fn hold(
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawHold = sections.read_into()?;
-    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
-    let mut sound = true;
-    let mut review = Review { checks, sound: &mut sound };
-    let field = review.field(&raw.central_body);
-    review.place("spacecraft.initial_radius_du", raw.spacecraft.initial_radius_du, field.as_ref());
-    review.place("controller.target_radius_du", raw.controller.target_radius_du, field.as_ref());
-    review.loops(&raw.controller.gain, raw.controller.thrust_max_du_s2);
-    review.sensor("spacecraft", &raw.spacecraft.noise);
-    let sensors = vec![sensor(context, 0, &raw.spacecraft.noise, &raw.spacecraft.bias)];
-    let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
-    let full_state = raw.controller.feedback == Feedback::FullState;
-    let aim = Aim::Circle { radius: raw.controller.target_radius_du, full_state };
-    let RawHoldController { gain, thrust_max_du_s2, predict, .. } = &raw.controller;
-    let controller = Some(gain.controller(field, *thrust_max_du_s2, *predict, context));
-    let initial = vec![OrbitState::from(&raw.spacecraft)];
-    let speed = Limits::resolve(&raw.limits, field, &initial, Some(raw.controller.target_radius_du), review.checks);
-    let rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "spacecraft".into(), driven: true, fleet: None }],
-        field,
-        initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], raw.controller.thrust_max_du_s2, &raw.limits, context),
-        sensors,
-        filter,
-        initial_guess: raw.observer.initial_guess_du_s.into(),
-        controller,
-        aim,
-        tick_s: context.tick_s,
+    let RawHoldController { target_radius_du: radius, feedback, gain, thrust_max_du_s2, predict } = &raw.controller;
+    let parts = Parts {
+        central_body: &raw.central_body,
+        name: "spacecraft",
+        observed: &raw.spacecraft,
+        followers: &[],
+        observer: &raw.observer,
+        controller: Some((gain, *thrust_max_du_s2, *predict)),
+        aim: Aim::Circle { radius: *radius, full_state: *feedback == Feedback::FullState },
+        limits: &raw.limits,
     };
-    if sound {
-        check_loop(&rig, checks);
-    }
-    Ok((Some(rig), table))
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    Ok((parts.build(context, checks), table))
 }
 
 /// Reads and checks a scenario of the rig `orbit-rendezvous`.
@@ -200,41 +181,82 @@ pub(super) fn rendezvous(
     checks: &mut Checks<'_>,
 ) -> Result<(Option<OrbitRig>, toml::Table), ConfigError> {
     let raw: RawRendezvous = sections.read_into()?;
-    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
-    let mut sound = true;
-    let mut review = Review { checks, sound: &mut sound };
-    let field = review.field(&raw.central_body);
-    review.place("leader.initial_radius_du", raw.leader.initial_radius_du, field.as_ref());
-    review.followers(&raw.follower, field.as_ref());
-    review.controller(raw.controller.as_ref(), raw.follower.is_empty());
-    review.sensor("leader", &raw.leader.noise);
-    let sensors = vec![sensor(context, 0, &raw.leader.noise, &raw.leader.bias)];
-    let (Some(field), Some(filter)) = (field, review.filter(&raw.observer)) else { return Ok((None, table)) };
-    let thrust_max = raw.controller.as_ref().map_or(0.0, |controller| controller.thrust_max_du_s2);
-    let designed = |raw: &RawController| raw.gain.controller(field, raw.thrust_max_du_s2, raw.predict, context);
-    let mut initial = vec![OrbitState::from(&raw.leader)];
-    initial.extend(raw.follower.iter().map(OrbitState::from));
-    let speed = Limits::resolve(&raw.limits, field, &initial, None, review.checks);
-    let mut rig = OrbitRig {
-        bodies: vec![BodyInfo { name: "leader".into(), driven: false, fleet: None }],
-        field,
-        initial,
-        limits: limits(field, speed, &raw.observer, &sensors[0], thrust_max, &raw.limits, context),
-        sensors,
-        filter,
-        initial_guess: raw.observer.initial_guess_du_s.into(),
-        controller: raw.controller.as_ref().map(designed),
+    let parts = Parts {
+        central_body: &raw.central_body,
+        name: "leader",
+        observed: &raw.leader,
+        followers: &raw.follower,
+        observer: &raw.observer,
+        controller: raw.controller.as_ref().map(|raw| (&raw.gain, raw.thrust_max_du_s2, raw.predict)),
         aim: Aim::Leader,
-        tick_s: context.tick_s,
+        limits: &raw.limits,
     };
-    for follower in &raw.follower {
-        rig.bodies.push(BodyInfo { name: follower.name.clone().into(), driven: true, fleet: None });
-        rig.sensors.push(sensor(context, rig.sensors.len() as u64, &follower.noise, &follower.bias));
+    let table = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
+    Ok((parts.build(context, checks), table))
+}
+
+/// What the tables of both rigs say.
+struct Parts<'a> {
+    central_body: &'a RawCentralBody,
+    /// The observed body, and what its table is called.
+    name: &'static str,
+    observed: &'a RawBody,
+    followers: &'a [RawFollower],
+    observer: &'a RawObserver,
+    /// Gains, greatest thrust, and whether it predicts.
+    controller: Option<(&'a RawGain, f64, bool)>,
+    aim: Aim,
+    limits: &'a RawLimits,
+}
+
+impl Parts<'_> {
+    fn build(&self, context: Context, checks: &mut Checks<'_>) -> Option<OrbitRig> {
+        let mut sound = true;
+        let mut review = Review { checks, sound: &mut sound };
+        let field = review.field(self.central_body);
+        review.place(&format!("{}.initial_radius_du", self.name), self.observed.initial_radius_du, field.as_ref());
+        // A body that holds an orbit is driven itself.
+        let (driven, target) = match self.aim {
+            Aim::Circle { radius, .. } => (true, Some(radius)),
+            Aim::Leader => (false, None),
+        };
+        if let Some(radius) = target {
+            review.place("controller.target_radius_du", radius, field.as_ref());
+        }
+        review.followers(self.followers, field.as_ref());
+        review.controller(self.controller, !driven && self.followers.is_empty());
+        review.sensor(self.name, &self.observed.noise);
+        let (Some(field), Some(filter)) = (field, review.filter(self.observer)) else { return None };
+        let initial: Vec<OrbitState> =
+            [self.observed.into()].into_iter().chain(self.followers.iter().map(OrbitState::from)).collect();
+        let sensed = [(&self.observed.noise, &self.observed.bias)]
+            .into_iter()
+            .chain(self.followers.iter().map(|follower| (&follower.noise, &follower.bias)));
+        let sensors: Vec<Sensors> =
+            sensed.zip(0..).map(|((noise, bias), stream)| sensor(context, stream, noise, bias)).collect();
+        let follower = |raw: &RawFollower| BodyInfo { name: raw.name.clone().into(), driven: true, fleet: None };
+        let bodies = [BodyInfo { name: self.name.into(), driven, fleet: None }];
+        let thrust_max = self.controller.map_or(0.0, |(_, thrust_max, _)| thrust_max);
+        let speed = Limits::resolve(self.limits, field, &initial, target, review.checks);
+        let rig = OrbitRig {
+            bodies: bodies.into_iter().chain(self.followers.iter().map(follower)).collect(),
+            field,
+            initial,
+            limits: limits(field, speed, self.observer, &sensors[0], thrust_max, self.limits, context),
+            sensors,
+            filter,
+            initial_guess: self.observer.initial_guess_du_s.into(),
+            controller: self
+                .controller
+                .map(|(gain, thrust_max, predict)| gain.controller(field, thrust_max, predict, context)),
+            aim: self.aim,
+            tick_s: context.tick_s,
+        };
+        if sound {
+            check_loop(&rig, checks);
+        }
+        Some(rig)
     }
-    if sound {
-        check_loop(&rig, checks);
-    }
-    Ok((Some(rig), table))
 }
 
 fn sensor(context: Context, stream: u64, noise: &RawSensor, bias: &RawSensor) -> Sensors {
@@ -347,9 +369,9 @@ impl Review<'_, '_> {
     }
 
     /// A controller for followers, and none without.
-    fn controller(&mut self, controller: Option<&RawController>, alone: bool) {
+    fn controller(&mut self, controller: Option<(&RawGain, f64, bool)>, alone: bool) {
         match controller {
-            Some(RawController { gain, thrust_max_du_s2, .. }) => self.loops(gain, *thrust_max_du_s2),
+            Some((gain, thrust_max, _)) => self.loops(gain, thrust_max),
             None => self.require(alone, "controller", || {
                 "is missing; followers need a [controller] with gain and thrust_max_du_s2".to_owned()
             }),

@@ -1,0 +1,304 @@
+//! Every command of README and of the manual, run as it is typed there, in the order of its page, in one directory per page.
+//!
+//! What is not run here is listed with its reason; a command that is in neither place fails the test. The synopses of
+//! `docs/commands.md` are held against the program's own help.
+
+mod common;
+
+use common::{Bench, Done, Running};
+use corotate::record::{Recording, SignalInfo};
+use std::fs;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::path::Path;
+
+/// A command by its first words, and where else it is run or why it cannot be.
+const ELSEWHERE: [(&str, &str); 23] = [
+    ("cargo run --release", "tests/run builds it so; `run` without arguments is run here"),
+    ("tests/run", "it runs this test"),
+    ("cargo install --path . --locked", "tests/run"),
+    ("cargo build --release --features", "tests/run builds with them"),
+    ("cargo bench --bench", "tests/run, short"),
+    ("corotate bench", "five minutes; tests/bench.rs, some rows"),
+    ("cargo test --release --features hooks --test claims", "tests/claims.rs"),
+    ("corotate run config/rigid-pair.toml --external follower", "it waits for a partner; tests/hil.rs"),
+    ("corotate run rigid-pair --external follower", "it waits for a partner; tests/hil.rs and tests/serial.rs"),
+    ("corotate run tests/hil/pair.toml --clock lockstep", "it waits for a partner; tests/hil.rs"),
+    ("$(tests/hil/venv) tests/hil/follower.py", "tests/hil.rs"),
+    ("corotate bridge --serial", "it needs a device; tests/serial.rs"),
+    ("socat", "it goes on until it is ended; tests/serial.rs has a line of its own"),
+    ("cargo run --release --example serial_device", "it needs a line; tests/serial.rs"),
+    ("corotate watch --once", "beside a run, below"),
+    ("corotate watch runs/pair", "a screen that is left by a key; tests/watch.rs, in a terminal"),
+    ("corotate watch", "a screen that is left by a key; tests/watch.rs, in a terminal"),
+    ("corotate new two-motors", "tests/run"),
+    ("cargo run --release --", "tests/own_rig.rs"),
+    ("tests/", "a campaign of its own; its short form is in the tests"),
+    ("fuzz/run", "a campaign of its own; tests/run checks the targets"),
+    ("COROTATE_", "a campaign of its own; its short form is in the tests"),
+    ("packaging/", "it needs Docker or cargo-deb"),
+];
+/// What needs a run beside it.
+const BESIDE: [&str; 4] = [
+    "corotate record --out part.mcap",
+    "corotate watch --once 0.5",
+    "corotate watch --once 0.5 --json",
+    "corotate foxglove",
+];
+
+/// The commands of a page, by line: what stands in a block of code and begins with the name of a program of ours.
+fn commands(text: &str) -> Vec<(usize, String)> {
+    let (mut found, mut code, mut before) = (Vec::new(), false, "");
+    let mut lines = text.lines().enumerate();
+    while let Some((index, line)) = lines.next() {
+        code = line.starts_with("    ") && (code || before.trim().is_empty());
+        before = line;
+        if !code {
+            continue;
+        }
+        let mut command = line.trim().to_owned();
+        // A loop is one command.
+        if command.starts_with("for ") {
+            for (_, line) in lines.by_ref() {
+                command = format!("{command}\n{line}");
+                if line.trim() == "done" {
+                    break;
+                }
+            }
+        }
+        let programs = [
+            "corotate ",
+            "cargo ",
+            "tests/",
+            "fuzz/",
+            "packaging/",
+            "socat ",
+            "for ",
+            "mkdir ",
+            "$(tests",
+            "COROTATE_",
+        ];
+        let ours = programs.iter().any(|program| command.starts_with(program));
+        // What the program prints, and what a tree of files says, begins as it does.
+        let printed = command.starts_with("corotate rigid-pair ")
+            || command.contains("/            ")
+            || command.contains("/             ");
+        if ours && !printed {
+            found.push((index + 1, command));
+        }
+    }
+    found
+}
+
+/// The page that begins with all synopses.
+const SYNOPSES: &str = "docs/commands.md";
+
+/// A command without its comment.
+fn bare(command: &str) -> &str {
+    command.split(" #").next().unwrap_or(command).trim_end()
+}
+
+struct Page {
+    bench: Bench,
+    /// The shell's PATH.
+    path: String,
+}
+
+impl Page {
+    fn new() -> Self {
+        let bench = Bench::new();
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        for directory in ["config", "tests"] {
+            symlink(root.join(directory), bench.path(directory)).unwrap();
+        }
+        let programs = bench.path("programs");
+        fs::create_dir(&programs).unwrap();
+        symlink(env!("CARGO_BIN_EXE_corotate"), programs.join("corotate")).unwrap();
+        // A desktop that shows pages.
+        let opener = programs.join("xdg-open");
+        fs::write(&opener, "#!/bin/sh\ntest -s \"$1\"\n").unwrap();
+        fs::set_permissions(&opener, fs::Permissions::from_mode(0o755)).unwrap();
+        for name in ["throws.csv", "racquet.csv"] {
+            fs::write(bench.path(name), throws(root)).unwrap();
+        }
+        let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
+        Self { bench, path }
+    }
+
+    fn start(&self, command: &str) -> Running {
+        let mut shell = self.bench.command_of("bash".as_ref());
+        shell.env("PATH", &self.path).env("HOME", self.bench.path("home")).args(["-c", command]);
+        Running::new(&mut shell)
+    }
+
+    fn run(&self, command: &str) -> Done {
+        self.start(command).wait()
+    }
+
+    /// A run of a few seconds to look at, once it has begun.
+    fn beside(&self) -> Running {
+        let run = self.bench.start(&[
+            "run",
+            "--duration",
+            "8",
+            "--set",
+            "accept={}",
+            "--set",
+            "limits={}",
+            "--out",
+            "beside",
+        ]);
+        self.bench.await_ticks("controller");
+        run
+    }
+}
+
+/// The shipped log as three throws.
+fn throws(root: &Path) -> String {
+    let text = fs::read_to_string(root.join("config/tumbling-throw.csv")).unwrap();
+    let mut lines = text.lines().filter(|line| !line.starts_with('#'));
+    let head = lines.next().unwrap();
+    let rows: Vec<&str> = lines.collect();
+    let throw = |number: usize| rows.iter().map(move |row| format!("{row},{number}\n"));
+    format!("{head},throw\n{}", (1..=3).flat_map(throw).collect::<String>())
+}
+
+/// Runs a page's commands, and gives what failed, by line.
+fn check(name: &str) -> Vec<String> {
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap();
+    // The synopses are no commands.
+    let first = if name == SYNOPSES { text.lines().position(|line| line.starts_with('|')).unwrap() } else { 0 };
+    let page = Page::new();
+    let mut failed = Vec::new();
+    for (line, command) in commands(&text).into_iter().filter(|(line, _)| *line > first) {
+        let typed = bare(&command);
+        let beside = BESIDE.contains(&typed);
+        if !beside
+            && ELSEWHERE.iter().any(|(start, _)| {
+                typed == *start
+                    || typed.starts_with(&format!("{start} "))
+                    || start.ends_with(['/', '_']) && typed.starts_with(start)
+            })
+        {
+            continue;
+        }
+        let needs = ["--parquet", "foxglove"].into_iter().zip([cfg!(feature = "parquet"), cfg!(feature = "foxglove")]);
+        let refused = needs.into_iter().any(|(word, built)| typed.contains(word) && !built);
+        let other = beside.then(|| page.beside());
+        let done = page.run(&command);
+        // In real time, beside other tests, a bound may be missed; `doctor` judges the machine, `diff` two runs.
+        let judged = ["corotate run", "corotate doctor", "corotate diff"].iter().any(|start| typed.starts_with(start))
+            && !typed.contains("--clock in-process");
+        let codes: &[i32] = if refused {
+            &[2]
+        } else if judged {
+            &[0, 3]
+        } else {
+            &[0]
+        };
+        if !done.code.is_some_and(|code| codes.contains(&code)) {
+            failed.push(format!("{name}:{line}: {command}\n{done:?}"));
+        }
+        other.map(Running::wait);
+    }
+    failed
+}
+
+macro_rules! pages {
+    ($($test:ident: $page:literal,)*) => {
+        $(#[test]
+        fn $test() {
+            let failed = check($page);
+            assert!(failed.is_empty(), "{}", failed.join("\n"));
+        })*
+
+        const PAGES: &[&str] = &[$($page),*];
+    };
+}
+
+pages! {
+    readme: "README.md",
+    quickstart: "docs/quickstart.md",
+    claims: "docs/claims.md",
+    concepts: "docs/concepts.md",
+    commands_page: "docs/commands.md",
+    foreign_role: "docs/foreign-role.md",
+    formats: "docs/formats.md",
+    foxglove: "docs/foxglove.md",
+    own_data: "docs/own-data.md",
+    papers: "docs/papers.md",
+    real_time: "docs/real-time.md",
+    record_replay: "docs/record-replay.md",
+    report: "docs/report.md",
+    scenario: "docs/scenario.md",
+    security: "docs/security.md",
+    serial_device: "docs/serial-device.md",
+    table: "docs/table.md",
+    troubleshooting: "docs/troubleshooting.md",
+    watch: "docs/watch.md",
+    when_things_go_wrong: "docs/when-things-go-wrong.md",
+    your_own_rig: "docs/your-own-rig.md",
+    benchmarks: "docs/benchmarks.md",
+}
+
+#[test]
+fn every_page_is_tried() {
+    let pages = fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")).unwrap();
+    let names =
+        pages.map(|entry| entry.unwrap().file_name().into_string().unwrap()).filter(|name| name.ends_with(".md"));
+    for name in names.filter(|name| !["SUMMARY.md", "glossary.md"].contains(&name.as_str())) {
+        assert!(PAGES.contains(&format!("docs/{name}").as_str()), "docs/{name} is in no test");
+    }
+}
+
+/// Every synopsis names a command that exists, and options that it has.
+#[test]
+fn the_synopses_agree_with_the_help() {
+    let bench = Bench::new();
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(SYNOPSES)).unwrap();
+    let mut command = String::new();
+    let mut checked = 0;
+    for line in text.lines().take_while(|line| !line.starts_with('|')).filter(|line| line.starts_with("    ")) {
+        if let Some(rest) = line.trim().strip_prefix("corotate ").filter(|rest| !rest.starts_with(' ')) {
+            let word = rest.split_whitespace().next().unwrap_or_default();
+            command = word.split('|').next().unwrap().to_owned();
+        }
+        if command.is_empty() {
+            continue;
+        }
+        let help = bench.run(&[&command, "--help"]);
+        assert_eq!(help.code, Some(0), "{line}: {help:?}");
+        let options = line.split(|letter: char| !(letter.is_ascii_alphanumeric() || letter == '-'));
+        for option in options.filter(|word| word.starts_with("--") && word.len() > 2) {
+            assert!(help.stdout.contains(option) || option == "--external", "{line}: {option} is not in its help");
+            checked += 1;
+        }
+    }
+    assert!(checked > 30, "{checked} options were found");
+}
+
+/// The layouts for Foxglove and PlotJuggler name fields that a recording of `rigid-pair` has.
+#[test]
+fn the_layouts_name_what_is_recorded() {
+    let bench = Bench::new();
+    let done = bench.run(&["run", "rigid-pair", "--clock", "in-process", "--record", "--out", "run"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let recording = Recording::open(&bench.path("run/run.mcap")).unwrap();
+    let fields = |between: char| -> Vec<String> {
+        let of = |signal: &SignalInfo| {
+            let topic = format!("/corotate/rigid_pair/{}/{}", signal.body, signal.signal);
+            let elements = signal.layout.columns.iter().flat_map(|column| column.elements());
+            elements.map(|element| format!("{topic}{between}{element}")).collect::<Vec<_>>()
+        };
+        recording.signals().iter().flat_map(of).collect()
+    };
+    for (file, between) in [("foxglove.json", '.'), ("plotjuggler.xml", '/')] {
+        let text =
+            fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("packaging/layouts").join(file)).unwrap();
+        let named: Vec<&str> = text.split('"').filter(|word| word.starts_with("/corotate/")).collect();
+        let known = fields(between);
+        assert!(
+            named.len() == 11 && named.iter().all(|name| known.iter().any(|field| field == name)),
+            "{file}: {named:?}, {known:?}"
+        );
+    }
+}
