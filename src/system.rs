@@ -3,8 +3,35 @@
 
 use rustix::io::retry_on_intr;
 use rustix::rand::{GetRandomFlags, getrandom};
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::OnceLock;
+
+/// The file that this program is started from, and what it is given before all else.
+static PROGRAM: OnceLock<(PathBuf, Vec<OsString>)> = OnceLock::new();
+
+/// Says how this program is started, where that is not by the file that runs: as a library in an interpreter. Once, before
+/// anything is started.
+pub fn started_by(file: PathBuf, arguments: Vec<OsString>) {
+    let _ = PROGRAM.set((file, arguments));
+}
+
+/// This program, to be started again: as a role, as the janitor. The same file whatever has taken its place since.
+///
+/// # Errors
+/// Those of the system, where it does not tell the file.
+pub fn this_program() -> io::Result<Command> {
+    if PROGRAM.get().is_none() {
+        started_by(std::env::current_exe()?, Vec::new());
+    }
+    let (file, arguments) = PROGRAM.get().expect("it has just been set");
+    let mut command = Command::new(file);
+    command.args(arguments);
+    Ok(command)
+}
 
 /// What to do about an error of the system.
 pub fn remedy(error: &io::Error) -> &'static str {

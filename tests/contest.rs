@@ -10,7 +10,6 @@ use contest::compiled::NATIVE;
 use contest::step::{agreements, library};
 use corotate::bench::{Bench, Results, run};
 use corotate::config::SHIPPED;
-use std::path::PathBuf;
 use std::sync::atomic::AtomicUsize;
 
 #[test]
@@ -18,7 +17,6 @@ fn the_step_and_the_fleet_stand_beside_all_their_floors() {
     let mut bench = Bench {
         rows: ROWS.to_vec(),
         quick: true,
-        program: PathBuf::new(),
         scenarios: &SHIPPED,
         signal: &AtomicUsize::new(0),
         progress: &mut |_| {},

@@ -29,7 +29,7 @@ fn samples(scenario: &Scenario, pieces: &[(bool, &[u8])]) {
     let mut words = bus.writer::<Schedule>(&of_run, 1).expect("a writer");
     let terminated = AtomicBool::new(false);
     let reader = bus.reader(&of_run, Reader::Role).expect("a reader");
-    let mut control = Control::<MemoryBus>::new(reader, Vec::new(), 0, &terminated);
+    let mut control = Control::<MemoryBus>::new(&bus, reader, Vec::new(), 0, &terminated);
     let mut line = RoleLine::new("follower");
     for (number, (health, raw)) in pieces.iter().enumerate() {
         if *health {

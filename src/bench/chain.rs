@@ -31,7 +31,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     }
     let all = format!("[{:?}]", scenario.rig.roles());
     let domain = OwnedDomain::create(0)?;
-    let mut raw = RawChain::open(bench, board, &domain)?;
+    let mut raw = RawChain::open(board, &domain)?;
     for round in 1..=rounds {
         for hz in bench.size(&RATES_HZ[..], &RATES_HZ[..1]) {
             bench.next(&format!("chain: {hz} Hz, round {round} of {rounds}"))?;
@@ -94,7 +94,7 @@ struct RawChain {
 }
 
 impl RawChain {
-    fn open(bench: &Bench<'_>, board: &mut Board, domain: &OwnedDomain) -> Result<Self, BenchError> {
+    fn open(board: &mut Board, domain: &OwnedDomain) -> Result<Self, BenchError> {
         let link = |name: &str| Opening {
             mechanism: Mechanism::Iceoryx,
             wake: Wake::Spin,
@@ -103,8 +103,8 @@ impl RawChain {
             direction: 0,
             descriptors: None,
         };
-        let mut relay = Peer::start(bench, domain.domain(), true, Vec::new())?;
-        let mut last = Peer::start(bench, domain.domain(), false, Vec::new())?;
+        let mut relay = Peer::start(domain.domain(), true, Vec::new())?;
+        let mut last = Peer::start(domain.domain(), false, Vec::new())?;
         let mut sender = Station { domain: domain.domain(), process: "bench" }.sender(&link("first"), None)?;
         relay.open(link("first"), Some(link("second")))?;
         last.open(link("second"), None)?;

@@ -54,10 +54,8 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     for (wake, mechanisms) in ways {
         for words in bench.size(&SIZES[..], &SIZES[..1]).iter().copied() {
             bench.next(&format!("hop: {}, {} bytes", wake.name(), 8 * words))?;
-            let pairs: Result<Vec<_>, _> = mechanisms
-                .iter()
-                .map(|mechanism| Pair::open(bench, domain.domain(), *mechanism, wake, words))
-                .collect();
+            let pairs: Result<Vec<_>, _> =
+                mechanisms.iter().map(|mechanism| Pair::open(domain.domain(), *mechanism, wake, words)).collect();
             let mut pairs = pairs?;
             for pair in &mut pairs {
                 board.granted(pair.grants());
@@ -105,13 +103,7 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
 
 impl Pair {
     /// Opens both ends.
-    pub fn open(
-        bench: &Bench<'_>,
-        domain: &Domain,
-        mechanism: Mechanism,
-        wake: Wake,
-        words: usize,
-    ) -> Result<Self, BenchError> {
+    pub fn open(domain: &Domain, mechanism: Mechanism, wake: Wake, words: usize) -> Result<Self, BenchError> {
         let title = |mechanism: Mechanism| format!("{}, {}, {} B", mechanism.name(wake), wake.name(), 8 * words);
         let floor = (mechanism == Mechanism::Ours).then(|| title(Mechanism::Iceoryx));
         let name: String = title(mechanism).chars().filter(|letter| letter.is_ascii_alphanumeric()).collect();
@@ -124,7 +116,7 @@ impl Pair {
             |direction| Opening { mechanism, wake, words, name: name.clone(), direction, descriptors: numbers };
         let (ours, theirs) = descriptors.map_or((None, Vec::new()), |pair| (Some(pair.ours), pair.theirs.into()));
         let [read, write] = ours.map_or([None, None], |[read, write]| [Some(read), Some(write)]);
-        let mut peer = Peer::start(bench, domain, false, theirs)?;
+        let mut peer = Peer::start(domain, false, theirs)?;
         let station = Station { domain, process: "bench" };
         // A blackboard must be there before anybody reads it: the writers' ends come first.
         let mut sender = station.sender(&opening(0), write)?;

@@ -32,7 +32,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     let floor = RoleId::all(&measured).contains(&RoleId::Controller).then_some("two raw hops back to back");
     let arithmetic = format!("arithmetic alone, {}", bench.scenarios[0].0);
     let domain = OwnedDomain::create(0)?;
-    let mut hop = Pair::open(bench, domain.domain(), Mechanism::Iceoryx, Wake::Spin, 16)?;
+    let mut hop = Pair::open(domain.domain(), Mechanism::Iceoryx, Wake::Spin, 16)?;
     board.granted(hop.grants());
     for round in 1..=rounds {
         bench.next(&format!("lockstep: round {round} of {rounds}"))?;

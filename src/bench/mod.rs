@@ -34,7 +34,6 @@ use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::Grant;
 use rustix::thread::{sched_getaffinity, sched_setaffinity};
 use std::io;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// A row of a benchmark.
@@ -78,8 +77,6 @@ pub struct Bench<'a> {
     pub rows: Vec<Row>,
     /// A smoke run: every row, a second each, figures that mean nothing.
     pub quick: bool,
-    /// The program whose subcommands are the roles and the peers: this one.
-    pub program: PathBuf,
     /// Its scenarios, name and text; whole runs are of the first.
     pub scenarios: &'a [(&'a str, &'a str)],
     /// The signal that asked the run to end; 0 while none has.
@@ -190,7 +187,7 @@ impl Bench<'_> {
         signal: &AtomicUsize,
         progress: &mut dyn FnMut(&Progress<'_>),
     ) -> Result<Outcome, BenchError> {
-        let mut launch = Launch { program: self.program.clone(), ..Launch::new(signal, progress) };
+        let mut launch = Launch::new(signal, progress);
         let outcome = launch::run(scenario, &mut launch)?;
         self.interrupted()?;
         Ok(outcome)
@@ -247,7 +244,6 @@ mod tests {
         act(&mut Bench {
             rows: ROWS.iter().filter(|row| row.name == name).copied().collect(),
             quick: true,
-            program: PathBuf::new(),
             scenarios,
             signal: &AtomicUsize::new(0),
             progress: &mut |_| {},

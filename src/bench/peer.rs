@@ -3,19 +3,20 @@
 //! Asks for the same privileges as the role whose place it has. Takes its orders as lines of JSON on standard input and
 //! answers on standard output, never while it measures. Dies with its parent.
 
+use super::BenchError;
 use super::exchange::{Opening, Receiver, Sender, Station, Wake, system};
-use super::{Bench, BenchError};
 use crate::bus::domain::Domain;
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
 use crate::runtime::{Privileges, RoleId, take_privileges};
+use crate::system::this_program;
 use crate::telemetry::{Grant, Latency, StageReport};
 use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
 use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Child, ChildStdin, Stdio};
 use std::sync::mpsc::{Receiver as Lines, channel};
 use std::time::Duration;
 
@@ -173,12 +174,12 @@ pub(super) struct Peer {
 
 impl Peer {
     /// Starts a peer; it inherits `theirs`, which are of no more use here then.
-    pub fn start(bench: &Bench<'_>, domain: &Domain, observer: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
+    pub fn start(domain: &Domain, observer: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
         for fd in &theirs {
             rustix::io::fcntl_setfd(fd, rustix::io::FdFlags::empty())
                 .map_err(|error| BenchError::system("hand a descriptor on")(error.into()))?;
         }
-        let mut command = Command::new(&bench.program);
+        let mut command = this_program().map_err(BenchError::system("find this program"))?;
         command.arg("bench-peer").arg("--domain").arg(domain.root());
         command.arg("--parent").arg(std::process::id().to_string());
         if observer {

@@ -4,7 +4,8 @@ use super::watch::Watch;
 use super::{Bench, BenchError, Board};
 use crate::bus::domain::OwnedDomain;
 use crate::bus::raw::RawNode;
-use std::process::{Command, Stdio};
+use crate::system::this_program;
+use std::process::Stdio;
 use std::time::Instant;
 
 /// Measures the row.
@@ -21,7 +22,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         ] {
             value.into_iter().for_each(|value| board.add(name, "ms", floor, value));
         }
-        board.add("bare process", "ms", None, bare_process(bench)?);
+        board.add("bare process", "ms", None, bare_process()?);
         board.add("bare iceoryx2 node", "ms", None, bare_node()?);
         let roles = || observed.resident_mib.iter().filter(|(name, _)| *name != "launcher");
         let largest = |which: usize| roles().map(|(_, mib)| mib[which]).fold(f64::NAN, f64::max);
@@ -36,9 +37,9 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
 }
 
 /// This program started, and ended at once, ms.
-fn bare_process(bench: &Bench<'_>) -> Result<f64, BenchError> {
+fn bare_process() -> Result<f64, BenchError> {
     let began = Instant::now();
-    let mut command = Command::new(&bench.program);
+    let mut command = this_program().map_err(BenchError::system("find this program"))?;
     command.arg("--version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command.status().map_err(BenchError::system("start a process"))?;
     Ok(began.elapsed().as_secs_f64() * 1e3)

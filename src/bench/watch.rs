@@ -12,6 +12,7 @@ use crate::clock::monotonic_ns;
 use crate::config::Scenario;
 use crate::runtime::{RoleId, depths, ports, topic};
 use crate::sample::{Phase, Schedule, Stamp};
+use crate::system::this_program;
 use rustix::process::{Pid, Signal as Kill, kill_process};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -19,7 +20,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use std::time::Duration;
 
 /// Between two looks, ns.
@@ -82,7 +83,7 @@ impl Watch<'_> {
         let directory = tempfile::tempdir().map_err(BenchError::system("make a temporary directory"))?;
         let file = directory.path().join("scenario.toml");
         fs::write(&file, scenario.to_toml()).map_err(BenchError::system("write a scenario"))?;
-        let mut command = Command::new(&bench.program);
+        let mut command = this_program().map_err(BenchError::system("find this program"))?;
         command.arg("run").arg(&file).arg("--out").arg(directory.path().join("out"));
         command.envs(self.environment.drain(..)).process_group(0);
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit());

@@ -92,8 +92,10 @@ impl fmt::Display for RateUnit {
 const STAMPS: [&str; 9] =
     ["time", "t", "timestamp", "stamp", "seconds", "elapsed", "secondselapsed", "elapsedtime", "timesec"];
 /// What a name without its unit and its axis calls an angular velocity.
-const RATES: [&str; 15] = [
+const RATES: [&str; 16] = [
     "w",
+    // As in ax, ay, az, gx, gy, gz.
+    "g",
     "omega",
     "gyro",
     "gyr",

@@ -7,14 +7,13 @@ use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::runtime::RoleId;
-use crate::system::tell;
+use crate::system::{tell, this_program};
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -35,11 +34,16 @@ pub(super) struct RoleProcess {
     listener: Option<JoinHandle<()>>,
 }
 
+/// This program, to be started in a role.
+pub fn program(role: &str) -> Result<Command, LaunchError> {
+    this_program().map_err(|source| LaunchError::Spawn { role: role.to_owned(), source })
+}
+
 impl RoleProcess {
     /// Starts a role of a scenario in a domain.
-    pub fn start(program: &Path, scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
+    pub fn start(scenario: &Scenario, role: RoleId, domain: &Domain) -> Result<Self, LaunchError> {
         let name = role.name(scenario).to_owned();
-        let mut command = Command::new(program);
+        let mut command = program(&name)?;
         command.arg(role.kind()).arg("--domain").arg(domain.root());
         if let RoleId::Plant(_) = role {
             command.arg("--body").arg(&name);

@@ -60,10 +60,9 @@ struct Run<'a, R: Rig> {
     measurement_guard: R::MeasurementGuard,
     estimate: Estimate<R>,
     estimate_hash: StateHash,
-    /// The controller's, and the scorer's.
-    estimate_guards: [R::EstimateGuard; 2],
+    /// The controller's and the scorer's: both judge the same samples.
+    estimate_guard: R::EstimateGuard,
     scoring: Scoring<R>,
-    controlled: bool,
 }
 
 impl<'a, R: Rig> Run<'a, R> {
@@ -85,13 +84,12 @@ impl<'a, R: Rig> Run<'a, R> {
         Self {
             scenario,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
-            controlled: bodies.iter().any(|body| body.command.is_some()),
             bodies,
             observer: Observer::new(rig.estimator(), scenario.tick_s()),
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
             estimate_hash: hash(scenario),
-            estimate_guards: [rig.estimate_guard(), rig.estimate_guard()],
+            estimate_guard: rig.estimate_guard(),
             scoring: Scoring::new(rig, scenario),
         }
     }
@@ -141,8 +139,7 @@ impl<'a, R: Rig> Run<'a, R> {
         self.observer.step(observed, &mut self.estimate);
         (self.estimate.stamp_mut().generation, self.estimate.stamp_mut().sent_ns) = (1, 0);
         self.estimate_hash.absorb(tick, self.estimate.content());
-        let [controller_s, scorer_s] = &mut self.estimate_guards;
-        if self.controlled && !controller_s.accepts(&self.estimate) {
+        if !self.estimate_guard.accepts(&self.estimate) {
             return false;
         }
         for Driven { measurement, command, .. } in &mut self.bodies {
@@ -154,9 +151,6 @@ impl<'a, R: Rig> Run<'a, R> {
             let stamp = controlled.command.stamp_mut();
             (stamp.generation, stamp.sent_ns) = (1, 0);
             controlled.hash.absorb(tick, controlled.command.content());
-        }
-        if !scorer_s.accepts(&self.estimate) {
-            return false;
         }
         let bodies = &self.bodies;
         self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);

@@ -3,13 +3,12 @@
 //! No role waits for it; the ticks do, once, until it listens. Must not let its end be the run's.
 
 use super::LaunchError;
-use super::children::RoleProcess;
+use super::children::{RoleProcess, program};
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::system::tell;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::PathBuf;
 
 /// The process's name.
 pub(super) const FOXGLOVE: &str = "foxglove";
@@ -24,10 +23,10 @@ pub(super) struct FoxgloveWatch {
 
 impl FoxgloveWatch {
     /// Starts the process, if there is an `address` for it.
-    pub fn start(program: &Path, address: Option<SocketAddr>, domain: &Domain) -> Result<Self, LaunchError> {
+    pub fn start(address: Option<SocketAddr>, domain: &Domain) -> Result<Self, LaunchError> {
         let tells = domain.root().join("foxglove.address");
         let start = |address: SocketAddr| {
-            let mut command = Command::new(program);
+            let mut command = program(FOXGLOVE)?;
             command
                 .arg(FOXGLOVE)
                 .arg(domain.root())

@@ -9,7 +9,7 @@ use super::LaunchError;
 use crate::bus::domain::{self, Domain};
 use crate::bus::iox;
 use crate::clock::monotonic_ns;
-use crate::system::tell;
+use crate::system::{tell, this_program};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use std::fs::{self, Metadata};
@@ -17,7 +17,7 @@ use std::io::{self, Read, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Stdio};
 use std::time::{Duration, SystemTime};
 
 /// The launcher asks for what the dead left to be put away; so is answered when it is done.
@@ -33,7 +33,6 @@ const GRAIN: Duration = Duration::from_millis(100);
 
 /// The janitor, seen from the launcher.
 pub(super) struct Janitor {
-    program: PathBuf,
     root: PathBuf,
     limit: Duration,
     process: Process,
@@ -53,11 +52,11 @@ struct Process {
 
 impl Janitor {
     /// Starts the janitor of a domain. A file that its maker does not finish for `limit` is taken for abandoned.
-    pub fn start(program: &Path, domain: &Domain, limit: Duration) -> Result<Self, LaunchError> {
-        let (program, root) = (program.to_owned(), domain.root().to_owned());
-        let process = Process::start(&program, &root, limit)
-            .map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
-        Ok(Self { program, root, limit, process, pending: 0, since_ns: 0, attempts: 0 })
+    pub fn start(domain: &Domain, limit: Duration) -> Result<Self, LaunchError> {
+        let root = domain.root().to_owned();
+        let process =
+            Process::start(&root, limit).map_err(|source| LaunchError::Spawn { role: "janitor".to_owned(), source })?;
+        Ok(Self { root, limit, process, pending: 0, since_ns: 0, attempts: 0 })
     }
 
     /// Asks for what dead processes left to be put away.
@@ -99,7 +98,7 @@ impl Janitor {
 
     /// Starts another one in its place, and asks that one.
     fn replace(&mut self, how: &str) {
-        let started = (self.attempts < ATTEMPTS).then(|| Process::start(&self.program, &self.root, self.limit));
+        let started = (self.attempts < ATTEMPTS).then(|| Process::start(&self.root, self.limit));
         match started {
             Some(Ok(process)) => {
                 self.process.kill();
@@ -118,8 +117,8 @@ impl Janitor {
 }
 
 impl Process {
-    fn start(program: &Path, root: &Path, limit: Duration) -> io::Result<Self> {
-        let mut command = Command::new(program);
+    fn start(root: &Path, limit: Duration) -> io::Result<Self> {
+        let mut command = this_program()?;
         command.arg("janitor").arg("--domain").arg(root).arg("--limit-s").arg(limit.as_secs_f64().to_string());
         let mut child =
             command.process_group(0).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;

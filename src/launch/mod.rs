@@ -15,6 +15,7 @@ mod recorder;
 mod replay;
 mod results;
 mod score;
+mod steps;
 mod supervision;
 mod table;
 mod trace;
@@ -29,6 +30,7 @@ pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
 pub use results::{ResultsError, claim, new_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub(crate) use score::{lyapunov_floor, score_rig};
+pub use steps::Steps;
 pub use supervision::{Action, Incident};
 pub(crate) use table::plain;
 pub use table::{line_words, table};
@@ -47,8 +49,6 @@ use std::sync::atomic::AtomicUsize;
 
 /// What a run needs besides its scenario.
 pub struct Launch<'a> {
-    /// The program whose subcommands are the roles: this one.
-    pub program: PathBuf,
     /// Roles that somebody else starts, besides the scenario's own.
     pub external: Vec<String>,
     /// The file to record every sample to.
@@ -66,11 +66,10 @@ pub struct Launch<'a> {
 }
 
 impl<'a> Launch<'a> {
-    /// What a run needs at the least, to be added to by whoever wants more. In one thread no program is needed; elsewhere
-    /// [`program`](Self::program) is to be named.
+    /// What a run needs at the least, to be added to by whoever wants more. Roles are processes of this program: its `main` is
+    /// [`Program::main`](crate::Program::main).
     pub fn new(signal: &'a AtomicUsize, progress: &'a mut dyn FnMut(&Progress<'_>)) -> Self {
         Self {
-            program: PathBuf::new(),
             external: Vec::new(),
             record: None,
             results: None,
@@ -110,6 +109,12 @@ pub enum Progress<'a> {
 /// Why a run failed. Whatever had been started is gone.
 #[derive(Debug, thiserror::Error)]
 pub enum LaunchError {
+    /// The run cannot be stepped.
+    #[error("the scenario cannot be stepped: {reason}; run it")]
+    NotStepped {
+        /// Why.
+        reason: &'static str,
+    },
     /// The domain could not be made.
     #[error(transparent)]
     Domain(#[from] DomainError),

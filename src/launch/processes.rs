@@ -28,7 +28,6 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::fmt;
 use std::os::fd::AsFd;
 use std::os::unix::ffi::OsStrExt;
-use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
@@ -66,7 +65,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     }
     describe_seats(scenario, launch, domain)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
-    let mut janitor = Janitor::start(&launch.program, domain, startup_limit)?;
+    let mut janitor = Janitor::start(domain, startup_limit)?;
     let (_low_latency, grants) = match scenario.clock {
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
@@ -170,7 +169,6 @@ struct Supervisor<'a> {
     scenario: &'a Scenario,
     domain: &'a Domain,
     janitor: &'a mut Janitor,
-    program: PathBuf,
     members: Vec<Member>,
     externals: ExternalWatch,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
@@ -189,12 +187,12 @@ impl<'a> Supervisor<'a> {
         janitor: &'a mut Janitor,
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
-        let mut recorder = RecorderWatch::start(&launch.program, launch.record.as_deref(), scenario, domain, bus)?;
-        let foxglove = FoxgloveWatch::start(&launch.program, launch.foxglove, domain)?;
+        let mut recorder = RecorderWatch::start(launch.record.as_deref(), scenario, domain, bus)?;
+        let foxglove = FoxgloveWatch::start(launch.foxglove, domain)?;
         // All of them first: they come up while their links are opened here.
         let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
             true => Ok((role, None)),
-            false => RoleProcess::start(&launch.program, scenario, role, domain).map(|process| (role, Some(process))),
+            false => RoleProcess::start(scenario, role, domain).map(|process| (role, Some(process))),
         };
         let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
         let mut started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
@@ -207,20 +205,8 @@ impl<'a> Supervisor<'a> {
         })?;
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
-        let (program, word, incidents) = (launch.program.clone(), Schedule::default(), Vec::new());
-        Ok(Self {
-            scenario,
-            domain,
-            janitor,
-            program,
-            members,
-            externals,
-            schedule,
-            word,
-            incidents,
-            recorder,
-            foxglove,
-        })
+        let (word, incidents) = (Schedule::default(), Vec::new());
+        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove })
     }
 
     /// See [`blame`].
@@ -370,7 +356,7 @@ impl<'a> Supervisor<'a> {
             }
             // A successor finds its links free once the remains of its predecessor are put away.
             if !self.janitor.is_busy() {
-                member.restart(&self.program, self.scenario, self.domain, now_ns)?;
+                member.restart(self.scenario, self.domain, now_ns)?;
             }
             if let Some(outage_ns) = member.back_after_ns(now_ns) {
                 let last = self.incidents.iter_mut().rev().find(|incident| incident.role == member.name);

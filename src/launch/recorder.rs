@@ -4,7 +4,7 @@
 //! nothing any more, hold the run up.
 
 use super::LaunchError;
-use super::children::RoleProcess;
+use super::children::{RoleProcess, program};
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -17,7 +17,6 @@ use crate::sample::{Health, RoleState};
 use crate::system::tell;
 use crate::telemetry::RoleReport;
 use std::path::Path;
-use std::process::Command;
 
 /// The most that one look adds to its silence, ns: a launcher that stood still blames nobody.
 const LOOK_MAX_NS: u64 = 100_000_000;
@@ -37,15 +36,9 @@ pub(super) struct RecorderWatch {
 
 impl RecorderWatch {
     /// Starts a recorder to `file`; without one, looks out for somebody else's.
-    pub fn start(
-        program: &Path,
-        file: Option<&Path>,
-        scenario: &Scenario,
-        domain: &Domain,
-        bus: &IoxBus,
-    ) -> Result<Self, LaunchError> {
+    pub fn start(file: Option<&Path>, scenario: &Scenario, domain: &Domain, bus: &IoxBus) -> Result<Self, LaunchError> {
         let start = |file: &Path| {
-            let mut command = Command::new(program);
+            let mut command = program(RECORDER)?;
             command.arg("record").arg("--domain").arg(domain.root()).arg("--out").arg(file);
             RoleProcess::spawn(command, RECORDER.to_owned())
         };

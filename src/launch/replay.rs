@@ -13,7 +13,6 @@ use crate::config::Scenario;
 use crate::record::{Comparer, Inlets, Limit, Outlets, Recording, RoleReplay, Script};
 use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes, topic, window_ticks, write_whole};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
-use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -30,7 +29,6 @@ pub fn replay_as_process(
     recording: &Recording,
     scenario: &Scenario,
     role: RoleId,
-    program: &Path,
     signal: &AtomicUsize,
 ) -> Result<RoleReplay, LaunchError> {
     let mut script = Script::read(recording, scenario, role)?;
@@ -40,7 +38,7 @@ pub fn replay_as_process(
     let path = scenario_path(domain);
     write_whole(&path, without_interruptions(scenario).as_bytes())
         .map_err(|source| LaunchError::Write { path, source })?;
-    let _janitor = Janitor::start(program, domain, Duration::from_secs_f64(scenario.startup_timeout_s))?;
+    let _janitor = Janitor::start(domain, Duration::from_secs_f64(scenario.startup_timeout_s))?;
     let bus = IoxBus::enter(domain, "replay", depths(scenario))?;
     let mut prompter = Prompter {
         schedule: bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?,
@@ -49,7 +47,7 @@ pub fn replay_as_process(
         inlets: Inlets::open(scenario, role, &bus)?,
         outlets: Outlets::open(scenario, role, &bus)?,
         comparer: Comparer::new(&script),
-        process: RoleProcess::start(program, scenario, role, domain)?,
+        process: RoleProcess::start(scenario, role, domain)?,
         signal,
         script: &script,
         moved_ns: monotonic_ns(),

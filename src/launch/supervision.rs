@@ -16,7 +16,6 @@ use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
 use serde::Serialize;
 use std::fmt;
-use std::path::Path;
 
 /// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
 /// clock of silence too: a role is only judged for the time in which it was listened to.
@@ -177,14 +176,8 @@ impl Member {
     }
 
     /// Starts its process.
-    pub fn start(
-        &mut self,
-        program: &Path,
-        scenario: &Scenario,
-        domain: &Domain,
-        now_ns: u64,
-    ) -> Result<(), LaunchError> {
-        self.process = Some(RoleProcess::start(program, scenario, self.role, domain)?);
+    pub fn start(&mut self, scenario: &Scenario, domain: &Domain, now_ns: u64) -> Result<(), LaunchError> {
+        self.process = Some(RoleProcess::start(scenario, self.role, domain)?);
         (self.started_ns, self.looked_ns, self.silent_ns) = (now_ns, now_ns, 0);
         Ok(())
     }
@@ -370,17 +363,9 @@ impl Member {
     }
 
     /// Starts the successor if it is due.
-    pub fn restart(
-        &mut self,
-        program: &Path,
-        scenario: &Scenario,
-        domain: &Domain,
-        now_ns: u64,
-    ) -> Result<(), LaunchError> {
+    pub fn restart(&mut self, scenario: &Scenario, domain: &Domain, now_ns: u64) -> Result<(), LaunchError> {
         match self.restart {
-            Some((due_ns, _)) if self.process.is_none() && now_ns >= due_ns => {
-                self.start(program, scenario, domain, now_ns)
-            }
+            Some((due_ns, _)) if self.process.is_none() && now_ns >= due_ns => self.start(scenario, domain, now_ns),
             _ => Ok(()),
         }
     }

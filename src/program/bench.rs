@@ -69,14 +69,12 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, String
     let asked = |row: &&Row| arguments.rows.is_empty() || arguments.rows.iter().any(|name| name == row.name);
     let started = jiff::Timestamp::now();
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
-    let program = std::env::current_exe().map_err(|error| broken(error.to_string()))?;
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner();
     let last = RefCell::new(String::new());
     let mut bench = Bench {
         rows: rows.iter().filter(asked).copied().collect(),
         quick: arguments.quick,
-        program,
         scenarios: scenarios(),
         signal: &signal,
         progress: &mut |what| {

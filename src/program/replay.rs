@@ -78,11 +78,10 @@ fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleRepla
             .collect::<Result<_, _>>()?);
     }
     let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
-    let program = std::env::current_exe().map_err(spawn)?;
     let signal = super::run::catch_signals().map_err(spawn)?;
     let mut replays = Vec::new();
     for role in roles {
-        replays.push(replay_as_process(recording, &scenario, role, &program, &signal)?);
+        replays.push(replay_as_process(recording, &scenario, role, &signal)?);
         if signal.load(Ordering::Relaxed) != 0 {
             return Err(RecordError::Missing { reason: "ended by a signal before all was replayed".to_owned() }.into());
         }

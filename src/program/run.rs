@@ -190,8 +190,6 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
         })?;
     }
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
-    let program = std::env::current_exe()
-        .map_err(|error| broken(format!("cannot find this program's own file: {error}; {}", remedy(&error))))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
     let mut screen = Screen { bar: None, asked: false, fleets, level: Level::of(arguments), told: String::new() };
@@ -202,7 +200,6 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let outcome = crate::launch::run(
         scenario,
         &mut Launch {
-            program,
             external: arguments.external.clone(),
             record: scenario.record.then(|| directory.join("run.mcap")),
             results: std::fs::canonicalize(&directory).ok(),
@@ -323,6 +320,7 @@ pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
+        LaunchError::NotStepped { .. } => Exit::Usage,
         LaunchError::Domain(_)
         | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)

@@ -4,6 +4,7 @@
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
 mod bridge;
+mod compute;
 mod disturb;
 mod drive;
 mod hooks;
@@ -15,6 +16,7 @@ mod process;
 mod seat;
 
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
+pub use compute::{Compute, ComputedTick};
 pub use disturb::{Disturbance, Interruptions};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
@@ -28,7 +30,7 @@ pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, with_realtime_priority,
 };
-pub use process::{RoleError, RoleSeat, Service, run_role, serve};
+pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, serve};
 pub(crate) use process::{join, open_ledger, report_path, results_path, run_under_way, scenario_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 

@@ -15,6 +15,7 @@ pub use ports::{Port, Ports, ports};
 pub use role_id::{RoleId, RoleImpl};
 
 use super::bridge::DeviceError;
+use super::compute::Computing;
 use super::disturb::{Disturbance, Interruptions};
 use super::hooks::{self, Failpoint};
 use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
@@ -79,6 +80,12 @@ pub enum NodeError {
     /// The device at the end of a serial line is gone for good.
     #[error(transparent)]
     Device(#[from] DeviceError),
+    /// The function that computes a role failed.
+    #[error("{reason}")]
+    Computed {
+        /// As it says.
+        reason: String,
+    },
 }
 
 /// A role with its links and counters.
@@ -442,11 +449,18 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
         let generation = ledger.enter();
         Seat { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
     };
-    if let RoleImpl::Device(index, link) = occupant {
-        let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
-        return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
+    match occupant {
+        RoleImpl::Device(index, link) => {
+            let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
+            return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
+        }
+        RoleImpl::Computed(role, compute) => {
+            let computing = Computing::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
+            return role_node(rig, &seat(&(role, ledger.reopened())), Some(computing));
+        }
+        RoleImpl::Role(..) => {}
     }
-    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &seat(of))?));
+    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &seat(of), None)?));
     if let [only] = &mut roles[..] {
         return open(only).map(|(_, node)| node);
     }
@@ -454,18 +468,22 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
     Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)))
 }
 
-/// The node of one role of this program.
-fn role_node<R: Rig, B: Bus + 'static>(rig: &R, seat: &Seat<'_, B>) -> Result<ReadyNode, BusError> {
+/// The node of one role of this program, whose samples somebody else may compute.
+fn role_node<R: Rig, B: Bus + 'static>(
+    rig: &R,
+    seat: &Seat<'_, B>,
+    computing: Option<Computing>,
+) -> Result<ReadyNode, BusError> {
     Ok(match seat.role {
         RoleId::Plant(index) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {
-                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat)?),
-                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, seat)?),
+                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat, computing)?),
+                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, seat, None)?),
             }
         }
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat)?),
+        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat, computing)?),
+        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat, computing)?),
     })
 }
 

@@ -3,6 +3,7 @@
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
 use super::bridge::DeviceError;
+use super::compute::Compute;
 use super::drive::{Control, Drive, Ended, Heartbeat, Waiting};
 use super::hooks::{self, Failpoint};
 use super::node::{self, NodeError, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
@@ -104,6 +105,12 @@ pub enum RoleError {
         /// How long the role waited, s.
         waited_s: f64,
     },
+    /// It serves a fleet.
+    #[error("{role} serves a fleet, which no function computes; give its bodies roles of their own")]
+    Fleet {
+        /// Its name.
+        role: String,
+    },
     /// The run is gone, and nobody is left to report to.
     #[error("the run is gone: its launcher was killed, or ended without waiting for this role; start it again")]
     Gone,
@@ -164,6 +171,21 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     in_domain(&domain, &scenario, occupant, terminated, |_| {})
 }
 
+/// The same with a function that computes the role's samples. The process takes no privileges for it.
+///
+/// # Errors
+/// [`RoleError`]; [`RoleError::Fleet`] for a role that serves a fleet.
+pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &AtomicBool) -> Result<(), RoleError> {
+    let (domain, scenario) = join(&seat.domain)?;
+    let role = find_role(&scenario, &seat.role)?;
+    require_process(&scenario, role)?;
+    let ports = node::ports(&scenario, role);
+    if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
+        return Err(RoleError::Fleet { role: seat.role.clone() });
+    }
+    in_domain(&domain, &scenario, RoleImpl::Computed(role, compute), terminated, |_| {})
+}
+
 /// Refuses a role that has no process of its own.
 pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), RoleError> {
     let host = role.host(scenario);
@@ -195,7 +217,9 @@ pub(super) fn in_domain(
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
-    let privileges = if realtime { privileges::take(scenario, role) } else { Privileges::default() };
+    // What computes in an interpreter has threads and memory of its own.
+    let takes = realtime && !matches!(occupant, RoleImpl::Computed(..));
+    let privileges = if takes { privileges::take(scenario, role) } else { Privileges::default() };
     let ledger = take_ledger(domain, scenario, role)?;
     let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
     hooks::enter(&roles, ledger.generation() + 1);

@@ -9,6 +9,7 @@ use crate::clock::{Clock, Grid};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::role::{Controller, Guard, Law};
+use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::Message;
@@ -65,6 +66,11 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         (!self.measurement.knows(tick)).then_some(self.body)
     }
 
+    /// The measurement of the tick at hand, as words.
+    fn words(&self) -> Option<&[u64]> {
+        self.measurement.sample().filter(|_| self.ready).map(Message::words)
+    }
+
     /// There is no estimate for this tick, and so there is no command.
     fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
         // What is not used now will never be, and must not fill the link.
@@ -83,6 +89,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         silent: bool,
         (clock, began_ns): (Clock, u64),
         starved: &mut bool,
+        computed: Option<(&Computing, usize)>,
     ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
         self.ready &= !silent;
@@ -93,6 +100,9 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
         self.command.stage(|sample| {
             controller.step(estimate, measurement, sample);
+            if let Some((computing, index)) = computed {
+                computing.write(index, sample.words_mut());
+            }
             *sent_ns = clock.now_ns();
             sample.stamp_mut().sent_ns = *sent_ns;
         })?;
@@ -148,6 +158,8 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     watchdog: Watchdog,
     interruptions: Interruptions,
     ledger: Ledger,
+    /// What computes the commands in the place of the laws, if that is somebody else.
+    computing: Option<Computing>,
     /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
     look: usize,
     /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
@@ -160,7 +172,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computing>) -> Result<Self, BusError> {
         let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
         // In the order of the counters: everything written, then everything read; fleets last.
         let written = |(_, body)| seat.output(body, Signal::Command);
@@ -187,6 +199,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             watchdog: Watchdog::new(seat.scenario.watch),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
+            computing,
             look: 0,
             origin_ns: 0,
             estimate_sent_ns: 0,
@@ -307,17 +320,25 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let Some(estimate) = self.estimate.sample() else { return Ok(Poll::Waiting) };
         let stamp = *estimate.stamp();
         let silent = self.watchdog.latched_at().is_some();
+        if let Some(computing) = &mut self.computing {
+            let singles = self.channels.iter().map(|channel| channel.words());
+            let fleets = self.fleets.iter().map(|fleet| fleet.words());
+            let inputs: Vec<Option<&[u64]>> =
+                [Some(estimate.words())].into_iter().chain(singles).chain(fleets).collect();
+            computing.tick(stamp.tick, &inputs)?;
+        }
         let clock = self.clock;
         let mut began_ns = self.received_ns;
         let mut starved = false;
-        for channel in &mut self.channels {
-            began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved)?;
+        for (index, channel) in self.channels.iter_mut().enumerate() {
+            let computed = self.computing.as_ref().map(|computing| (computing, index));
+            began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved, computed)?;
             if self.watchdog.active() && channel.ready {
                 Self::watch_command(&mut self.watchdog, stamp.tick, channel.command.last());
             }
         }
         for fleet in &mut self.fleets {
-            began_ns = fleet.execute(estimate, silent, (clock, began_ns), &mut starved)?;
+            began_ns = fleet.execute(estimate, silent, (clock, began_ns), &mut starved, None)?;
         }
         (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
         self.skip_to(stamp.tick);

@@ -7,6 +7,7 @@ use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
+use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::Message;
@@ -31,6 +32,8 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
+    /// What computes the estimate in the place of the observer, if that is somebody else.
+    computing: Option<Computing>,
     instants: Instants,
     hop: Latency,
     step: Latency,
@@ -38,7 +41,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computing>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0];
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
@@ -49,6 +52,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             counters: TickCounters::default(),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
+            computing,
             instants: Instants::default(),
             hop: Latency::default(),
             step: Latency::default(),
@@ -61,12 +65,18 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let received = self.clock.now_ns();
         let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
         let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
-        let (observer, clock) = (&mut self.observer, self.clock);
+        if let Some(computing) = &mut self.computing {
+            computing.tick(stamp.tick, &[measurement.map(Message::words)])?;
+        }
+        let (observer, computing, clock) = (&mut self.observer, &self.computing, self.clock);
         let mut done = 0;
         self.estimate.stage(|sample| {
             match measurement {
                 Some(measurement) => observer.step(measurement, sample),
                 None => observer.reject(&stamp, sample),
+            }
+            if let Some(computing) = computing {
+                computing.write(0, sample.words_mut());
             }
             done = clock.now_ns();
             sample.stamp_mut().sent_ns = done;

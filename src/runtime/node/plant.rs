@@ -7,6 +7,7 @@ use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::BodyInfo;
 use crate::role::{Body, CommandEvent, Guard, Plant};
+use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Stamp};
@@ -30,6 +31,8 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
+    /// What computes the samples in the place of the body, if that is somebody else.
+    computing: Option<Computing>,
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
     unfinished: Option<u64>,
@@ -39,7 +42,13 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
 }
 
 impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
-    pub fn open(body: P, guard: G, info: &BodyInfo, seat: &Seat<'_, B>) -> Result<Self, BusError> {
+    pub fn open(
+        body: P,
+        guard: G,
+        info: &BodyInfo,
+        seat: &Seat<'_, B>,
+        computing: Option<Computing>,
+    ) -> Result<Self, BusError> {
         let scenario = seat.scenario;
         let measurement = seat.output(info, Signal::Measurement)?;
         let truth = seat.output(info, Signal::Truth)?;
@@ -55,6 +64,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             counters: TickCounters::default(),
             interruptions: seat.interruptions(),
             ledger: seat.ledger.reopened(),
+            computing,
             inherited: Inherited::Nothing,
             unfinished: None,
             lateness: Latency::default(),
@@ -93,8 +103,12 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
     fn stage_truth(&mut self, tick: u64) -> Result<(), NodeError> {
         let (plant, clock, origin_ns) = (&self.plant, self.clock, self.grid.due_ns(tick));
+        let computing = &self.computing;
         Ok(self.truth.stage(|sample| {
             plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
+            if let Some(computing) = computing {
+                computing.write_truth(sample.words_mut());
+            }
         })?)
     }
 
@@ -108,11 +122,19 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
             self.counters.safe();
         }
-        let (plant, clock) = (&mut self.plant, self.clock);
+        if let Some(computing) = &mut self.computing {
+            let applied = matches!(event, CommandEvent::Applied);
+            let command = self.command.as_ref().and_then(Input::sample).filter(|_| applied);
+            computing.tick(tick, &[command.map(Message::words)][..usize::from(self.command.is_some())])?;
+        }
+        let (plant, computing, clock) = (&mut self.plant, &self.computing, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
         self.measurement.stage(|sample| {
             stamp.sent_ns = clock.now_ns();
             plant.measure(&stamp, sample);
+            if let Some(computing) = computing {
+                computing.write(0, sample.words_mut());
+            }
         })?;
         self.unfinished = Some(tick);
         self.counters.executed();

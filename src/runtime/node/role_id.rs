@@ -2,6 +2,7 @@
 
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::bridge::DeviceLink;
+use crate::runtime::compute::Compute;
 use crate::telemetry::Ledger;
 
 /// Which role of a scenario.
@@ -69,6 +70,8 @@ impl RoleId {
 pub enum RoleImpl {
     /// This program, with other roles in the same process: these, in the order of a tick, with their ledgers.
     Role(RoleId, Vec<(RoleId, Ledger)>),
+    /// This program's node, whose samples a function computes.
+    Computed(RoleId, Box<dyn Compute>),
     /// A device, as the driven body with this index.
     Device(usize, Box<DeviceLink>),
 }
@@ -77,7 +80,7 @@ impl RoleImpl {
     /// The seat.
     pub fn role(&self) -> RoleId {
         match self {
-            Self::Role(role, _) => *role,
+            Self::Role(role, _) | Self::Computed(role, _) => *role,
             Self::Device(index, _) => RoleId::Plant(*index),
         }
     }
@@ -86,7 +89,7 @@ impl RoleImpl {
     pub(in crate::runtime) fn books(&self, ledger: &Ledger) -> Vec<(RoleId, Ledger)> {
         let others = match self {
             Self::Role(_, others) => &others[..],
-            Self::Device(..) => &[],
+            Self::Computed(..) | Self::Device(..) => &[],
         };
         let others = others.iter().map(|(role, ledger)| (*role, ledger.reopened()));
         others.chain([(self.role(), ledger.reopened())]).collect()

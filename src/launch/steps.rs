@@ -1,0 +1,204 @@
+//! A run in one thread that its caller makes tick by tick: he is the controller. Everything else is as in any run in one thread, and
+//! so are the bits.
+//!
+//! Must not decide anything for the controller: a tick without a command has none.
+
+use super::score::{self, Scorer};
+use super::{LaunchError, Outcome};
+use crate::bus::memory::MemoryBus;
+use crate::bus::{Reader, WordReader};
+use crate::config::{ClockKind, Scenario};
+use crate::runtime::{
+    Compute, ComputedTick, Poll, Port, ReadyNode, RoleId, RoleImpl, RunCondition, build, depths, ports, private_ledger,
+    report,
+};
+use crate::telemetry::Ledger;
+use std::cell::RefCell;
+use std::rc::Rc;
+
+/// A run that is stepped.
+///
+/// ```
+/// use corotate::config::{SHIPPED, Scenario};
+/// use corotate::launch::Steps;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let overrides = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
+/// let scenario = Scenario::parse(SHIPPED[0].1, "rigid-pair.toml", &overrides)?;
+/// let mut steps = Steps::new(scenario)?;
+/// while steps.observe()? {
+///     // Words 4 to 6 of the estimate, after its stamp, are the leader's angular velocity, rad/s.
+///     let estimate = steps.inputs()[0].as_ref().map(|words| f64::from_bits(words[6]));
+///     assert!(estimate.is_some());
+///     let nothing = vec![0; steps.outputs()[0].size / 8 - 4];
+///     steps.act(&[&nothing])?;
+/// }
+/// assert_eq!(steps.finish()?.score.scored_ticks, 1001);
+/// # Ok(())
+/// # }
+/// ```
+pub struct Steps {
+    scenario: Scenario,
+    seats: Vec<(RoleId, Ledger)>,
+    nodes: Vec<ReadyNode>,
+    scorer: Box<dyn Scorer>,
+    /// What the controller reads, and the last sample of each; none of a tick without.
+    readers: Vec<WordReader>,
+    inputs: Vec<Option<Vec<u64>>>,
+    outputs: Vec<Port>,
+    commands: Rc<RefCell<Vec<Vec<u64>>>>,
+    tick: u64,
+    _bus: MemoryBus,
+}
+
+/// Hands the caller's commands on.
+struct Given(Rc<RefCell<Vec<Vec<u64>>>>);
+
+impl Compute for Given {
+    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+        for (output, given) in tick.outputs.iter_mut().zip(self.0.borrow().iter()) {
+            output.copy_from_slice(given);
+        }
+        Ok(())
+    }
+}
+
+impl Steps {
+    /// A run of a scenario before its first tick.
+    ///
+    /// # Errors
+    /// [`LaunchError`]; [`LaunchError::NotStepped`] where it has no controller, a fleet, or a role that a fault kills.
+    pub fn new(scenario: Scenario) -> Result<Self, LaunchError> {
+        let scenario = Scenario { clock: ClockKind::InProcess, ..scenario };
+        let refuse = |reason| Err(LaunchError::NotStepped { reason });
+        let roles = RoleId::all(&scenario);
+        if !roles.contains(&RoleId::Controller) {
+            return refuse("it has no controller");
+        }
+        let of_controller = ports(&scenario, RoleId::Controller);
+        if of_controller.reads.iter().any(|port| port.fleet) {
+            return refuse("a fleet is driven as one, by our controller alone");
+        }
+        let bus = MemoryBus::new(depths(&scenario));
+        let scorer = score::open(&scenario, &bus)?;
+        let seats: Vec<(RoleId, Ledger)> =
+            roles.into_iter().map(|role| (role, private_ledger(&scenario, role))).collect();
+        let readers = of_controller.reads.iter().map(|port| port.reader(&bus, Reader::Scorer));
+        let readers = readers.collect::<Result<Vec<_>, _>>()?;
+        let content = |port: &Port| vec![0; port.size / size_of::<u64>() - STAMP];
+        let commands = Rc::new(RefCell::new(of_controller.writes.iter().map(content).collect()));
+        let node = |(role, ledger): &(RoleId, Ledger)| {
+            let occupant = match role {
+                RoleId::Controller => RoleImpl::Computed(*role, Box::new(Given(Rc::clone(&commands)))),
+                role => RoleImpl::from(*role),
+            };
+            build(&scenario, occupant, &bus, ledger)
+        };
+        let nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
+        let (inputs, outputs) = (vec![None; readers.len()], of_controller.writes);
+        Ok(Self { scenario, seats, nodes, scorer, readers, inputs, outputs, commands, tick: 0, _bus: bus })
+    }
+
+    /// Lets bodies and observer make the next tick, up to where the controller is to act; false once there is none.
+    ///
+    /// # Errors
+    /// [`LaunchError`].
+    pub fn observe(&mut self) -> Result<bool, LaunchError> {
+        if self.tick > self.scenario.last_tick {
+            return Ok(false);
+        }
+        let controller = self.nodes.len() - 1;
+        for node in &mut self.nodes[..controller] {
+            step(node, self.tick)?;
+        }
+        for (reader, input) in self.readers.iter_mut().zip(&mut self.inputs) {
+            let room = input.take();
+            while let Some(words) = reader.next()? {
+                // A sample of this tick; no other tick's, and no marker that there is none.
+                let stamp: &crate::sample::Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
+                if stamp.tick == self.tick && stamp.generation & crate::sample::VOID == 0 && stamp.generation > 0 {
+                    let mut kept = room.clone().unwrap_or_default();
+                    kept.clear();
+                    kept.extend_from_slice(words);
+                    *input = Some(kept);
+                }
+            }
+        }
+        Ok(true)
+    }
+
+    /// What the controller has of the tick at hand: the estimate, then each driven body's measurement, as words with their stamps.
+    pub fn inputs(&self) -> &[Option<Vec<u64>>] {
+        &self.inputs
+    }
+
+    /// The commands that it is to give, one for each driven body.
+    pub fn outputs(&self) -> &[Port] {
+        &self.outputs
+    }
+
+    /// The tick at hand.
+    pub fn tick(&self) -> u64 {
+        self.tick
+    }
+
+    /// The latest value of the rig's first metric.
+    pub fn metric(&self) -> f64 {
+        self.scorer.latest()
+    }
+
+    /// Gives the commands of the tick at hand, as words without their stamps, and ends it.
+    ///
+    /// # Errors
+    /// [`LaunchError`].
+    ///
+    /// # Panics
+    /// If they are not as many, or not as long, as [`outputs`](Self::outputs) says.
+    pub fn act(&mut self, commands: &[&[u64]]) -> Result<(), LaunchError> {
+        let mut given = self.commands.borrow_mut();
+        assert_eq!(commands.len(), given.len(), "one command for each driven body");
+        given.iter_mut().zip(commands).for_each(|(given, command)| given.copy_from_slice(command));
+        drop(given);
+        if let Some(controller) = self.nodes.last_mut() {
+            step(controller, self.tick)?;
+        }
+        self.scorer.poll(1)?;
+        self.tick += 1;
+        Ok(())
+    }
+
+    /// Ends the run, wherever it is, with its scores and counters.
+    ///
+    /// # Errors
+    /// [`LaunchError`].
+    pub fn finish(mut self) -> Result<Outcome, LaunchError> {
+        self.nodes.iter_mut().try_for_each(|node| node.finish())?;
+        let score = self.scorer.finish()?;
+        let of = |(role, ledger): &(RoleId, Ledger)| report(&self.scenario, *role, ledger, Vec::new(), Vec::new());
+        Ok(Outcome {
+            reports: self.seats.iter().map(of).collect(),
+            recording: None,
+            unbooked: Vec::new(),
+            problems: Vec::new(),
+            score,
+            incidents: Vec::new(),
+            grants: Vec::new(),
+            domain: None,
+            remains: None,
+            signal: 0,
+        })
+    }
+}
+
+/// Words of a stamp.
+const STAMP: usize = size_of::<crate::sample::Stamp>() / size_of::<u64>();
+
+fn step(node: &mut ReadyNode, tick: u64) -> Result<(), LaunchError> {
+    if node.before_tick() {
+        return Err(LaunchError::NotStepped { reason: "a fault kills one of its roles" });
+    }
+    if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
+        node.finish_tick()?;
+    }
+    Ok(())
+}

@@ -1,0 +1,152 @@
+//! Roles whose samples a function computes: the same bits as the built-in ones if it computes the same, in one thread step by step
+//! and as a process of a run.
+
+mod common;
+
+use bytemuck::{bytes_of, from_bytes};
+use common::{Bench, await_some};
+use corotate::config::{SHIPPED, Scenario};
+use corotate::launch::{Launch, Outcome, Steps, Summary, run};
+use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
+use corotate::role::Law;
+use corotate::runtime::{Compute, ComputedTick, RoleSeat, run_computed};
+use corotate::sample::Message;
+use std::sync::atomic::{AtomicBool, AtomicUsize};
+
+type R = RigidBodyRig;
+
+fn scenario(name: &str, overrides: &[&str]) -> Scenario {
+    let text = SHIPPED.iter().find(|(shipped, _)| *shipped == name).unwrap().1;
+    Scenario::parse(text, name, &overrides.iter().map(|set| (*set).to_owned()).collect::<Vec<_>>()).unwrap()
+}
+
+fn hash(scenario: &Scenario, outcome: &Outcome) -> String {
+    let summary = Summary::new(scenario, outcome, jiff::Timestamp::UNIX_EPOCH);
+    serde_json::to_value(summary).unwrap()["state"]["hash"].as_str().unwrap().to_owned()
+}
+
+/// The rig's own laws, called by somebody else.
+struct Laws(Vec<<R as Rig>::Law>);
+
+impl Laws {
+    fn of(scenario: &Scenario) -> Self {
+        let rig = scenario.rig.downcast_ref::<R>().unwrap();
+        Self((1..rig.bodies().len()).map(|index| rig.law(index)).collect())
+    }
+
+    /// The content of each command.
+    fn commands(&mut self, inputs: &[Option<&[u64]>]) -> Vec<Vec<u64>> {
+        let estimate: &Estimate<R> = from_bytes(bytemuck::cast_slice(inputs[0].unwrap()));
+        let command = |(law, input): (&mut <R as Rig>::Law, &Option<&[u64]>)| {
+            let mut command = Command::<R>::default();
+            // In real time one may be missing.
+            if let Some(words) = input {
+                let measurement: &Measurement<R> = from_bytes(bytemuck::cast_slice(words));
+                law.command(estimate, measurement, &mut command);
+            }
+            assert_eq!(bytes_of(&command).len(), 8 * command.words().len());
+            command.words()[4..].to_vec()
+        };
+        self.0.iter_mut().zip(&inputs[1..]).map(command).collect()
+    }
+}
+
+impl Compute for Laws {
+    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+        for (output, command) in tick.outputs.iter_mut().zip(self.commands(tick.inputs)) {
+            output.copy_from_slice(&command);
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn a_run_that_is_stepped_has_the_bits_of_one_that_is_not() {
+    for name in ["rigid-pair", "rigid-trio", "noisy-pair", "gyro-loss"] {
+        let of_run = || scenario(name, &["clock=in-process", "accept={}", "duration_s=3"]);
+        let scenario = of_run();
+        let mut steps = Steps::new(of_run()).unwrap();
+        let mut laws = Laws::of(&scenario);
+        while steps.observe().unwrap() {
+            let inputs: Vec<Option<&[u64]>> = steps.inputs().iter().map(Option::as_deref).collect();
+            let commands = laws.commands(&inputs);
+            steps.act(&commands.iter().map(Vec::as_slice).collect::<Vec<_>>()).unwrap();
+        }
+        assert_eq!(steps.tick(), scenario.last_tick + 1);
+        let stepped = steps.finish().unwrap();
+        let ran = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).unwrap();
+        assert_eq!(hash(&scenario, &stepped), hash(&scenario, &ran), "{name}");
+        assert_eq!(stepped.score.metrics, ran.score.metrics, "{name}");
+    }
+}
+
+#[test]
+fn what_cannot_be_stepped_says_why() {
+    for (name, set, reason) in [("rigid-fleet", "accept={}", "fleet"), ("inertia", "accept={}", "no controller")] {
+        let error = Steps::new(scenario(name, &["clock=in-process", set])).err().unwrap();
+        assert!(error.to_string().contains(reason), "{error}");
+    }
+    let killed =
+        scenario("rigid-pair", &["clock=in-process", r#"fault=[{kind="kill",role="observer",from_tick=3,ticks=1}]"#]);
+    let mut steps = Steps::new(killed).unwrap();
+    let nothing = vec![0; steps.outputs()[0].size / 8 - 4];
+    let error = loop {
+        match steps.observe() {
+            Ok(_) => steps.act(&[&nothing]).unwrap(),
+            Err(error) => break error,
+        }
+    };
+    assert!(error.to_string().contains("a fault kills"), "{error}");
+}
+
+/// A controller in this process, in a run of another.
+#[test]
+fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
+    let bench = Bench::new();
+    let quick = ["--set", "accept={}", "--duration", "3", "--json"];
+    let alone = bench.run(&[&["run", "rigid-pair", "--clock", "in-process"], &quick[..]].concat());
+    let told = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+    for clock in ["lockstep", "realtime"] {
+        let running =
+            bench.start(&[&["run", "rigid-pair", "--clock", clock, "--external", "controller"], &quick[..]].concat());
+        let domain = await_some(|| bench.domains().pop());
+        let seat = await_some(|| {
+            let seat = domain.join("controller.seat.json");
+            seat.exists().then(|| RoleSeat { domain: domain.clone(), role: "controller".to_owned() })
+        });
+        let laws = Laws::of(&scenario("rigid-pair", &[]));
+        run_computed(&seat, Box::new(laws), &AtomicBool::new(false)).unwrap();
+        let done = running.wait();
+        assert_eq!(done.code, Some(0), "{done:?}");
+        let (own, built_in) = (told(&done.stdout), told(&alone.stdout));
+        if own["state"]["first_disturbed_tick"].is_null() {
+            assert_eq!(own["state"]["hash"], built_in["state"]["hash"], "{clock}");
+        }
+        assert!(clock == "realtime" || own["state"]["first_disturbed_tick"].is_null());
+        assert!(own["books"]["roles"]["controller"]["executed"].as_u64().unwrap() > 2000, "{own:#}");
+        bench.assert_clean(&[domain]);
+    }
+}
+
+/// A function that fails ends its role with what it says, and the run in order.
+#[test]
+fn a_function_that_fails_ends_the_run_in_order() {
+    struct Fails;
+    impl Compute for Fails {
+        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+            if tick.tick < 100 { Ok(()) } else { Err("it cannot divide by zero".to_owned()) }
+        }
+    }
+    let bench = Bench::new();
+    let options = ["--set", "accept={}", "--set", "launch.external_timeout_s=3", "--duration", "1000"];
+    let running = bench
+        .start(&[&["run", "rigid-pair", "--clock", "lockstep", "--external", "controller"], &options[..]].concat());
+    let domain = await_some(|| bench.domains().pop());
+    await_some(|| domain.join("controller.seat.json").exists().then_some(()));
+    let seat = RoleSeat { domain: domain.clone(), role: "controller".to_owned() };
+    let error = run_computed(&seat, Box::new(Fails), &AtomicBool::new(false)).unwrap_err();
+    assert_eq!(error.to_string(), "it cannot divide by zero");
+    let done = running.wait();
+    assert_eq!(done.code, Some(4), "{done:?}");
+    bench.assert_clean(&[domain]);
+}
