@@ -27,7 +27,7 @@ pub(crate) use outcome::State;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub use replay::replay_as_process;
 pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
-pub use results::{ResultsError, claim, new_run};
+pub use results::{LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub(crate) use score::{lyapunov_floor, score_rig};
 pub use steps::Steps;

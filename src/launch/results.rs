@@ -52,6 +52,53 @@ pub enum ResultsError {
     },
 }
 
+/// Where runs go that are not told where.
+pub const RUNS: &str = "runs";
+/// The link in it to the newest.
+pub const LATEST: &str = "latest";
+/// The most runs of one scenario that begin in one second.
+const DIRECTORIES: u32 = 10_000;
+
+/// The directory for the results of a run that began then: as given, or a new one under `runs/`.
+///
+/// # Errors
+/// Those of the system, with the path.
+pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
+    let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
+    if let Some(path) = given {
+        return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
+    }
+    let runs = Path::new(RUNS);
+    files::create_directories(runs).map_err(|error| named(runs, error))?;
+    let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
+    for attempt in 1..=DIRECTORIES {
+        let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
+        match files::create_directory(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
+        }
+    }
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
+}
+
+/// Makes a run's directory the newest of `runs/`, if that is where it lies: a link, made in one step.
+///
+/// # Errors
+/// Those of the system, and where something else than a link has the name.
+pub fn make_latest(directory: &Path) -> io::Result<()> {
+    let runs = match fs::canonicalize(RUNS) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        runs => runs?,
+    };
+    let directory = fs::canonicalize(directory)?;
+    match directory.file_name() {
+        Some(name) if directory.parent() == Some(&runs) && name != LATEST => {
+            files::link(Path::new(RUNS), LATEST, Path::new(name))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// An identifier for a new run.
 ///
 /// # Errors

@@ -1,10 +1,11 @@
 //! `corotate bench`: the benchmark, from the rows asked for to a table, JSON and histograms.
 
 use super::role::die_with;
-use super::run::{catch_signals, make_directory};
+use super::run::catch_signals;
 use super::scenario::load;
 use super::{Exit, fail, print, scenarios};
 use crate::bench::{Bench, BenchError, Results, Row, run, serve_peer, table, write_results};
+use crate::launch::make_directory;
 use indicatif::ProgressBar;
 use std::cell::RefCell;
 use std::path::PathBuf;

@@ -72,7 +72,7 @@ fn version() -> &'static str {
 
 /// What `--color` asks for. Help is printed while the line is read, so it cannot wait for the result.
 fn asked_color() -> ColorChoice {
-    let words: Vec<String> = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+    let words: Vec<String> = super::words_given().iter().map(|word| word.to_string_lossy().into_owned()).collect();
     let beside = words.windows(2).find(|pair| pair[0] == "--color").map(|pair| pair[1].as_str());
     let within = || words.iter().find_map(|word| word.strip_prefix("--color="));
     match beside.or_else(within).and_then(|word| When::from_str(word, false).ok()) {

@@ -2,34 +2,11 @@
 //!
 //! Must not follow a link of another user.
 
-use crate::files::{self, Directory};
-use crate::launch::RECORDING;
+use crate::files::Directory;
+use crate::launch::{LATEST, RECORDING, RUNS};
 use std::fs;
-use std::io::{self, ErrorKind};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-
-/// Where runs go that are not told where.
-pub const RUNS: &str = "runs";
-/// The link in it.
-const LATEST: &str = "latest";
-
-/// Makes a run's directory the newest of `runs/`, if that is where it lies.
-///
-/// # Errors
-/// Those of the system, and where something else than a link has the name.
-pub fn point(directory: &Path) -> io::Result<()> {
-    let runs = match fs::canonicalize(RUNS) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
-        runs => runs?,
-    };
-    let directory = fs::canonicalize(directory)?;
-    match directory.file_name() {
-        Some(name) if directory.parent() == Some(&runs) && name != LATEST => {
-            files::link(Path::new(RUNS), LATEST, Path::new(name))
-        }
-        _ => Ok(()),
-    }
-}
 
 /// The directory of the newest run.
 ///

@@ -38,6 +38,7 @@ use clap::{FromArgMatches, Parser, Subcommand};
 use color::When;
 use help::WIDTH;
 use std::backtrace::{Backtrace, BacktraceStatus};
+use std::ffi::OsString;
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -136,17 +137,17 @@ enum Exit {
     Signal(usize),
 }
 
-impl From<Exit> for ExitCode {
-    fn from(exit: Exit) -> Self {
-        Self::from(match exit {
-            Exit::Ok => 0,
-            Exit::Failure => 1,
-            Exit::Usage => 2,
-            Exit::NotAccepted => 3,
-            Exit::ProcessLost => 4,
-            Exit::PrivilegeMissing => 5,
-            Exit::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
-        })
+impl Exit {
+    fn code(self) -> u8 {
+        match self {
+            Self::Ok => 0,
+            Self::Failure => 1,
+            Self::Usage => 2,
+            Self::NotAccepted => 3,
+            Self::ProcessLost => 4,
+            Self::PrivilegeMissing => 5,
+            Self::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
+        }
     }
 }
 
@@ -243,15 +244,24 @@ impl Program {
     /// # Panics
     /// If a scenario was read before: the rigs are known from then on.
     pub fn main(self) -> ExitCode {
+        ExitCode::from(self.obey(std::env::args_os().collect()))
+    }
+
+    /// The same for a program that is a library in an interpreter: does what these words ask for, the first of which is its name,
+    /// and gives the exit code. It may end the process, as a program does that was asked for help.
+    ///
+    /// # Panics
+    /// As [`main`](Self::main).
+    pub fn obey(self, words: Vec<OsString>) -> u8 {
+        let _ = WORDS.set(words);
         self.begin();
-        let mut line = help::line();
-        let arguments = Arguments::from_arg_matches_mut(&mut line.get_matches_mut());
+        let arguments = Arguments::from_arg_matches_mut(&mut help::line().get_matches_from(words_given()));
         let Arguments { command, color } = arguments.unwrap_or_else(|error| error.exit());
         color::choose(color);
         // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
         let exit = std::panic::catch_unwind(|| obey(command))
             .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
-        exit.into()
+        exit.code()
     }
 
     /// Measures rows as the command `bench` does its own, with its options: the whole `main` of a bench target.
@@ -262,7 +272,7 @@ impl Program {
         self.begin();
         // `cargo bench` adds a word of its own.
         let words = std::env::args().filter(|word| word != "--bench");
-        bench::bench(&BenchArguments::parse_from(words).bench, rows).into()
+        ExitCode::from(bench::bench(&BenchArguments::parse_from(words).bench, rows).code())
     }
 
     fn begin(self) {
@@ -288,12 +298,19 @@ fn scenarios() -> &'static [(&'static str, &'static str)] {
     SCENARIOS.get().map_or(&[], Vec::as_slice)
 }
 
-/// How this program is called: by the name of its file.
+/// What the program was called with.
+static WORDS: OnceLock<Vec<OsString>> = OnceLock::new();
+
+fn words_given() -> &'static [OsString] {
+    WORDS.get().map_or(&[], Vec::as_slice)
+}
+
+/// How this program is called.
 fn name() -> &'static str {
     static NAME: OnceLock<String> = OnceLock::new();
     NAME.get_or_init(|| {
-        let file = std::env::current_exe().ok();
-        file.as_deref().and_then(Path::file_name).map_or("corotate".into(), |name| name.to_string_lossy().into_owned())
+        let file = words_given().first().map(Path::new).and_then(Path::file_name);
+        file.map_or("corotate".into(), |name| name.to_string_lossy().into_owned())
     })
 }
 

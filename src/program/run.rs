@@ -2,12 +2,13 @@
 
 use super::color::{Color, paint};
 use super::scenario::{Change, load, stem};
-use super::{Exit, fail, foxglove, latest, name, print, remark};
+use super::{Exit, fail, foxglove, name, print, remark};
 use crate::config::{ClockKind, RunId, Scenario};
 use crate::doctor::Machine;
 use crate::files;
 use crate::launch::{
-    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, new_run, table, write_run,
+    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, make_directory, make_latest,
+    new_run, table, write_run,
 };
 use crate::runtime::seat_path;
 use crate::system::{remedy, tell};
@@ -215,7 +216,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
     written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
-    if let Err(error) = latest::point(&directory) {
+    if let Err(error) = make_latest(&directory) {
         remark(&format!("runs/latest does not lead to this run: {error}; name {} instead", directory.display()));
     }
     reported.map_err(broken)?;
@@ -344,28 +345,6 @@ pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
         signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
     }
     Ok(signal)
-}
-
-/// The most runs of one scenario that begin in one second.
-const DIRECTORIES: u32 = 10_000;
-
-/// The directory for the results: as given, or a new one under `runs/`.
-pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
-    let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
-    if let Some(path) = given {
-        return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
-    }
-    let runs = Path::new(latest::RUNS);
-    files::create_directories(runs).map_err(|error| named(runs, error))?;
-    let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
-    for attempt in 1..=DIRECTORIES {
-        let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
-        match files::create_directory(&path) {
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-            other => return other.map(|()| path.clone()).map_err(|error| named(&path, error)),
-        }
-    }
-    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{stem} and {DIRECTORIES} more are there already")))
 }
 
 /// How much is said of a run while it goes on.
