@@ -1,0 +1,37 @@
+"""Control loops over shared memory: run a scenario, read a recording, be a role, step a loop.
+
+>>> import corotate
+>>> run = corotate.run("rigid-pair", clock="in-process", set={"duration_s": 9}, out=tmp / "run")
+>>> run.accepted
+True
+>>> sorted(run.metrics)
+['estimate_error_rad_s', 'sync_error_rad_s']
+"""
+
+import sys as _sys
+
+from . import _corotate
+from ._corotate import CorotateError, __version__
+from .logs import HiddenRate, Identified, Synchronizer, identify
+from .recording import Recording
+from .run import Run, certificate, run, shipped
+from .seat import Seat
+
+__all__ = [
+    "CorotateError", "Env", "HiddenRate", "Identified", "Recording", "Run", "Seat", "Synchronizer", "__version__", "certificate",
+    "identify", "run", "shipped", "to_control",
+]
+
+# Roles of a run are processes of this interpreter with this package.
+_corotate.started_by(_sys.executable, ["-m", "corotate"])
+
+
+def __getattr__(name):
+    # What needs packages that few have.
+    if name == "Env":
+        from .env import Env
+        return Env
+    if name == "to_control":
+        from .control import to_control
+        return to_control
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,113 @@
+"""The papers' observers on arrays: a body's inertia, a rate that is not measured, and the law."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import _corotate
+
+
+def _log(t, w, segments):
+    t = np.ascontiguousarray(t, dtype=float)
+    w = np.ascontiguousarray(w, dtype=float)
+    labels = np.zeros(len(t), dtype=np.int64) if segments is None else np.unique(np.asarray(segments), return_inverse=True)[1]
+    return t, w, np.ascontiguousarray(labels, dtype=np.int64).reshape(-1)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A body's inertia up to scale, the largest moment being 1.
+
+    `moments` are about the sensor's axes, (3,); `tensor_moments` and `axes`, (3, 3) with the principal axes as columns, are of the
+    whole tensor. `coefficients` are those of Euler's equations, each axis by itself, and `closure` their identity, zero for every
+    body. Deviations are standard deviations by resampling, None if there is too little. `findings` says what the log cannot tell.
+    """
+
+    coefficients: np.ndarray
+    coefficients_deviation: np.ndarray
+    closure: float
+    r_squared: np.ndarray
+    moments: np.ndarray
+    moments_deviation: np.ndarray
+    damping_per_s: float
+    tensor_moments: np.ndarray
+    tensor_deviation: np.ndarray
+    axes: np.ndarray
+    findings: list
+
+
+def identify(t, w, *, segments=None, damping=True):
+    """The inertia of a body from a log of its angular velocity.
+
+    Parameters
+    ----------
+    t : (n,) s
+    w : (n, 3) rad/s
+    segments : (n,) labels
+        Where a label changes, the motion was not free in between.
+    damping : bool
+        Whether the torque of the air is part of the fit.
+
+    >>> t = np.arange(0, 20, 0.01)
+    >>> w = euler([1.0, 2.0, 2.5], [0.6, -0.4, 0.8], t)
+    >>> corotate.identify(t, w, damping=False).moments.round(3)
+    array([0.4, 0.8, 1. ])
+    """
+    told = json.loads(_corotate.identify(*_log(t, w, segments), damping))
+    arrays = {key: np.array(value) if isinstance(value, list) and key != "findings" else value for key, value in told.items()}
+    return Identified(**arrays)
+
+
+class HiddenRate:
+    """The rate about one axis from the other two, by the method of invariant relations.
+
+    Parameters
+    ----------
+    inertia : (3,) any unit
+    hidden : 1, 2 or 3
+    decay : 1/s
+        How fast the error falls (first order).
+    bandwidth : rad/s
+        Instead of decay, a filter of second order.
+    damping : 1/s
+        That of the air, 0 without.
+    guess : rad/s
+        The first estimate of every segment; without one it is what the first step tells.
+    floor : rad/s
+        Below this the measured rates carry no information.
+
+    >>> t = np.arange(0, 20, 0.01)
+    >>> w = euler([1.0, 2.0, 2.5], [0.6, -0.4, 0.8], t)
+    >>> z, observed = corotate.HiddenRate([1.0, 2.0, 2.5], hidden=3, decay=4.0).filter(t, w)
+    >>> bool(abs(z[-1] - w[-1, 2]) < 1e-3)
+    True
+    """
+
+    def __init__(self, inertia, hidden=3, decay=None, *, bandwidth=None, damping=0.0, guess=None, floor=1e-3):
+        if (decay is None) == (bandwidth is None):
+            raise ValueError("give decay (first order) or bandwidth (second order)")
+        self._filter = ("first", float(decay)) if bandwidth is None else ("second", float(bandwidth))
+        self._body, self._rest = list(map(float, inertia)), (float(damping), guess, float(floor))
+        self.hidden = hidden
+
+    def filter(self, t, w, *, segments=None):
+        """The hidden rate along a log, (n,) rad/s, nan as long as nothing has told of it; and whether each step told of it, (n,) bool.
+
+        `t` is (n,) s, `w` (n, 3) rad/s; the hidden column is not read and may hold anything.
+        """
+        t, w, labels = _log(t, w, segments)
+        return _corotate.reconstruct(t, w, labels, self._body, self.hidden, *self._filter, *self._rest)
+
+
+class Synchronizer:
+    """The law that makes a follower turn as its leader does: `inertia` (3,), `gain` 1/s, `lead_s` how far both are predicted."""
+
+    def __init__(self, inertia, gain, lead_s=0.0):
+        self._body, self._lead = list(map(float, inertia)), float(lead_s)
+        self._gain = list(map(float, np.broadcast_to(gain, 3)))
+
+    def command(self, leader, follower, applied=(0.0, 0.0, 0.0)):
+        """The acceleration to apply, (3,) rad/s²: of both rates, rad/s, and what the actuators apply now, rad/s²."""
+        vectors = [list(map(float, vector)) for vector in (leader, follower, applied)]
+        return np.array(_corotate.command(self._body, self._gain, self._lead, *vectors))

@@ -1,0 +1,33 @@
+"""What a scenario may be given as. Must not know what is in one."""
+
+import json
+import os
+
+
+def given(scenario):
+    """A scenario as the extension takes it: a text, and what it is."""
+    if isinstance(scenario, dict):
+        return json.dumps(scenario), "tables"
+    path = os.fspath(scenario)
+    is_path = not isinstance(scenario, str) or "/" in path or path.endswith(".toml")
+    return path, "path" if is_path else "name"
+
+
+def toml(value):
+    """A value as TOML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(str(key))} = {toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, (list, tuple)) or hasattr(value, "tolist"):
+        values = value.tolist() if hasattr(value, "tolist") else value
+        return "[" + ", ".join(map(toml, values)) + "]" if isinstance(values, (list, tuple)) else toml(values)
+    if isinstance(value, float):
+        # Infinities and what is no number are told by TOML too, by other words than JSON's.
+        return repr(value)
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    return json.dumps(value)
+
+
+def overrides(changes):
+    """Changes by key as `KEY=VALUE`."""
+    return [f"{key}={toml(value)}" for key, value in changes.items()]

@@ -1,0 +1,31 @@
+//! The library as a Python extension: what needs its types. How it looks to a user is in `corotate/*.py`.
+//!
+//! Must not decide anything that the library decides.
+
+mod logs;
+mod recording;
+mod run;
+mod seat;
+mod steps;
+
+use pyo3::prelude::*;
+
+/// What corotate's package is made of.
+#[pymodule]
+fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_function(wrap_pyfunction!(run::main, module)?)?;
+    module.add_function(wrap_pyfunction!(run::started_by, module)?)?;
+    module.add_function(wrap_pyfunction!(run::run, module)?)?;
+    module.add_function(wrap_pyfunction!(run::certificate, module)?)?;
+    module.add_function(wrap_pyfunction!(run::shipped, module)?)?;
+    module.add_function(wrap_pyfunction!(seat::describe, module)?)?;
+    module.add_function(wrap_pyfunction!(seat::serve, module)?)?;
+    module.add_function(wrap_pyfunction!(logs::identify, module)?)?;
+    module.add_function(wrap_pyfunction!(logs::reconstruct, module)?)?;
+    module.add_function(wrap_pyfunction!(logs::command, module)?)?;
+    module.add_class::<seat::Ticks>()?;
+    module.add_class::<steps::Steps>()?;
+    module.add_class::<recording::Recording>()?;
+    module.add("CorotateError", module.py().get_type::<run::CorotateError>())?;
+    module.add("__version__", env!("CARGO_PKG_VERSION"))
+}

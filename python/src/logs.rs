@@ -1,0 +1,128 @@
+//! The papers' observers on arrays: inertia, a hidden rate, the law.
+
+use crate::run::failed;
+use corotate::control::Synchronizer;
+use corotate::estimate::{FilterKind, Reconstruction, Setup};
+use corotate::identify::{Motion, Sample, findings};
+use corotate::model::{Inertia, RigidBody};
+use corotate::nalgebra::Vector3;
+use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use serde_json::json;
+
+/// A log as samples, and where a segment ends: before the samples whose label is another.
+fn samples(
+    time: &PyReadonlyArray1<'_, f64>,
+    rates: &PyReadonlyArray2<'_, f64>,
+    segments: &PyReadonlyArray1<'_, i64>,
+) -> PyResult<Vec<(bool, Sample)>> {
+    let (time, rates, segments) = (time.as_slice()?, rates.as_array(), segments.as_slice()?);
+    if rates.shape() != [time.len(), 3] || segments.len() != time.len() {
+        let shape = rates.shape();
+        return Err(PyValueError::new_err(format!("times are {}, rates {shape:?}: give n times and an (n, 3) array", time.len())));
+    }
+    let sample = |index: usize| {
+        let begins = index > 0 && segments[index] != segments[index - 1];
+        let rate_rad_s = Vector3::new(rates[[index, 0]], rates[[index, 1]], rates[[index, 2]]);
+        (begins, Sample { time_s: time[index], rate_rad_s })
+    };
+    Ok((0..time.len()).map(sample).collect())
+}
+
+/// What a log says of a body, as JSON.
+#[pyfunction]
+pub fn identify(
+    py: Python<'_>,
+    time: PyReadonlyArray1<'_, f64>,
+    rates: PyReadonlyArray2<'_, f64>,
+    segments: PyReadonlyArray1<'_, i64>,
+    damping: bool,
+) -> PyResult<String> {
+    let samples = samples(&time, &rates, &segments)?;
+    if let Some((_, sample)) = samples.iter().find(|(_, sample)| !sample.rate_rad_s.iter().all(|rate| rate.is_finite())) {
+        return Err(PyValueError::new_err(format!("the rates at {} s are not finite; leave such rows out", sample.time_s)));
+    }
+    let value = py.detach(|| {
+        let mut motion = Motion::default();
+        for (begins, sample) in &samples {
+            if *begins {
+                motion.end_segment();
+            }
+            motion.push(sample);
+        }
+        motion.end_segment();
+        let (axes, body, tensor) =
+            (motion.about_known_axes(damping), motion.moments_about_known_axes(damping), motion.about_unknown_axes(damping));
+        let found = findings(&motion, axes.as_ref(), tensor.as_ref());
+        let list = |vector: &Vector3<f64>| vector.as_slice().to_vec();
+        json!({
+            "coefficients": axes.as_ref().map(|fit| list(&fit.coefficients)),
+            "coefficients_deviation": axes.as_ref().and_then(|fit| fit.deviation.as_ref().map(list)),
+            "closure": axes.as_ref().map(|fit| fit.closure()),
+            "r_squared": axes.as_ref().map(|fit| list(&fit.r_squared)),
+            "moments": body.as_ref().map(|fit| list(&fit.moments)),
+            "moments_deviation": body.as_ref().and_then(|fit| fit.deviation.as_ref().map(list)),
+            "damping_per_s": body.as_ref().map(|fit| fit.damping_per_s),
+            "tensor_moments": tensor.as_ref().map(|fit| list(&fit.moments)),
+            "tensor_deviation": tensor.as_ref().and_then(|fit| fit.deviation.as_ref().map(list)),
+            "axes": tensor.as_ref().map(|fit| fit.axes.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>()),
+            "findings": found.iter().map(ToString::to_string).collect::<Vec<_>>(),
+        })
+    });
+    Ok(value.to_string())
+}
+
+/// The rate about a hidden axis (1 to 3), rad/s, not a number as long as nothing has told of it; and whether each step told of it.
+#[pyfunction]
+#[allow(clippy::too_many_arguments, reason = "one call from one place")]
+pub fn reconstruct<'py>(
+    py: Python<'py>,
+    time: PyReadonlyArray1<'py, f64>,
+    rates: PyReadonlyArray2<'py, f64>,
+    segments: PyReadonlyArray1<'py, i64>,
+    inertia: [f64; 3],
+    hidden: usize,
+    filter: &str,
+    rate: f64,
+    damping_per_s: f64,
+    guess: Option<f64>,
+    floor_rad_s: f64,
+) -> PyResult<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<bool>>)> {
+    let body = RigidBody::new(&Inertia::new(inertia).map_err(failed)?);
+    let filter = match filter {
+        "first" => FilterKind::First { decay_per_s: rate },
+        "second" => FilterKind::Second { bandwidth_rad_s: rate },
+        other => return Err(PyValueError::new_err(format!("there is no filter `{other}`; give first or second"))),
+    };
+    let setup = Setup { coefficients: *body.coefficients(), axis: hidden, damping_per_s, filter, guess_rad_s: guess, floor_rad_s };
+    let mut reconstruction = Reconstruction::new(&setup).map_err(|error| PyValueError::new_err(error.to_string()))?;
+    let samples = samples(&time, &rates, &segments)?;
+    let (estimates, seen): (Vec<f64>, Vec<bool>) = py.detach(|| {
+        let each = samples.iter().map(|(begins, sample)| {
+            if *begins {
+                reconstruction.end_segment();
+            }
+            let found = reconstruction.push(sample);
+            (found.rate_rad_s, found.observed)
+        });
+        each.unzip()
+    });
+    Ok((estimates.into_pyarray(py), seen.into_pyarray(py)))
+}
+
+/// The synchronising law's command, rad/s²: of leader and follower, rad/s.
+#[pyfunction]
+pub fn command(
+    inertia: [f64; 3],
+    gain_per_s: [f64; 3],
+    lead_s: f64,
+    leader: [f64; 3],
+    follower: [f64; 3],
+    applied: [f64; 3],
+) -> PyResult<[f64; 3]> {
+    let body = RigidBody::new(&Inertia::new(inertia).map_err(failed)?);
+    let law = Synchronizer::new(body, gain_per_s.into(), lead_s);
+    let (reference, own) = law.ahead(leader.into(), follower.into(), &applied);
+    Ok(law.command(&reference, &own).into())
+}

@@ -1,0 +1,135 @@
+//! Runs, and what may be claimed of them.
+
+use corotate::Program;
+use corotate::config::{RunId, SHIPPED, Scenario};
+use corotate::launch::{
+    Launch, Outcome, Progress, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
+};
+use corotate::rig::shipped as rigs;
+use pyo3::create_exception;
+use pyo3::exceptions::{PyException, PyValueError};
+use pyo3::prelude::*;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+create_exception!(_corotate, CorotateError, PyException, "A run, a seat or a recording failed, with the program's own words.");
+
+/// The number of the signal by which Ctrl-C ends a run in order.
+const SIGINT: usize = 2;
+
+pub fn failed(error: impl Display) -> PyErr {
+    CorotateError::new_err(error.to_string())
+}
+
+fn refused(error: impl Display) -> PyErr {
+    PyValueError::new_err(error.to_string())
+}
+
+/// Does what a command line asks for; the first word is the program's name.
+#[pyfunction]
+pub fn main(py: Python<'_>, words: Vec<String>) -> u8 {
+    py.detach(|| {
+        let program = SHIPPED.iter().fold(Program::new().rigs(rigs()), |program, (name, text)| program.scenario(name, text));
+        program.obey(words.into_iter().map(Into::into).collect())
+    })
+}
+
+/// Says how the roles of a run are started.
+#[pyfunction]
+pub fn started_by(file: PathBuf, arguments: Vec<String>) {
+    corotate::system::started_by(file, arguments.into_iter().map(Into::into).collect());
+}
+
+/// The scenarios that ship, by name.
+#[pyfunction]
+pub fn shipped() -> Vec<(&'static str, &'static str)> {
+    SHIPPED.to_vec()
+}
+
+/// A scenario by its path, by the name of one that ships, or as JSON of its tables.
+pub fn scenario(given: &str, kind: &str, overrides: &[String]) -> PyResult<Scenario> {
+    match kind {
+        "tables" => {
+            let tables: toml::Table = serde_json::from_str(given).map_err(refused)?;
+            let text = toml::to_string(&tables).map_err(refused)?;
+            Scenario::parse(&text, "the scenario given", overrides)
+        }
+        "name" => {
+            let named = SHIPPED.iter().find(|(name, _)| *name == given);
+            let names = || SHIPPED.map(|(name, _)| name).join(", ");
+            let known = || refused(format!("there is no scenario `{given}`; known here: {}. A file is given by its path", names()));
+            Scenario::parse(named.ok_or_else(known)?.1, given, overrides)
+        }
+        _ => Scenario::load(Path::new(given), overrides),
+    }
+    .map_err(refused)
+}
+
+/// Runs a scenario; gives its summary as JSON and its directory. `tell` gets `("waiting", domain)` and `("running", tick)` now and
+/// then; what it raises ends the run in order, and is raised then.
+#[pyfunction]
+#[pyo3(signature = (given, kind, overrides, external, record, out, require_realtime, tell))]
+#[allow(clippy::too_many_arguments, reason = "one call from one place")]
+pub fn run(
+    py: Python<'_>,
+    given: &str,
+    kind: &str,
+    overrides: Vec<String>,
+    external: Vec<String>,
+    record: bool,
+    out: Option<PathBuf>,
+    require_realtime: bool,
+    tell: Option<Py<PyAny>>,
+) -> PyResult<(String, PathBuf)> {
+    let id: RunId = new_run().map_err(failed)?;
+    let scenario = Scenario { run: Some(id), ..scenario(given, kind, &overrides)? };
+    external.iter().try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
+    let started = jiff::Timestamp::now();
+    let directory = make_directory(out.as_deref(), &scenario.name, started).map_err(failed)?;
+    if out.is_some() {
+        claim(&directory).map_err(failed)?;
+    }
+    let signal = AtomicUsize::new(0);
+    let mut raised: Option<PyErr> = None;
+    let ended: Result<String, PyErr> = py.detach(|| {
+        let mut progress = |progress: &Progress<'_>| {
+            let told = Python::attach(|py| {
+                py.check_signals()?;
+                let Some(tell) = &tell else { return Ok(()) };
+                match progress {
+                    Progress::Waiting { domain, .. } => tell.call1(py, ("waiting", domain.display().to_string())),
+                    Progress::Running { tick, .. } => tell.call1(py, ("running", *tick)),
+                    Progress::External(words) => tell.call1(py, ("external", *words)),
+                }
+                .map(drop)
+            });
+            if let Err(error) = told {
+                signal.store(SIGINT, Ordering::Relaxed);
+                raised.get_or_insert(error);
+            }
+        };
+        let launched = &mut Launch {
+            external,
+            record: (record || scenario.record).then(|| directory.join("run.mcap")),
+            results: std::fs::canonicalize(&directory).ok(),
+            require_realtime,
+            ..Launch::new(&signal, &mut progress)
+        };
+        // Results are written before what is left of the run is put away.
+        let outcome: Outcome = launch(&scenario, launched).map_err(failed)?;
+        let summary = Summary::new(&scenario, &outcome, started);
+        write_run(&directory, &scenario, &summary).map_err(failed)?;
+        let _ = make_latest(&directory);
+        serde_json::to_string(&summary).map_err(failed)
+    });
+    // The exception of whoever was told comes before what followed from it.
+    raised.map_or(ended, Err).map(|summary| (summary, directory))
+}
+
+/// What may be claimed of a scenario's loop, as JSON: one entry per driven body.
+#[pyfunction]
+pub fn certificate(py: Python<'_>, given: &str, kind: &str, overrides: Vec<String>) -> PyResult<String> {
+    let scenario = scenario(given, kind, &overrides)?;
+    py.detach(|| serde_json::to_string(&corotate::analysis::claims(&scenario)).map_err(failed))
+}

@@ -1,0 +1,178 @@
+//! A role's seat: its samples to a function, or to a loop that asks for tick after tick.
+
+use crate::run::{failed, scenario};
+use corotate::config::Scenario;
+use corotate::runtime::{Compute, ComputedTick, Port, RoleId, RoleSeat, ports, run_computed};
+use corotate::sample::{FieldKind, Stamp};
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Between two looks for Ctrl-C.
+const LOOK: Duration = Duration::from_millis(50);
+/// What a function is told that nobody asks any more.
+const LEFT: &str = "nobody computes this role any more";
+
+/// A signal: body and signal, and each field with its kind, count and offset in bytes after the stamp.
+pub type LayoutOf = (String, String, Vec<(String, String, usize, usize)>);
+
+/// The layouts of what a role reads and writes.
+fn layouts(ports: &[Port]) -> Vec<LayoutOf> {
+    let kind = |kind: FieldKind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
+    let of = |port: &Port| {
+        let field = |field: &corotate::sample::Field| {
+            (field.name.to_owned(), kind(field.kind), field.count, field.offset - size_of::<Stamp>())
+        };
+        (port.topic.body.clone(), port.topic.signal.name().to_owned(), port.fields.iter().map(field).collect())
+    };
+    ports.iter().map(of).collect()
+}
+
+/// What a role of a scenario reads, and what it writes.
+pub fn seat_of(scenario: &Scenario, role: &str) -> PyResult<(Vec<LayoutOf>, Vec<LayoutOf>)> {
+    let known = scenario.rig.roles().join(", ");
+    let id = RoleId::named(scenario, role).ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
+    let ports = ports(scenario, id);
+    Ok((layouts(&ports.reads), layouts(&ports.writes)))
+}
+
+/// The same for a scenario by name, path or tables, or for that of a run under way by its domain; and its tick, s.
+#[pyfunction]
+pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>, Vec<LayoutOf>, f64)> {
+    let scenario = match kind {
+        "domain" => scenario(&format!("{given}/scenario.toml"), "path", &[])?,
+        _ => scenario(given, kind, &[])?,
+    };
+    let (reads, writes) = seat_of(&scenario, role)?;
+    Ok((reads, writes, scenario.tick_s()))
+}
+
+/// The samples of a tick as bytes without their stamps.
+fn inputs(tick: &ComputedTick<'_>) -> Vec<Option<Vec<u8>>> {
+    let words = size_of::<Stamp>() / size_of::<u64>();
+    let content = |words_of: &&[u64]| words_of[words..].iter().flat_map(|word| word.to_ne_bytes()).collect();
+    tick.inputs.iter().map(|input| input.as_ref().map(content)).collect()
+}
+
+fn fill(outputs: &mut [Vec<u64>], given: &[Vec<u8>]) {
+    for (output, bytes) in outputs.iter_mut().zip(given) {
+        for (word, bytes) in output.iter_mut().zip(bytes.chunks_exact(size_of::<u64>())) {
+            *word = u64::from_ne_bytes(bytes.try_into().unwrap_or_default());
+        }
+    }
+}
+
+/// Outputs before they are computed, as bytes.
+fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
+    outputs.iter().map(|words| words.iter().flat_map(|word| word.to_ne_bytes()).collect()).collect()
+}
+
+/// Serves a seat with a function of tick, inputs and blank outputs, all as bytes, that gives the outputs. To the end of the run.
+#[pyfunction]
+pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
+    let served = py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(Function(function)), &AtomicBool::new(false)));
+    served.map_err(failed)
+}
+
+struct Function(Py<PyAny>);
+
+impl Compute for Function {
+    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+        let computed = Python::attach(|py| {
+            let bytes = |bytes: Vec<u8>| PyBytes::new(py, &bytes).unbind();
+            let given: Vec<Option<Py<PyBytes>>> = inputs(&tick).into_iter().map(|input| input.map(bytes)).collect();
+            let blank: Vec<Py<PyBytes>> = blank(tick.outputs).into_iter().map(bytes).collect();
+            self.0.call1(py, (tick.tick, given, blank))?.extract::<Vec<Vec<u8>>>(py)
+        });
+        let outputs = computed.map_err(|error| Python::attach(|py| words(py, &error)))?;
+        fill(tick.outputs, &outputs);
+        Ok(())
+    }
+}
+
+/// An exception with its traceback, as one text.
+fn words(py: Python<'_>, error: &PyErr) -> String {
+    let format = |error: &PyErr| -> PyResult<String> {
+        let lines = py.import("traceback")?.call_method1("format_exception", (error.value(py),))?.extract::<Vec<String>>()?;
+        Ok(lines.concat())
+    };
+    format(error).unwrap_or_else(|_| error.to_string()).trim_end().to_owned()
+}
+
+/// One tick on its way to a loop.
+type Asked = (u64, Vec<Option<Vec<u8>>>, Vec<Vec<u8>>);
+
+struct Handed {
+    asked: SyncSender<Asked>,
+    answers: Receiver<Vec<Vec<u8>>>,
+}
+
+impl Compute for Handed {
+    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+        let asked = (tick.tick, inputs(&tick), blank(tick.outputs));
+        self.asked.send(asked).map_err(|_| LEFT.to_owned())?;
+        fill(tick.outputs, &self.answers.recv().map_err(|_| LEFT.to_owned())?);
+        Ok(())
+    }
+}
+
+/// A seat that is asked for tick after tick. A thread serves it meanwhile.
+#[pyclass]
+pub struct Ticks {
+    /// Behind a lock, for a class of Python may be used by any thread.
+    line: Mutex<Option<(Receiver<Asked>, SyncSender<Vec<Vec<u8>>>)>>,
+    served: Option<JoinHandle<Result<(), String>>>,
+    leaves: Arc<AtomicBool>,
+}
+
+#[pymethods]
+impl Ticks {
+    #[new]
+    fn new(domain: PathBuf, role: String) -> Self {
+        let ((asked, ticks), (give, answers)) = (sync_channel(0), sync_channel(0));
+        let leaves = Arc::new(AtomicBool::new(false));
+        let terminated = Arc::clone(&leaves);
+        let served = std::thread::spawn(move || {
+            let handed = Box::new(Handed { asked, answers });
+            run_computed(&RoleSeat { domain, role }, handed, &terminated).map_err(|error| error.to_string())
+        });
+        Self { line: Mutex::new(Some((ticks, give))), served: Some(served), leaves }
+    }
+
+    /// Gives the outputs of the tick before, if there was one, and waits for the next: its number, inputs, and blank outputs. None
+    /// at the end of the run.
+    #[pyo3(signature = (outputs))]
+    fn next(&mut self, py: Python<'_>, outputs: Option<Vec<Vec<u8>>>) -> PyResult<Option<Asked>> {
+        let mut line = self.line.lock().map_err(failed)?;
+        let Some((ticks, give)) = &mut *line else { return Ok(None) };
+        // A seat that has ended takes nothing more; it is told below.
+        let _ = outputs.map(|outputs| give.send(outputs));
+        loop {
+            let ticks = &mut *ticks;
+            match py.detach(move || ticks.recv_timeout(LOOK)) {
+                Ok(asked) => return Ok(Some(asked)),
+                Err(RecvTimeoutError::Timeout) => py.check_signals()?,
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+        }
+        drop(line);
+        self.close(py).map(|()| None)
+    }
+
+    /// Leaves the seat; raises what it ended with.
+    fn close(&mut self, py: Python<'_>) -> PyResult<()> {
+        self.leaves.store(true, Ordering::Relaxed);
+        *self.line.lock().map_err(failed)? = None;
+        let Some(served) = self.served.take() else { return Ok(()) };
+        match py.detach(|| served.join()) {
+            Ok(Err(reason)) if reason != LEFT => Err(failed(reason)),
+            Ok(_) => Ok(()),
+            Err(_) => Err(failed("the seat's thread panicked")),
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! A loop in one thread, stepped by its controller.
+
+use crate::run::{failed, scenario};
+use crate::seat::seat_of;
+use corotate::launch::Summary;
+use corotate::sample::{FieldKind, Stamp};
+use numpy::{PyArray1, PyReadonlyArray1};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// Words of a stamp.
+const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
+
+/// A run that is stepped. What is observed is every number of the estimate, then of each driven body's measurement; an action is the
+/// first field of each command.
+#[pyclass(unsendable)]
+pub struct Steps {
+    steps: Option<corotate::launch::Steps>,
+    /// Again, for the summary.
+    scenario: corotate::config::Scenario,
+    /// Of each input, where its numbers are: first word and count.
+    numbers: Vec<Vec<(usize, usize)>>,
+    commands: Vec<Vec<u64>>,
+    /// Of each command, how many numbers its first field has.
+    actions: Vec<usize>,
+    observation: Vec<f64>,
+    over: bool,
+}
+
+impl Steps {
+    fn steps(&mut self) -> PyResult<&mut corotate::launch::Steps> {
+        self.steps.as_mut().ok_or_else(|| failed("the run has been finished"))
+    }
+
+    /// Observes the next tick, and keeps what was seen of what is missing.
+    fn observe(&mut self) -> PyResult<()> {
+        let Some(steps) = &mut self.steps else { return Err(failed("the run has been finished")) };
+        self.over = !steps.observe().map_err(failed)?;
+        let mut at = 0;
+        for (input, numbers) in steps.inputs().iter().zip(&self.numbers) {
+            for (first, count) in numbers {
+                if let Some(words) = input.as_ref().filter(|_| !self.over) {
+                    for (seen, word) in self.observation[at..].iter_mut().zip(&words[*first..first + count]) {
+                        *seen = f64::from_bits(*word);
+                    }
+                }
+                at += count;
+            }
+        }
+        Ok(())
+    }
+}
+
+#[pymethods]
+impl Steps {
+    #[new]
+    fn new(given: &str, kind: &str, overrides: Vec<String>) -> PyResult<Self> {
+        let scenario_again = || scenario(given, kind, &overrides);
+        let steps = corotate::launch::Steps::new(scenario_again()?).map_err(failed)?;
+        let scenario = scenario_again()?;
+        let ports = corotate::runtime::ports(&scenario, corotate::runtime::RoleId::Controller);
+        let numbers = |port: &corotate::runtime::Port| {
+            let numbers = port.fields.iter().filter(|field| field.kind == FieldKind::F64);
+            numbers.map(|field| (field.offset / size_of::<u64>(), field.count)).collect::<Vec<_>>()
+        };
+        let numbers: Vec<Vec<(usize, usize)>> = ports.reads.iter().map(numbers).collect();
+        let length = numbers.iter().flatten().map(|(_, count)| count).sum();
+        let mut this = Self {
+            steps: Some(steps),
+            scenario,
+            numbers,
+            commands: ports.writes.iter().map(|port| vec![0; port.size / size_of::<u64>() - STAMP]).collect(),
+            actions: ports.writes.iter().map(|port| port.fields.first().map_or(0, |field| field.count)).collect(),
+            observation: vec![0.0; length],
+            over: false,
+        };
+        this.observe()?;
+        Ok(this)
+    }
+
+    /// Layouts of what the controller reads and writes.
+    fn seat(&self) -> PyResult<(Vec<crate::seat::LayoutOf>, Vec<crate::seat::LayoutOf>)> {
+        seat_of(&self.scenario, "controller")
+    }
+
+    /// What is observed at the tick at hand.
+    fn observation<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, &self.observation)
+    }
+
+    /// Whether there is no tick any more.
+    fn over(&self) -> bool {
+        self.over
+    }
+
+    /// The tick at hand.
+    fn tick(&mut self) -> PyResult<u64> {
+        self.steps().map(|steps| steps.tick())
+    }
+
+    /// Acts at the tick at hand, and observes the next: what is seen, the metric of the tick, whether it was the last.
+    fn step<'py>(
+        &mut self,
+        py: Python<'py>,
+        action: PyReadonlyArray1<'py, f64>,
+    ) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, bool)> {
+        let action = action.as_slice()?;
+        let length: usize = self.actions.iter().sum();
+        if action.len() != length {
+            return Err(PyValueError::new_err(format!("an action has {length} numbers, not {}", action.len())));
+        }
+        let mut rest = action;
+        for (command, count) in self.commands.iter_mut().zip(&self.actions) {
+            let (own, others) = rest.split_at(*count);
+            command.iter_mut().zip(own).for_each(|(word, value)| *word = value.to_bits());
+            rest = others;
+        }
+        self.act_and_observe()?;
+        let metric = self.steps()?.metric();
+        Ok((self.observation(py), metric, self.over))
+    }
+
+    /// The same with whole commands, as bytes without their stamps.
+    fn act(&mut self, commands: Vec<Vec<u8>>) -> PyResult<bool> {
+        if commands.len() != self.commands.len() {
+            return Err(PyValueError::new_err(format!("there are {} commands, not {}", self.commands.len(), commands.len())));
+        }
+        for (command, bytes) in self.commands.iter_mut().zip(&commands) {
+            for (word, bytes) in command.iter_mut().zip(bytes.chunks_exact(size_of::<u64>())) {
+                *word = u64::from_ne_bytes(bytes.try_into().unwrap_or_default());
+            }
+        }
+        self.act_and_observe()?;
+        Ok(!self.over)
+    }
+
+    /// The samples that the controller has, as bytes without their stamps; none where one is missing.
+    fn inputs(&mut self) -> PyResult<Vec<Option<Vec<u8>>>> {
+        let content = |words: &Vec<u64>| words[STAMP..].iter().flat_map(|word| word.to_ne_bytes()).collect();
+        Ok(self.steps()?.inputs().iter().map(|input| input.as_ref().map(content)).collect())
+    }
+
+    /// Ends the run, and gives its summary as JSON.
+    fn finish(&mut self) -> PyResult<String> {
+        let steps = self.steps.take().ok_or_else(|| failed("the run has been finished"))?;
+        let outcome = steps.finish().map_err(failed)?;
+        serde_json::to_string(&Summary::new(&self.scenario, &outcome, jiff::Timestamp::now())).map_err(failed)
+    }
+}
+
+impl Steps {
+    fn act_and_observe(&mut self) -> PyResult<()> {
+        if self.over {
+            return Err(failed("the run is over; begin another"));
+        }
+        let commands: Vec<&[u64]> = self.commands.iter().map(Vec::as_slice).collect();
+        let Some(steps) = &mut self.steps else { return Err(failed("the run has been finished")) };
+        steps.act(&commands).map_err(failed)?;
+        self.observe()
+    }
+}
