@@ -226,6 +226,7 @@ pages! {
     foxglove: "docs/foxglove.md",
     own_data: "docs/own-data.md",
     papers: "docs/papers.md",
+    python: "docs/python.md",
     real_time: "docs/real-time.md",
     record_replay: "docs/record-replay.md",
     report: "docs/report.md",

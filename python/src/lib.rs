@@ -20,6 +20,7 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run::shipped, module)?)?;
     module.add_function(wrap_pyfunction!(seat::describe, module)?)?;
     module.add_function(wrap_pyfunction!(seat::serve, module)?)?;
+    module.add_function(wrap_pyfunction!(seat::domain_of, module)?)?;
     module.add_function(wrap_pyfunction!(logs::identify, module)?)?;
     module.add_function(wrap_pyfunction!(logs::reconstruct, module)?)?;
     module.add_function(wrap_pyfunction!(logs::command, module)?)?;

@@ -11,6 +11,8 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use serde_json::json;
 
+type Column<'py, T> = Bound<'py, PyArray1<T>>;
+
 /// A log as samples, and where a segment ends: before the samples whose label is another.
 fn samples(
     time: &PyReadonlyArray1<'_, f64>,
@@ -20,7 +22,10 @@ fn samples(
     let (time, rates, segments) = (time.as_slice()?, rates.as_array(), segments.as_slice()?);
     if rates.shape() != [time.len(), 3] || segments.len() != time.len() {
         let shape = rates.shape();
-        return Err(PyValueError::new_err(format!("times are {}, rates {shape:?}: give n times and an (n, 3) array", time.len())));
+        return Err(PyValueError::new_err(format!(
+            "times are {}, rates {shape:?}: give n times and an (n, 3) array",
+            time.len()
+        )));
     }
     let sample = |index: usize| {
         let begins = index > 0 && segments[index] != segments[index - 1];
@@ -40,8 +45,12 @@ pub fn identify(
     damping: bool,
 ) -> PyResult<String> {
     let samples = samples(&time, &rates, &segments)?;
-    if let Some((_, sample)) = samples.iter().find(|(_, sample)| !sample.rate_rad_s.iter().all(|rate| rate.is_finite())) {
-        return Err(PyValueError::new_err(format!("the rates at {} s are not finite; leave such rows out", sample.time_s)));
+    if let Some((_, sample)) = samples.iter().find(|(_, sample)| !sample.rate_rad_s.iter().all(|rate| rate.is_finite()))
+    {
+        return Err(PyValueError::new_err(format!(
+            "the rates at {} s are not finite; leave such rows out",
+            sample.time_s
+        )));
     }
     let value = py.detach(|| {
         let mut motion = Motion::default();
@@ -88,14 +97,21 @@ pub fn reconstruct<'py>(
     damping_per_s: f64,
     guess: Option<f64>,
     floor_rad_s: f64,
-) -> PyResult<(Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<bool>>)> {
+) -> PyResult<(Column<'py, f64>, Column<'py, bool>)> {
     let body = RigidBody::new(&Inertia::new(inertia).map_err(failed)?);
     let filter = match filter {
         "first" => FilterKind::First { decay_per_s: rate },
         "second" => FilterKind::Second { bandwidth_rad_s: rate },
         other => return Err(PyValueError::new_err(format!("there is no filter `{other}`; give first or second"))),
     };
-    let setup = Setup { coefficients: *body.coefficients(), axis: hidden, damping_per_s, filter, guess_rad_s: guess, floor_rad_s };
+    let setup = Setup {
+        coefficients: *body.coefficients(),
+        axis: hidden,
+        damping_per_s,
+        filter,
+        guess_rad_s: guess,
+        floor_rad_s,
+    };
     let mut reconstruction = Reconstruction::new(&setup).map_err(|error| PyValueError::new_err(error.to_string()))?;
     let samples = samples(&time, &rates, &segments)?;
     let (estimates, seen): (Vec<f64>, Vec<bool>) = py.detach(|| {

@@ -7,6 +7,9 @@ use numpy::{IntoPyArray, PyArray1};
 use pyo3::prelude::*;
 use std::path::PathBuf;
 
+/// Body, signal, and its fields with kind and count.
+type Signal = (String, String, Vec<(String, String, usize)>);
+
 /// A recording of a run.
 #[pyclass]
 pub struct Recording {
@@ -35,10 +38,11 @@ impl Recording {
     }
 
     /// Every signal: body, name, and its fields with kind and count, the stamp's first.
-    fn signals(&self) -> Vec<(String, String, Vec<(String, String, usize)>)> {
+    fn signals(&self) -> Vec<Signal> {
         let kind = |kind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
         let of = |info: &corotate::record::SignalInfo| {
-            let columns = info.layout.columns.iter().map(|column| (column.name.clone(), kind(column.kind), column.count));
+            let columns =
+                info.layout.columns.iter().map(|column| (column.name.clone(), kind(column.kind), column.count));
             (info.body.clone(), info.signal.clone(), columns.collect())
         };
         self.recorded.signals().iter().map(of).collect()

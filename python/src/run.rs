@@ -13,7 +13,12 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-create_exception!(_corotate, CorotateError, PyException, "A run, a seat or a recording failed, with the program's own words.");
+create_exception!(
+    _corotate,
+    CorotateError,
+    PyException,
+    "A run, a seat or a recording failed, with the program's own words."
+);
 
 /// The number of the signal by which Ctrl-C ends a run in order.
 const SIGINT: usize = 2;
@@ -30,7 +35,8 @@ fn refused(error: impl Display) -> PyErr {
 #[pyfunction]
 pub fn main(py: Python<'_>, words: Vec<String>) -> u8 {
     py.detach(|| {
-        let program = SHIPPED.iter().fold(Program::new().rigs(rigs()), |program, (name, text)| program.scenario(name, text));
+        let program =
+            SHIPPED.iter().fold(Program::new().rigs(rigs()), |program, (name, text)| program.scenario(name, text));
         program.obey(words.into_iter().map(Into::into).collect())
     })
 }
@@ -58,7 +64,9 @@ pub fn scenario(given: &str, kind: &str, overrides: &[String]) -> PyResult<Scena
         "name" => {
             let named = SHIPPED.iter().find(|(name, _)| *name == given);
             let names = || SHIPPED.map(|(name, _)| name).join(", ");
-            let known = || refused(format!("there is no scenario `{given}`; known here: {}. A file is given by its path", names()));
+            let known = || {
+                refused(format!("there is no scenario `{given}`; known here: {}. A file is given by its path", names()))
+            };
             Scenario::parse(named.ok_or_else(known)?.1, given, overrides)
         }
         _ => Scenario::load(Path::new(given), overrides),
@@ -84,7 +92,9 @@ pub fn run(
 ) -> PyResult<(String, PathBuf)> {
     let id: RunId = new_run().map_err(failed)?;
     let scenario = Scenario { run: Some(id), ..scenario(given, kind, &overrides)? };
-    external.iter().try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
+    external
+        .iter()
+        .try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
     let started = jiff::Timestamp::now();
     let directory = make_directory(out.as_deref(), &scenario.name, started).map_err(failed)?;
     if out.is_some() {

@@ -21,6 +21,9 @@ const LEFT: &str = "nobody computes this role any more";
 /// A signal: body and signal, and each field with its kind, count and offset in bytes after the stamp.
 pub type LayoutOf = (String, String, Vec<(String, String, usize, usize)>);
 
+/// What a role reads, and what it writes.
+pub type Seat = (Vec<LayoutOf>, Vec<LayoutOf>);
+
 /// The layouts of what a role reads and writes.
 fn layouts(ports: &[Port]) -> Vec<LayoutOf> {
     let kind = |kind: FieldKind| if kind == FieldKind::F64 { "f8" } else { "u8" }.to_owned();
@@ -34,9 +37,10 @@ fn layouts(ports: &[Port]) -> Vec<LayoutOf> {
 }
 
 /// What a role of a scenario reads, and what it writes.
-pub fn seat_of(scenario: &Scenario, role: &str) -> PyResult<(Vec<LayoutOf>, Vec<LayoutOf>)> {
+pub fn seat_of(scenario: &Scenario, role: &str) -> PyResult<Seat> {
     let known = scenario.rig.roles().join(", ");
-    let id = RoleId::named(scenario, role).ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
+    let id = RoleId::named(scenario, role)
+        .ok_or_else(|| failed(format!("there is no role `{role}`; known here: {known}")))?;
     let ports = ports(scenario, id);
     Ok((layouts(&ports.reads), layouts(&ports.writes)))
 }
@@ -50,6 +54,13 @@ pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>,
     };
     let (reads, writes) = seat_of(&scenario, role)?;
     Ok((reads, writes, scenario.tick_s()))
+}
+
+/// The domain of the run that is meant by its domain, or by the directory that its results go to; none if there is no such run.
+#[pyfunction]
+pub fn domain_of(given: PathBuf) -> PyResult<Option<PathBuf>> {
+    let found = corotate::runtime::run_under_way(Some(&given)).map_err(failed)?;
+    Ok(found.filter(|domain| domain.join("scenario.toml").exists()))
 }
 
 /// The samples of a tick as bytes without their stamps.
@@ -75,7 +86,8 @@ fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
 /// Serves a seat with a function of tick, inputs and blank outputs, all as bytes, that gives the outputs. To the end of the run.
 #[pyfunction]
 pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
-    let served = py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(Function(function)), &AtomicBool::new(false)));
+    let served =
+        py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(Function(function)), &AtomicBool::new(false)));
     served.map_err(failed)
 }
 
@@ -98,7 +110,10 @@ impl Compute for Function {
 /// An exception with its traceback, as one text.
 fn words(py: Python<'_>, error: &PyErr) -> String {
     let format = |error: &PyErr| -> PyResult<String> {
-        let lines = py.import("traceback")?.call_method1("format_exception", (error.value(py),))?.extract::<Vec<String>>()?;
+        let lines = py
+            .import("traceback")?
+            .call_method1("format_exception", (error.clone_ref(py).into_value(py),))?
+            .extract::<Vec<String>>()?;
         Ok(lines.concat())
     };
     format(error).unwrap_or_else(|_| error.to_string()).trim_end().to_owned()
@@ -121,11 +136,14 @@ impl Compute for Handed {
     }
 }
 
+/// Where ticks come from, and where their outputs go.
+type Line = (Receiver<Asked>, SyncSender<Vec<Vec<u8>>>);
+
 /// A seat that is asked for tick after tick. A thread serves it meanwhile.
 #[pyclass]
 pub struct Ticks {
     /// Behind a lock, for a class of Python may be used by any thread.
-    line: Mutex<Option<(Receiver<Asked>, SyncSender<Vec<Vec<u8>>>)>>,
+    line: Mutex<Option<Line>>,
     served: Option<JoinHandle<Result<(), String>>>,
     leaves: Arc<AtomicBool>,
 }

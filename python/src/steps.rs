@@ -1,12 +1,13 @@
 //! A loop in one thread, stepped by its controller.
 
 use crate::run::{failed, scenario};
-use crate::seat::seat_of;
-use corotate::launch::Summary;
+use crate::seat::{Seat, seat_of};
+use corotate::launch::{Summary, make_directory, make_latest, new_run, write_run};
 use corotate::sample::{FieldKind, Stamp};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use std::path::PathBuf;
 
 /// Words of a stamp.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
@@ -25,6 +26,7 @@ pub struct Steps {
     actions: Vec<usize>,
     observation: Vec<f64>,
     over: bool,
+    started: jiff::Timestamp,
 }
 
 impl Steps {
@@ -57,7 +59,7 @@ impl Steps {
     fn new(given: &str, kind: &str, overrides: Vec<String>) -> PyResult<Self> {
         let scenario_again = || scenario(given, kind, &overrides);
         let steps = corotate::launch::Steps::new(scenario_again()?).map_err(failed)?;
-        let scenario = scenario_again()?;
+        let scenario = corotate::config::Scenario { run: Some(new_run().map_err(failed)?), ..scenario_again()? };
         let ports = corotate::runtime::ports(&scenario, corotate::runtime::RoleId::Controller);
         let numbers = |port: &corotate::runtime::Port| {
             let numbers = port.fields.iter().filter(|field| field.kind == FieldKind::F64);
@@ -73,13 +75,14 @@ impl Steps {
             actions: ports.writes.iter().map(|port| port.fields.first().map_or(0, |field| field.count)).collect(),
             observation: vec![0.0; length],
             over: false,
+            started: jiff::Timestamp::now(),
         };
         this.observe()?;
         Ok(this)
     }
 
     /// Layouts of what the controller reads and writes.
-    fn seat(&self) -> PyResult<(Vec<crate::seat::LayoutOf>, Vec<crate::seat::LayoutOf>)> {
+    fn seat(&self) -> PyResult<Seat> {
         seat_of(&self.scenario, "controller")
     }
 
@@ -123,7 +126,11 @@ impl Steps {
     /// The same with whole commands, as bytes without their stamps.
     fn act(&mut self, commands: Vec<Vec<u8>>) -> PyResult<bool> {
         if commands.len() != self.commands.len() {
-            return Err(PyValueError::new_err(format!("there are {} commands, not {}", self.commands.len(), commands.len())));
+            return Err(PyValueError::new_err(format!(
+                "there are {} commands, not {}",
+                self.commands.len(),
+                commands.len()
+            )));
         }
         for (command, bytes) in self.commands.iter_mut().zip(&commands) {
             for (word, bytes) in command.iter_mut().zip(bytes.chunks_exact(size_of::<u64>())) {
@@ -140,11 +147,30 @@ impl Steps {
         Ok(self.steps()?.inputs().iter().map(|input| input.as_ref().map(content)).collect())
     }
 
-    /// Ends the run, and gives its summary as JSON.
-    fn finish(&mut self) -> PyResult<String> {
+    /// The physical bounds that samples are held against, by name: of measurements, estimates, commands.
+    fn limits(&self) -> Vec<(String, f64)> {
+        self.scenario.rig.limits().into_iter().map(|limit| (limit.name, limit.value)).collect()
+    }
+
+    /// Ends the run, and gives its summary as JSON; its results are written to a directory if that is asked for.
+    #[pyo3(signature = (write, out))]
+    fn finish(&mut self, write: bool, out: Option<PathBuf>) -> PyResult<(String, Option<PathBuf>)> {
         let steps = self.steps.take().ok_or_else(|| failed("the run has been finished"))?;
         let outcome = steps.finish().map_err(failed)?;
-        serde_json::to_string(&Summary::new(&self.scenario, &outcome, jiff::Timestamp::now())).map_err(failed)
+        let summary = Summary::new(&self.scenario, &outcome, self.started);
+        let directory = match write {
+            true => {
+                let directory = make_directory(out.as_deref(), &self.scenario.name, self.started).map_err(failed)?;
+                if out.is_some() {
+                    corotate::launch::claim(&directory).map_err(failed)?;
+                }
+                write_run(&directory, &self.scenario, &summary).map_err(failed)?;
+                let _ = make_latest(&directory);
+                Some(directory)
+            }
+            false => None,
+        };
+        Ok((serde_json::to_string(&summary).map_err(failed)?, directory))
     }
 }
 

@@ -59,6 +59,11 @@ impl Janitor {
         Ok(Self { root, limit, process, pending: 0, since_ns: 0, attempts: 0 })
     }
 
+    /// The domain's directory.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
     /// Asks for what dead processes left to be put away.
     pub fn clear_dead(&mut self) {
         if self.pending == 0 {

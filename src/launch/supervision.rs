@@ -11,7 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
-use crate::runtime::{RoleId, open_ledger, report_path, topic};
+use crate::runtime::{RoleId, open_ledger, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
 use serde::Serialize;
@@ -263,7 +263,10 @@ impl Member {
     fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
-        let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
+        let fail = |janitor: &Janitor, cause: String| {
+            let last_words = std::fs::read_to_string(words_path(janitor.root(), &self.name)).unwrap_or_default();
+            Some(Failure { cause, last_words })
+        };
         let timeout_s = scenario.supervision.heartbeat_timeout_s;
         let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
@@ -271,21 +274,23 @@ impl Member {
         }
         // Not before: a program that was started again in its seat is not there for a moment.
         if state == RoleState::Running && !present {
-            return fail("it left before its last tick".to_owned());
+            return fail(janitor, "it left before its last tick".to_owned());
         }
         // One that was killed has left once its remains are put away.
         if !janitor.is_busy() {
             janitor.clear_dead();
         }
         match (tells, state, scenario.clock) {
-            (true, ..) => fail(format!("it said nothing for {limit_s} s")),
+            (true, ..) => fail(janitor, format!("it said nothing for {limit_s} s")),
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
                     self.last.state = RoleState::Done as u64;
                 }
                 None
             }
-            (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),
+            (false, RoleState::Running, ClockKind::Realtime) => {
+                fail(janitor, format!("it sent nothing for {limit_s} s"))
+            }
             _ => None,
         }
     }

@@ -14,6 +14,7 @@ use crate::runtime::seat_path;
 use crate::system::{remedy, tell};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use std::collections::BTreeMap;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -60,6 +61,9 @@ pub struct Arguments {
     /// Print the summary as JSON, all else on stderr
     #[arg(long)]
     json: bool,
+    /// Tell programs what happens, on stdout, each event as one line of JSON (corotate/event/v1)
+    #[arg(long, conflicts_with = "json")]
+    events: bool,
     /// Print nothing but errors and the last line
     #[arg(short, long, conflicts_with = "verbose")]
     quiet: bool,
@@ -161,7 +165,7 @@ pub fn run(arguments: &Arguments) -> Exit {
     let exit = match told {
         Ok(summary) => {
             let verdict = Verdict::of(summary);
-            verdict.tell(arguments.json).map_or_else(|error| fail(Exit::Failure, &error), |()| verdict.exit)
+            verdict.tell(arguments).map_or_else(|error| fail(Exit::Failure, &error), |()| verdict.exit)
         }
         Err(failure) => fail(failure.exit, &failure.reason),
     };
@@ -193,7 +197,8 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
-    let mut screen = Screen { bar: None, asked: false, fleets, level: Level::of(arguments), told: String::new() };
+    let (level, events) = (Level::of(arguments), arguments.events);
+    let mut screen = Screen { bar: None, asked: false, fleets, level, told: String::new(), events };
     screen.tell_verbose(format_args!("results go to {}", directory.display()));
     if scenario.clock == ClockKind::Realtime && screen.level > Level::Quiet {
         tell_ungranted(scenario);
@@ -234,7 +239,13 @@ fn tell_ungranted(scenario: &Scenario) {
 fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
     let text =
         if arguments.quiet { String::new() } else { format!("{}results in {}\n", table(summary), directory.display()) };
-    if arguments.json {
+    if arguments.events {
+        text.lines().for_each(tell);
+        for incident in &summary.incidents {
+            event("incident", serde_json::json!({ "incident": incident }))?;
+        }
+        event("results", serde_json::json!({ "directory": directory, "accepted": summary.accepted }))
+    } else if arguments.json {
         text.lines().for_each(tell);
         print(&format!("{}\n", serde_json::to_string(summary).expect("a summary of plain values is JSON")))
     } else {
@@ -296,9 +307,12 @@ impl Verdict {
     }
 
     /// Prints the last line where the table is.
-    fn tell(&self, json: bool) -> Result<(), String> {
+    fn tell(&self, arguments: &Arguments) -> Result<(), String> {
         let (word, color) = self.word;
-        if json {
+        if arguments.events {
+            event("verdict", serde_json::json!({ "word": word, "reason": self.reason, "exit": self.exit.code() }))?;
+        }
+        if arguments.json || arguments.events {
             tell(format_args!("{}: {}", paint(word, color, &io::stderr()), self.reason));
             return Ok(());
         }
@@ -347,6 +361,13 @@ pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
     Ok(signal)
 }
 
+/// Tells programs of one thing that happened: a line of JSON.
+fn event(what: &str, mut about: serde_json::Value) -> Result<(), String> {
+    about["schema"] = "corotate/event/v1".into();
+    about["event"] = what.into();
+    print(&format!("{about}\n"))
+}
+
 /// How much is said of a run while it goes on.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Level {
@@ -377,6 +398,8 @@ struct Screen {
     level: Level,
     /// What was told last of the phases.
     told: String,
+    /// Whether programs are told, too.
+    events: bool,
 }
 
 impl Screen {
@@ -415,6 +438,20 @@ impl Screen {
         if phase != self.told {
             self.tell_verbose(format_args!("{phase}"));
             self.told = phase;
+            if self.events {
+                // A reader that has gone is told of at the end, when what it lacks is most.
+                let _ = match progress {
+                    Progress::Waiting { external, domain, .. } => {
+                        let seat = |role: &&str| (role.to_string(), seat_path(domain, role));
+                        let seats: BTreeMap<String, PathBuf> = external.iter().map(seat).collect();
+                        event("waiting", serde_json::json!({ "domain": domain, "seats": seats }))
+                    }
+                    Progress::Running { last_tick, .. } => {
+                        event("running", serde_json::json!({ "last_tick": last_tick }))
+                    }
+                    Progress::External(_) => Ok(()),
+                };
+            }
         }
     }
 

@@ -30,8 +30,8 @@ pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, with_realtime_priority,
 };
-pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, serve};
-pub(crate) use process::{join, open_ledger, report_path, results_path, run_under_way, scenario_path, write_whole};
+pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
+pub(crate) use process::{join, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

@@ -134,6 +134,11 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.report.json"))
 }
 
+/// The file in a domain's directory that an external role leaves its last words in, if it has any.
+pub fn words_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.words"))
+}
+
 /// The file in a domain's directory that says where the run's results will be: a path, and nothing else.
 pub fn results_path(root: &Path) -> PathBuf {
     root.join("results")
@@ -183,7 +188,12 @@ pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &Ato
     if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
         return Err(RoleError::Fleet { role: seat.role.clone() });
     }
-    in_domain(&domain, &scenario, RoleImpl::Computed(role, compute), terminated, |_| {})
+    let served = in_domain(&domain, &scenario, RoleImpl::Computed(role, compute), terminated, |_| {});
+    if let Err(RoleError::Node(NodeError::Computed { reason })) = &served {
+        // For the launcher, which has no line to it. If the run is gone, whoever called it is told all the same.
+        let _ = write_whole(&words_path(domain.root(), &seat.role), reason.as_bytes());
+    }
+    served
 }
 
 /// Refuses a role that has no process of its own.

@@ -13,8 +13,8 @@ from .seat import Samples
 class Env(gymnasium.Env):
     """A scenario in one thread. The bits are those of a run with the same commands.
 
-    An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`); an
-    action is the first field of each command (`action_names`). The reward is minus the scenario's first metric. An episode is
+    Nothing is judged unless `set` has an `accept`. An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`); an
+    action is the first field of each command (`action_names`), bounded by what the command guard believes. The reward is minus the scenario's first metric. An episode is
     truncated at the scenario's last tick.
     """
 
@@ -28,7 +28,9 @@ class Env(gymnasium.Env):
         self.observation_names = names
         firsts = [(body, signal, dtype.names[0], int(np.prod(dtype[0].shape))) for body, signal, dtype in samples.writes]
         self.action_names = [f"{body}/{signal}.{name}[{index}]" for body, signal, name, count in firsts for index in range(count)]
-        bound = np.inf if action_bound is None else float(action_bound)
+        # The last of a rig's bounds is that of its commands.
+        limits = steps.limits()
+        bound = float(action_bound) if action_bound is not None else limits[-1][1] if limits else np.inf
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(steps.observation()),), np.float64)
         self.action_space = gymnasium.spaces.Box(-bound, bound, (len(self.action_names),), np.float64)
         self._steps = None
@@ -41,7 +43,7 @@ class Env(gymnasium.Env):
                 yield from [f"{name}[{index}]" for index in range(shape[0])] if shape else [name]
 
     def _begin(self, more):
-        return _corotate.Steps(*self._given, overrides({**self._changes, "clock": "in-process", **more}))
+        return _corotate.Steps(*self._given, overrides({"accept": {}, **self._changes, "clock": "in-process", **more}))
 
     def reset(self, *, seed=None, options=None):
         """Begins the run anew; `seed` is the scenario's, of all noise."""
@@ -58,5 +60,6 @@ class Env(gymnasium.Env):
 
     def summary(self):
         """Ends the run and gives its summary, as `Run.summary`."""
-        summary, self._steps = json.loads(self._steps.finish()), None
-        return summary
+        summary, _ = self._steps.finish(False, None)
+        self._steps = None
+        return json.loads(summary)

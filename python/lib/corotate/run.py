@@ -111,7 +111,8 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     ValueError
         What is wrong with the scenario, with file, line, key and remedy.
     CorotateError
-        Why there is no result. A role that raised is in it with its traceback.
+        Why there is no result. A role that raised ends the run in order: its traceback is in the error and in the run's incident, and
+        the error's `run` is the Run.
 
     >>> corotate.run("rigid-pair", clock="in-process", set={"duration_s": 9}, out=tmp / "repr").accepted
     True
@@ -133,8 +134,6 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
 
     def tell(what, value):
         timeout.check()
-        for failure in failures:
-            raise failure
         if what == "waiting" and not helpers:
             for role, function in roles.items():
                 helpers[role] = _start(value, role, function, roles_in, failures)
@@ -144,9 +143,11 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     finally:
         for helper in helpers.values():
             helper.join(30)
+    made = Run(json.loads(summary), Path(directory))
     if failures:
+        failures[0].run = made
         raise failures[0]
-    return Run(json.loads(summary), Path(directory))
+    return made
 
 
 def _start(domain, role, function, where, failures):
@@ -176,9 +177,8 @@ def _stepped(text, kind, changes, function, timeout, out):
         function(steps.tick(), inputs, outputs)
         steps.act(outputs.close())
         timeout.check()
-    summary = json.loads(steps.finish())
-    directory = Path(out) if out else Path()
-    return Run(summary, directory)
+    summary, directory = steps.finish(True, out and str(out))
+    return Run(json.loads(summary), Path(directory))
 
 
 def certificate(scenario, *, set={}):

@@ -5,6 +5,7 @@ belongs to its tick: to write to it afterwards is an error.
 """
 
 import os
+import time
 
 import numpy as np
 
@@ -106,7 +107,7 @@ class Samples:
 def serve(domain, role, function):
     """Serves a role's seat with `function(tick, inputs, outputs)` to the end of the run.
 
-    `domain` is the run's domain or the path of the role's seat file.
+    `domain` is as the `run` of a `Seat`.
     """
     domain = _domain(domain)
     samples = Samples(*_corotate.describe(domain, "domain", role)[:2])
@@ -119,16 +120,23 @@ def serve(domain, role, function):
     _corotate.serve(domain, role, tick)
 
 
-def _domain(path):
+def _domain(path, wait_s=10.0):
+    """The domain of a run: by itself, by a seat file in it, or by the directory that the run's results go to. It is waited for."""
     path = os.fspath(path)
-    return os.path.dirname(path) if path.endswith(".seat.json") else path
+    path = os.path.dirname(path) if path.endswith(".seat.json") else path
+    end = time.monotonic() + wait_s
+    while (domain := _corotate.domain_of(path)) is None:
+        if time.monotonic() > end:
+            raise _corotate.CorotateError(f"{path} is no run under way: give its domain, its seat file, or the directory given to --out")
+        time.sleep(0.02)
+    return str(domain)
 
 
 class Seat:
     """A role of a run that waits for it: a loop over its ticks.
 
-    `run` is the domain of the run, which `corotate run --external ROLE` prints, or the path of the seat file in it. Warm-up,
-    heartbeat, counters, what is late and the report at the end are inside. `tick_s` is the period, s.
+    `run` is the path of the seat file, which `corotate run --external ROLE` prints, or the directory that the run's results go to
+    (`--out`); a run that is not there yet is waited for, for 10 s. Warm-up, heartbeat, counters, what is late and the report at the end are inside. `tick_s` is the period, s.
 
         for tick, inputs, outputs in corotate.Seat(path, "controller"):
             outputs.command.acceleration_rad_s2[:] = law(inputs.estimate, inputs.measurement)

@@ -59,14 +59,15 @@ class Recording:
             return view[:, 0]
         bodies = self._bodies(signal)
         # A fleet has one component of all bodies after the other.
-        return view.reshape(len(view), 3, bodies).transpose(0, 2, 1) if bodies and view.shape[1] == 3 * bodies else view
+        components = view.shape[1] // bodies if bodies else 0
+        return view.reshape(len(view), components, bodies).transpose(0, 2, 1) if components > 1 else view
 
     def _bodies(self, signal):
         """How many bodies a fleet's signal tells of; 0 of a single body's."""
         names = [field for field, _, _ in self._fields[signal]]
-        if "count" not in names or not len(self._all(signal)):
+        if "bodies" not in names or not len(self._all(signal)):
             return 0
-        return int(self._all(signal)[0, sum(count for _, _, count in self._fields[signal][:names.index("count")])])
+        return int(self._all(signal)[0, sum(count for _, _, count in self._fields[signal][:names.index("bodies")])])
 
     def ticks(self, signal):
         """The tick of each sample, (n,)."""

@@ -1,0 +1,44 @@
+"""Every test in a runtime directory of its own; doctests with what they name."""
+
+import tempfile
+
+import numpy as np
+import pytest
+
+pytest_plugins = ["pytester"]
+
+
+def euler(moments, rate, t):
+    """The free motion of a body, by classical Runge-Kutta steps: (n, 3) rad/s."""
+    a, b, c = moments
+    slope = lambda w: np.array([(b - c) / a * w[1] * w[2], (c - a) / b * w[2] * w[0], (a - b) / c * w[0] * w[1]])
+    rates, w = [], np.array(rate, dtype=float)
+    for step in np.diff(t, append=2 * t[-1] - t[-2]):
+        rates.append(w)
+        k1 = slope(w)
+        k2 = slope(w + step / 2 * k1)
+        k3 = slope(w + step / 2 * k2)
+        w = w + step / 6 * (k1 + 2 * k2 + 2 * k3 + slope(w + step * k3))
+    return np.array(rates)
+
+
+@pytest.fixture(autouse=True)
+def own_runtime(monkeypatch):
+    # Names of sockets limit the length of its path.
+    with tempfile.TemporaryDirectory(prefix="ct", dir="/tmp") as directory:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
+        yield
+
+
+@pytest.fixture
+def law():
+    """The law of rigid-pair's controller."""
+    import corotate
+    law = corotate.Synchronizer([1.0, 2.0, 2.5], gain=4.0)
+
+    def controller(tick, inputs, outputs):
+        if inputs.estimate is not None and inputs.measurement is not None:
+            measured = inputs.measurement
+            outputs.command.acceleration_rad_s2 = law.command(inputs.estimate.omega_rad_s, measured.omega_rad_s, measured.applied_rad_s2)
+
+    return controller
