@@ -18,7 +18,7 @@ use crate::config::{ClockKind, Scenario};
 use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, results_path, scenario_path,
-    seat_path, shared_memory_bytes, topic, write_whole,
+    seat_path, shared_memory_bytes, take_short_turns, topic, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::system::tell;
@@ -53,6 +53,8 @@ const HUNG_PERIODS: u64 = 10;
 
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
+    // What it starts has them too.
+    take_short_turns();
     require_descriptors(scenario)?;
     require_files(FILES + FILES_PER_ROLE * RoleId::all(scenario).len() as u64)?;
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;

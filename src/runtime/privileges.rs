@@ -162,6 +162,35 @@ pub fn release() {
     let _ = set_scheduler(libc::SCHED_OTHER, 0);
 }
 
+/// For how long a process without priority is asked to be let run at a time, ns: the least that the kernel grants.
+const TURN_NS: u64 = 100_000;
+
+/// Asks for short turns, for the calling thread and what it starts from now on. Whoever sleeps until a sample comes is then woken at
+/// once, and not when the turns of busy processes are over; its share of the processor stays the same. It needs no privilege. Linux
+/// heeds it from 6.12 on; on others nothing changes.
+pub fn take_short_turns() {
+    let mut attributes = libc::sched_attr {
+        size: size_of::<libc::sched_attr>() as u32,
+        sched_policy: 0,
+        sched_flags: 0,
+        sched_nice: 0,
+        sched_priority: 0,
+        sched_runtime: 0,
+        sched_deadline: 0,
+        sched_period: 0,
+    };
+    let size = attributes.size;
+    #[allow(unsafe_code)]
+    // SAFETY: thread 0 is the calling one, and the pointer is to a live structure of the size that is told.
+    let told = unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attributes, size, 0) };
+    if told == 0 && attributes.sched_policy == libc::SCHED_OTHER as u32 {
+        attributes.sched_runtime = TURN_NS;
+        #[allow(unsafe_code)]
+        // SAFETY: as above; the kernel only reads it. A kernel that does not know it leaves all as it is.
+        let _ = unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0) };
+    }
+}
+
 #[allow(unsafe_code)]
 fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
     let parameters = libc::sched_param { sched_priority: priority };

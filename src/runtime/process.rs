@@ -227,6 +227,7 @@ pub(super) fn in_domain(
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
+    privileges::take_short_turns();
     // What computes in an interpreter has threads and memory of its own.
     let takes = realtime && !matches!(occupant, RoleImpl::Computed(..));
     let privileges = if takes { privileges::take(scenario, role) } else { Privileges::default() };
