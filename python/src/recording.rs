@@ -16,14 +16,15 @@ pub struct Recording {
     recorded: Recorded,
 }
 
-impl Recording {
-    fn track(&self, body: &str, signal: &str) -> PyResult<Track> {
-        let mut tracks = self.recorded.tracks(|info| info.body == body && info.signal == signal).map_err(failed)?;
-        if tracks.is_empty() {
-            return Err(failed(format!("the recording has no signal {body}/{signal}")));
-        }
-        Ok(tracks.swap_remove(0))
+/// The samples of a signal that were sent for a tick, one after the other, as words.
+fn words(track: &Track) -> (Vec<u64>, usize) {
+    let each = track.info.layout.size() / size_of::<u64>();
+    let regular: Vec<usize> = track.regular().collect();
+    let mut words = vec![0; regular.len() * each];
+    for (place, index) in words.chunks_exact_mut(each).zip(regular) {
+        bytemuck::cast_slice_mut(place).copy_from_slice(track.sample(index));
     }
+    (words, each)
 }
 
 #[pymethods]
@@ -55,18 +56,24 @@ impl Recording {
         Ok((info.scenario_name.clone(), info.clock.to_string(), info.period_ns, scenario.to_toml()))
     }
 
-    /// All samples of a signal that were sent for a tick, one after the other, as words of eight bytes; and the words of one.
-    fn words<'py>(&self, py: Python<'py>, body: &str, signal: &str) -> PyResult<(Bound<'py, PyArray1<u64>>, usize)> {
-        let (words, each) = py.detach(|| {
-            let track = self.track(body, signal)?;
-            let each = track.info.layout.size() / size_of::<u64>();
-            let mut words = Vec::with_capacity(track.len() * each);
-            for index in track.regular() {
-                let sample = track.sample(index).chunks_exact(size_of::<u64>());
-                words.extend(sample.map(|bytes| u64::from_ne_bytes(bytes.try_into().unwrap_or_default())));
-            }
-            Ok::<_, PyErr>((words, each))
+    /// All samples of each of these signals that were sent for a tick, one after the other, as words of eight bytes; and the words of
+    /// one. The file is read once.
+    fn words<'py>(
+        &self,
+        py: Python<'py>,
+        names: Vec<(String, String)>,
+    ) -> PyResult<Vec<(Bound<'py, PyArray1<u64>>, usize)>> {
+        let read = py.detach(|| {
+            let wanted = |info: &corotate::record::SignalInfo| {
+                names.iter().any(|(body, name)| (body, name) == (&info.body, &info.signal))
+            };
+            let tracks = self.recorded.tracks(wanted).map_err(failed)?;
+            let of = |(body, name): &(String, String)| {
+                let track = tracks.iter().find(|track| (&track.info.body, &track.info.signal) == (body, name));
+                track.map(words).ok_or_else(|| failed(format!("the recording has no signal {body}/{name}")))
+            };
+            names.iter().map(of).collect::<PyResult<Vec<_>>>()
         })?;
-        Ok((words.into_pyarray(py), each))
+        Ok(read.into_iter().map(|(words, each)| (words.into_pyarray(py), each)).collect())
     }
 }

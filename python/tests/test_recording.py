@@ -22,6 +22,13 @@ def test_fields_are_arrays_without_a_copy(recording):
     assert recording.signals["follower/command"]["acceleration_rad_s2"] == 3
 
 
+def test_many_signals_are_read_in_one_pass(recording):
+    loaded = corotate.Recording(recording.path).load()
+    for name in ("leader/truth.omega_rad_s", "follower/command.acceleration_rad_s2"):
+        assert np.array_equal(loaded.array(name), recording.array(name))
+    assert loaded.load("leader/truth") is loaded
+
+
 def test_values_are_those_of_the_export(recording, tmp_path):
     import csv
     import subprocess

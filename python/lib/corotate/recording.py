@@ -14,7 +14,7 @@ STATUS = ("holding", "safe", "initial", "unobservable", "unusable", "learning", 
 class Recording:
     """A recording of a run, by its path or its directory.
 
-    One that is not complete is refused unless `accept_incomplete`.
+    One that is not complete is refused unless `accept_incomplete`. A signal is read when it is first asked for; `load` reads many.
     """
 
     def __init__(self, path, accept_incomplete=False):
@@ -36,10 +36,16 @@ class Recording:
         if signal not in self._fields:
             raise KeyError(f"the recording has no signal {signal!r}; it has {', '.join(self._fields)}")
         if signal not in self._words:
-            words, each = self._recording.words(*signal.split("/"))
+            self.load(signal)
+        return self._words[signal]
+
+    def load(self, *signals):
+        """Reads signals, or all of them, in one pass over the file: what is asked for one by one is read one by one."""
+        wanted = [signal for signal in signals or self._fields if signal not in self._words]
+        for signal, (words, each) in zip(wanted, self._recording.words([tuple(signal.split("/")) for signal in wanted])):
             words.flags.writeable = False
             self._words[signal] = words.reshape(-1, each)
-        return self._words[signal]
+        return self
 
     def array(self, name):
         """A field of a signal, `"leader/estimate.omega_rad_s"`: (n, elements), or (n,) for a single element; of a fleet
