@@ -55,11 +55,14 @@ pub struct Plausible<const N: usize> {
     repeated: [u64; N],
     /// Whether that one was believed.
     trusted: bool,
-    /// The bits of the components that were believed in that sample; follows from the above.
-    recent: u64,
+    /// Whether every component of that sample was believed; follows from the above.
+    whole: bool,
 }
 
 impl<const N: usize> Plausible<N> {
+    /// The bits of all components.
+    const ALL: u64 = (1 << N) - 1;
+
     /// Nothing is known yet: the first value of a component is checked for its magnitude only.
     pub fn new(bounds: Bounds<N>) -> Self {
         Self {
@@ -70,7 +73,7 @@ impl<const N: usize> Plausible<N> {
             before_tick: 0,
             repeated: [0; N],
             trusted: true,
-            recent: 0,
+            whole: false,
         }
     }
 
@@ -94,17 +97,15 @@ impl<const N: usize> Plausible<N> {
         change: impl Fn(usize, &[f64; N], f64) -> f64,
     ) -> bool {
         let counts = self.bounds.repeats != u64::MAX;
-        // As a rule every component that is told was believed a tick ago, and is now: what follows says the same at greater length.
-        let told = |i: usize| valid >> i & 1 == 1;
+        // As a rule every component was believed a tick ago, and is now: what follows says the same at greater length.
+        let next = self.whole && self.trusted && !counts && self.before_tick.checked_add(1) == Some(stamp.tick);
         let near = |i: usize| {
             let bound = self.bounds.allowance[i] + change(i, &self.believed, 1.0);
             self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
         };
-        let next = self.trusted && !counts && self.before_tick.checked_add(1) == Some(stamp.tick);
-        if next && (0..N).all(|i| !told(i) || self.recent >> i & 1 == 1 && near(i)) {
-            self.believe(stamp, values, valid);
-            (self.before, self.before_tick) = (*values, stamp.tick);
-            self.recent = valid & ((1 << N) - 1);
+        if next && valid & Self::ALL == Self::ALL && (0..N).all(near) {
+            (self.believed, self.before) = (*values, *values);
+            (self.believed_tick, self.before_tick) = ([Some(stamp.tick); N], stamp.tick);
             return true;
         }
         let mut believed = true;
@@ -121,7 +122,7 @@ impl<const N: usize> Plausible<N> {
             self.believe(stamp, values, valid);
         }
         (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
-        self.set_recent();
+        self.set_whole();
         believed
     }
 
@@ -132,13 +133,11 @@ impl<const N: usize> Plausible<N> {
             (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
         }
         self.trusted = true;
-        // Whoever believes otherwise does so for the sample before.
-        self.recent |= if stamp.tick == self.before_tick { valid & ((1 << N) - 1) } else { 0 };
+        self.set_whole();
     }
 
-    fn set_recent(&mut self) {
-        let recent = |i: &usize| self.believed_tick[*i] == Some(self.before_tick);
-        self.recent = (0..N).filter(recent).fold(0, |bits, i| bits | 1 << i);
+    fn set_whole(&mut self) {
+        self.whole = self.believed_tick == [Some(self.before_tick); N];
     }
 
     /// The bounds that it judges by.
@@ -181,7 +180,7 @@ impl<const N: usize> Persist for Plausible<N> {
         self.before_tick.persist(words);
         self.repeated.persist(words);
         self.trusted.persist(words);
-        self.set_recent();
+        self.set_whole();
     }
 }
 
