@@ -203,39 +203,6 @@ fn a_role_by_hand_does_not_outlive_a_killed_launcher() {
     }
 }
 
-/// Whoever joins a run at its very end may have missed its last word.
-#[test]
-fn who_joins_a_run_that_ends_ends_too() {
-    let bench = Bench::new();
-    for attempt in 0..30 {
-        let run = bench.start(&[
-            "run",
-            "rigid-pair",
-            "--clock",
-            "lockstep",
-            "--duration",
-            "20",
-            "--set",
-            "accept={}",
-            "--out",
-            "out",
-        ]);
-        let domain = await_some(|| bench.domains().pop());
-        std::thread::sleep(std::time::Duration::from_millis(10 * attempt));
-        let domain = domain.to_str().unwrap();
-        let joiners = [
-            bench.start(&["record", "--domain", domain, "--out", "part.mcap"]),
-            bench.start(&["watch", domain, "--once", "600"]),
-        ];
-        for joiner in joiners {
-            let done = joiner.wait();
-            assert!(done.signal.is_none(), "{done:?}");
-        }
-        assert_eq!(run.wait().code, Some(0));
-    }
-    bench.assert_clean(&[]);
-}
-
 #[test]
 fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it() {
     let bench = Bench::new();

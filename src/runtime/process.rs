@@ -150,7 +150,8 @@ pub fn results_path(root: &Path) -> PathBuf {
 /// # Errors
 /// [`DomainError::Privacy`].
 pub fn run_under_way(given: Option<&Path>) -> Result<Option<PathBuf>, DomainError> {
-    if let Some(given) = given.filter(|given| Domain::join(given).is_ok()) {
+    // A domain that cannot be joined is told by whoever joins it.
+    if let Some(given) = given.filter(|given| !matches!(Domain::join(given), Err(DomainError::NotADomain { .. }))) {
         return Ok(Some(given.to_owned()));
     }
     let mut running = domains()?.into_iter().filter(|found| found.alive).map(|found| found.root);
