@@ -179,7 +179,7 @@ fn follow(
         let (word, now_ns) = (links.hear()?, monotonic_ns());
         let phase = Phase::from_number(word.phase);
         if phase >= Phase::Run {
-            links.taps.start(word.epoch_ns);
+            links.taps.start(word.epoch_ns, Some(0));
             if links.taps.drain(channels)? > 0 {
                 came_ns = now_ns;
             }

@@ -18,6 +18,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 const SIGKILL: i32 = 9;
+const SIGCONT: i32 = 18;
 const SIGSTOP: i32 = 19;
 
 /// Runs a shipped scenario with a recording; gives the run's end and the recording.
@@ -328,6 +329,31 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
     }
 }
 
+/// Nothing is sent to whoever joins then, and the loop must not wait for it to take something.
+#[test]
+fn a_recorder_that_joins_a_loop_that_waits_for_credit_does_not_stop_it() {
+    let bench = Bench::new();
+    let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}", "--out", "out"];
+    let running = bench.start(&words);
+    let domain = await_some(|| bench.domains().pop());
+    bench.await_ticks("controller");
+    running.signal(SIGSTOP);
+    let mut commits = u64::MAX;
+    await_some(|| {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        let before = std::mem::replace(&mut commits, bench.commits("leader"));
+        (before == commits).then_some(())
+    });
+    let recorder = bench.start(&["record", "--domain", domain.to_str().unwrap(), "--out", "part.mcap"]);
+    // Every signal is open before there is a file; its first word follows at once.
+    await_some(|| std::fs::metadata(bench.path("part.mcap")).ok());
+    std::thread::sleep(std::time::Duration::from_millis(200));
+    running.signal(SIGCONT);
+    let done = running.wait();
+    assert!(done.code == Some(0) && recorder.wait().code == Some(0), "{done:?}");
+    bench.assert_clean(&[domain]);
+}
+
 /// All that a run shares lies in files that begin with its domain's name.
 fn shared_bytes(domain: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
@@ -422,7 +448,7 @@ impl<'a> Scheduled<'a> {
         let length_ns = (scenario.last_tick + 1) * scenario.period_ns;
         let grid = Grid { epoch_ns: monotonic_ns() - length_ns, period_ns: scenario.period_ns };
         let mut recorder = Recorder::open(scenario, bus, file).unwrap();
-        recorder.start(grid.epoch_ns, true).unwrap();
+        recorder.start(grid.epoch_ns, None).unwrap();
         let roles = RoleId::all(scenario);
         let memory = tempfile::tempdir().unwrap();
         let ledger = |role: &RoleId| shared_ledger(scenario, *role, &memory.path().join(role.name(scenario))).unwrap();

@@ -468,7 +468,7 @@ fn a_million_ticks_fit_in_two_megabytes_with_every_spike() {
     let bus = MemoryBus::new(corotate::runtime::depths(&scenario));
     let file = bench.path("long.mcap");
     let mut recorder = Recorder::open(&scenario, &bus, &file).unwrap();
-    recorder.start(0, true).unwrap();
+    recorder.start(0, None).unwrap();
     let topic = |body: &str, signal| corotate::runtime::topic(&scenario, body, signal);
     let mut truths =
         ["leader", "follower"].map(|body| bus.writer::<RateTruth>(&topic(body, Signal::Truth), 1).unwrap());

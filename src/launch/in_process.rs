@@ -50,7 +50,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
     };
     let mut recorder = launch.record.as_deref().map(|file| Recorder::open(scenario, &bus, file)).transpose()?;
     if let Some(recorder) = &mut recorder {
-        recorder.start(0, true)?;
+        recorder.start(0, None)?;
     }
     let (mut failure, mut unrecorded) = (None, None);
     let ended = in_turn(&mut nodes, scenario.last_tick, revive, |tick| {

@@ -297,7 +297,7 @@ impl<'a> Supervisor<'a> {
         let (mut next_look_ns, mut somebody_ended) = (0, false);
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
             let scored = scorer.poll(CREDIT_TICKS)?;
-            let credit = if lockstep { self.recorder.credit(scorer.next_tick())? } else { 0 };
+            let credit = if lockstep { self.recorder.credit(scorer.next_tick(), self.word.credit_tick)? } else { 0 };
             if credit > self.word.credit_tick {
                 self.word.credit_tick = credit;
                 self.announce()?;

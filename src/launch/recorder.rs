@@ -11,7 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::Scenario;
-use crate::record::{RECORDER, RecordingReport};
+use crate::record::{JOINING, RECORDER, RecordingReport};
 use crate::runtime::{report_path, topic};
 use crate::sample::{Health, RoleState};
 use crate::system::tell;
@@ -28,6 +28,8 @@ pub(super) struct RecorderWatch {
     file: Option<String>,
     health: <IoxBus as Bus>::Reader<Health>,
     last: Health,
+    /// The credit while it joins.
+    joined_at: Option<u64>,
     silent_ns: u64,
     looked_ns: u64,
     limit_ns: u64,
@@ -47,6 +49,7 @@ impl RecorderWatch {
             process: file.map(start).transpose()?,
             file: file.map(|file| file.file_name().unwrap_or_default().to_string_lossy().into_owned()),
             last: Health::default(),
+            joined_at: None,
             silent_ns: 0,
             looked_ns: monotonic_ns(),
             limit_ns: (scenario.supervision.heartbeat_timeout_s * 1e9) as u64,
@@ -79,10 +82,19 @@ impl RecorderWatch {
         Ok(self.state() >= RoleState::Ready)
     }
 
-    /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder.
-    pub fn credit(&mut self, scored: u64) -> Result<u64, BusError> {
+    /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder and the last
+    /// credit was `given`. One that joined late gets nothing from a writer that waits: there is credit for one tick more, of
+    /// which it gets everything.
+    pub fn credit(&mut self, scored: u64, given: u64) -> Result<u64, BusError> {
         self.listen()?;
-        Ok(if self.active() { self.last.stamp.tick.min(scored) } else { scored })
+        if !self.active() {
+            self.joined_at = None;
+            return Ok(scored);
+        }
+        Ok(scored.min(match self.last.stamp.tick {
+            JOINING => *self.joined_at.get_or_insert(given + 1),
+            tick => tick,
+        }))
     }
 
     /// Looks whether it has failed: then the run goes on without.

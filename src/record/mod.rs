@@ -37,7 +37,7 @@ pub use layout::{Column, Layout, topic_of};
 pub(crate) use layout::{MESSAGE_ENCODING, SCHEMA_ENCODING, frame};
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
-pub(crate) use recorder::RECORDER;
+pub(crate) use recorder::{JOINING, RECORDER};
 pub use recorder::{Recorder, RecordingReport, SignalReport};
 pub use replay::{Comparer, Difference, Inlets, Outlets, RoleReplay, replay_in_process};
 pub use script::{InputScript, Item, Limit, Script, Step};

@@ -5,7 +5,7 @@
 //! beyond what it has taken.
 
 use super::RecordError;
-use super::recorder::{RECORDER, Recorder, RecordingReport};
+use super::recorder::{JOINING, RECORDER, Recorder, RecordingReport};
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
@@ -74,7 +74,7 @@ fn open(seat: &RecorderSeat, domain: &Domain, scenario: &Scenario) -> Result<(Io
 }
 
 /// Takes samples from the first tick to the last, or until it is to `end`: a run that ended while this joined it has said its
-/// last word to others.
+/// last word to others. Who joins lockstep late takes everything from the credit of that moment on.
 fn follow(
     recorder: &mut Recorder,
     line: &mut Line,
@@ -83,14 +83,21 @@ fn follow(
 ) -> Result<(), RecordError> {
     let (mut backoff, mut whole) = (Backoff::default(), false);
     loop {
-        line.say(RoleState::Ready, 0)?;
         let schedule = line.hear()?;
         let phase = Phase::from_number(schedule.phase);
-        // Before the first word nothing is known.
         whole |= schedule.stamp.generation > 0 && phase < Phase::Run;
+        // Before the first word nothing is known.
+        line.say(if whole { RoleState::Ready } else { RoleState::Open }, 0)?;
         match phase {
+            Phase::Run if whole => {
+                recorder.start(schedule.epoch_ns, None)?;
+                break;
+            }
             Phase::Run => {
-                recorder.start(schedule.epoch_ns, whole)?;
+                line.say(RoleState::Running, JOINING)?;
+                // Heard after that is said: what is sent beyond it is little enough to be kept.
+                let from_tick = line.hear()?.credit_tick;
+                recorder.start(schedule.epoch_ns, Some(from_tick))?;
                 break;
             }
             Phase::Stop => return Ok(()),
@@ -104,7 +111,7 @@ fn follow(
         let (now_ns, next_tick) = (monotonic_ns(), recorder.next_tick());
         let time_for_a_word = now_ns >= next_word_ns;
         if time_for_a_word || credit_ticks.is_some_and(|ticks| next_tick >= said + ticks) {
-            line.say(RoleState::Running, next_tick)?;
+            line.say(RoleState::Running, if whole || next_tick > 0 { next_tick } else { JOINING })?;
             (said, next_word_ns) = (next_tick, now_ns + WORD_NS);
         }
         if time_for_a_word && end() || Phase::from_number(line.hear()?.phase) == Phase::Stop {

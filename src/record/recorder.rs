@@ -16,6 +16,8 @@ use xxhash_rust::xxh3::xxh3_64;
 
 /// The recorder's name where a role would have its own.
 pub(crate) const RECORDER: &str = "recorder";
+/// The tick told to the launcher by a recorder that joined late and lacks a sample of some signal.
+pub(crate) const JOINING: u64 = u64::MAX;
 /// Layout version of the metadata.
 pub const SCHEMA: &str = "corotate/recording/v2";
 /// The metadata record that is written first, and the one that is written last.
@@ -136,14 +138,15 @@ impl Recorder {
         })
     }
 
-    /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. `whole` tells that no tick has run.
+    /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. If ticks have run, `joined` is
+    /// the first that is taken.
     ///
     /// # Errors
     /// [`RecordError::Write`].
-    pub fn start(&mut self, epoch_ns: u64, whole: bool) -> Result<(), RecordError> {
-        self.taps.start(epoch_ns);
+    pub fn start(&mut self, epoch_ns: u64, joined: Option<u64>) -> Result<(), RecordError> {
+        self.taps.start(epoch_ns, joined);
         self.begun = true;
-        self.run.insert("whole".to_owned(), whole.to_string());
+        self.run.insert("whole".to_owned(), joined.is_none().to_string());
         self.run.insert("epoch_ns".to_owned(), epoch_ns.to_string());
         let run = self.run.clone();
         self.taps.announce(&mut self.writer)?;
@@ -196,7 +199,7 @@ impl Recorder {
 
     fn end(&mut self, report: &RecordingReport, roles: &[RoleReport]) -> Result<u64, RecordError> {
         if !self.begun {
-            self.start(0, false)?;
+            self.start(0, Some(0))?;
         }
         let grants: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), &role.grants)).collect();
         let ticks: BTreeMap<&str, _> = roles.iter().map(|role| (role.role.as_str(), role.ticks)).collect();

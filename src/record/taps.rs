@@ -90,6 +90,7 @@ impl SignalCounters {
 struct Desk<'a> {
     sink: &'a mut dyn MessageSink,
     grid: Grid,
+    joined: Option<u64>,
     last_tick: u64,
     realtime: bool,
 }
@@ -110,15 +111,15 @@ impl Tap {
         while let Some(words) = self.reader.next()? {
             let body = bytemuck::cast_slice(words);
             let stamp: Stamp = bytemuck::pod_read_unaligned(&body[..size_of::<Stamp>()]);
-            if stamp.generation == 0 && !self.counters.begun {
+            if (stamp.generation == 0 || desk.joined.is_some_and(|from| stamp.tick < from)) && !self.counters.begun {
                 continue;
             }
             let now_ns = monotonic_ns();
             let due = match (desk.realtime, self.counters.begun) {
                 (true, _) => desk.grid.tick_at(now_ns).min(desk.last_tick),
-                // Where nothing is lost, a sample is of the next tick or of none.
-                (false, true) => self.counters.next,
-                (false, false) => desk.last_tick,
+                // Where nothing can be lost, a sample is of the next tick or of none.
+                (false, true) if desk.joined.is_none() => self.counters.next,
+                (false, _) => desk.last_tick,
             };
             let due_ns = if stamp.tick <= desk.last_tick { desk.grid.due_ns(stamp.tick) } else { now_ns };
             // Only real time has another time than that of the ticks.
@@ -149,6 +150,7 @@ impl Tap {
 pub struct Taps {
     taps: Vec<Tap>,
     grid: Grid,
+    joined: Option<u64>,
     last_tick: u64,
     realtime: bool,
 }
@@ -169,14 +171,16 @@ impl Taps {
         Ok(Self {
             taps,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
+            joined: None,
             last_tick: scenario.last_tick,
             realtime: scenario.clock == ClockKind::Realtime,
         })
     }
 
-    /// Sets the epoch of the ticks, once it is known: 0 where there is no time.
-    pub fn start(&mut self, epoch_ns: u64) {
-        self.grid.epoch_ns = epoch_ns;
+    /// Sets the epoch of the ticks, once it is known: 0 where there is no time; and the first tick that is taken, if
+    /// some have run.
+    pub fn start(&mut self, epoch_ns: u64, joined: Option<u64>) {
+        (self.grid.epoch_ns, self.joined) = (epoch_ns, joined);
     }
 
     /// Announces every signal.
@@ -192,8 +196,8 @@ impl Taps {
     /// # Errors
     /// [`RecordError::Bus`], and the sink's.
     pub fn drain(&mut self, sink: &mut dyn MessageSink) -> Result<u64, RecordError> {
-        let Self { taps, grid, last_tick, realtime } = self;
-        let mut desk = Desk { sink, grid: *grid, last_tick: *last_tick, realtime: *realtime };
+        let Self { taps, grid, joined, last_tick, realtime } = self;
+        let mut desk = Desk { sink, grid: *grid, joined: *joined, last_tick: *last_tick, realtime: *realtime };
         let mut taken = 0;
         for tap in taps {
             taken += tap.drain(&mut desk)?;
