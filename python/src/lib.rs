@@ -24,6 +24,7 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(logs::identify, module)?)?;
     module.add_function(wrap_pyfunction!(logs::reconstruct, module)?)?;
     module.add_function(wrap_pyfunction!(logs::command, module)?)?;
+    module.add_function(wrap_pyfunction!(logs::thrust, module)?)?;
     module.add_class::<seat::Ticks>()?;
     module.add_class::<steps::Steps>()?;
     module.add_class::<recording::Recording>()?;

@@ -1,10 +1,10 @@
-//! The papers' observers on arrays: inertia, a hidden rate, the law.
+//! The papers' observers on arrays: inertia, a hidden rate, the laws.
 
 use crate::run::failed;
-use corotate::control::Synchronizer;
+use corotate::control::{OrbitGains, OrbitHold, Synchronizer};
 use corotate::estimate::{FilterKind, Reconstruction, Setup};
 use corotate::identify::{Motion, Sample, findings};
-use corotate::model::{Inertia, RigidBody};
+use corotate::model::{CentralField, Inertia, OrbitState, RigidBody};
 use corotate::nalgebra::Vector3;
 use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
@@ -141,4 +141,36 @@ pub fn command(
     let law = Synchronizer::new(body, gain_per_s.into(), lead_s);
     let (reference, own) = law.ahead(leader.into(), follower.into(), &applied);
     Ok(law.command(&reference, &own).into())
+}
+
+/// The orbit law's thrust, du/s²: of the states (r, θ, Vr, Vθ) of a body and of what it is taken to, a circle's radius or a
+/// leader's state.
+#[pyfunction]
+#[allow(clippy::too_many_arguments, reason = "one call from one place")]
+pub fn thrust(
+    mu: f64,
+    radii: [f64; 2],
+    gains: [f64; 3],
+    thrust_max: f64,
+    lead_s: f64,
+    body: [f64; 4],
+    target: Vec<f64>,
+    applied: [f64; 2],
+) -> PyResult<[f64; 2]> {
+    let field = CentralField::new(mu, radii[0], radii[1]).map_err(failed)?;
+    let [radius_per_s2, radial_per_s, transverse_per_s] = gains;
+    let law = OrbitHold::new(field, OrbitGains { radius_per_s2, radial_per_s, transverse_per_s }, thrust_max, lead_s);
+    let state = |[r, theta, vr, vtheta]: [f64; 4]| OrbitState { r, vr, theta, vtheta };
+    let (body, applied) = (state(body), applied.into());
+    let thrust = match (target.as_slice(), <[f64; 4]>::try_from(target.as_slice())) {
+        ([radius], _) => law.to_circle(*radius, &body, &applied),
+        (_, Ok(leader)) => law.to_leader(&state(leader), &body, &applied),
+        (other, _) => {
+            let count = other.len();
+            return Err(PyValueError::new_err(format!(
+                "a target of {count} numbers: give a radius, or (r, theta, vr, vtheta)"
+            )));
+        }
+    };
+    Ok(thrust.into())
 }

@@ -43,3 +43,23 @@ def test_mistakes_are_told():
         corotate.identify(T, np.zeros((len(T), 2)))
     with pytest.raises(ValueError, match="not finite"):
         corotate.identify(T, np.full((len(T), 3), np.nan))
+
+
+@pytest.mark.parametrize("name, body, target, damping", [("orbit-hold", "spacecraft", 1.3, 1.8), ("orbit-rendezvous", "follower", None, 2.0)])
+def test_the_orbit_law_is_the_one_that_runs(tmp_path, name, body, target, damping):
+    run = corotate.run(name, clock="in-process", set={"duration_s": 1, "controller.predict": True, "accept": {}}, record=True, out=tmp_path / "run")
+    observed = "leader" if target is None else body
+    law = corotate.OrbitHold((1.0, damping, 1.0), thrust_max=0.5, lead_s=1e-3)
+
+    def state(signal, tick):
+        parts = [run.recording.array(f"{signal}.{field}")[tick] for field in ("radius_du", "angle_rad", "velocity_du_s")]
+        return np.hstack(parts)
+
+    for tick in (0, 1, 500):
+        estimate = state(f"{observed}/estimate", tick)
+        own = state(f"{body}/measurement", tick) if target is None else estimate
+        applied = run.recording.array(f"{body}/measurement.applied_du_s2")[tick]
+        thrust = law.command(own, estimate if target is None else target, applied)
+        assert np.array_equal(thrust, run.recording.array(f"{body}/command.thrust_du_s2")[tick]), tick
+    with pytest.raises(ValueError, match="give a radius"):
+        law.command(own, [1.0, 2.0])

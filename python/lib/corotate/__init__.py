@@ -12,14 +12,14 @@ import sys as _sys
 
 from . import _corotate
 from ._corotate import CorotateError, __version__
-from .logs import HiddenRate, Identified, Synchronizer, identify
+from .logs import HiddenRate, Identified, OrbitHold, Synchronizer, identify
 from .recording import Recording
 from .run import Run, certificate, run, shipped
 from .seat import Seat
 
 __all__ = [
-    "CorotateError", "Env", "HiddenRate", "Identified", "Recording", "Run", "Seat", "Synchronizer", "__version__", "certificate",
-    "identify", "run", "shipped", "to_control",
+    "CorotateError", "Env", "HiddenRate", "Identified", "OrbitHold", "Recording", "Run", "Seat", "Synchronizer", "__version__",
+    "certificate", "identify", "run", "shipped", "to_control",
 ]
 
 # Roles of a run are processes of this interpreter with this package.

@@ -111,3 +111,17 @@ class Synchronizer:
         """The acceleration to apply, (3,) rad/s²: of both rates, rad/s, and what the actuators apply now, rad/s²."""
         vectors = [list(map(float, vector)) for vector in (leader, follower, applied)]
         return np.array(_corotate.command(self._body, self._gain, self._lead, *vectors))
+
+
+class OrbitHold:
+    """The law that takes a body to an orbit: `gain` (radius 1/s², radial 1/s, transverse 1/s), each component of the thrust within
+    `thrust_max` du/s²; `mu` du³/s² of the centre, `radii` du between which its field holds, `lead_s` how far motions are predicted."""
+
+    def __init__(self, gain, thrust_max, mu=1.0, *, radii=(0.05, 10.0), lead_s=0.0):
+        self._rest = (float(mu), list(map(float, radii)), list(map(float, gain)), float(thrust_max), float(lead_s))
+
+    def command(self, body, target, applied=(0.0, 0.0)):
+        """The thrust to apply, (2,) du/s², radial and transverse: of the `body`'s state (r, θ, Vr, Vθ), du, rad and du/s, the radius
+        of a circle or a leader's state as `target`, and the thrust that acts now, du/s²."""
+        body, target, applied = (list(map(float, np.atleast_1d(vector))) for vector in (body, target, applied))
+        return np.array(_corotate.thrust(*self._rest, body, target, applied))
