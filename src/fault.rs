@@ -3,6 +3,12 @@
 //! Pure: the same fault gives the same bits under every clock and in every life of a role. Must not send, wait or count; the
 //! runtime does that with what is decided here.
 
+mod delay;
+mod occurrence;
+
+pub use delay::{Delay, Distribution};
+pub use occurrence::{Channel, Course, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
+
 use crate::model::Noise;
 use crate::sample::{Field, FieldKind, Message, Stamp};
 
@@ -18,8 +24,8 @@ pub struct Fault {
     pub from_tick: u64,
     /// For how many ticks it may.
     pub ticks: u64,
-    /// The probability with which it does, tick by tick; 1 is always.
-    pub probability: f64,
+    /// On which of these it does; a [`Course`] tells.
+    pub occurrence: Occurrence,
     /// What its draws follow from, beside the tick.
     pub seed: u64,
     /// What goes wrong.
@@ -38,17 +44,25 @@ pub enum Action {
 }
 
 /// What happens to a sample on its way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Transport {
     /// It is never sent.
     Drop,
     /// It is sent twice.
     Duplicate,
-    /// It is sent so many ticks late.
-    Delay {
-        /// At least 1.
-        ticks: u64,
-    },
+    /// It is sent late.
+    Delay(Delay),
+}
+
+/// What has happened to one sample on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Way {
+    /// It is never sent.
+    Dropped,
+    /// It is sent twice.
+    Twice,
+    /// It is sent so many ticks late, at least 1.
+    Late(u64),
 }
 
 /// What happens to a role.
@@ -61,6 +75,8 @@ pub enum Interruption {
     },
     /// Its process is killed, in its first life only.
     Kill,
+    /// It does not execute the tick.
+    Miss,
 }
 
 /// What happens to the content of a sample, and to which words of it.
@@ -107,16 +123,21 @@ pub enum Change {
 }
 
 impl Fault {
-    /// Whether it acts at this tick.
-    #[inline]
-    pub fn acts(&self, tick: u64) -> bool {
-        let within = tick >= self.from_tick && tick - self.from_tick < self.ticks;
-        within && (self.probability >= 1.0 || unit(self.draw(tick, 0)) < self.probability)
-    }
-
     /// Whether it changes contents.
     pub fn tampers(&self) -> bool {
         matches!(self.action, Action::Content(_))
+    }
+
+    /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if its delay is drawn as 0.
+    pub fn way(&self, tick: u64) -> Option<Way> {
+        match self.action {
+            Action::Transport(Transport::Drop) => Some(Way::Dropped),
+            Action::Transport(Transport::Duplicate) => Some(Way::Twice),
+            Action::Transport(Transport::Delay(delay)) => {
+                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > 0).map(Way::Late)
+            }
+            _ => None,
+        }
     }
 
     /// Changes the content of the sample of `tick`, where it is a fault of that kind. `last` is the sample sent before.
@@ -189,7 +210,7 @@ mod tests {
 
     fn fault(change: Change, words: Words) -> Fault {
         let action = Action::Content(Tamper { change, words });
-        Fault { from_tick: 10, ticks: 3, probability: 1.0, seed: seed(7, 0), action }
+        Fault { from_tick: 10, ticks: 3, occurrence: Occurrence::Independent(1.0), seed: seed(7, 0), action }
     }
 
     fn sample() -> RateMeasurement {
@@ -210,19 +231,6 @@ mod tests {
 
     fn omega() -> Words {
         field(RateMeasurement::FIELDS, "omega_rad_s").unwrap().0
-    }
-
-    #[test]
-    fn acts_within_its_ticks_and_as_often_as_it_is_told() {
-        let mut fault = fault(Change::Freeze, omega());
-        let acted = |fault: &Fault| (0..10_020).filter(|tick| fault.acts(*tick)).count();
-        assert_eq!(acted(&fault), 3);
-        (fault.ticks, fault.probability) = (10_000, 0.25);
-        assert!((2_300..2_700).contains(&acted(&fault)), "{}", acted(&fault));
-        fault.probability = 0.0;
-        assert_eq!(acted(&fault), 0);
-        fault.ticks = u64::MAX;
-        assert!(!fault.acts(9), "no overflow");
     }
 
     #[test]

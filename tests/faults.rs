@@ -388,6 +388,38 @@ fn a_fault_that_makes_no_sense_is_refused_with_place_and_remedy() {
         (("= 10", "= 10\nfield = \"omega_rad_s\""), "has no meaning for this kind; remove it"),
         (("= 10", "= 10\nbody = \"follower\""), "is for the controller"),
         (("drop\"\nrole = \"leader", "drop\"\nrole = \"controller\"\nbody = \"leader"), "drives no `leader`"),
+        (("= 10", "= 10\nevery = 1\nticks = 9"), "every 1 is no interval; give 2 or more"),
+        (("= 10", "= 10\nevery = 5"), "1 are too few for `every`; give at least 6"),
+        (
+            ("= 10", "= 10\nticks = 9\nevery = 5\nprobability = 0.5"),
+            "is a second answer to when it acts, beside `every`",
+        ),
+        (("= 10", "= 10\njitter_ticks = 2"), "fault[0].jitter_ticks: has no meaning for this kind; remove it"),
+        (("\"drop\"", "\"delay\"\ndelay_ticks = 3\njitter_ticks = 998"), "give 1 to 997"),
+        (("\"drop\"", "\"delay\"\ndelay_ticks = 3\ndistribution = \"normal\""), "give jitter_ticks, or remove it"),
+        (
+            ("\"drop\"", "\"delay\"\ndelay_ticks = 3\njitter_ticks = 4\ndistribution = \"normal\""),
+            "is missing for this distribution",
+        ),
+        (
+            ("\"drop\"", "\"delay\"\ndelay_ticks = 3\njitter_ticks = 4\nspread_ticks = 1.0"),
+            "has no meaning for a uniform distribution",
+        ),
+        (("\"drop\"", "\"miss\"\nbody = \"follower\""), "fault[0].body: has no meaning for this kind; remove it"),
+        (("= 10", "= 10\nticks = 99\nweakly_hard = { misses = 5, window = 5, pattern = \"burst\" }"), "give 1 to 4"),
+        (("= 10", "= 10\nticks = 99\nweakly_hard = { misses = 5, window = 65, pattern = \"burst\" }"), "give 2 to 64"),
+        (
+            ("= 10", "= 10\nticks = 99\nweakly_hard = { misses = 5, window = 9, pattern = \"random\" }"),
+            "give a number below 1",
+        ),
+        (
+            ("= 10", "= 10\nticks = 99\ngilbert_elliott = { good_to_bad = 0.0, bad_to_good = 0.1 }"),
+            "give a number above 0, up to 1",
+        ),
+        (
+            ("= 10", "= 10\nticks = 99\nevery = 3\ngilbert_elliott = { good_to_bad = 0.1, bad_to_good = 0.1 }"),
+            "beside `every`; give one",
+        ),
         (("\"drop\"", "\"delay\""), "fault[0].delay_ticks: is missing for this kind; add it"),
         (("\"drop\"", "\"delay\"\ndelay_ticks = 0"), "give 1 to 1000"),
         (("\"drop\"", "\"bit-flip\"\nbit = 64"), "a word has 64 bits"),

@@ -2,12 +2,15 @@
 //!
 //! Must refuse a fault that would do nothing, or something else than its author meant.
 
+mod occurrence;
+
 use super::nearest;
 use super::scenario::Checks;
 use crate::bus::Carried;
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
 use crate::rig::{AnyRig, Command, Estimate, FleetCommand, FleetMeasurement, Measurement, Rig};
 use crate::sample::FieldKind;
+use occurrence::{DistributionName, RawChannel, RawWeaklyHard};
 use serde::{Deserialize, Serialize};
 
 /// The most faults of one scenario.
@@ -46,6 +49,7 @@ pub(super) enum Kind {
     LostAxis,
     NoiseBurst,
     Stall,
+    Miss,
     Kill,
 }
 
@@ -62,6 +66,12 @@ pub(super) struct RawFault {
     #[serde(default = "always")]
     pub probability: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub every: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gilbert_elliott: Option<RawChannel>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weakly_hard: Option<RawWeaklyHard>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub component: Option<usize>,
@@ -73,6 +83,12 @@ pub(super) struct RawFault {
     pub deviation: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub delay_ticks: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub jitter_ticks: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub distribution: Option<DistributionName>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spread_ticks: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stall_ms: Option<f64>,
 }
@@ -127,14 +143,15 @@ impl One<'_, '_, '_> {
     fn resolve(mut self) -> Option<Vec<ScriptedFault>> {
         self.check_keys();
         self.check_time();
-        let bodies = self.bodies()?;
-        let RawFault { from_tick, ticks, probability, .. } = *self.raw;
+        let (bodies, occurrence) = (self.bodies(), self.occurrence());
+        let (bodies, occurrence) = (bodies?, occurrence?);
+        let RawFault { from_tick, ticks, .. } = *self.raw;
         let seed = fault::seed(self.setting.seed, self.number as u64);
         let mut faults = Vec::new();
         for (index, body) in (0..).zip(bodies) {
             // A fleet's samples have other fields than a single body's.
             let action = self.action(body.as_deref())?;
-            let fault = Fault { from_tick, ticks, probability, seed: fault::seed(seed, index), action };
+            let fault = Fault { from_tick, ticks, occurrence, seed: fault::seed(seed, index), action };
             faults.push(ScriptedFault { role: self.raw.role.clone(), body, fault });
         }
         Some(faults)
@@ -142,18 +159,21 @@ impl One<'_, '_, '_> {
 
     /// Keys that mean nothing for the kind, and such that it cannot do without.
     fn check_keys(&mut self) {
-        use Kind::{BitFlip, Delay, Freeze, Infinite, Kill, LostAxis, NoiseBurst, NotANumber, OutOfRange, Stall};
+        use Kind::{BitFlip, Delay, Freeze, Infinite, LostAxis, NoiseBurst, NotANumber, OutOfRange, Stall};
         let raw = self.raw;
         let of = |kinds: &[Kind]| kinds.contains(&raw.kind);
         let content = of(&[Freeze, NotANumber, Infinite, OutOfRange, BitFlip, NoiseBurst]);
         for (name, given, wanted, needed) in [
-            ("body", raw.body.is_some(), !of(&[Stall, Kill]), false),
+            ("body", raw.body.is_some(), !self.of_role(), false),
             ("field", raw.field.is_some(), content, false),
             ("component", raw.component.is_some(), content || of(&[LostAxis]), of(&[LostAxis])),
             ("value", raw.value.is_some(), of(&[OutOfRange]), of(&[OutOfRange])),
             ("bit", raw.bit.is_some(), of(&[BitFlip]), false),
             ("deviation", raw.deviation.is_some(), of(&[NoiseBurst]), of(&[NoiseBurst])),
             ("delay_ticks", raw.delay_ticks.is_some(), of(&[Delay]), of(&[Delay])),
+            ("jitter_ticks", raw.jitter_ticks.is_some(), of(&[Delay]), false),
+            ("distribution", raw.distribution.is_some(), of(&[Delay]), false),
+            ("spread_ticks", raw.spread_ticks.is_some(), of(&[Delay]), false),
             ("stall_ms", raw.stall_ms.is_some(), of(&[Stall]), of(&[Stall])),
         ] {
             self.require(wanted || !given, name, || "has no meaning for this kind; remove it".to_owned());
@@ -167,9 +187,6 @@ impl One<'_, '_, '_> {
             format!("{} is after the last tick {last_tick}; lower it or raise duration_s", raw.from_tick)
         });
         self.require(raw.ticks >= 1, "ticks", || "0 ticks are none; give at least 1, or remove the fault".to_owned());
-        self.require(raw.probability > 0.0 && raw.probability <= 1.0, "probability", || {
-            format!("{} is none with which anything happens; give a number above 0, up to 1", raw.probability)
-        });
         if raw.kind == Kind::Freeze {
             self.require(raw.from_tick >= 1, "from_tick", || {
                 "at tick 0 there is nothing to stay at; give 1 or more".into()
@@ -186,7 +203,7 @@ impl One<'_, '_, '_> {
         self.require(roles.contains(&&*raw.role), "role", || {
             format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
         })?;
-        if matches!(raw.kind, Kind::Stall | Kind::Kill) {
+        if self.of_role() {
             return Some(vec![None]);
         }
         if raw.role == "controller" {
@@ -213,13 +230,7 @@ impl One<'_, '_, '_> {
         Some(match raw.kind {
             Kind::Drop => Action::Transport(Transport::Drop),
             Kind::Duplicate => Action::Transport(Transport::Duplicate),
-            Kind::Delay => {
-                let ticks = raw.delay_ticks?;
-                self.require((1..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", || {
-                    format!("{ticks} is no delay that is kept; give 1 to {MAX_DELAY_TICKS}, or drop the sample")
-                })?;
-                Action::Transport(Transport::Delay { ticks })
-            }
+            Kind::Delay => Action::Transport(Transport::Delay(self.delay()?)),
             Kind::Stall => {
                 let ms = raw.stall_ms?;
                 self.require(ms > 0.0 && ms <= MAX_STALL_MS, "stall_ms", || {
@@ -228,6 +239,7 @@ impl One<'_, '_, '_> {
                 Action::Role(Interruption::Stall { ns: (ms * 1e6) as u64 })
             }
             Kind::Kill => Action::Role(Interruption::Kill),
+            Kind::Miss => Action::Role(Interruption::Miss),
             _ => {
                 let fields = self.setting.rig.face().fields(&raw.role, fleet);
                 Action::Content(self.tamper(&fields)?)

@@ -300,7 +300,7 @@ impl Accounting {
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
             rejected_samples: links.iter().map(|link| link.rejected).sum(),
             injected_faults: written.iter().map(|(_, link)| link.injected).sum::<u64>()
-                + reports.iter().map(|report| report.ticks.stalled).sum::<u64>(),
+                + reports.iter().map(|report| report.ticks.stalled + report.ticks.scripted).sum::<u64>(),
             roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
             links,
         }

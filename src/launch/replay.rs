@@ -11,7 +11,9 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::Scenario;
 use crate::record::{Comparer, Inlets, Limit, Outlets, Recording, RoleReplay, Script};
-use crate::runtime::{Backoff, RoleId, depths, scenario_path, shared_memory_bytes, topic, window_ticks, write_whole};
+use crate::runtime::{
+    Backoff, Interruptions, RoleId, depths, scenario_path, shared_memory_bytes, topic, window_ticks, write_whole,
+};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -32,7 +34,7 @@ pub fn replay_as_process(
     signal: &AtomicUsize,
 ) -> Result<RoleReplay, LaunchError> {
     let mut script = Script::read(recording, scenario, role)?;
-    cut(&mut script);
+    cut(&mut script, scenario);
     let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
     let domain = owned.domain();
     let path = scenario_path(domain);
@@ -61,11 +63,12 @@ pub fn replay_as_process(
 }
 
 /// What one process cannot do again is left out, and said.
-fn cut(script: &mut Script) {
+fn cut(script: &mut Script, scenario: &Scenario) {
     let plant = matches!(script.role, RoleId::Plant(_));
-    let mut next = 0;
+    // What a scripted fault took from it, that takes from it again.
+    let (mut next, mut interruptions) = (0, Interruptions::of(scenario, &script.name, 1, 0));
     let broken = script.steps.iter().find_map(|step| {
-        let missed = plant && step.tick > next;
+        let missed = plant && (next..step.tick).any(|tick| !interruptions.misses(tick));
         next = step.tick + 1;
         match (missed, step.generation) {
             (true, _) => Some((step.tick, "in lockstep a body cannot miss a tick; replay it without --processes")),

@@ -7,7 +7,7 @@ use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
-use crate::runtime::{AcceptedTicks, Input, Seek, topic};
+use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -360,6 +360,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
         // What no role uses is not scored either.
         let mut estimate =
             Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
+                .with_late(LateSamples::of(scenario, Signal::Estimate, &rig.bodies()[0].name))
                 .guarded(rig.estimate_guard());
         estimate.expect(crate::runtime::accepted_ticks(scenario, None));
         let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);

@@ -198,11 +198,13 @@ impl<'a> Comparer<'a> {
     /// Closes the comparison of a role up to the step `last`: what is recorded and did not come is a difference too.
     pub fn finish(mut self, script: &Script, steps: &[Step], limit: Option<Limit>) -> RoleReplay {
         let end = limit.as_ref().map_or(u64::MAX, |limit| limit.tick);
+        // Behind the last step nothing is sent any more, late or not.
+        let sent_before = end.min(steps.last().map_or(0, |step| step.tick + 1));
         for (output, track) in self.tracks.iter().enumerate() {
             if let Some(index) = (self.next[output]..track.len()).find(|index| self.counts(&track.stamp(*index))) {
                 let tick = track.stamp(index).tick;
                 // One that a fault delayed may have been sent behind the end.
-                if tick.saturating_add(script.late_ticks) < end {
+                if tick.saturating_add(script.late_ticks) < sent_before {
                     self.differ(tick, track, None, "a sample".to_owned(), "nothing".to_owned());
                 }
             }

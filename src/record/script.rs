@@ -11,7 +11,7 @@ use super::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
 use crate::clock::Grid;
 use crate::config::{ClockKind, Scenario, ScriptedFault};
-use crate::fault::{Action, Change, Tamper, Transport};
+use crate::fault::{Action, Change, Course, Interruption, Tamper, Transport};
 use crate::runtime::{Port, RoleId, ports};
 use crate::sample::{Stamp, VOID, status};
 use crate::telemetry::Ticks;
@@ -121,13 +121,21 @@ impl Script {
         let (inputs, outputs) = (take(&reads), take(&writes));
         let realtime = recording.info().clock == ClockKind::Realtime.name();
         let grid = Grid { epoch_ns: recording.info().epoch_ns, period_ns: recording.info().period_ns.max(1) };
+        let first = |track: &Track| {
+            let mut firsts = BTreeMap::new();
+            let all = if realtime { track.len() } else { 0 };
+            (0..all).for_each(|index| _ = firsts.entry(track.stamp(index).tick).or_insert(index));
+            firsts
+        };
         let mut reading = Reading {
             recording,
             scenario,
             role,
             grid,
             inputs: inputs.into_iter().map(Source::new).collect(),
+            firsts: outputs.iter().map(first).collect(),
             outputs,
+            scripted: Acting::of(scenario, role.name(scenario)),
             limit: None,
         };
         if !recording.info().whole {
@@ -141,7 +149,7 @@ impl Script {
         let Reading { outputs, limit, .. } = reading;
         let name = role.name(scenario).to_owned();
         let late = |scripted: &ScriptedFault| match scripted.fault.action {
-            Action::Transport(Transport::Delay { ticks }) if scripted.role == name => Some(ticks),
+            Action::Transport(Transport::Delay(delay)) if scripted.role == name => Some(delay.bound()),
             _ => None,
         };
         let late_ticks = scenario.faults.iter().filter_map(late).max().unwrap_or(0);
@@ -189,7 +197,35 @@ struct Reading<'a> {
     grid: Grid,
     inputs: Vec<Source>,
     outputs: Vec<Track>,
+    /// In real time, per output, the first sample of each tick: a fault may have put them into another order.
+    firsts: Vec<BTreeMap<u64, usize>>,
+    /// What the scenario does to the role, and when.
+    scripted: Vec<Acting<'a>>,
     limit: Option<Limit>,
+}
+
+/// A scripted fault, and the ticks up to the last at which it acts, by bits from its first on.
+struct Acting<'a> {
+    scripted: &'a ScriptedFault,
+    bits: Vec<u64>,
+}
+
+impl<'a> Acting<'a> {
+    fn of(scenario: &'a Scenario, role: &str) -> Vec<Self> {
+        let acting = |scripted: &'a ScriptedFault| {
+            let (mut course, from) = (Course::new(scripted.fault.clone()), scripted.fault.from_tick);
+            let ticks = scripted.fault.ticks.min((scenario.last_tick + 1).saturating_sub(from));
+            let mut bits = vec![0; ticks.div_ceil(64) as usize];
+            (0..ticks).filter(|at| course.acts(from + at)).for_each(|at| bits[(at / 64) as usize] |= 1 << (at % 64));
+            Self { scripted, bits }
+        };
+        scenario.faults.iter().filter(|scripted| scripted.role == role).map(acting).collect()
+    }
+
+    fn at(&self, tick: u64) -> bool {
+        let at = tick.checked_sub(self.scripted.fault.from_tick);
+        at.is_some_and(|at| self.bits.get((at / 64) as usize).is_some_and(|word| word >> (at % 64) & 1 == 1))
+    }
 }
 
 impl Reading<'_> {
@@ -212,12 +248,18 @@ impl Reading<'_> {
     }
 
     fn touched(&self, output: &Track, tick: u64, by: impl Fn(&Action) -> bool) -> bool {
-        let name = self.role.name(self.scenario);
         let here = |body: &Option<String>| body.as_ref() == Some(&output.info.body);
         output.info.signal != "truth"
-            && self.scenario.faults.iter().any(|scripted| {
-                scripted.role == name && here(&scripted.body) && by(&scripted.fault.action) && scripted.fault.acts(tick)
+            && self.scripted.iter().any(|acting| {
+                let ScriptedFault { body, fault, .. } = acting.scripted;
+                here(body) && by(&fault.action) && acting.at(tick)
             })
+    }
+
+    /// Whether a scripted fault has taken the tick from the role.
+    fn taken(&self, tick: u64) -> bool {
+        let miss = Action::Role(Interruption::Miss);
+        self.scripted.iter().any(|acting| acting.scripted.fault.action == miss && acting.at(tick))
     }
 
     /// Lockstep: every tick, in as many lives as the generations tell.
@@ -329,7 +371,7 @@ impl Reading<'_> {
                 withheld.extend(first.by_tick.keys().filter(|tick| self.disturbed(output, **tick)));
             }
         }
-        withheld.retain(|tick| !ticks.contains_key(tick));
+        withheld.retain(|tick| !ticks.contains_key(tick) && !self.taken(*tick));
         self.unfinished(&mut ticks);
         if let Some(first) = withheld.first().filter(|_| !self.executed_all(&ticks, withheld.len() as u64)) {
             let first = *first;
@@ -421,9 +463,8 @@ impl Reading<'_> {
                     (None, _) => true,
                     (Some(ticks), _) => ticks.binary_search(&step.tick).is_ok(),
                 };
-                let withheld = |output: usize| {
-                    self.outputs.get(output).is_some_and(|output| first_of(output, step.tick).is_none())
-                };
+                let withheld =
+                    |output: usize| self.firsts.get(output).is_some_and(|firsts| !firsts.contains_key(&step.tick));
                 if used && starves && told_by.is_some_and(withheld) {
                     self.limit(step.tick, || {
                         "a fault kept a sample back, and nothing tells whether its input was there".to_owned()
@@ -455,7 +496,7 @@ impl Reading<'_> {
         let stamps = (0..output.len()).map(|index| output.stamp(index)).filter(|stamp| self.possible(stamp));
         let mut ticks: Vec<u64> = stamps.map(|stamp| stamp.tick).collect();
         let last = self.scenario.last_tick;
-        let faults = self.scenario.faults.iter().map(|scripted| &scripted.fault);
+        let faults = self.scripted.iter().map(|acting| &acting.scripted.fault);
         let touched =
             faults.flat_map(|fault| fault.from_tick..fault.from_tick.saturating_add(fault.ticks).min(last + 1));
         ticks.extend(touched.filter(|tick| self.disturbed(output, *tick)));
@@ -467,8 +508,10 @@ impl Reading<'_> {
     /// Whether a body applied the command that was due at a tick, or had one that it did not believe. Its truth says so, or,
     /// where it died before that, its measurement.
     fn applied(&self, tick: u64) -> bool {
-        let status = |output: &Track| first_of(output, tick).and_then(|index| output.unsigned(index, "status"));
-        let word = self.outputs.iter().rev().find_map(status);
+        let status = |(output, firsts): (&Track, &BTreeMap<u64, usize>)| {
+            firsts.get(&tick).and_then(|index| output.unsigned(*index, "status"))
+        };
+        let word = self.outputs.iter().zip(&self.firsts).rev().find_map(status);
         word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
     }
 
@@ -497,14 +540,4 @@ impl Reading<'_> {
             self.limit(tick, || format!("{count} samples of {service} are not in the recording"));
         }
     }
-}
-
-/// The first sample of a tick: a track is in the order of its ticks but for what a fault has touched.
-fn first_of(track: &Track, tick: u64) -> Option<usize> {
-    let (mut low, mut high) = (0, track.len());
-    while low < high {
-        let middle = low + (high - low) / 2;
-        if track.stamp(middle).tick < tick { low = middle + 1 } else { high = middle }
-    }
-    (low < track.len() && track.stamp(low).tick == tick).then_some(low)
 }

@@ -2,10 +2,10 @@
 //!
 //! Must cost an undisturbed role nothing but one look whether there is anything to do.
 
-use crate::bus::Carried;
+use crate::bus::{Carried, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario, ScriptedFault};
-use crate::fault::{Action, Change, Fault, Interruption, Transport};
+use crate::fault::{Action, Change, Course, Fault, Interruption, Transport, Way};
 use crate::state::{Persist, Words};
 use crate::telemetry::TickCounters;
 use std::borrow::{Borrow, BorrowMut};
@@ -13,7 +13,7 @@ use std::borrow::{Borrow, BorrowMut};
 /// What happens to the samples of one signal.
 #[derive(Debug)]
 pub struct Disturbance<S: Carried + ?Sized> {
-    faults: Vec<Fault>,
+    faults: Vec<Course>,
     /// Samples that are held back, each with the tick at which it is sent, in the order in which they are sent. As much room
     /// as can ever be needed is taken at the start.
     late: Vec<(u64, S::Owned)>,
@@ -23,34 +23,28 @@ pub struct Disturbance<S: Carried + ?Sized> {
 }
 
 impl<S: Carried + ?Sized> Disturbance<S> {
-    /// What a scenario does to a role's signal about a body, or a fleet of so many; nothing if there is nothing.
-    pub fn of(scenario: &Scenario, role: &str, body: &str, bodies: usize) -> Option<Box<Self>> {
-        let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == Some(body);
-        Self::new(scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect(), bodies)
+    /// What a scenario does to a role's signal about a body, or a fleet of so many, from a tick on; nothing if there is
+    /// nothing.
+    pub fn of(scenario: &Scenario, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
+        Self::new(courses(scenario, role, Some(body), next_tick), bodies)
     }
 
-    fn new(faults: Vec<Fault>, bodies: usize) -> Option<Box<Self>> {
-        let kept = |fault: &Fault| match fault.action {
-            Action::Transport(Transport::Delay { ticks }) => ticks.min(fault.ticks) as usize,
-            _ => 0,
-        };
+    fn new(faults: Vec<Course>, bodies: usize) -> Option<Box<Self>> {
+        let kept = |course: &Course| delay_bound(course.fault()).min(course.fault().ticks) as usize;
         // One is added before those that are due are let go.
         let room = faults.iter().map(kept).sum::<usize>() + 1;
         (!faults.is_empty()).then(|| Box::new(Self { faults, late: Vec::with_capacity(room), room, bodies }))
     }
 
     /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
-    pub fn tamper(&self, tick: u64, sample: &mut S, last: &S) -> bool {
-        let acting = self.faults.iter().filter(|fault| fault.tampers() && fault.acts(tick));
-        acting.map(|fault| fault.tamper(tick, sample, last)).count() > 0
+    pub fn tamper(&mut self, tick: u64, sample: &mut S, last: &S) -> bool {
+        let acting = self.faults.iter_mut().filter_map(|course| course.acts(tick).then_some(course.fault()));
+        acting.filter(|fault| fault.tampers()).map(|fault| fault.tamper(tick, sample, last)).count() > 0
     }
 
     /// What happens to the sample of `tick` on its way: of several faults, what the first says.
-    pub fn way(&self, tick: u64) -> Option<Transport> {
-        self.faults.iter().find_map(|fault| match fault.action {
-            Action::Transport(transport) if fault.acts(tick) => Some(transport),
-            _ => None,
-        })
+    pub fn way(&mut self, tick: u64) -> Option<Way> {
+        way(&mut self.faults, tick)
     }
 
     /// A sample to be disturbed.
@@ -95,6 +89,59 @@ impl<S: Carried + ?Sized> Persist for Disturbance<S> {
     }
 }
 
+/// What a scenario does to a role (`body` none) or to its signal about a body. What a predecessor has passed is decided here,
+/// and not at its successor's first tick.
+fn courses(scenario: &Scenario, role: &str, body: Option<&str>, next_tick: u64) -> Vec<Course> {
+    let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == body;
+    let course = |scripted: &ScriptedFault| {
+        let mut course = Course::new(scripted.fault.clone());
+        if let Some(last) = next_tick.checked_sub(1) {
+            course.acts(last);
+        }
+        course
+    };
+    scenario.faults.iter().filter(here).map(course).collect()
+}
+
+fn way(faults: &mut [Course], tick: u64) -> Option<Way> {
+    faults.iter_mut().find_map(|course| course.fault().way(tick).filter(|_| course.acts(tick)))
+}
+
+/// Which samples of a signal are late because a scripted fault says so. Where there are no voids, a reader knows by it that
+/// they are, however soon after their tick it looks: what is late is so by the script, not by who was faster.
+#[derive(Debug)]
+pub struct LateSamples(Vec<Course>);
+
+impl LateSamples {
+    /// Those of a signal about a body; nothing if there are none that a reader could take for samples in time.
+    pub fn of(scenario: &Scenario, signal: Signal, body: &str) -> Option<Box<Self>> {
+        let role = match signal {
+            Signal::Measurement => body,
+            Signal::Estimate => "observer",
+            Signal::Command => "controller",
+            _ => return None,
+        };
+        let faults = courses(scenario, role, Some(body), 0);
+        let late = scenario.clock == ClockKind::Realtime && faults.iter().any(|course| delay_bound(course.fault()) > 0);
+        late.then(|| Box::new(Self(faults)))
+    }
+
+    /// Whether that of a tick is.
+    pub fn contains(&mut self, tick: u64) -> bool {
+        matches!(way(&mut self.0, tick), Some(Way::Late(_)))
+    }
+}
+
+/// By how many ticks a fault sends a sample late, at the most.
+fn delay_bound(fault: &Fault) -> u64 {
+    if let Action::Transport(Transport::Delay(delay)) = fault.action { delay.bound() } else { 0 }
+}
+
+/// How many late samples may come at once on a signal of a scenario, at the most.
+pub fn late_samples(scenario: &Scenario) -> usize {
+    scenario.faults.iter().map(|scripted| delay_bound(&scripted.fault) as usize).sum()
+}
+
 /// How many samples per tick a signal of a scenario may carry beyond the one that is its own.
 pub fn extra_samples(scenario: &Scenario) -> usize {
     let extra = |scripted: &&ScriptedFault| match scripted.fault.action {
@@ -118,7 +165,7 @@ struct InjectedFaults {
 /// What happens to a role before its ticks.
 #[derive(Debug)]
 pub struct Interruptions {
-    faults: Vec<Fault>,
+    faults: Vec<Course>,
     first_life: bool,
     /// Whether the role is a process, which can be killed.
     process: bool,
@@ -127,12 +174,23 @@ pub struct Interruptions {
 }
 
 impl Interruptions {
-    /// What a scenario does to a role in this generation of it.
-    pub fn of(scenario: &Scenario, role: &str, generation: u64) -> Self {
-        let here = |fault: &&ScriptedFault| fault.role == role && fault.body.is_none();
-        let faults = scenario.faults.iter().filter(here).map(|scripted| scripted.fault.clone()).collect();
+    /// What a scenario does to a role in this generation of it, from a tick on.
+    pub fn of(scenario: &Scenario, role: &str, generation: u64, next_tick: u64) -> Self {
         let process = scenario.clock != ClockKind::InProcess;
+        let faults = courses(scenario, role, None, next_tick);
         Self { faults, first_life: generation == 1, process, next: 0 }
+    }
+
+    /// Whether the role is not to execute this tick, whatever is there for it.
+    #[inline]
+    pub fn misses(&mut self, tick: u64) -> bool {
+        !self.faults.is_empty() && self.scripts_miss(tick)
+    }
+
+    #[cold]
+    fn scripts_miss(&mut self, tick: u64) -> bool {
+        let miss = Action::Role(Interruption::Miss);
+        self.faults.iter_mut().any(|course| course.fault().action == miss && course.acts(tick))
     }
 
     /// Acts before the next tick of a role, once, and enters it into the role's counters; true if the role's life is over.
@@ -152,8 +210,10 @@ impl Interruptions {
     fn act(&mut self, tick: u64) -> InjectedFaults {
         self.next = tick + 1;
         let mut injected = InjectedFaults::default();
-        for fault in self.faults.iter().filter(|fault| fault.acts(tick)) {
-            match fault.action {
+        for course in &mut self.faults {
+            let acts = course.acts(tick);
+            match course.fault().action {
+                _ if !acts => {}
                 Action::Role(Interruption::Stall { ns }) => {
                     stall(ns);
                     injected.stalls += 1;
@@ -188,15 +248,16 @@ fn kill() {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fault::{Delay, Distribution, Occurrence};
     use crate::sample::RateCommand;
 
-    fn fault(from_tick: u64, ticks: u64, action: Action) -> Fault {
-        Fault { from_tick, ticks, probability: 1.0, seed: 1, action }
+    fn fault(from_tick: u64, ticks: u64, action: Action) -> Course {
+        Course::new(Fault { from_tick, ticks, occurrence: Occurrence::Independent(1.0), seed: 1, action })
     }
 
     #[test]
     fn what_is_kept_comes_in_order_when_it_is_due_and_takes_no_memory_on_the_way() {
-        let delay = Action::Transport(Transport::Delay { ticks: 3 });
+        let delay = Action::Transport(Transport::Delay(Delay::constant(3)));
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)], 1).unwrap();
         let room = disturbance.late.capacity();
         assert_eq!(room, 3 + 1);
@@ -205,7 +266,7 @@ mod tests {
             let sent = (0..due).map(|index| disturbance.late(index).unwrap().stamp.tick).collect::<Vec<_>>();
             disturbance.forget(due);
             assert_eq!(sent, if tick < 8 { vec![] } else { vec![tick - 3] });
-            assert_eq!(disturbance.way(tick), Some(Transport::Delay { ticks: 3 }));
+            assert_eq!(disturbance.way(tick), Some(Way::Late(3)));
             let mut sample = RateCommand::default();
             sample.stamp.tick = tick;
             disturbance.keep(tick + 3, &sample);
@@ -213,12 +274,46 @@ mod tests {
         assert_eq!((disturbance.way(105), disturbance.late.capacity()), (None, room));
     }
 
+    /// Whatever is drawn, what is late finds room, and comes when it is due.
+    #[test]
+    fn samples_that_overtake_one_another_take_no_memory_on_the_way() {
+        let delay = Delay { ticks: 0, jitter_ticks: 7, distribution: Distribution::Uniform };
+        let delay = Action::Transport(Transport::Delay(delay));
+        let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 500, delay)], 1).unwrap();
+        let (room, mut overtaken, mut at_once, mut come) = (disturbance.late.capacity(), 0, 0, Vec::new());
+        for tick in 5..520_u64 {
+            let due = disturbance.due(tick);
+            at_once = at_once.max(due);
+            for index in 0..due {
+                let sent = disturbance.late(index).unwrap().stamp.tick;
+                overtaken += u64::from(come.last().is_some_and(|last| *last > sent));
+                come.push(sent);
+            }
+            disturbance.forget(due);
+            match disturbance.way(tick) {
+                Some(Way::Late(ticks)) => {
+                    let mut sample = RateCommand::default();
+                    sample.stamp.tick = tick;
+                    disturbance.keep(tick + ticks, &sample);
+                }
+                way => {
+                    assert_eq!(way, None);
+                    come.push(tick);
+                }
+            }
+        }
+        assert!(overtaken > 50 && at_once > 2, "{overtaken} {at_once}");
+        assert_eq!((disturbance.late.len(), disturbance.late.capacity()), (0, room));
+        come.sort_unstable();
+        assert_eq!(come, (5..520).collect::<Vec<_>>(), "each once");
+    }
+
     #[test]
     fn of_several_faults_the_first_decides_the_way() {
         let [drop, twice] = [Transport::Drop, Transport::Duplicate].map(Action::Transport);
-        let disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)], 1).unwrap();
+        let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)], 1).unwrap();
         let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.way(tick));
-        let (drop, twice) = (Some(Transport::Drop), Some(Transport::Duplicate));
+        let (drop, twice) = (Some(Way::Dropped), Some(Way::Twice));
         assert_eq!(ways, [None, twice, twice, drop, None]);
         assert!(Disturbance::<RateCommand>::new(Vec::new(), 1).is_none());
     }

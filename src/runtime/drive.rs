@@ -277,8 +277,11 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         let mut backoff = Backoff::default();
         while node.next_tick() <= self.last_tick {
             node.before_tick();
-            if node.poll(RunCondition::Inputs { up_to })? == Poll::Executed {
+            let polled = node.poll(RunCondition::Inputs { up_to })?;
+            if polled == Poll::Executed {
                 node.finish_tick()?;
+            }
+            if polled != Poll::Waiting {
                 backoff = Backoff::default();
                 if !node.next_tick().is_multiple_of(TURN_TICKS) {
                     continue;

@@ -17,7 +17,7 @@ mod seat;
 
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use compute::{Compute, ComputedTick};
-pub use disturb::{Disturbance, Interruptions};
+pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 pub use link::{AcceptedTicks, Input, Output, Seek};
@@ -65,12 +65,14 @@ pub fn depths(scenario: &Scenario) -> Depths {
     match scenario.clock {
         ClockKind::Realtime => {
             let fits = longest_sample(scenario).map_or(usize::MAX, |bytes| (SCORED_BYTES / bytes).max(8));
-            Depths { role: 1, scorer: quarter_second.clamp(64, 8192).min(fits), history: 0 }
+            let late = disturb::late_samples(scenario);
+            Depths { role: 1, scorer: quarter_second.clamp(64, 8192).min(fits) + late, history: 0 }
         }
         // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever
         // scripted faults add.
         ClockKind::Lockstep | ClockKind::InProcess => {
-            let deep = (2 + disturb::extra_samples(scenario)) * window_ticks(scenario) as usize;
+            let extra = disturb::extra_samples(scenario);
+            let deep = (2 + extra) * window_ticks(scenario) as usize + disturb::late_samples(scenario);
             Depths { role: deep, scorer: deep, history: deep }
         }
     }

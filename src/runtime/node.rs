@@ -16,7 +16,7 @@ pub use role_id::{RoleId, RoleImpl};
 
 use super::bridge::DeviceError;
 use super::compute::Computing;
-use super::disturb::{Disturbance, Interruptions};
+use super::disturb::{Disturbance, Interruptions, LateSamples};
 use super::hooks::{self, Failpoint};
 use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
 use crate::bus::iox::{COMMON_BYTES, footprint};
@@ -250,6 +250,7 @@ impl<B: Bus> Seat<'_, B> {
         let topic = topic(self.scenario, &body.name, signal);
         let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?
             .inheriting(self.kept(&topic), body.bodies())
+            .with_late(LateSamples::of(self.scenario, signal, &body.name))
             .guarded(guard);
         input.expect(accepted_ticks(self.scenario, None));
         Ok(input)
@@ -279,7 +280,10 @@ impl<B: Bus> Seat<'_, B> {
         // Nobody in the loop reads the truth, and the score is to tell what really happened.
         let disturbance = match signal {
             Signal::Truth => None,
-            _ => Disturbance::of(self.scenario, self.role.name(self.scenario), &body.name, bodies),
+            _ => {
+                let role = self.role.name(self.scenario);
+                Disturbance::of(self.scenario, role, &body.name, bodies, next_tick(&self.ledger))
+            }
         };
         // In a process with others whoever has a short way is served at once, and all others when the tick is done.
         let alone = self.role.host(self.scenario).hosted(self.scenario).len() == 1;
@@ -288,7 +292,8 @@ impl<B: Bus> Seat<'_, B> {
     }
 
     fn interruptions(&self) -> Interruptions {
-        Interruptions::of(self.scenario, self.role.name(self.scenario), self.generation)
+        let role = self.role.name(self.scenario);
+        Interruptions::of(self.scenario, role, self.generation, next_tick(&self.ledger))
     }
 }
 

@@ -16,11 +16,12 @@ pub struct TickCounters {
     starved: u64,
     safe: u64,
     stalled: u64,
+    scripted: u64,
     anew: u64,
     first_disturbed: Option<u64>,
 }
 
-persist_fields!(TickCounters, next, executed, missed, starved, safe, stalled, anew, first_disturbed);
+persist_fields!(TickCounters, next, executed, missed, starved, safe, stalled, scripted, anew, first_disturbed);
 
 impl TickCounters {
     /// The next tick to execute.
@@ -67,6 +68,12 @@ impl TickCounters {
         self.stalled += stalls;
     }
 
+    /// Counts the next tick as missed, because a scripted fault takes it or for want of inputs.
+    pub fn pass(&mut self, scripted: bool) {
+        self.scripted += u64::from(scripted);
+        self.skip_to(self.next + 1);
+    }
+
     /// Counts a life that began without the state of the one before: nothing from here on is as it would have been.
     pub fn began_anew(&mut self) {
         self.anew += 1;
@@ -87,6 +94,7 @@ impl TickCounters {
             starved: self.starved,
             safe: self.safe,
             stalled: self.stalled,
+            scripted: self.scripted,
             anew: self.anew,
             first_disturbed: self.first_disturbed,
         }

@@ -72,6 +72,9 @@ pub struct Ticks {
     /// Scripted stalls.
     #[serde(default)]
     pub stalled: u64,
+    /// Of the missed ticks, those that a scripted fault took.
+    #[serde(default)]
+    pub scripted: u64,
     /// Lives that began without the state of the one before.
     #[serde(default)]
     pub anew: u64,

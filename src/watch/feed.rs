@@ -381,9 +381,10 @@ fn word(fault: &Fault) -> &'static str {
         Action::Content(_) => "a wrong sample",
         Action::Transport(Transport::Drop) => "a dropped sample",
         Action::Transport(Transport::Duplicate) => "a sample sent twice",
-        Action::Transport(Transport::Delay { .. }) => "a late sample",
+        Action::Transport(Transport::Delay(_)) => "a late sample",
         Action::Role(Interruption::Stall { .. }) => "a stall",
         Action::Role(Interruption::Kill) => "a kill",
+        Action::Role(Interruption::Miss) => "missed ticks",
     }
 }
 

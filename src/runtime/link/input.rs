@@ -7,6 +7,7 @@ use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
 use crate::role::{Guard, Unguarded};
+use crate::runtime::disturb::LateSamples;
 use crate::sample::{Stamp, VOID};
 use crate::state::{Persist, Words};
 use crate::telemetry::ReadCounters;
@@ -61,6 +62,7 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
     /// Whether what arrives may be what a predecessor of this end has counted already.
     pub(super) repeated: bool,
     inheritance: Option<Inheritance<S>>,
+    late: Option<Box<LateSamples>>,
     counters: ReadCounters,
 }
 
@@ -93,14 +95,20 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
             doubted: None,
             repeated: false,
             inheritance: None,
+            late: None,
             counters: ReadCounters::default(),
         })
     }
 
     /// The same with a guard.
     pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
-        let Self { port, accepted_ticks, last, newest, doubted, repeated, inheritance, counters, .. } = self;
-        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, inheritance, counters }
+        let Self { port, accepted_ticks, last, newest, doubted, repeated, inheritance, late, counters, .. } = self;
+        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, inheritance, late, counters }
+    }
+
+    /// The same where a scripted fault sends samples late.
+    pub fn with_late(self, late: Option<Box<LateSamples>>) -> Self {
+        Self { late, ..self }
     }
 
     /// The same for a successor, with what the writer of a signal of so many bodies has kept.
@@ -196,6 +204,10 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             } else if generation == known {
                 self.counters.stale();
             }
+            return Newest::None;
+        }
+        if self.late.as_mut().is_some_and(|late| late.contains(stamp.tick)) {
+            self.counters.stale();
             return Newest::None;
         }
         // What is inherited may come once more, by the link.

@@ -6,7 +6,7 @@
 
 use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
-use crate::fault::Transport;
+use crate::fault::Way;
 use crate::runtime::disturb::Disturbance;
 use crate::runtime::hooks::{self, Failpoint};
 use crate::sample::{Stamp, VOID};
@@ -180,14 +180,14 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let late = disturbance.due(stamp.tick);
         // A sample with a broken stamp goes out as it is, but not as the one of its tick.
         let sound = (sample.stamp().tick, sample.stamp().generation) == (stamp.tick, stamp.generation);
-        let delivered = sound && !matches!(way, Some(Transport::Drop | Transport::Delay { .. }));
+        let delivered = sound && !matches!(way, Some(Way::Dropped | Way::Late(_)));
         let copies = match way {
-            Some(Transport::Drop) => 0,
-            Some(Transport::Delay { ticks }) => {
+            Some(Way::Dropped) => 0,
+            Some(Way::Late(ticks)) => {
                 disturbance.keep(stamp.tick + ticks, sample);
                 0
             }
-            Some(Transport::Duplicate) => 2,
+            Some(Way::Twice) => 2,
             None => 1,
         };
         self.counters.extra(late + copies - u64::from(delivered));

@@ -170,6 +170,19 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         Ok(Poll::Executed)
     }
 
+    /// Does not execute the next tick, as a scripted fault has it: the device is not asked, and has missed it too.
+    #[cold]
+    fn miss(&mut self) -> Result<Poll, NodeError> {
+        let tick = self.counters.next();
+        self.measurement.stage_void(tick);
+        self.truth.stage_void(tick);
+        self.counters.pass(true);
+        commit(self);
+        self.measurement.dispatch()?;
+        self.finish_tick()?;
+        Ok(Poll::Missed)
+    }
+
     /// The period is over for this tick.
     fn give_up(&mut self) -> Poll {
         self.link.give_up();
@@ -220,6 +233,9 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         match condition {
             RunCondition::Inputs { up_to } => {
                 if !self.asked && self.counters.next() <= up_to && self.inputs_ready()? {
+                    if self.interruptions.misses(self.counters.next()) {
+                        return self.miss();
+                    }
                     self.ask(monotonic_ns())?;
                 }
             }
@@ -229,6 +245,9 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
                     return Ok(Poll::Waiting);
                 }
                 self.lateness.record(self.grid.due_ns(tick), now_ns);
+                if self.interruptions.misses(self.counters.next()) {
+                    return self.miss();
+                }
                 self.ask(now_ns)?;
             }
             RunCondition::Arrived | RunCondition::Overdue => {}

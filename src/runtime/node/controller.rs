@@ -71,7 +71,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         self.measurement.sample().filter(|_| self.ready).map(Message::words)
     }
 
-    /// There is no estimate for this tick, and so there is no command.
+    /// There is no command for this tick.
     fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
         // What is not used now will never be, and must not fill the link.
         self.measurement.seek(tick)?;
@@ -258,14 +258,28 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     fn pass_over(&mut self) -> Result<(), NodeError> {
         let next = self.counters.next();
         for tick in next..=self.estimate.last_tick().unwrap_or(next) {
-            self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
-            self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
-            self.skip_to(tick + 1);
-            commit(self);
-            self.dispatch()?;
-            self.finish_commands()?;
+            self.counters.pass(self.interruptions.misses(tick));
+            self.send_nothing(tick)?;
         }
         Ok(())
+    }
+
+    /// Does not execute a tick, as a scripted fault has it, nor those before it.
+    #[cold]
+    fn miss(&mut self, tick: u64) -> Result<Poll, NodeError> {
+        self.skip_to(tick);
+        self.counters.pass(true);
+        self.send_nothing(tick)?;
+        Ok(Poll::Missed)
+    }
+
+    /// Says that there are no commands of a tick, where somebody waits for them.
+    fn send_nothing(&mut self, tick: u64) -> Result<(), NodeError> {
+        self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
+        self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
+        commit(self);
+        self.dispatch()?;
+        self.finish_commands()
     }
 
     /// Sends the commands that are staged.
@@ -314,6 +328,11 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn execute(&mut self) -> Result<Poll, NodeError> {
         self.received_ns = self.clock.now_ns();
+        if let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick)
+            && self.interruptions.misses(tick)
+        {
+            return self.miss(tick);
+        }
         if self.watchdog.active() {
             self.watch();
         }
@@ -390,7 +409,12 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     #[inline]
     fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
-        let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
+        let inputs = if let RunCondition::Inputs { up_to } = condition { Some(up_to) } else { None };
+        let allowed = inputs.is_none_or(|up_to| self.counters.next() <= up_to);
+        // In real time nobody waits for what is not used.
+        if inputs.is_none() && self.interruptions.misses(self.counters.next()) {
+            return self.miss(self.counters.next());
+        }
         if allowed && self.gather(condition == RunCondition::Overdue)? { self.execute() } else { Ok(Poll::Waiting) }
     }
 

@@ -54,10 +54,12 @@ impl GroupNode {
     fn poll_in_turn(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let mut polled = Poll::Waiting;
         for Member { node, .. } in &mut self.members {
-            if node.poll(condition)? == Poll::Executed {
-                node.finish_tick()?;
-                polled = Poll::Executed;
+            match node.poll(condition)? {
+                Poll::Executed => node.finish_tick()?,
+                Poll::Missed => {}
+                Poll::Waiting => continue,
             }
+            polled = Poll::Executed;
         }
         Ok(polled)
     }

@@ -65,6 +65,9 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let received = self.clock.now_ns();
         let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
         let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
+        if self.interruptions.misses(stamp.tick) {
+            return self.miss(stamp.tick);
+        }
         if let Some(computing) = &mut self.computing {
             computing.tick(stamp.tick, &[measurement.map(Message::words)])?;
         }
@@ -94,13 +97,26 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     fn pass_over(&mut self) -> Result<Poll, NodeError> {
         let next = self.counters.next();
         for tick in next..=self.measurement.last_tick().unwrap_or(next) {
-            self.estimate.stage_void(tick);
-            self.skip_to(tick + 1);
-            commit(self);
-            self.estimate.dispatch()?;
-            self.estimate.finish()?;
+            self.counters.pass(self.interruptions.misses(tick));
+            self.send_void(tick)?;
         }
         Ok(Poll::Waiting)
+    }
+
+    /// Does not execute a tick, as a scripted fault has it, nor those before it.
+    #[cold]
+    fn miss(&mut self, tick: u64) -> Result<Poll, NodeError> {
+        self.skip_to(tick);
+        self.counters.pass(true);
+        self.send_void(tick)?;
+        Ok(Poll::Missed)
+    }
+
+    fn send_void(&mut self, tick: u64) -> Result<(), NodeError> {
+        self.estimate.stage_void(tick);
+        commit(self);
+        self.estimate.dispatch()?;
+        Ok(self.estimate.finish()?)
     }
 }
 
@@ -138,7 +154,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     #[inline]
     fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
-        let allowed = !matches!(condition, RunCondition::Inputs { up_to } if self.counters.next() > up_to);
+        let inputs = if let RunCondition::Inputs { up_to } = condition { Some(up_to) } else { None };
+        let allowed = inputs.is_none_or(|up_to| self.counters.next() <= up_to);
+        // In real time nobody waits for what is not used.
+        if inputs.is_none() && self.interruptions.misses(self.counters.next()) {
+            return self.miss(self.counters.next());
+        }
         let there = allowed && self.measurement.seek(self.counters.next())? != Seek::NotYet;
         if there { self.execute() } else { Ok(Poll::Waiting) }
     }

@@ -36,6 +36,8 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
     unfinished: Option<u64>,
+    /// So many ticks up to the next were missed: the body moves over them by itself, at once, before it is looked at again.
+    behind: u64,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -67,6 +69,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             computing,
             inherited: Inherited::Nothing,
             unfinished: None,
+            behind: 0,
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -92,13 +95,36 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     fn take_over(&mut self) -> Result<(), NodeError> {
         self.measurement.dispatch()?;
         self.measurement.finish()?;
-        if let Some(tick) = self.unfinished.take() {
+        let unfinished = self.unfinished.take();
+        if let Some(tick) = unfinished {
             self.stage_truth(tick)?;
-            self.truth.dispatch_rest()?;
-            self.truth.finish()?;
-            self.plant.advance(1);
         }
+        self.truth.dispatch_rest()?;
+        self.truth.finish()?;
+        self.plant.advance(u64::from(unfinished.is_some()));
         Ok(())
+    }
+
+    /// Does not execute the next tick, as a scripted fault has it: no samples, no command, and the body moves by itself.
+    #[cold]
+    fn miss(&mut self) -> Result<Poll, NodeError> {
+        let tick = self.counters.next();
+        self.measurement.stage_void(tick);
+        self.truth.stage_void(tick);
+        self.counters.pass(true);
+        self.behind += 1;
+        commit(self);
+        self.measurement.dispatch()?;
+        self.truth.dispatch()?;
+        self.measurement.finish()?;
+        self.truth.finish()?;
+        Ok(Poll::Missed)
+    }
+
+    /// Executes the next tick, unless it is one that is to be missed.
+    #[inline]
+    fn execute_or_miss(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
+        if self.interruptions.misses(self.counters.next()) { self.miss() } else { self.execute(now_ns) }
     }
 
     fn stage_truth(&mut self, tick: u64) -> Result<(), NodeError> {
@@ -115,6 +141,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     #[inline]
     fn execute(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
+        self.plant.advance_alone(std::mem::take(&mut self.behind));
         let event = self.take_command(tick, now_ns)?;
         if event.missed() {
             self.counters.starved(tick);
@@ -200,14 +227,16 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     #[inline]
     fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         match condition {
-            RunCondition::Inputs { up_to } if self.counters.next() <= up_to && self.inputs_ready()? => self.execute(0),
+            RunCondition::Inputs { up_to } if self.counters.next() <= up_to && self.inputs_ready()? => {
+                self.execute_or_miss(0)
+            }
             RunCondition::Now { tick, now_ns } => {
                 self.catch_up(tick.min(self.last_tick + 1), now_ns);
                 if self.counters.next() > self.last_tick {
                     return Ok(Poll::Waiting);
                 }
                 self.lateness.record(self.grid.due_ns(tick), now_ns);
-                self.execute(now_ns)
+                self.execute_or_miss(now_ns)
             }
             RunCondition::Inputs { .. } | RunCondition::Arrived | RunCondition::Overdue => Ok(Poll::Waiting),
         }
@@ -249,8 +278,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 
     fn skip_to(&mut self, tick: u64) {
-        let missed = self.counters.skip_to(tick);
-        self.plant.advance_alone(missed);
+        self.behind += self.counters.skip_to(tick);
     }
 
     fn warm_up(&mut self) -> Result<(), NodeError> {
@@ -299,6 +327,7 @@ impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
     fn state<W: Words>(&mut self, words: &mut W) {
         self.plant.persist(words);
         self.unfinished.persist(words);
+        self.behind.persist(words);
         self.command.iter_mut().for_each(|command| command.persist(words));
         self.measurement.persist_late(words);
     }

@@ -1,0 +1,184 @@
+//! The keys of a `[[fault]]` that say on which of its ticks it acts, and how late a sample is sent: as typed, with their checks.
+//!
+//! Must refuse two answers to one question, and what would never act as its author meant.
+
+use super::{Kind, MAX_DELAY_TICKS, One, RawFault};
+use crate::fault::{Channel, Delay, Distribution, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
+use serde::{Deserialize, Serialize};
+
+/// The channel of Gilbert and Elliott, as a scenario has it.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::config) struct RawChannel {
+    good_to_bad: f64,
+    bad_to_good: f64,
+    #[serde(default)]
+    when_good: f64,
+    #[serde(default = "super::always")]
+    when_bad: f64,
+}
+
+/// A weakly-hard constraint, as a scenario has it.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::config) struct RawWeaklyHard {
+    misses: u64,
+    window: u64,
+    pattern: PatternName,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum PatternName {
+    Random,
+    Burst,
+    Even,
+}
+
+/// The distributions of a delay's jitter, as a scenario names them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(in crate::config) enum DistributionName {
+    Uniform,
+    Geometric,
+    Normal,
+}
+
+impl One<'_, '_, '_> {
+    /// On which of its ticks the fault acts.
+    pub(super) fn occurrence(&mut self) -> Option<Occurrence> {
+        let RawFault { every, gilbert_elliott, weakly_hard, probability, .. } = *self.raw;
+        let answers = [
+            ("every", every.is_some()),
+            ("gilbert_elliott", gilbert_elliott.is_some()),
+            ("weakly_hard", weakly_hard.is_some()),
+        ];
+        let mut given = answers.into_iter().filter(|(_, given)| *given);
+        let (first, second) = (given.next(), given.next());
+        if let (Some((first, _)), Some((second, _))) = (first, second) {
+            self.require(false, second, || format!("is a second answer to when it acts, beside `{first}`; give one"))?;
+        }
+        self.require(probability > 0.0 && probability <= 1.0, "probability", || {
+            format!("{probability} is none with which anything happens; give a number above 0, up to 1")
+        })?;
+        let draws = weakly_hard.is_none_or(|hard| hard.pattern == PatternName::Random);
+        if let Some((first, _)) = first.filter(|(name, _)| *name != "weakly_hard" || !draws) {
+            self.require(probability >= 1.0, "probability", || {
+                format!("is a second answer to when it acts, beside `{first}`; remove one")
+            })?;
+        }
+        match (every, gilbert_elliott, weakly_hard) {
+            (Some(n), ..) => self.every(n),
+            (_, Some(channel), _) => self.channel(channel),
+            (.., Some(hard)) => self.weakly_hard(hard),
+            _ => Some(Occurrence::Independent(probability)),
+        }
+    }
+
+    /// Whether the fault lasts so long that the key has a meaning.
+    fn long_enough(&mut self, name: &str, ticks: u64) -> Option<()> {
+        self.require(self.raw.ticks >= ticks, "ticks", || {
+            format!("{} are too few for `{name}`; give at least {ticks}", self.raw.ticks)
+        })
+    }
+
+    fn every(&mut self, n: u64) -> Option<Occurrence> {
+        self.require(n >= 2, "every", || {
+            format!("every {n} is no interval; give 2 or more, or leave it out for every tick")
+        })?;
+        self.long_enough("every", n.saturating_add(1))?;
+        Some(Occurrence::Every(n))
+    }
+
+    fn channel(&mut self, raw: RawChannel) -> Option<Occurrence> {
+        let RawChannel { good_to_bad, bad_to_good, when_good, when_bad } = raw;
+        for (name, value, least) in [
+            ("good_to_bad", good_to_bad, f64::MIN_POSITIVE),
+            ("bad_to_good", bad_to_good, f64::MIN_POSITIVE),
+            ("when_good", when_good, 0.0),
+            ("when_bad", when_bad, 0.0),
+        ] {
+            self.require((least..=1.0).contains(&value), &format!("gilbert_elliott.{name}"), || {
+                let from = if least > 0.0 { "above 0" } else { "from 0" };
+                format!("{value} is no such probability; give a number {from}, up to 1")
+            })?;
+        }
+        self.require(when_good != when_bad, "gilbert_elliott.when_bad", || {
+            "is the same as when_good, and the state of the channel changes nothing; give `probability` instead"
+                .to_owned()
+        })?;
+        self.long_enough("gilbert_elliott", 2)?;
+        Some(Occurrence::GilbertElliott(Channel { good_to_bad, bad_to_good, when_good, when_bad }))
+    }
+
+    fn weakly_hard(&mut self, raw: RawWeaklyHard) -> Option<Occurrence> {
+        let RawWeaklyHard { misses, window, pattern } = raw;
+        let (longest, probability) = (u64::from(WINDOW_MAX), self.raw.probability);
+        self.require((2..=longest).contains(&window), "weakly_hard.window", || {
+            format!("{window} ticks are no window; give 2 to {longest}")
+        })?;
+        self.require((1..window).contains(&misses), "weakly_hard.misses", || {
+            format!("{misses} of {window} are no constraint; give 1 to {}", window - 1)
+        })?;
+        self.require(pattern != PatternName::Random || probability < 1.0, "probability", || {
+            "is missing for pattern = \"random\", or is 1, which makes it \"burst\"; give a number below 1".to_owned()
+        })?;
+        self.long_enough("weakly_hard", window)?;
+        let pattern = match pattern {
+            PatternName::Random => Pattern::Random(probability),
+            PatternName::Burst => Pattern::Burst,
+            PatternName::Even => Pattern::Even,
+        };
+        Some(Occurrence::WeaklyHard(WeaklyHard { misses: misses as u32, window: window as u32, pattern }))
+    }
+
+    /// How late samples are.
+    pub(super) fn delay(&mut self) -> Option<Delay> {
+        let RawFault { jitter_ticks, distribution, spread_ticks, .. } = *self.raw;
+        let ticks = self.raw.delay_ticks?;
+        let least = u64::from(jitter_ticks.is_none());
+        self.require((least..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", || {
+            format!("{ticks} is no delay that is kept; give {least} to {MAX_DELAY_TICKS}, or drop the sample")
+        })?;
+        let Some(jitter_ticks) = jitter_ticks else {
+            self.require(distribution.is_none(), "distribution", || {
+                "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
+            })?;
+            self.require(spread_ticks.is_none(), "spread_ticks", || {
+                "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
+            })?;
+            return Some(Delay::constant(ticks));
+        };
+        let most = MAX_DELAY_TICKS - ticks;
+        self.require((1..=most).contains(&jitter_ticks), "jitter_ticks", || {
+            format!("{jitter_ticks} is no jitter that is kept; give 1 to {most}: no sample is kept for more than {MAX_DELAY_TICKS}")
+        })?;
+        let distribution = distribution.unwrap_or(DistributionName::Uniform);
+        if distribution == DistributionName::Uniform {
+            self.require(spread_ticks.is_none(), "spread_ticks", || {
+                "has no meaning for a uniform distribution; remove it, or give another distribution".to_owned()
+            })?;
+            return Some(Delay { ticks, jitter_ticks, distribution: Distribution::Uniform });
+        }
+        self.require(spread_ticks.is_some(), "spread_ticks", || {
+            "is missing for this distribution: the mean of a geometric one, the standard deviation of a normal one; add it"
+                .to_owned()
+        })?;
+        let spread = spread_ticks?;
+        self.require(spread > 0.0 && spread <= jitter_ticks as f64, "spread_ticks", || {
+            format!(
+                "{spread} does not fit into {jitter_ticks} ticks of jitter; give a number above 0, up to {jitter_ticks}"
+            )
+        })?;
+        let distribution = match distribution {
+            DistributionName::Normal => Distribution::Normal(spread),
+            _ => Distribution::Geometric(spread),
+        };
+        Some(Delay { ticks, jitter_ticks, distribution })
+    }
+
+    /// Whether the fault is one of the role itself.
+    pub(super) fn of_role(&self) -> bool {
+        matches!(self.raw.kind, Kind::Stall | Kind::Kill | Kind::Miss)
+    }
+}
