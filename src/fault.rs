@@ -128,13 +128,14 @@ impl Fault {
         matches!(self.action, Action::Content(_))
     }
 
-    /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if its delay is drawn as 0.
+    /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if it is
+    /// in time nevertheless.
     pub fn way(&self, tick: u64) -> Option<Way> {
         match self.action {
             Action::Transport(Transport::Drop) => Some(Way::Dropped),
             Action::Transport(Transport::Duplicate) => Some(Way::Twice),
             Action::Transport(Transport::Delay(delay)) => {
-                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > 0).map(Way::Late)
+                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > delay.slack_ticks).map(Way::Late)
             }
             _ => None,
         }

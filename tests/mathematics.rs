@@ -450,7 +450,7 @@ proptest! {
         gain[j] = a[j].abs() * bound * (1.0 + over[1]) + f64::MIN_POSITIVE;
         gain[k] = over[2];
         let decay = (gain[k] / 2.0 + (a[i].abs() + a[j].abs()) * bound) * (1.0 + last);
-        let certificate = Certificate::new(&a, axis, &gain, decay, bound, 1e-3, false);
+        let certificate = Certificate::new(&a, axis, &gain, decay, bound, 1e-3, 1);
         prop_assert!(certificate.paper.iter().all(Condition::holds), "the case is not what it should be: {certificate:?}");
         prop_assert!(certificate.exact.holds(), "{certificate:?}");
         prop_assert!(certificate.exact.required <= certificate.paper[2].required / 2.0 * (1.0 + 1e-9), "{certificate:?}");

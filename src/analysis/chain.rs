@@ -17,7 +17,8 @@ pub(super) struct Chain<R: Rig> {
     controller: Controller<R::Law>,
     measurement: Measurement<R>,
     own: Measurement<R>,
-    command: Command<R>,
+    /// Those on their way and the one that acts, by their tick modulo the delay.
+    commands: Vec<Command<R>>,
     truths: [Truth<R>; 2],
     estimate: Estimate<R>,
     tick: u64,
@@ -25,12 +26,12 @@ pub(super) struct Chain<R: Rig> {
 
 impl<R: Rig> Chain<R> {
     /// The loop of a rig whose last body is the driven one, at its start.
-    pub fn new(rig: &R, tick_s: f64) -> Self {
+    pub fn new(rig: &R, tick_s: f64, delay_ticks: u64) -> Self {
         let last = rig.bodies().len() - 1;
         let plant = |index: usize| {
             let driven = rig.bodies()[index].driven;
             // No command is ever missing here.
-            let actuation = Actuation { driven, timeout_ticks: u64::MAX, rearm: Rearm::Auto };
+            let actuation = Actuation { driven, delay_ticks, timeout_ticks: u64::MAX, rearm: Rearm::Auto };
             Plant::new(rig.body(index), actuation, tick_s)
         };
         Self {
@@ -41,16 +42,26 @@ impl<R: Rig> Chain<R> {
             controller: Controller::new(rig.law(last)),
             measurement: Default::default(),
             own: Default::default(),
-            command: Default::default(),
+            commands: vec![Default::default(); delay_ticks as usize],
             truths: Default::default(),
             estimate: Default::default(),
             tick: 0,
         }
     }
 
-    /// One tick: measure, estimate, command, move on, and hand the command over. What is in flight between two ticks is then
-    /// with the plant.
+    fn place(&self, tick: u64) -> usize {
+        (tick % self.commands.len() as u64) as usize
+    }
+
+    /// The command made last.
+    fn command(&self) -> &Command<R> {
+        &self.commands[self.place(self.tick - 1)]
+    }
+
+    /// One tick: measure, estimate, command, move on, and hand over the command that is to act then. With a delay of one tick
+    /// nothing is in flight between two ticks.
     pub fn advance(&mut self) {
+        let (made, acts) = (self.place(self.tick), self.place(self.tick + 1));
         let stamp = Stamp { tick: self.tick, generation: 1, ..Stamp::default() };
         self.observed.measure(&stamp, &mut self.measurement);
         self.observer.step(&self.measurement, &mut self.estimate);
@@ -60,15 +71,15 @@ impl<R: Rig> Chain<R> {
             Some(driven) => {
                 driven.measure(&stamp, &mut self.own);
                 driven.truth(&stamp, &mut self.truths[1]);
-                self.controller.step(&self.estimate, &self.own, &mut self.command);
+                self.controller.step(&self.estimate, &self.own, &mut self.commands[made]);
                 driven.advance(1);
-                driven.command(self.tick, Some(&self.command));
+                driven.command(self.tick, Some(&self.commands[acts]));
                 self.observed.advance(1);
             }
             None => {
-                self.controller.step(&self.estimate, &self.measurement, &mut self.command);
+                self.controller.step(&self.estimate, &self.measurement, &mut self.commands[made]);
                 self.observed.advance(1);
-                self.observed.command(self.tick, Some(&self.command));
+                self.observed.command(self.tick, Some(&self.commands[acts]));
             }
         }
     }
@@ -124,6 +135,18 @@ impl<R: Rig> Chain<R> {
         }
         self.observer.persist(words);
         self.controller.persist(words);
+        // The plant has the one that acts.
+        let (tick, count) = (self.tick, self.commands.len() as u64);
+        for command in (1..count).map(|after| ((tick + after) % count) as usize) {
+            let sent = self.commands[command].words_mut();
+            for field in numbers::<Command<R>>() {
+                for bits in &mut sent[field.offset / 8..][..field.count] {
+                    let mut number = f64::from_bits(*bits);
+                    words.number(&mut number);
+                    *bits = number.to_bits();
+                }
+            }
+        }
     }
 
     /// The numbers of the state.
@@ -170,7 +193,7 @@ impl<R: Rig> Guards<R> {
             ("the measurement of the observed body", self.measurement.accepts(&chain.measurement)),
             ("the estimate", self.estimate.accepts(&chain.estimate)),
             ("the measurement of the driven body", self.own.accepts(own)),
-            ("the command", self.command.accepts(&chain.command)),
+            ("the command", self.command.accepts(chain.command())),
         ];
         let mut counted = self.refused.iter_mut().zip(accepted);
         counted.find_map(|(refused, (name, accepted))| {

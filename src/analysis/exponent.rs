@@ -40,9 +40,13 @@ pub(super) struct Exponent {
 impl<R: Rig> Analysis<'_, R> {
     /// The largest exponent of the loop about the motion that it is to follow.
     pub fn exponent(&self, ideal: &R) -> Exponent {
-        let begun = |start| self.rig.alone(self.index, start, false).map(|rig| Chain::new(&rig, self.tick_s));
+        let begun = |start| {
+            self.rig
+                .alone(self.index, start, false)
+                .map(|rig| Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks))
+        };
         let (mut here, mut there) = (Vec::new(), Vec::new());
-        let mut reference = Chain::new(ideal, self.tick_s);
+        let mut reference = Chain::new(ideal, self.tick_s, self.scenario.actuation_delay_ticks);
         reference.advance();
         reference.output(&mut here);
         let size = norm(&here).max(f64::MIN_POSITIVE);

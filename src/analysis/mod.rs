@@ -1,7 +1,7 @@
 //! What may be claimed of the loop that runs: the rate at which its error falls, the floor that it falls to, and whether it
 //! gets there from the scenario's own start.
 //!
-//! The loop is sampled, held and one tick late, so the theorems about continuous time say nothing of its rate. Here the roles'
+//! The loop is sampled, held and late by a tick or more, so the theorems about continuous time say nothing of its rate. Here the roles'
 //! own code is run in one thread (`chain.rs`): beside a loop that is synchronised from the start runs one that is off by a
 //! little, and the logarithm of their distance gives the largest exponent, which is a Floquet exponent where the leader's
 //! motion is periodic. The numbers of the state are those by which a killed role is continued, so none is forgotten, whatever
@@ -149,7 +149,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
             return Vec::new();
         };
         let mut start = vec![0.0; floors.len()];
-        let mut chain = Chain::new(&rig, self.tick_s);
+        let mut chain = Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks);
         chain.advance();
         chain.score(&mut start);
         let limits = &self.scenario.accept.metric_max;
@@ -173,7 +173,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
         let mut floors = vec![0.0; self.rig.metrics().len()];
         let mut values = floors.clone();
         if let Some(rig) = self.rig.alone(self.index, Start::Settled, true) {
-            let mut chain = Chain::new(&rig, self.tick_s);
+            let mut chain = Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks);
             let (mut output, mut size) = (Vec::new(), None);
             for tick in 0..ticks {
                 chain.advance();
@@ -196,7 +196,8 @@ impl<'a, R: Rig> Analysis<'a, R> {
         let Some(rig) = self.rig.alone(self.index, Start::Given, true) else {
             return Ok(());
         };
-        let (mut chain, mut guards) = (Chain::new(&rig, self.tick_s), Guards::new(&rig));
+        let (mut chain, mut guards) =
+            (Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks), Guards::new(&rig));
         let (mut values, mut motion) = (vec![0.0; floors.len()], Vec::new());
         // The largest errors of all, in the second quarter, and in the last.
         let (mut largest, mut halfway, mut last) = (values.clone(), values.clone(), values.clone());

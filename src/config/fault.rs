@@ -106,6 +106,7 @@ pub(super) struct Setting<'a> {
     pub rig: &'a AnyRig,
     pub last_tick: u64,
     pub seed: u64,
+    pub actuation_delay_ticks: u64,
 }
 
 /// Checks all faults of a scenario. What is refused is noted and left out.

@@ -18,6 +18,8 @@ pub(super) struct Raw {
     pub duration_s: f64,
     #[serde(default = "default_seed")]
     pub seed: u64,
+    #[serde(default = "next_tick")]
+    pub actuation_delay_ticks: u64,
     #[serde(default)]
     pub record: bool,
     #[serde(default)]
@@ -37,6 +39,10 @@ pub(super) struct Raw {
 }
 
 fn default_seed() -> u64 {
+    1
+}
+
+fn next_tick() -> u64 {
     1
 }
 

@@ -4,7 +4,7 @@ use super::fault::{self, ScriptedFault};
 use super::raw::{Launch, Policy, Raw};
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
 use crate::control::WatchBounds;
-use crate::rig::{self, AnyRig, Context};
+use crate::rig::{self, ACTUATION_DELAY_MAX, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -43,6 +43,8 @@ pub struct Scenario {
     pub record: bool,
     /// After how many missing commands a driven body goes to its safe command.
     pub command_timeout_ticks: u64,
+    /// From so many ticks after its measurement on a command acts.
+    pub actuation_delay_ticks: u64,
     /// What ends the safe command.
     pub rearm: Rearm,
     /// What a real-time run asks of the machine.
@@ -106,7 +108,7 @@ impl Scenario {
             Ok(raw) => raw,
             Err(error) => {
                 // The rig's own sections are read all the same; of what they say nothing can be judged.
-                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0 };
+                let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0, actuation_delay_ticks: 1 };
                 let read = |rig: &str| rig::resolve(rig, &sections, context, &mut checks).err();
                 let own = document.text("rig").and_then(read);
                 checks.problems.retain(|problem| problem.key == "rig");
@@ -118,7 +120,8 @@ impl Scenario {
         // A tick that is refused is not complained of by the rig too: the shortest one stands in for it.
         let tick_s = if tick_possible(raw.tick_hz) { period_ns as f64 / 1e9 } else { 1.0 / MAX_TICK_HZ };
         let length_s = if length_possible(&raw) { raw.duration_s } else { 0.0 };
-        let context = Context { tick_s, duration_s: length_s, seed: raw.seed };
+        let actuation_delay_ticks = raw.actuation_delay_ticks.clamp(1, ACTUATION_DELAY_MAX);
+        let context = Context { tick_s, duration_s: length_s, seed: raw.seed, actuation_delay_ticks };
         let (rig, rig_table) = match rig::resolve(&raw.rig, &sections, context, &mut checks) {
             Ok(resolved) => resolved,
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
@@ -133,7 +136,7 @@ impl Scenario {
         if let Some(rig) = &rig {
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
             let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
-            let setting = fault::Setting { rig, last_tick, seed: raw.seed };
+            let setting = fault::Setting { rig, last_tick, seed: raw.seed, actuation_delay_ticks };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             watch = watchdog::resolve(&raw.watchdog, &maxima.watchdog, rig, tick_s, duration_s, &mut checks);
         }
@@ -151,6 +154,7 @@ impl Scenario {
             seed: raw.seed,
             record: raw.record,
             command_timeout_ticks: raw.actuator.command_timeout_ticks,
+            actuation_delay_ticks,
             rearm: raw.actuator.rearm,
             realtime: raw.realtime,
             startup_timeout_s: raw.launch.startup_timeout_s,
@@ -195,7 +199,8 @@ impl Scenario {
 
     /// How the actuators of a body treat their commands.
     pub fn actuation(&self, driven: bool) -> Actuation {
-        Actuation { driven, timeout_ticks: self.command_timeout_ticks, rearm: self.rearm }
+        let (delay_ticks, timeout_ticks) = (self.actuation_delay_ticks, self.command_timeout_ticks);
+        Actuation { driven, delay_ticks, timeout_ticks, rearm: self.rearm }
     }
 
     /// The scenario as the file of its run, which the first line names.
@@ -281,6 +286,12 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     checks.require(length_possible(raw), "duration_s", || {
         let ticks = raw.duration_s * raw.tick_hz;
         format!("{} s is {ticks} ticks; give a length of 1 to {MAX_TICKS:e} ticks", raw.duration_s)
+    });
+    checks.require((1..=ACTUATION_DELAY_MAX).contains(&raw.actuation_delay_ticks), "actuation_delay_ticks", || {
+        format!(
+            "no command acts {} ticks after its measurement; give 1 (the next tick) to {ACTUATION_DELAY_MAX}",
+            raw.actuation_delay_ticks
+        )
     });
     checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", || {
         "0 would make every tick unsafe; give at least 1".to_owned()

@@ -36,8 +36,8 @@ pub struct Certificate {
     /// The slowest exponent of the error, 1/s: min(|k_1|, |k_2|, |k_3|, −λ). The error decays so in any case, since the
     /// observer's error does not depend on the others.
     pub rate_per_s: f64,
-    /// Largest |k|·h: with one tick of delay an axis obeys z² − z + |k|h = 0 and is stable below 1; predicted,
-    /// z = 1 − |k|h, stable below 2.
+    /// Largest |k|·h: with d ticks of delay that the law does not predict over an axis obeys z^(d+1) − z^d + |k|h = 0 and is
+    /// stable below 2 sin(π/(4d + 2)): 1 for one tick, 2 for none.
     pub gain_step: Condition,
     /// What multiplies −e_i² and −ε² in the bound on V̇ of \[D\](18), 1/s.
     slopes: Vector3<f64>,
@@ -48,7 +48,7 @@ impl Certificate {
     /// The certificate of a loop with tick `tick_s`.
     ///
     /// `coefficients` are the a of \[D\](2), `hidden_axis` is 1 to 3, `gain_per_s` = −k and `decay_rate_per_s` = −λ are
-    /// positive, `rate_bound_rad_s` is M; `predict` tells whether the law predicts over the delay.
+    /// positive, `rate_bound_rad_s` is M; `unpredicted_ticks` is the delay, or 0 where the law predicts over it.
     pub fn new(
         coefficients: &Vector3<f64>,
         hidden_axis: usize,
@@ -56,7 +56,7 @@ impl Certificate {
         decay_rate_per_s: f64,
         rate_bound_rad_s: f64,
         tick_s: f64,
-        predict: bool,
+        unpredicted_ticks: u64,
     ) -> Self {
         let [i, j, k] = [hidden_axis % 3, (hidden_axis + 1) % 3, (hidden_axis - 1) % 3];
         let m = rate_bound_rad_s;
@@ -77,7 +77,7 @@ impl Certificate {
                 required: m * m / 4.0 * schur[0].max(schur[1]) + gain_per_s[k] / 4.0,
             },
             rate_per_s: gain_per_s.min().min(decay_rate_per_s),
-            gain_step: Self::gain_step(gain_per_s, tick_s, predict),
+            gain_step: Self::gain_step(gain_per_s, tick_s, unpredicted_ticks),
             slopes,
             hidden_slope: decay_rate_per_s - pull[0] - pull[1] - gain_per_s[k] / 2.0,
         }
@@ -93,8 +93,13 @@ impl Certificate {
     }
 
     /// The condition of the sampled loop alone, which needs no observer: see the field of this name.
-    pub fn gain_step(gain_per_s: &Vector3<f64>, tick_s: f64, predict: bool) -> Condition {
-        Condition { value: if predict { 2.0 } else { 1.0 }, required: gain_per_s.max() * tick_s }
+    pub fn gain_step(gain_per_s: &Vector3<f64>, tick_s: f64, unpredicted_ticks: u64) -> Condition {
+        let value = match unpredicted_ticks {
+            0 => 2.0,
+            1 => 1.0,
+            ticks => 2.0 * libm::sin(core::f64::consts::PI / (4 * ticks + 2) as f64),
+        };
+        Condition { value, required: gain_per_s.max() * tick_s }
     }
 
     /// Whether the tick is so coarse that the sampled loop visibly differs from the continuous one.
@@ -128,7 +133,7 @@ mod tests {
     #[test]
     fn the_exact_condition_is_where_the_largest_eigenvalue_changes_its_sign() {
         let (a, gain, m) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0), 1.5);
-        let needed = Certificate::new(&a, 3, &gain, 1.0, m, 1e-3, false).exact.required;
+        let needed = Certificate::new(&a, 3, &gain, 1.0, m, 1e-3, 1).exact.required;
         assert!(worst_eigenvalue(&a, &gain, needed * 1.001, m) < 0.0);
         assert!(worst_eigenvalue(&a, &gain, needed * 0.999, m) > 0.0);
     }
@@ -137,7 +142,7 @@ mod tests {
     #[test]
     fn the_bound_on_the_rate_of_v_is_one() {
         let (a, gain, m) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0), 1.5);
-        let certificate = Certificate::new(&a, 3, &gain, 5.0, m, 1e-3, false);
+        let certificate = Certificate::new(&a, 3, &gain, 5.0, m, 1e-3, 1);
         for step in 0..360 {
             let angle = f64::from(step).to_radians();
             let q = form(&a, &gain, 5.0, m * angle.cos(), m * angle.sin());
@@ -156,8 +161,8 @@ mod tests {
     #[test]
     fn the_paper_s_condition_implies_the_exact_one() {
         let (a, gain) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0));
-        let loose = Certificate::new(&a, 3, &gain, 1.0, 1.5, 1e-3, false);
-        let certificate = Certificate::new(&a, 3, &gain, loose.paper[2].required * 1.01, 1.5, 1e-3, false);
+        let loose = Certificate::new(&a, 3, &gain, 1.0, 1.5, 1e-3, 1);
+        let certificate = Certificate::new(&a, 3, &gain, loose.paper[2].required * 1.01, 1.5, 1e-3, 1);
         assert!(certificate.paper.iter().all(Condition::holds) && certificate.exact.holds());
         assert!(!loose.paper[2].holds());
     }
@@ -166,23 +171,26 @@ mod tests {
     fn relabelling_the_axes_moves_the_condition_with_them() {
         let (a, gain) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0));
         let turned = |v: &Vector3<f64>| Vector3::new(v.z, v.x, v.y);
-        let third = Certificate::new(&a, 3, &gain, 5.0, 1.5, 1e-3, false);
-        let first = Certificate::new(&turned(&a), 1, &turned(&gain), 5.0, 1.5, 1e-3, false);
+        let third = Certificate::new(&a, 3, &gain, 5.0, 1.5, 1e-3, 1);
+        let first = Certificate::new(&turned(&a), 1, &turned(&gain), 5.0, 1.5, 1e-3, 1);
         assert_eq!(third.exact, first.exact);
         assert_eq!(third.paper, first.paper);
     }
 
-    /// The sampled axis e(n+1) = e(n) − g h e(n−1) really is stable up to the limit and not beyond.
+    /// The sampled axis e(n+1) = e(n) − g h e(n−d) really is stable up to the limit and not beyond.
     #[test]
     fn the_sampled_limit_is_the_real_one() {
-        let grows = |gain_step: f64| {
-            let (mut e, mut before) = (1.0_f64, 1.0_f64);
-            for _ in 0..2000 {
-                (e, before) = (e - gain_step * before, e);
-            }
-            e.abs() > 1.0
-        };
-        let limit = Certificate::new(&Vector3::zeros(), 3, &Vector3::repeat(1.0), 1.0, 1.0, 1.0, false).gain_step.value;
-        assert!(!grows(limit * 0.99) && grows(limit * 1.01));
+        for delay in [0, 1, 2, 5, 64] {
+            let grows = |gain_step: f64| {
+                let mut e = vec![1.0_f64; delay + 1];
+                for _ in 0..200_000 {
+                    e.push(e[e.len() - 1] - gain_step * e[e.len() - 1 - delay]);
+                }
+                e.iter().rev().take(200).any(|e| e.is_nan() || e.abs() > 1.0)
+            };
+            let gain = Vector3::repeat(1.0);
+            let limit = Certificate::new(&Vector3::zeros(), 3, &gain, 1.0, 1.0, 1.0, delay as u64).gain_step.value;
+            assert!(!grows(limit * 0.99) && grows(limit * 1.01), "{delay}: {limit}");
+        }
     }
 }

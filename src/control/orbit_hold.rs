@@ -77,9 +77,9 @@ impl OrbitHold {
         Condition { value: self.thrust_max, required: asked.amax() }
     }
 
-    /// The state after the delay; the present one where the model cannot tell.
+    /// The state after the lead, du and du/s, under a thrust, du/s²; the present one where the model cannot tell.
     #[inline]
-    fn ahead(&self, state: &OrbitState, thrust: &Vector2<f64>) -> OrbitState {
+    pub fn ahead(&self, state: &OrbitState, thrust: &Vector2<f64>) -> OrbitState {
         if self.lead_s > 0.0 { self.field.flow(state, thrust, self.lead_s).unwrap_or(*state) } else { *state }
     }
 
@@ -95,8 +95,15 @@ impl OrbitHold {
     }
 
     /// The law with its prediction and without the limit, for linearising the sampled loop.
-    pub(super) fn unlimited(&self, target: f64, body: &OrbitState, applied: &Vector2<f64>) -> Vector2<f64> {
-        self.law(&self.field.circular(target), &self.ahead(body, applied))
+    /// What acts until the thrust does is given tick by tick.
+    pub(super) fn unlimited(
+        &self,
+        target: f64,
+        body: &OrbitState,
+        acting: impl Iterator<Item = Vector2<f64>>,
+    ) -> Vector2<f64> {
+        let body = acting.fold(*body, |body, thrust| self.ahead(&body, &thrust));
+        self.law(&self.field.circular(target), &body)
     }
 
     #[inline]

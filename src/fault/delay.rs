@@ -14,6 +14,8 @@ pub struct Delay {
     pub jitter_ticks: u64,
     /// How these are distributed over 0 to `jitter_ticks`.
     pub distribution: Distribution,
+    /// A sample that is late by no more than this is in time all the same: nobody needs it sooner.
+    pub slack_ticks: u64,
 }
 
 /// A distribution over 0, 1, … up to a bound.
@@ -34,7 +36,7 @@ const REDRAWS: usize = 64;
 impl Delay {
     /// Always so many ticks.
     pub fn constant(ticks: u64) -> Self {
-        Self { ticks, jitter_ticks: 0, distribution: Distribution::Uniform }
+        Self { ticks, jitter_ticks: 0, distribution: Distribution::Uniform, slack_ticks: 0 }
     }
 
     /// The most.
@@ -78,7 +80,7 @@ mod tests {
 
     #[test]
     fn every_distribution_is_what_its_name_says() {
-        let delay = |distribution| Delay { ticks: 2, jitter_ticks: 8, distribution };
+        let delay = |distribution| Delay { jitter_ticks: 8, distribution, ..Delay::constant(2) };
         let uniform = histogram(delay(Distribution::Uniform), 90_000);
         assert!(uniform[2..].iter().all(|share| (share - 1.0 / 9.0).abs() < 0.01), "{uniform:?}");
         let geometric = histogram(delay(Distribution::Geometric(1.0)), 90_000);
@@ -104,7 +106,7 @@ mod tests {
             for distribution in
                 [Distribution::Uniform, Distribution::Geometric(spread), Distribution::Normal(spread)]
             {
-                let delay = Delay { ticks, jitter_ticks, distribution };
+                let delay = Delay { jitter_ticks, distribution, ..Delay::constant(ticks) };
                 prop_assert!((ticks..=delay.bound()).contains(&delay.draw(draw)));
             }
         }

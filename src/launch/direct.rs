@@ -31,7 +31,8 @@ struct Controlled<R: Rig> {
     controller: Controller<R::Law>,
     measurement_guard: R::MeasurementGuard,
     command_guard: R::CommandGuard,
-    command: Command<R>,
+    /// Those on their way, by their tick modulo the delay.
+    commands: Vec<Command<R>>,
     hash: StateHash,
 }
 
@@ -50,6 +51,11 @@ pub(crate) fn run_rig<R: Rig>(rig: &R, scenario: &Scenario, launch: &mut Launch<
 /// The hash of a signal of this run.
 fn hash(scenario: &Scenario) -> StateHash {
     StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick)
+}
+
+/// Where the command of a tick lies, and where that lay which is applied then.
+fn place(tick: u64, delay_ticks: u64) -> usize {
+    (tick % delay_ticks) as usize
 }
 
 struct Run<'a, R: Rig> {
@@ -75,7 +81,7 @@ impl<'a, R: Rig> Run<'a, R> {
                 controller: Controller::new(rig.law(index)),
                 measurement_guard: rig.measurement_guard(index, true),
                 command_guard: rig.command_guard(index),
-                command: Command::<R>::default(),
+                commands: vec![Command::<R>::default(); scenario.actuation_delay_ticks as usize],
                 hash: hash(scenario),
             }),
             hashes: [hash(scenario), hash(scenario)],
@@ -113,11 +119,14 @@ impl<'a, R: Rig> Run<'a, R> {
     #[inline]
     fn tick(&mut self, tick: u64) -> bool {
         let stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
+        let delay = self.scenario.actuation_delay_ticks;
         for body in &mut self.bodies {
             let applied = match &mut body.command {
                 Some(controlled) if tick > 0 => {
-                    controlled.command_guard.accepts(&controlled.command)
-                        && body.plant.command(tick, Some(&controlled.command)) == CommandEvent::Applied
+                    let (came, due) = (place(tick - 1, delay), place(tick, delay));
+                    let expected = if tick < delay { CommandEvent::NotDue } else { CommandEvent::Applied };
+                    controlled.command_guard.accepts(&controlled.commands[came])
+                        && body.plant.command(tick, Some(&controlled.commands[due])) == expected
                 }
                 _ => body.plant.command(tick, None) == CommandEvent::NotDue,
             };
@@ -147,10 +156,11 @@ impl<'a, R: Rig> Run<'a, R> {
             if !controlled.measurement_guard.accepts(measurement) {
                 return false;
             }
-            controlled.controller.step(&self.estimate, measurement, &mut controlled.command);
-            let stamp = controlled.command.stamp_mut();
+            let command = &mut controlled.commands[place(tick, delay)];
+            controlled.controller.step(&self.estimate, measurement, command);
+            let stamp = command.stamp_mut();
             (stamp.generation, stamp.sent_ns) = (1, 0);
-            controlled.hash.absorb(tick, controlled.command.content());
+            controlled.hash.absorb(tick, command.content());
         }
         let bodies = &self.bodies;
         self.scoring.take(|body| Some(&bodies[body].truth), |_| None, Some(&self.estimate), true);

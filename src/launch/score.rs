@@ -226,6 +226,7 @@ pub(super) struct Scoring<R: Rig> {
     rig: R,
     accept: Accept,
     tick_s: f64,
+    delay_ticks: u64,
     driven: Vec<DrivenBody>,
     /// Of the estimate, and of every body's truth.
     statuses: Vec<Statuses>,
@@ -257,6 +258,7 @@ impl<R: Rig> Scoring<R> {
             rig: rig.clone(),
             accept: scenario.accept.clone(),
             tick_s: scenario.tick_s(),
+            delay_ticks: scenario.actuation_delay_ticks,
             driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
             statuses: core::iter::once(estimates).chain(truths).collect(),
             next_tick: 0,
@@ -316,7 +318,7 @@ impl<R: Rig> Scoring<R> {
             };
             // A follower that held or was safe did not apply what the certificate is about.
             let undisturbed = own.is_some_and(|truth| R::undisturbed(truth));
-            driven.judge(tick, self.tick_s, now, undisturbed, &mut self.score.certificate);
+            driven.judge(tick, (self.tick_s, self.delay_ticks), now, undisturbed, &mut self.score.certificate);
         }
         self.next_tick += 1;
     }
@@ -397,7 +399,7 @@ impl DrivenBody {
     fn judge(
         &mut self,
         tick: u64,
-        tick_s: f64,
+        (tick_s, delay_ticks): (f64, u64),
         now: Option<(f64, f64)>,
         undisturbed: bool,
         score: &mut Option<CertificateScore>,
@@ -405,10 +407,10 @@ impl DrivenBody {
         let now = now.filter(|(v, bound)| v.is_finite() && bound.is_finite());
         if let Some((v, _)) = now {
             let score = score.get_or_insert_default();
-            // The first command acts from tick 1 on: V is under control from there.
+            // V is under control from where the first command acts.
             if let Some((before, v_before, bound)) = self.before
                 && before + 1 == tick
-                && before > 0
+                && before >= delay_ticks
                 && undisturbed
             {
                 let holds = v <= (v_before + tick_s * bound).max(lyapunov_floor(tick_s));

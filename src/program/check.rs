@@ -78,10 +78,14 @@ fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     if claims.is_empty() {
         writeln!(text, "# no body is driven, so there is no loop to claim anything of")?;
     }
-    claims.iter().try_for_each(|claim| tell_claim(claim, text))
+    let late = match scenario.actuation_delay_ticks {
+        1 => "one tick".to_owned(),
+        ticks => format!("{ticks} ticks"),
+    };
+    claims.iter().try_for_each(|claim| tell_claim(claim, &late, text))
 }
 
-fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
+fn tell_claim(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
     writeln!(text, "# {}, the law in continuous time", claim.body)?;
     for bound in &claim.bounds {
         writeln!(text, "#   {}: {}", bound.name, digits(bound.value))?;
@@ -97,7 +101,7 @@ fn tell_claim(claim: &Claim, text: &mut String) -> std::fmt::Result {
         None if claim.conditions.is_empty() => writeln!(text, "#   this rig proves nothing of it")?,
         None => writeln!(text, "#   no constant rate: the observer's gain varies")?,
     }
-    writeln!(text, "# {}, the loop that runs: sampled, held, one tick late", claim.body)?;
+    writeln!(text, "# {}, the loop that runs: sampled, held, {late} late", claim.body)?;
     match (claim.loop_rate_per_s, &claim.reason) {
         (Some(rate), _) => writeln!(text, "#   once it is small, the error falls as exp(-{} t)", digits(rate))?,
         (None, reason) => writeln!(text, "#   no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,

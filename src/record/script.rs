@@ -331,7 +331,7 @@ impl Reading<'_> {
         scripts
     }
 
-    /// By how many ticks an input is older than the step that takes it: a command acts one tick later.
+    /// By how many ticks an input is older than the step that takes it: a command is taken one tick later.
     fn delay(&self) -> u64 {
         u64::from(matches!(self.role, RoleId::Plant(_)))
     }
@@ -456,6 +456,18 @@ impl Reading<'_> {
                 if step.generation != life {
                     (life, at_tick) = (step.generation, at_tick.min(needed));
                 }
+                let waits = delay == 1 && self.scenario.actuation_delay_ticks > 1;
+                if waits {
+                    // What a body takes now it uses later, or never.
+                    for tick in at_tick..=needed {
+                        let (index, item) = self.applied_later(&source, tick, steps);
+                        generation = index.map_or(generation, |index| source.track.stamp(index).generation);
+                        items.push(item.unwrap_or(Item::Void(tick, generation)));
+                    }
+                    at_tick = needed + 1;
+                    spans.push([begin, items.len()]);
+                    continue;
+                }
                 items.extend((at_tick..needed).map(|tick| Item::Void(tick, generation)));
                 at_tick = needed + 1;
                 let used = match (&said, delay) {
@@ -488,6 +500,21 @@ impl Reading<'_> {
             scripts.push(InputScript { track: source.track, items, spans });
         }
         scripts
+    }
+
+    /// The command of a tick, if the body applied it when it was due: its sample's index, and that as an item.
+    fn applied_later(&mut self, source: &Source, tick: u64, steps: &[Step]) -> (Option<usize>, Option<Item>) {
+        let due = tick + self.scenario.actuation_delay_ticks;
+        let executed = steps.binary_search_by_key(&due, |step| step.tick).is_ok();
+        if !executed || !self.applied(due) {
+            return (None, None);
+        }
+        let index = source.by_tick.get(&tick).copied();
+        if index.is_none() {
+            let service = source.track.info.service.clone();
+            self.limit(due, || format!("the recording lacks {service} of tick {tick}"));
+        }
+        (index, index.map(Item::Recorded))
     }
 
     /// The ticks of which an output has a sample, or would have but for a scripted fault.

@@ -3,6 +3,7 @@
 //! Must not know how roles are driven, nor what carries their samples; `any.rs` alone knows who asks.
 
 mod any;
+mod delay;
 mod fleet;
 mod orbit;
 mod pictures;
@@ -11,6 +12,7 @@ mod rigid_body;
 mod simple;
 
 pub use any::AnyRig;
+pub use delay::{ACTUATION_DELAY_MAX, DelayLine, Due, InFlight};
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
@@ -298,6 +300,8 @@ pub struct Context {
     pub duration_s: f64,
     /// The seed of all randomness.
     pub seed: u64,
+    /// From so many ticks after its measurement on a command acts.
+    pub actuation_delay_ticks: u64,
 }
 
 /// How a filter is designed: its order, and what follows from that.

@@ -45,6 +45,9 @@ pub struct OrbitRig {
 struct ControllerDesign {
     gains: OrbitGains,
     law: OrbitHold,
+    /// From so many ticks after its measurement on a command acts.
+    delay_ticks: u64,
+    predict: bool,
 }
 
 /// What a body's sensors add to (r, θ, Vr, Vθ).
@@ -73,8 +76,8 @@ impl OrbitRig {
         let full_state = matches!(self.aim, Aim::Circle { full_state: true, .. });
         let rates = self.filter.decay_rates().filter(|_| !full_state);
         let decay = rates.map_or(Vector2::repeat(f64::INFINITY), Vector2::from);
-        let ControllerDesign { gains, law } = controller;
-        OrbitCertificate::new(&self.field, law, gains, &decay, self.certified_radius(), self.tick_s)
+        let ControllerDesign { gains, law, delay_ticks, .. } = controller;
+        OrbitCertificate::new(&self.field, law, gains, &decay, self.certified_radius(), self.tick_s, *delay_ticks)
     }
 
     /// What a body is to be like, at the given state of the leader.
@@ -264,7 +267,8 @@ impl Rig for OrbitRig {
         let Some(controller) = self.controller else {
             unreachable!("a scenario with a driven body has a controller: checked when it was resolved")
         };
-        OrbitLaw::new(controller.law, self.aim)
+        let predicted_ticks = if controller.predict { controller.delay_ticks } else { 1 };
+        OrbitLaw::new(controller.law, self.aim, predicted_ticks)
     }
 
     fn metrics(&self) -> Vec<&'static str> {

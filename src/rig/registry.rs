@@ -64,7 +64,7 @@ pub(crate) fn shapes() -> Vec<(&'static str, Vec<Key>)> {
         let _ = (kind.resolve)(
             name,
             &sections,
-            Context { tick_s: 1e-3, duration_s: 1.0, seed: 1 },
+            Context { tick_s: 1e-3, duration_s: 1.0, seed: 1, actuation_delay_ticks: 1 },
             &mut Checks::new(&sections),
         );
         let unknown = |name: &&'static str| Key { name, required: false, shape: Shape::Any(None) };

@@ -1,7 +1,7 @@
 //! The plant: a body behind its sensors and actuators, and the actuators' own protection against silence.
 //!
-//! Logical execution time: what was computed from the measurement of tick k−1 acts from tick k on, never earlier, never
-//! later. Must not need any other role to be alive.
+//! Logical execution time: what was computed from the measurement of tick k acts from tick k + d on, never earlier, never
+//! later; d is 1 unless the scenario says otherwise. Must not need any other role to be alive.
 
 use crate::sample::{Message, Sample, Stamp, status};
 use crate::state::{Persist, Words};
@@ -46,6 +46,8 @@ pub enum Rearm {
 pub struct Actuation {
     /// Whether the body is driven at all; a free body expects no command and misses none.
     pub driven: bool,
+    /// From so many ticks after its measurement on a command acts. At least 1.
+    pub delay_ticks: u64,
     /// After so many consecutive missing commands the safe command takes over. At least 1.
     pub timeout_ticks: u64,
     /// What ends it.
@@ -56,7 +58,7 @@ pub struct Actuation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serial", derive(serde::Serialize, serde::Deserialize))]
 pub enum CommandEvent {
-    /// None was due: the body is free or the tick is the first.
+    /// None was due: the body is free or no command can act yet.
     NotDue,
     /// It was in time and is applied.
     Applied,
@@ -100,15 +102,20 @@ impl<B: Body> Plant<B> {
         self.actuation.driven
     }
 
-    /// Decides the input from tick `tick` on: the command computed from measurement `tick` − 1, if it is there.
+    /// How many ticks, counted from `tick`, there can be no command yet, beside the very first.
+    fn ticks_before_commands(&self, tick: u64) -> u64 {
+        (self.actuation.delay_ticks - 1).saturating_sub(tick)
+    }
+
+    /// Decides the input from tick `tick` on: the command computed `delay_ticks` before, if it is there.
     #[inline]
     pub fn command(&mut self, tick: u64, command: Option<&B::Command>) -> CommandEvent {
-        if !self.actuation.driven || tick == 0 {
+        if !self.actuation.driven || tick < self.actuation.delay_ticks {
             return CommandEvent::NotDue;
         }
         self.rejected = false;
         let latched = self.safe && self.actuation.rearm == Rearm::Manual;
-        match command.filter(|command| command.stamp().tick == tick - 1) {
+        match command.filter(|command| command.stamp().tick == tick - self.actuation.delay_ticks) {
             Some(_) if latched => CommandEvent::Refused,
             Some(command) if self.body.apply(command) => {
                 self.silent_ticks = 0;
@@ -174,8 +181,15 @@ impl<B: Body> Plant<B> {
         }
     }
 
-    /// Moves the body on by `ticks` ticks that nobody served: no command came, and the actuators protect themselves.
-    pub fn advance_alone(&mut self, ticks: u64) {
+    /// Moves the body on over the `ticks` ticks before `tick`, which nobody served: no command came, and the actuators protect
+    /// themselves.
+    pub fn advance_alone_to(&mut self, tick: u64, ticks: u64) {
+        let early = self.ticks_before_commands(tick - ticks).min(ticks);
+        self.advance(early);
+        self.advance_alone(ticks - early);
+    }
+
+    fn advance_alone(&mut self, ticks: u64) {
         if !self.actuation.driven {
             return self.advance(ticks);
         }

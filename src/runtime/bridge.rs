@@ -63,6 +63,15 @@ pub enum DeviceError {
         /// The least speed that would do, bit/s.
         least: u64,
     },
+    /// The run asks for what a device does not do.
+    #[error(
+        "a device applies a command at the tick after it, and the run has actuation_delay_ticks = {ticks}; give 1, or let \
+         a simulated plant take part"
+    )]
+    Delayed {
+        /// The run's delay, ticks.
+        ticks: u64,
+    },
     /// It does not answer.
     #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
     Silent {
@@ -156,7 +165,7 @@ impl DeviceLink {
     /// Opens the line to a device that is to be a body of a scenario; `run` tells this run from others.
     ///
     /// # Errors
-    /// [`DeviceError::Line`] and [`DeviceError::TooSlow`].
+    /// [`DeviceError::Line`], [`DeviceError::TooSlow`] and [`DeviceError::Delayed`].
     pub fn open(seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
         scenario.rig.face().device(seat, scenario, run)
     }
@@ -168,6 +177,9 @@ impl DeviceLink {
         run: u64,
     ) -> Result<Self, DeviceError> {
         let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
+        if scenario.actuation_delay_ticks > 1 {
+            return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
+        }
         check_speed(seat.baud, scenario, command + measurement)?;
         let greeting = Greeting::new(rig, scenario, &seat.body, run);
         let terms = Terms {

@@ -248,7 +248,7 @@ fn kill() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fault::{Delay, Distribution, Occurrence};
+    use crate::fault::{Delay, Occurrence};
     use crate::sample::RateCommand;
 
     fn fault(from_tick: u64, ticks: u64, action: Action) -> Course {
@@ -277,7 +277,7 @@ mod tests {
     /// Whatever is drawn, what is late finds room, and comes when it is due.
     #[test]
     fn samples_that_overtake_one_another_take_no_memory_on_the_way() {
-        let delay = Delay { ticks: 0, jitter_ticks: 7, distribution: Distribution::Uniform };
+        let delay = Delay { jitter_ticks: 7, ..Delay::constant(0) };
         let delay = Action::Transport(Transport::Delay(delay));
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 500, delay)], 1).unwrap();
         let (room, mut overtaken, mut at_once, mut come) = (disturbance.late.capacity(), 0, 0, Vec::new());

@@ -66,6 +66,8 @@ pub fn depths(scenario: &Scenario) -> Depths {
         ClockKind::Realtime => {
             let fits = longest_sample(scenario).map_or(usize::MAX, |bytes| (SCORED_BYTES / bytes).max(8));
             let late = disturb::late_samples(scenario);
+            // Of commands on their way all are to be had.
+            let fits = fits.max(scenario.actuation_delay_ticks as usize);
             Depths { role: 1, scorer: quarter_second.clamp(64, 8192).min(fits) + late, history: 0 }
         }
         // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever

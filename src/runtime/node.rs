@@ -247,8 +247,21 @@ impl<B: Bus> Seat<'_, B> {
     where
         S: Carried + ?Sized,
     {
+        self.input_of(body, signal, guard, Reader::Role)
+    }
+
+    fn input_of<S, G: Guard<S>>(
+        &self,
+        body: &BodyInfo,
+        signal: Signal,
+        guard: G,
+        reader: Reader,
+    ) -> Result<Input<B, S, G>, BusError>
+    where
+        S: Carried + ?Sized,
+    {
         let topic = topic(self.scenario, &body.name, signal);
-        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), Reader::Role)?
+        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), reader)?
             .inheriting(self.kept(&topic), body.bodies())
             .with_late(LateSamples::of(self.scenario, signal, &body.name))
             .guarded(guard);
@@ -334,10 +347,14 @@ fn extent(scenario: &Scenario) -> Extent {
 }
 
 /// An upper bound on the shared memory that a role's record takes, bytes: two copies of what it writes, and of what bodies,
-/// filters, laws and guards remember, which is at most so many times what is said of them.
-fn record_bytes(ports: &Ports) -> usize {
-    let samples: usize = ports.writes.iter().chain(&ports.reads).map(|port| port.size).sum();
-    2 * (RECORD_BYTES + SAMPLES_KEPT * samples)
+/// filters, laws and guards remember, which is at most so many times what is said of them; and of commands, as many as are on
+/// their way.
+fn record_bytes(scenario: &Scenario, ports: &Ports) -> usize {
+    let all = || ports.writes.iter().chain(&ports.reads);
+    let samples: usize = all().map(|port| port.size).sum();
+    let commands: usize = all().filter(|port| port.topic.signal == Signal::Command).map(|port| port.size).sum();
+    let in_flight = if scenario.actuation_delay_ticks > 1 { scenario.actuation_delay_ticks as usize } else { 0 };
+    2 * (RECORD_BYTES + SAMPLES_KEPT * samples + in_flight * commands)
 }
 
 /// A ledger for a role that no successor will need.
@@ -360,7 +377,7 @@ pub(crate) fn shared_memory_bytes(scenario: &Scenario) -> usize {
     let role = |role: RoleId| {
         let ports = ports(scenario, role);
         let signals = ports.writes.iter().chain([&ports.health]).map(port).sum::<usize>();
-        signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(&ports)
+        signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(scenario, &ports)
     };
     let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
     // The recorder says how it is, as the roles do.

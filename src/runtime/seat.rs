@@ -7,7 +7,7 @@ use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, 
 use super::{depths, window_ticks};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{self, Qos};
-use crate::bus::{Depths, Reader};
+use crate::bus::{Depths, Reader, Signal};
 use crate::config::Scenario;
 use crate::role::Rearm;
 use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, VOID, status};
@@ -36,6 +36,8 @@ pub struct SeatDescription {
     last_tick: u64,
     /// How far a plant may run ahead of the credit in lockstep.
     window_ticks: u64,
+    /// From so many ticks after its measurement on a command acts.
+    actuation_delay_ticks: u64,
     command_timeout_ticks: u64,
     rearm: &'static str,
     transport: Transport,
@@ -109,7 +111,10 @@ struct WarmUp {
 pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>) -> SeatDescription {
     let (ports, depths) = (ports(scenario, role), depths(scenario));
     let written = |port: &Port| SignalDescription::new(port, depths, None);
-    let read = |port: &Port| SignalDescription::new(port, depths, Some(Reader::Role));
+    // Where several commands may come before one is due, the newest is not enough.
+    let waits = |port: &Port| port.topic.signal == Signal::Command && scenario.actuation_delay_ticks > 1;
+    let reader = |port: &Port| if waits(port) { Reader::Scorer } else { Reader::Role };
+    let read = |port: &Port| SignalDescription::new(port, depths, Some(reader(port)));
     let name = role.name(scenario);
     SeatDescription {
         schema: SCHEMA,
@@ -123,6 +128,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         period_ns: scenario.period_ns,
         last_tick: scenario.last_tick,
         window_ticks: window_ticks(scenario),
+        actuation_delay_ticks: scenario.actuation_delay_ticks,
         command_timeout_ticks: scenario.command_timeout_ticks,
         rearm: match scenario.rearm {
             Rearm::Auto => "auto",

@@ -171,7 +171,7 @@ fn greet<B: SingleBody>(
 impl<B: SingleBody> Session<B> {
     fn new(body: B, hello: &Hello<'_>, now_ns: u64) -> Self {
         let rearm = if hello.manual_rearm { Rearm::Manual } else { Rearm::Auto };
-        let actuation = Actuation { driven: true, timeout_ticks: hello.timeout_ticks, rearm };
+        let actuation = Actuation { driven: true, delay_ticks: 1, timeout_ticks: hello.timeout_ticks, rearm };
         Self {
             run: hello.run,
             plant: Plant::new(body, actuation, hello.period_ns as f64 / 1e9),

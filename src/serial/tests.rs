@@ -199,7 +199,7 @@ fn value(tick: u64) -> f64 {
 
 /// The answers of a plant that sits in the host's own process.
 fn built_in(ticks: u64) -> Vec<Event> {
-    let actuation = Actuation { driven: true, timeout_ticks: TIMEOUT_TICKS, rearm: Rearm::Auto };
+    let actuation = Actuation { driven: true, delay_ticks: 1, timeout_ticks: TIMEOUT_TICKS, rearm: Rearm::Auto };
     let mut plant = Plant::new(spinner(), actuation, PERIOD_NS as f64 / 1e9);
     let answer = |tick: u64| {
         let mut command = command(value(tick));

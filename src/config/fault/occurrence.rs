@@ -134,6 +134,17 @@ impl One<'_, '_, '_> {
 
     /// How late samples are.
     pub(super) fn delay(&mut self) -> Option<Delay> {
+        // A command has until it is to act; everything else, until its own tick is over.
+        let commands = self.raw.role == "controller";
+        let slack_ticks = if commands { self.setting.actuation_delay_ticks - 1 } else { 0 };
+        let delay = Delay { slack_ticks, ..self.lateness()? };
+        self.require(delay.bound() > slack_ticks, "delay_ticks", || {
+            format!("no command would be late: with actuation_delay_ticks they have {slack_ticks} ticks; give more")
+        })?;
+        Some(delay)
+    }
+
+    fn lateness(&mut self) -> Option<Delay> {
         let RawFault { jitter_ticks, distribution, spread_ticks, .. } = *self.raw;
         let ticks = self.raw.delay_ticks?;
         let least = u64::from(jitter_ticks.is_none());
@@ -158,7 +169,7 @@ impl One<'_, '_, '_> {
             self.require(spread_ticks.is_none(), "spread_ticks", || {
                 "has no meaning for a uniform distribution; remove it, or give another distribution".to_owned()
             })?;
-            return Some(Delay { ticks, jitter_ticks, distribution: Distribution::Uniform });
+            return Some(Delay { jitter_ticks, ..Delay::constant(ticks) });
         }
         self.require(spread_ticks.is_some(), "spread_ticks", || {
             "is missing for this distribution: the mean of a geometric one, the standard deviation of a normal one; add it"
@@ -174,7 +185,7 @@ impl One<'_, '_, '_> {
             DistributionName::Normal => Distribution::Normal(spread),
             _ => Distribution::Geometric(spread),
         };
-        Some(Delay { ticks, jitter_ticks, distribution })
+        Some(Delay { jitter_ticks, distribution, ..Delay::constant(ticks) })
     }
 
     /// Whether the fault is one of the role itself.

@@ -297,7 +297,8 @@ impl RawGain {
             transverse_per_s: self.transverse_per_s,
         };
         let lead_s = if predict { context.tick_s } else { 0.0 };
-        ControllerDesign { gains, law: OrbitHold::new(field, gains, thrust_max, lead_s) }
+        let (law, delay_ticks) = (OrbitHold::new(field, gains, thrust_max, lead_s), context.actuation_delay_ticks);
+        ControllerDesign { gains, law, delay_ticks, predict }
     }
 }
 

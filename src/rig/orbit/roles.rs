@@ -5,7 +5,7 @@
 use crate::control::OrbitHold;
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use crate::rig::FilterDesign;
+use crate::rig::{FilterDesign, InFlight};
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use crate::state::persist_fields;
@@ -200,29 +200,48 @@ pub(super) enum Aim {
 pub struct OrbitLaw {
     law: OrbitHold,
     aim: Aim,
+    /// What a law that predicts has sent and what does not act yet, du/s².
+    in_flight: InFlight<[f64; 2]>,
 }
 
 impl OrbitLaw {
-    pub(super) fn new(law: OrbitHold, aim: Aim) -> Self {
-        Self { law, aim }
+    /// The law of a body whose motion it is to predict over so many ticks, if it predicts.
+    pub(super) fn new(law: OrbitHold, aim: Aim, predicted_ticks: u64) -> Self {
+        Self { law, aim, in_flight: InFlight::new(predicted_ticks, || [0.0; 2]) }
     }
 
     /// The thrust, or none to be asked for: a lost body, or nothing known of the leader yet.
     fn thrust(&self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement) -> Option<Vector2<f64>> {
         let sound = measurement.status & status::FAULT == 0 && estimate.valid & POSITION == POSITION;
         let body = state(measurement.radius_du, measurement.angle_rad, &measurement.velocity_du_s);
-        let applied = measurement.applied_du_s2.into();
+        let tick = measurement.stamp.tick;
+        let applied = measurement.applied_du_s2;
         sound.then(|| match self.aim {
-            Aim::Circle { radius, full_state: true } => self.law.to_circle(radius, &body, &applied),
+            Aim::Circle { radius, full_state: true } => {
+                let (body, applied) = self.ahead(tick, body, applied);
+                self.law.to_circle(radius, &body, &applied)
+            }
             Aim::Circle { radius, full_state: false } => {
                 let [vr, vtheta] = estimate.velocity_du_s;
-                self.law.to_circle(radius, &OrbitState { vr, vtheta, ..body }, &applied)
+                let (body, applied) = self.ahead(tick, OrbitState { vr, vtheta, ..body }, applied);
+                self.law.to_circle(radius, &body, &applied)
             }
             Aim::Leader => {
                 let leader = state(estimate.radius_du, estimate.angle_rad, &estimate.velocity_du_s);
+                let coasting = |leader, _| self.law.ahead(&leader, &Vector2::zeros());
+                let leader = self.in_flight.after(tick).fold(leader, coasting);
+                let (body, applied) = self.ahead(tick, body, applied);
                 self.law.to_leader(&leader, &body, &applied)
             }
         })
+    }
+
+    /// A body one tick before a new command begins to act, and what acts in that tick: the law itself predicts the last.
+    fn ahead(&self, tick: u64, body: OrbitState, applied: [f64; 2]) -> (OrbitState, Vector2<f64>) {
+        let on = |(body, acts): (OrbitState, Vector2<f64>), input: Option<&[f64; 2]>| {
+            (self.law.ahead(&body, &acts), input.map_or(acts, |input| (*input).into()))
+        };
+        self.in_flight.after(tick).fold((body, applied.into()), on)
     }
 }
 
@@ -230,7 +249,7 @@ fn state(r: f64, theta: f64, velocity: &[f64; 2]) -> OrbitState {
     OrbitState { r, vr: velocity[0], theta, vtheta: velocity[1] }
 }
 
-persist_fields!(OrbitLaw,);
+persist_fields!(OrbitLaw, in_flight);
 
 impl Law for OrbitLaw {
     type Estimate = OrbitEstimate;
@@ -239,6 +258,9 @@ impl Law for OrbitLaw {
 
     fn command(&mut self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement, out: &mut OrbitCommand) {
         out.thrust_du_s2 = self.thrust(estimate, measurement).unwrap_or_default().into();
+        if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {
+            *sent = out.thrust_du_s2;
+        }
     }
 }
 
@@ -287,7 +309,7 @@ mod tests {
                 0.0,
             );
             for aim in [Aim::Leader, Aim::Circle { radius: 1.3, full_state: true }] {
-                assert_eq!(OrbitLaw::new(law, aim).thrust(&estimate, &frozen), None);
+                assert_eq!(OrbitLaw::new(law, aim, 1).thrust(&estimate, &frozen), None);
             }
         }
     }

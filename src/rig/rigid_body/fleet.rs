@@ -7,7 +7,7 @@ use super::RigidBodyRig;
 use super::limits::Motion;
 use crate::control::FleetLaw;
 use crate::model::{RigidBody, flow_all, uniform};
-use crate::rig::Fleet;
+use crate::rig::{Fleet, InFlight};
 use crate::role::{Body, Bounds, Guard, Law, Pursuit};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
@@ -58,6 +58,8 @@ pub struct RateFleet {
     initial: Arrays,
     law: FleetLaw,
     learned: bool,
+    /// How far the law predicts, ticks, if it does.
+    delay_ticks: u64,
     bounds: Bounds<3>,
     motion: Option<Motion>,
     acceleration_max_rad_s2: f64,
@@ -81,6 +83,7 @@ impl RateFleet {
             initial,
             law: FleetLaw::new(law, acceleration_max_rad_s2),
             learned: controller.learned,
+            delay_ticks: if controller.predict { rig.actuation_delay_ticks } else { 1 },
             bounds: rig.limits.bounds(&rig.sensed(index), rig.tick_s),
             motion: rig.sensed(index).motion(rig.tick_s),
             acceleration_max_rad_s2,
@@ -107,7 +110,8 @@ impl Fleet<RateEstimate> for RateFleet {
 
     fn law(&self) -> FleetRateLaw {
         let ahead = if self.law.predicts() { zeros(self.count()) } else { Arrays::default() };
-        FleetRateLaw { law: self.law, learned: self.learned, ahead }
+        let in_flight = InFlight::new(self.delay_ticks, || zeros(self.count()));
+        FleetRateLaw { law: self.law, learned: self.learned, ahead, in_flight }
     }
 
     fn measurement_guard(&self) -> FleetMeasurementGuard {
@@ -191,9 +195,15 @@ pub struct FleetRateLaw {
     learned: bool,
     /// Room for the predicted rates, if there is a prediction.
     ahead: Arrays,
+    /// What was sent and does not act yet, rad/s², if there is a prediction.
+    in_flight: InFlight<Arrays>,
 }
 
-persist_fields!(FleetRateLaw,);
+impl Persist for FleetRateLaw {
+    fn persist<W: Words>(&mut self, words: &mut W) {
+        self.in_flight.persist_by(words, persist_arrays);
+    }
+}
 
 impl Law for FleetRateLaw {
     type Estimate = RateEstimate;
@@ -209,8 +219,17 @@ impl Law for FleetRateLaw {
         out.set_status(0);
         if self.law.predicts() {
             assign(all_mut(&mut self.ahead), rates);
-            let reference = self.law.ahead(&reference, all_mut(&mut self.ahead), measurement.vector(APPLIED));
+            let applied = measurement.vector(APPLIED);
+            let tick = measurement.stamp().tick;
+            let mut reference = self.law.ahead(&reference, all_mut(&mut self.ahead), applied);
+            for input in self.in_flight.after(tick) {
+                let input = input.map_or(applied, all);
+                reference = self.law.ahead(&reference, all_mut(&mut self.ahead), input);
+            }
             self.law.command(&reference, all(&self.ahead), out.vector_mut(ACCELERATION));
+            if let Some(sent) = self.in_flight.sent(tick) {
+                assign(all_mut(sent), out.vector(ACCELERATION));
+            }
         } else {
             self.law.command(&reference, rates, out.vector_mut(ACCELERATION));
         }

@@ -1,6 +1,7 @@
 //! The synchronising law of one follower, with its certificate computed live.
 
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
+use crate::rig::InFlight;
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use crate::state::persist_fields;
@@ -21,10 +22,27 @@ pub struct RateLaw {
     /// No component is asked to be larger: the actuators would refuse it.
     pub(super) acceleration_max_rad_s2: f64,
     pub(super) tick_s: f64,
+    /// What a law that predicts has sent and what does not act yet, rad/s².
+    pub(super) in_flight: InFlight<[f64; 3]>,
+}
+
+impl RateLaw {
+    /// Reference and follower moved on, tick by tick, under what is on its way.
+    #[inline(never)]
+    fn further(
+        &self,
+        (mut w, mut p): (Vector3<f64>, Vector3<f64>),
+        measurement: &RateMeasurement,
+    ) -> (Vector3<f64>, Vector3<f64>) {
+        for input in self.in_flight.after(measurement.stamp.tick) {
+            (w, p) = self.law.ahead(w, p, input.unwrap_or(&measurement.applied_rad_s2));
+        }
+        (w, p)
+    }
 }
 
 // What was learned of the coefficients comes anew with every estimate.
-persist_fields!(RateLaw, adaptation);
+persist_fields!(RateLaw, adaptation, in_flight);
 
 impl Law for RateLaw {
     type Estimate = RateEstimate;
@@ -40,12 +58,18 @@ impl Law for RateLaw {
         if self.learned {
             self.law.learn(estimate.coefficients.into());
         }
-        let (w, p) = self.law.ahead(reference, follower, &measurement.applied_rad_s2);
+        let (mut w, mut p) = self.law.ahead(reference, follower, &measurement.applied_rad_s2);
+        if !self.in_flight.is_empty() {
+            (w, p) = self.further((w, p), measurement);
+        }
         let mut asked = self.law.command(&w, &p);
         if self.adaptation.acts() {
             asked += self.adaptation.correction(&w, &p, self.tick_s);
         }
         out.acceleration_rad_s2 = limited(asked, self.acceleration_max_rad_s2).into();
+        if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {
+            *sent = out.acceleration_rad_s2;
+        }
         // e = p − ω with ω = ω̂ + ε; the observer knows ε from its last step.
         let error = follower - reference - self.supplied * estimate.innovation_rad_s;
         (out.lyapunov_rad2_s2, out.lyapunov_rate_bound_rad2_s3) =

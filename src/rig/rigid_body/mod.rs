@@ -22,8 +22,8 @@ pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, Inputs, Lyapunov, Monitor,
-    Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, InFlight, Inputs, Lyapunov,
+    Monitor, Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
 };
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
@@ -68,6 +68,7 @@ pub struct RigidBodyRig {
     limits: Limits,
     notes: Vec<String>,
     tick_s: f64,
+    actuation_delay_ticks: u64,
     /// What is proven of any follower: they differ in nothing that it knows of.
     certificate: Option<Certificate>,
 }
@@ -143,7 +144,7 @@ impl RigidBodyRig {
             });
         }
         if let Some(controller) = self.controller {
-            let step = Certificate::gain_step(&controller.gain_per_s, tick_s, controller.predict);
+            let step = Certificate::gain_step(&controller.gain_per_s, tick_s, self.unpredicted_ticks(&controller));
             checks.require(step.holds(), "controller.gain_per_s", || {
                 format!(
                     "the largest gain times the tick is {:.3}, and the sampled loop is unstable from {} on; lower the gain \
@@ -182,6 +183,16 @@ impl RigidBodyRig {
         (Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s), controller)
     }
 
+    /// The delay that the law does not predict over, ticks.
+    fn unpredicted_ticks(&self, controller: &ControllerDesign) -> u64 {
+        if controller.predict { 0 } else { self.actuation_delay_ticks }
+    }
+
+    /// What a law that predicts has on its way.
+    fn in_flight<U>(&self, controller: &ControllerDesign, blank: impl Fn() -> U) -> InFlight<U> {
+        InFlight::new(if controller.predict { self.actuation_delay_ticks } else { 1 }, blank)
+    }
+
     fn certify(&self) -> Option<Certificate> {
         let controller = self.controller?;
         // It is about leaders that move freely.
@@ -201,7 +212,7 @@ impl RigidBodyRig {
             decay_rate_per_s,
             self.rate_bound_rad_s(),
             self.tick_s,
-            controller.predict,
+            self.unpredicted_ticks(&controller),
         ))
     }
 }
@@ -339,6 +350,7 @@ impl Rig for RigidBodyRig {
             supplied: Vector3::ith(self.supplied(), 1.0),
             learned: controller.learned,
             acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
+            in_flight: self.in_flight(&controller, || [0.0; 3]),
             tick_s: self.tick_s,
         }
     }

@@ -64,6 +64,7 @@ pub(super) fn resolve(
         playback,
         notes,
         tick_s: context.tick_s,
+        actuation_delay_ticks: context.actuation_delay_ticks,
         certificate: None,
     };
     rig.certificate = rig.certify();

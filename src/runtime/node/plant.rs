@@ -3,9 +3,9 @@
 use super::{
     Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
 };
-use crate::bus::{Bus, BusError, Carried, Signal};
+use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
-use crate::rig::BodyInfo;
+use crate::rig::{BodyInfo, DelayLine, Due};
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
@@ -13,6 +13,7 @@ use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use std::borrow::{Borrow, BorrowMut};
 
 /// A body whose samples links carry: one, or a fleet.
 pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
@@ -23,6 +24,8 @@ impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> 
 pub struct PlantNode<P: Hosted, G, B: Bus> {
     plant: Plant<P>,
     command: Option<Input<B, P::Command, G>>,
+    /// What has come and is not due, where a command does not act at the tick after its own.
+    line: Option<DelayLine<<P::Command as Carried>::Owned>>,
     measurement: Output<B, P::Measurement>,
     truth: Output<B, P::Truth>,
     clock: Clock,
@@ -54,10 +57,16 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         let scenario = seat.scenario;
         let measurement = seat.output(info, Signal::Measurement)?;
         let truth = seat.output(info, Signal::Truth)?;
-        let command = info.driven.then(|| seat.input(info, Signal::Command, guard)).transpose()?;
+        let delay_ticks = scenario.actuation_delay_ticks;
+        // Where several commands may come before one is due, the newest is not enough.
+        let (delayed, bodies) = (delay_ticks > 1, info.bodies());
+        let reader = if delayed { Reader::Scorer } else { Reader::Role };
+        let command = info.driven.then(|| seat.input_of(info, Signal::Command, guard, reader)).transpose()?;
+        let line = (delayed && info.driven).then(|| DelayLine::new(delay_ticks, || P::Command::blank(bodies)));
         Ok(Self {
             plant: Plant::new(body, scenario.actuation(info.driven), scenario.tick_s()),
             command,
+            line,
             measurement,
             truth,
             clock: seat.clock,
@@ -77,10 +86,30 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 
     fn inputs_ready(&mut self) -> Result<bool, NodeError> {
+        let Some(last) = self.counters.next().checked_sub(1) else { return Ok(true) };
         match &mut self.command {
-            Some(command) if self.counters.next() > 0 => Ok(command.seek(self.counters.next() - 1)? != Seek::NotYet),
-            _ => Ok(true),
+            Some(_) if self.line.is_some() => self.collect(last),
+            Some(command) => Ok(command.seek(last)? != Seek::NotYet),
+            None => Ok(true),
         }
+    }
+
+    /// Takes the commands up to that of a tick into the line, as far as they have come; whether it is known of all what has
+    /// become of them.
+    fn collect(&mut self, last: u64) -> Result<bool, NodeError> {
+        let (Some(input), Some(line)) = (&mut self.command, &mut self.line) else { return Ok(true) };
+        for tick in line.wanted_at(last + 1)..=last {
+            match input.seek(tick)? {
+                Seek::NotYet => return Ok(false),
+                Seek::Passed => line.lack(tick),
+                Seek::Rejected => line.reject(tick),
+                Seek::Found => match input.sample() {
+                    Some(command) => line.put(tick).borrow_mut().assign(command),
+                    None => line.lack(tick),
+                },
+            }
+        }
+        Ok(true)
     }
 
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
@@ -141,7 +170,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     #[inline]
     fn execute(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
-        self.plant.advance_alone(std::mem::take(&mut self.behind));
+        self.plant.advance_alone_to(tick, std::mem::take(&mut self.behind));
         let event = self.take_command(tick, now_ns)?;
         if event.missed() {
             self.counters.starved(tick);
@@ -149,10 +178,13 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         if matches!(event, CommandEvent::Expired | CommandEvent::Safe) {
             self.counters.safe();
         }
+        let driven = self.command.is_some();
         if let Some(computing) = &mut self.computing {
-            let applied = matches!(event, CommandEvent::Applied);
-            let command = self.command.as_ref().and_then(Input::sample).filter(|_| applied);
-            computing.tick(tick, &[command.map(Message::words)][..usize::from(self.command.is_some())])?;
+            let command = match due(self.command.as_mut(), self.line.as_ref(), tick)? {
+                Due::Here(command) if event == CommandEvent::Applied => Some(command),
+                _ => None,
+            };
+            computing.tick(tick, &[command.map(Message::words)][..usize::from(driven)])?;
         }
         let (plant, computing, clock) = (&mut self.plant, &self.computing, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
@@ -172,18 +204,47 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
     #[inline]
     fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, NodeError> {
-        let Some(input) = &mut self.command else { return Ok(self.plant.command(tick, None)) };
-        let found = if tick > 0 { input.seek(tick - 1)? } else { Seek::NotYet };
-        if found == Seek::Rejected {
-            return Ok(self.plant.reject(tick));
+        if self.command.is_none() {
+            return Ok(self.plant.command(tick, None));
         }
-        let command = input.sample().filter(|_| found == Seek::Found);
-        let event = self.plant.command(tick, command);
-        if let (CommandEvent::Applied, Some(command), Clock::Monotonic) = (event, command, self.clock) {
-            self.age.record(command.stamp().origin_ns, now_ns);
+        if self.line.is_some() {
+            let last = tick.checked_sub(1);
+            last.map_or(Ok(true), |last| self.collect(last))?;
+        }
+        let (input, line) = (&mut self.command, &self.line);
+        let due = due(input.as_mut(), line.as_ref(), tick)?;
+        let (event, origin_ns) = match due {
+            Due::Rejected => return Ok(self.plant.reject(tick)),
+            Due::Missing => return Ok(self.plant.command(tick, None)),
+            Due::Here(command) => (self.plant.command(tick, Some(command)), command.stamp().origin_ns),
+        };
+        if event == CommandEvent::Applied && self.clock == Clock::Monotonic {
+            self.age.record(origin_ns, now_ns);
         }
         Ok(event)
     }
+}
+
+/// The command that is due at a tick, of what has come.
+#[inline]
+fn due<'a, S: Carried + ?Sized, G: Guard<S>, B: Bus>(
+    input: Option<&'a mut Input<B, S, G>>,
+    line: Option<&'a DelayLine<S::Owned>>,
+    tick: u64,
+) -> Result<Due<&'a S>, NodeError> {
+    Ok(match (input, line, tick.checked_sub(1)) {
+        (_, Some(line), _) => match line.due(tick) {
+            Due::Here(command) => Due::Here(command.borrow()),
+            Due::Rejected => Due::Rejected,
+            Due::Missing => Due::Missing,
+        },
+        (Some(input), None, Some(last)) => match input.seek(last)? {
+            Seek::Found => input.sample().map_or(Due::Missing, Due::Here),
+            Seek::Rejected => Due::Rejected,
+            Seek::NotYet | Seek::Passed => Due::Missing,
+        },
+        _ => Due::Missing,
+    })
 }
 
 impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G, B> {
@@ -329,6 +390,9 @@ impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
         self.unfinished.persist(words);
         self.behind.persist(words);
         self.command.iter_mut().for_each(|command| command.persist(words));
+        if let Some(line) = &mut self.line {
+            line.persist(words, |command, words| command.borrow_mut().words_mut().persist(words));
+        }
         self.measurement.persist_late(words);
     }
 }
