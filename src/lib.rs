@@ -26,6 +26,7 @@
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
+//! | `campaign` | one scenario run many times, varied; the table of its cases | no |
 //! | `report` | a run as one page that is looked at | no |
 //! | `bench` | what all of it costs beside its floors | no |
 //! | `doctor` | whether this machine is fit for real time | no |
@@ -64,6 +65,8 @@ pub mod analysis;
 pub mod bench;
 #[cfg(feature = "runtime")]
 pub mod bus;
+#[cfg(feature = "runtime")]
+pub mod campaign;
 #[cfg(feature = "runtime")]
 pub mod clock;
 #[cfg(feature = "runtime")]

@@ -1,0 +1,362 @@
+//! The results of a campaign: one row per case, and the margins that were asked for.
+//!
+//! Plain data, the same in memory, as JSON and in the journal. Must not compute anything.
+
+use super::journal::{self, JournalError};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::path::Path;
+
+/// What came of a campaign, or of as much of it as has been run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Table {
+    /// The campaign's name.
+    pub name: String,
+    /// The scenario that is varied: the name of a shipped one, or a file, as the campaign names it.
+    pub base: String,
+    /// What is varied; a row has one parameter for each.
+    pub axes: Vec<Axis>,
+    /// What is measured; a row has one value for each.
+    pub metrics: Vec<Metric>,
+    /// How many cases the whole campaign has; where there are fewer rows, the others have not been run here.
+    pub cases: u64,
+    /// One per case that has been run, by its number.
+    pub rows: Vec<Row>,
+    /// One per margin that is searched for.
+    pub margins: Vec<Margin>,
+}
+
+/// One key of the scenario that is varied.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Axis {
+    /// The key, as `--set` takes it: `controller.gain_per_s`, `fault.0.probability`. Its unit is its last part.
+    pub key: String,
+    /// What to call it, where the campaign says so.
+    pub label: Option<String>,
+    /// How its values are spread.
+    pub kind: AxisKind,
+    /// Every value that it takes, in order, where these are known beforehand; empty where they are drawn.
+    pub values: Vec<Parameter>,
+}
+
+impl Axis {
+    /// What to call it: its label, or its key.
+    pub fn name(&self) -> &str {
+        self.label.as_deref().unwrap_or(&self.key)
+    }
+}
+
+/// How the values of an axis are spread.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AxisKind {
+    /// A list: words, flags, or numbers in the order of their author.
+    Values,
+    /// Evenly.
+    Linear,
+    /// By equal factors: to be drawn on a logarithmic axis.
+    Log,
+    /// About a mean.
+    Normal,
+}
+
+/// One number that is measured of every case: a statistic of one of the rig's metrics.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Metric {
+    /// The column's name: metric and statistic, as `sync_error_rad_s.peak`.
+    pub name: String,
+    /// The rig's metric. Its unit is its last part.
+    pub metric: String,
+    /// What is taken of it.
+    pub statistic: Statistic,
+}
+
+/// What is taken of a metric over a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Statistic {
+    /// Its value at the last tick.
+    Last,
+    /// The largest from `accept.settled_by_s` on.
+    SettledMax,
+    /// The largest from `accept.peak_from_s` on.
+    Peak,
+    /// The integral of its square over the run: unit² s.
+    Ise,
+}
+
+impl Statistic {
+    /// All of them, in the order of the columns.
+    pub const ALL: [Self; 4] = [Self::Last, Self::SettledMax, Self::Peak, Self::Ise];
+
+    /// The second part of a column's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Last => "last",
+            Self::SettledMax => "settled_max",
+            Self::Peak => "peak",
+            Self::Ise => "ise",
+        }
+    }
+}
+
+/// The value of a key in one case.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Parameter {
+    /// True or false.
+    Flag(bool),
+    /// A whole number.
+    Whole(i64),
+    /// A number.
+    Number(f64),
+    /// A word; for a list or a table its TOML text, or the name that the campaign gives it.
+    Word(String),
+}
+
+impl Parameter {
+    /// The value as a number, if it is one.
+    pub fn number(&self) -> Option<f64> {
+        match self {
+            Self::Whole(number) => Some(*number as f64),
+            Self::Number(number) => Some(*number),
+            Self::Flag(_) | Self::Word(_) => None,
+        }
+    }
+}
+
+impl fmt::Display for Parameter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Flag(flag) => flag.fmt(f),
+            Self::Whole(number) => number.fmt(f),
+            Self::Number(number) => number.fmt(f),
+            Self::Word(word) => word.fmt(f),
+        }
+    }
+}
+
+/// One case.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    /// Its number, from 0.
+    pub case: u64,
+    /// The seed of its randomness.
+    pub seed: u64,
+    /// The values of the axes, in their order.
+    pub parameters: Vec<Parameter>,
+    /// Whether every criterion that could be judged holds; none if none could be, or if it did not run to its end.
+    pub accepted: Option<bool>,
+    /// The same in words, as a run's summary has it.
+    pub verdict: String,
+    /// How it ended.
+    pub exit: End,
+    /// Why, where it did not run to its end.
+    pub reason: Option<String>,
+    /// From this time on every metric that has a limit in `[accept]` stayed within it, s; none if there is none, or one did not.
+    pub settled_at_s: Option<f64>,
+    /// The statistics, in the order of the table's metrics; none where there is none, or where it is not finite: of a body that
+    /// was lost.
+    pub metrics: Vec<Option<f64>>,
+    /// Ticks executed, all roles together.
+    pub executed: u64,
+    /// Ticks that a role did not execute.
+    pub missed: u64,
+    /// Ticks at which an input that was due was absent.
+    pub starved: u64,
+    /// Ticks at which a body applied its safe command.
+    pub safe: u64,
+    /// Ticks at which some body was lost.
+    pub lost: u64,
+    /// Samples that scripted faults touched, and stalls.
+    pub injected: u64,
+    /// The state hash, as 16 hexadecimal digits; empty where nothing ran.
+    pub hash: String,
+    /// The slowest rate that is claimed of the loop's driven bodies, 1/s; none if the campaign does not ask for it, or none is
+    /// claimed.
+    pub predicted_rate_per_s: Option<f64>,
+}
+
+/// How a case ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum End {
+    /// It ran to its last tick.
+    Completed,
+    /// It did, and a body came to where its model ends.
+    Lost,
+    /// A role failed, and the run was ended.
+    Stopped,
+    /// The scenario of this case is not valid; nothing ran.
+    Invalid,
+    /// It could not be run.
+    Failed,
+}
+
+impl End {
+    /// Its name, as in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Completed => "completed",
+            Self::Lost => "lost",
+            Self::Stopped => "stopped",
+            Self::Invalid => "invalid",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// A margin: how far a key can go at every point of the other axes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Margin {
+    /// The key that is moved.
+    pub key: String,
+    /// Which end is looked for.
+    pub find: Find,
+    /// What must hold: `accepted`.
+    pub such_that: String,
+    /// Where the search begins and ends.
+    pub range: [f64; 2],
+    /// The bracket is at most so wide, in the key's unit.
+    pub tolerance: f64,
+    /// One per point that has been searched, by its case.
+    pub points: Vec<MarginPoint>,
+}
+
+/// Which end of a range is looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Find {
+    /// The largest value at which it holds.
+    Largest,
+    /// The smallest.
+    Smallest,
+}
+
+/// A margin at one point of the other axes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MarginPoint {
+    /// The case whose parameters and seed it has, but for the key that is moved.
+    pub case: u64,
+    /// The values of the axes there, in their order; none for the key that is moved, if that is one.
+    pub parameters: Vec<Option<Parameter>>,
+    /// The last value at which it was seen to hold; none if it does not even where the search begins.
+    pub value: Option<f64>,
+    /// The margin lies between these: it was seen to hold at the first, and not to hold at the second. None for an end at which
+    /// nothing was seen: the margin is beyond the range.
+    pub bracket: [Option<f64>; 2],
+    /// How many runs were needed.
+    pub runs: u64,
+}
+
+impl Table {
+    /// Reads the results of a campaign from its directory, all of them or as many as there are.
+    ///
+    /// # Errors
+    /// [`JournalError`].
+    pub fn read(directory: &Path) -> Result<Self, JournalError> {
+        let mut opened = journal::Reader::open(directory)?;
+        let mut table = opened.head().table.clone();
+        while let Some(entry) = opened.next()? {
+            table.add(entry);
+        }
+        table.rows.sort_by_key(|row| row.case);
+        table.rows.dedup_by_key(|row| row.case);
+        for margin in &mut table.margins {
+            margin.points.sort_by_key(|point| point.case);
+            margin.points.dedup_by_key(|point| point.case);
+        }
+        Ok(table)
+    }
+
+    fn add(&mut self, entry: journal::Entry) {
+        match entry {
+            journal::Entry::Row(row) => self.rows.push(row),
+            journal::Entry::Margin { margin, point } => {
+                self.margins.get_mut(margin).into_iter().for_each(|margin| margin.points.push(point.clone()));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub(crate) fn table() -> Table {
+        let metric = |statistic: Statistic| Metric {
+            name: format!("sync_error_rad_s.{}", statistic.name()),
+            metric: "sync_error_rad_s".to_owned(),
+            statistic,
+        };
+        Table {
+            name: "map".to_owned(),
+            base: "rigid-pair".to_owned(),
+            axes: vec![Axis {
+                key: "controller.gain_per_s".to_owned(),
+                label: None,
+                kind: AxisKind::Log,
+                values: vec![Parameter::Number(1.0), Parameter::Whole(2), Parameter::Word("a".into())],
+            }],
+            metrics: Statistic::ALL.map(metric).to_vec(),
+            cases: 4,
+            rows: vec![Row {
+                case: 3,
+                seed: u64::MAX,
+                parameters: vec![Parameter::Number(0.1 + 0.2)],
+                accepted: Some(true),
+                verdict: "accepted".to_owned(),
+                exit: End::Completed,
+                reason: None,
+                settled_at_s: Some(1.0 / 3.0),
+                metrics: vec![Some(1e-300), None, Some(5.0), None],
+                executed: 4,
+                missed: 0,
+                starved: 0,
+                safe: 0,
+                lost: 0,
+                injected: 0,
+                hash: "00ff00ff00ff00ff".to_owned(),
+                predicted_rate_per_s: None,
+            }],
+            margins: vec![Margin {
+                key: "fault.0.ticks".to_owned(),
+                find: Find::Largest,
+                such_that: "accepted".to_owned(),
+                range: [1.0, 100.0],
+                tolerance: 1.0,
+                points: vec![MarginPoint {
+                    case: 3,
+                    parameters: vec![Some(Parameter::Flag(true)), None],
+                    value: Some(41.0),
+                    bracket: [Some(41.0), Some(42.0)],
+                    runs: 9,
+                }],
+            }],
+        }
+    }
+
+    #[test]
+    fn a_table_is_the_same_after_json() {
+        let table = table();
+        let text = serde_json::to_string(&table).unwrap();
+        assert_eq!(serde_json::from_str::<Table>(&text).unwrap(), table, "{text}");
+    }
+
+    #[test]
+    fn a_table_is_read_from_its_directory() {
+        let directory = tempfile::tempdir().unwrap();
+        let table = table();
+        let head = journal::Head::new("0123".to_owned(), None, &table);
+        let mut text = journal::line(&head);
+        // Out of order, and one of them twice.
+        let other = Row { case: 1, ..table.rows[0].clone() };
+        for row in [&table.rows[0], &other, &other] {
+            text += &journal::line(&journal::Entry::Row(row.clone()));
+        }
+        text += &journal::line(&journal::Entry::Margin { margin: 0, point: table.margins[0].points[0].clone() });
+        std::fs::write(directory.path().join(journal::FILE), format!("{text}0123456789abcdef {{\"row\"")).unwrap();
+        let read = Table::read(directory.path()).unwrap();
+        assert_eq!(read, Table { rows: vec![other, table.rows[0].clone()], ..table });
+    }
+}
