@@ -53,6 +53,7 @@ pub(super) struct Head {
 }
 
 impl Head {
+    #[cfg_attr(not(test), expect(dead_code, reason = "written by the sweep"))]
     pub fn new(identity: String, shard: Option<[u64; 2]>, table: &Table) -> Self {
         let mut table = Table { rows: Vec::new(), ..table.clone() };
         table.margins.iter_mut().for_each(|margin| margin.points.clear());
@@ -78,6 +79,7 @@ pub(super) enum Entry {
 }
 
 /// A line with its hash and its end.
+#[cfg_attr(not(test), expect(dead_code, reason = "written by the sweep"))]
 pub(super) fn line<T: Serialize>(content: &T) -> String {
     let text = serde_json::to_string(content).expect("plain values are JSON");
     format!("{:016x} {text}\n", xxh3_64(text.as_bytes()))
