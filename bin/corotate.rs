@@ -5,5 +5,7 @@ use std::process::ExitCode;
 
 fn main() -> ExitCode {
     let program = Program::new().rigs(corotate::rig::shipped());
-    corotate::config::SHIPPED.into_iter().fold(program, |program, (name, text)| program.scenario(name, text)).main()
+    let program =
+        corotate::config::SHIPPED.into_iter().fold(program, |program, (name, text)| program.scenario(name, text));
+    corotate::campaign::SHIPPED.into_iter().fold(program, |program, (name, text)| program.campaign(name, text)).main()
 }

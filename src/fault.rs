@@ -192,7 +192,7 @@ pub fn seed(scenario: u64, number: u64) -> u64 {
 }
 
 /// The finaliser of SplitMix64: every bit of the result depends on every bit of the argument.
-fn mix(value: u64) -> u64 {
+pub(crate) fn mix(value: u64) -> u64 {
     let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let value = (value ^ value >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let value = (value ^ value >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -200,7 +200,7 @@ fn mix(value: u64) -> u64 {
 }
 
 /// A draw as a number in \[0, 1).
-fn unit(draw: u64) -> f64 {
+pub(crate) fn unit(draw: u64) -> f64 {
     (draw >> 11) as f64 / (1_u64 << 53) as f64
 }
 

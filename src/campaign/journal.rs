@@ -7,8 +7,9 @@ use super::table::{MarginPoint, Row, Table};
 use crate::system::remedy;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use std::fs::File;
-use std::io::{self, BufRead, BufReader};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -29,6 +30,30 @@ pub enum JournalError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
+    },
+    /// It cannot be written.
+    #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// Somebody else writes it.
+    #[error("{}: another sweep is at work there; wait for its end, or name another directory with --out", path.display())]
+    Busy {
+        /// The file.
+        path: PathBuf,
+    },
+    /// It is another campaign's.
+    #[error("{}: holds {theirs}, and this is {ours}; name another directory with --out", path.display())]
+    Other {
+        /// The file.
+        path: PathBuf,
+        /// Whose it is.
+        theirs: String,
+        /// Who would write to it.
+        ours: String,
     },
     /// It does not begin as a journal does.
     #[error("{}: is no campaign's journal, or of another version; name a directory that `corotate sweep` made", path.display())]
@@ -53,7 +78,6 @@ pub(super) struct Head {
 }
 
 impl Head {
-    #[cfg_attr(not(test), expect(dead_code, reason = "written by the sweep"))]
     pub fn new(identity: String, shard: Option<[u64; 2]>, table: &Table) -> Self {
         let mut table = Table { rows: Vec::new(), ..table.clone() };
         table.margins.iter_mut().for_each(|margin| margin.points.clear());
@@ -65,6 +89,18 @@ impl Head {
             shard,
             table,
         }
+    }
+
+    /// That of the whole campaign, of which this may be a part.
+    pub fn of_all(&self) -> Self {
+        Self { shard: None, ..self.clone() }
+    }
+
+    /// Whose journal it is, in words.
+    fn words(&self) -> String {
+        let shard = self.shard.map_or(String::new(), |[index, count]| format!("shard {index}/{count} of "));
+        let Self { identity, version, revision, table, .. } = self;
+        format!("{shard}campaign `{}` ({identity}, by corotate {version} {revision})", table.name)
     }
 }
 
@@ -79,7 +115,6 @@ pub(super) enum Entry {
 }
 
 /// A line with its hash and its end.
-#[cfg_attr(not(test), expect(dead_code, reason = "written by the sweep"))]
 pub(super) fn line<T: Serialize>(content: &T) -> String {
     let text = serde_json::to_string(content).expect("plain values are JSON");
     format!("{:016x} {text}\n", xxh3_64(text.as_bytes()))
@@ -129,5 +164,115 @@ impl Reader {
         let entry = content(&self.line);
         self.end += if entry.is_some() { self.line.len() as u64 } else { 0 };
         Ok(entry)
+    }
+}
+
+/// Where no line is.
+const NOWHERE: u64 = 0;
+
+/// A journal that is written. It is this process's alone as long as it is open.
+pub(super) struct Journal {
+    path: PathBuf,
+    file: File,
+    /// Where the line of each piece of work is, bytes.
+    offsets: Vec<u64>,
+    end: u64,
+}
+
+impl Journal {
+    /// Begins a journal, or goes on with one that the same campaign began. `pieces` tells how many lines there will be, `place` which
+    /// of them an entry is.
+    pub fn open(
+        directory: &Path,
+        head: &Head,
+        pieces: u64,
+        place: impl Fn(&Entry) -> Option<u64>,
+    ) -> Result<Self, JournalError> {
+        let path = directory.join(FILE);
+        let refuse = |source| JournalError::Write { path: path.clone(), source };
+        let file = OpenOptions::new().read(true).append(true).create(true).custom_flags(libc::O_NOFOLLOW).open(&path);
+        let mut file = file.map_err(refuse)?;
+        match file.try_lock() {
+            Err(TryLockError::WouldBlock) => return Err(JournalError::Busy { path }),
+            Err(TryLockError::Error(source)) => return Err(refuse(source)),
+            Ok(()) => {}
+        }
+        let first = line(head);
+        // Killed before the first line was whole.
+        let begun =
+            std::fs::read(&path).ok().filter(|_| file.metadata().is_ok_and(|file| file.len() < first.len() as u64));
+        if begun.is_some_and(|begun| first.as_bytes().starts_with(&begun)) {
+            file.set_len(0).and_then(|()| file.write_all(first.as_bytes())).map_err(refuse)?;
+        }
+        let mut reader = Reader::open(directory)?;
+        if reader.head() != head {
+            return Err(JournalError::Other { path, theirs: reader.head().words(), ours: head.words() });
+        }
+        let mut offsets = vec![NOWHERE; pieces as usize];
+        let mut end = reader.end;
+        while let Some(entry) = reader.next()? {
+            if let Some(offset) = place(&entry).and_then(|place| offsets.get_mut(place as usize)) {
+                *offset = end;
+            }
+            end = reader.end;
+        }
+        // What is not whole is not there.
+        file.set_len(end).map_err(refuse)?;
+        Ok(Self { path, file, offsets, end })
+    }
+
+    /// Whether this piece of work is done.
+    pub fn has(&self, place: u64) -> bool {
+        self.offsets.get(place as usize).is_some_and(|offset| *offset != NOWHERE)
+    }
+
+    /// How many pieces of work are done.
+    pub fn done(&self) -> u64 {
+        self.offsets.iter().filter(|offset| **offset != NOWHERE).count() as u64
+    }
+
+    /// Writes a piece of work down: the whole line, at once.
+    pub fn add(&mut self, place: u64, entry: &Entry) -> Result<(), JournalError> {
+        let line = line(entry);
+        let written = self.file.write_all(line.as_bytes());
+        written.map_err(|source| JournalError::Write { path: self.path.clone(), source })?;
+        self.offsets[place as usize] = self.end;
+        self.end += line.len() as u64;
+        Ok(())
+    }
+
+    /// What has been written of the pieces of work, in their order.
+    pub fn entries(&self) -> Result<impl Iterator<Item = Result<Entry, JournalError>> + '_, JournalError> {
+        let mut lines = self.lines()?;
+        let offsets = self.offsets.iter().filter(|offset| **offset != NOWHERE);
+        Ok(offsets.map(move |offset| lines.at(*offset)))
+    }
+
+    /// The lines of what has been written, in any order.
+    pub fn lines(&self) -> Result<Lines<'_>, JournalError> {
+        let refuse = |source| JournalError::Read { path: self.path.clone(), source };
+        Ok(Lines { journal: self, file: BufReader::new(File::open(&self.path).map_err(refuse)?), line: Vec::new() })
+    }
+}
+
+/// A journal that is read where it is asked for.
+pub(super) struct Lines<'a> {
+    journal: &'a Journal,
+    file: BufReader<File>,
+    line: Vec<u8>,
+}
+
+impl Lines<'_> {
+    /// What has been written of a piece of work.
+    pub fn of(&mut self, place: u64) -> Result<Option<Entry>, JournalError> {
+        if self.journal.has(place) { self.at(self.journal.offsets[place as usize]).map(Some) } else { Ok(None) }
+    }
+
+    fn at(&mut self, offset: u64) -> Result<Entry, JournalError> {
+        self.line.clear();
+        let read = self.file.seek(SeekFrom::Start(offset)).and_then(|_| self.file.read_until(b'\n', &mut self.line));
+        let path = || self.journal.path.clone();
+        read.map_err(|source| JournalError::Read { path: path(), source })?;
+        content(&self.line).ok_or_else(|| JournalError::Foreign { path: path() })
     }
 }

@@ -3,8 +3,24 @@
 //! A case is a pure function of the campaign's text and the case's number: the same for ever, on every machine, under every
 //! clock. Must not print, nor know how a command line looks.
 
+mod axis;
+mod case;
+mod draw;
+mod file;
 mod journal;
+mod margin;
+#[cfg(feature = "parquet")]
+mod parquet;
+mod results;
+mod sweep;
 mod table;
 
+pub(crate) use file::is_campaign;
+pub use file::{Campaign, Case, Shipped};
 pub use journal::JournalError;
+pub use results::{Counts, worst};
+pub use sweep::{NoShard, Shard, Sweep, SweepError, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};
+
+/// The campaigns that ship with the program: name and text.
+pub const SHIPPED: [(&str, &str); 1] = [("timing-map", include_str!("../../config/campaigns/timing-map.toml"))];

@@ -25,10 +25,10 @@ const LARGEST: f64 = 1e30;
 /// A parsed scenario text: the table, and the place of every key for error messages.
 #[derive(Debug, Clone)]
 pub struct Document {
-    table: Table,
+    pub(super) table: Table,
     /// Key path, as `follower[0].name`, to `file:line` or `--set …`.
-    places: BTreeMap<String, String>,
-    origin: String,
+    pub(super) places: BTreeMap<String, String>,
+    pub(super) origin: String,
     /// The run whose file it is, as its first line says.
     run: Option<RunId>,
     /// Top-level keys that were split off: as good as known.
@@ -111,6 +111,11 @@ impl Document {
     /// Puts a value, as typed, at a path, as typed, and notes its place; or says what is wrong with them.
     fn assign(&mut self, path: &str, text: &str, place: String) -> Result<(), String> {
         let value = parse_value(text.trim()).ok_or("the value is neither TOML nor a bare word")?;
+        self.put_value(path, value, place)
+    }
+
+    /// The same for a value that is one already.
+    pub(super) fn put_value(&mut self, path: &str, value: Value, place: String) -> Result<(), String> {
         // Positions in a list also as error messages write them.
         let path = path.trim().replace('[', ".").replace(']', "");
         let steps: Vec<&str> = path.split('.').collect();
@@ -151,7 +156,7 @@ impl Document {
     }
 
     /// A document of a table that was taken out of this one.
-    fn part(&self, table: Table) -> Self {
+    pub(super) fn part(&self, table: Table) -> Self {
         let (places, origin) = (self.places.clone(), self.origin.clone());
         Self { table, places, origin, run: None, elsewhere: Vec::new(), asked: None }
     }
@@ -250,7 +255,7 @@ impl Document {
     }
 
     /// Where the files are that it names: beside its own.
-    pub(super) fn directory(&self) -> &Path {
+    pub(crate) fn directory(&self) -> &Path {
         Path::new(&self.origin).parent().unwrap_or(Path::new(""))
     }
 
@@ -290,7 +295,12 @@ impl Document {
     }
 
     fn refuse_absurd(&self) -> Result<(), ConfigError> {
-        match absurd(&Value::Table(self.table.clone()), String::new()) {
+        self.refuse_absurd_value(&Value::Table(self.table.clone()), String::new())
+    }
+
+    /// Refuses a number that is no quantity in a value at a path.
+    pub(super) fn refuse_absurd_value(&self, value: &Value, path: String) -> Result<(), ConfigError> {
+        match absurd(value, path) {
             Some((key, value)) => Err(ConfigError::Value {
                 place: self.place(&key),
                 key,

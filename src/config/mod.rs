@@ -4,6 +4,7 @@
 
 mod accept;
 mod document;
+mod edit;
 mod error;
 mod fault;
 mod raw;
@@ -25,6 +26,11 @@ pub use schema::schema;
 pub(crate) use shape::{Key, Shape};
 
 pub(crate) use document::nearest;
+
+/// Whether a text names what ships with the program; otherwise it is a file's path.
+pub(crate) fn is_name(text: &str) -> bool {
+    !text.contains('/') && !text.ends_with(".toml")
+}
 
 /// The scenarios that ship with the program: name and text.
 pub const SHIPPED: [(&str, &str); 13] = [

@@ -253,7 +253,7 @@ impl<'a> Checks<'a> {
         value.map_err(|error| self.refuse(key, error.to_string())).ok()
     }
 
-    fn finish<T>(self, value: Option<T>) -> Result<T, ConfigError> {
+    pub(crate) fn finish<T>(self, value: Option<T>) -> Result<T, ConfigError> {
         match value {
             Some(value) if self.problems.is_empty() => Ok(value),
             _ => Err(ConfigError::Invalid { problems: self.problems }),

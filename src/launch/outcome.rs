@@ -13,8 +13,8 @@ use crate::rig::Figure;
 use crate::runtime::RoleId;
 use crate::serial::LineCounters;
 use crate::telemetry::{
-    Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine, write_hgrm,
-    write_hlog,
+    Checkpoints, Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine,
+    write_hgrm, write_hlog,
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -223,9 +223,19 @@ impl State {
     }
 }
 
-impl Summary {
-    /// Draws up the summary of a run that began at `started`.
-    pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
+/// What a run came to, held against its scenario.
+pub(crate) struct Judged {
+    latencies: Vec<StageFigures>,
+    pub books: Accounting,
+    criteria: Vec<Criterion>,
+    /// Whether every criterion that could be judged holds; none if none could be.
+    pub accepted: Option<bool>,
+    /// The same in words.
+    pub verdict: String,
+}
+
+impl Judged {
+    pub fn new(scenario: &Scenario, outcome: &Outcome) -> Self {
         let mut latencies = latencies(&outcome.reports);
         latencies.extend(incident_figures(&outcome.incidents));
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
@@ -235,6 +245,28 @@ impl Summary {
         let books = Accounting::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies, interrupted);
         let accepted = accepted(&criteria, interrupted);
+        let verdict = verdict(accepted, criteria.is_empty(), interrupted);
+        Self { latencies, books, criteria, accepted, verdict }
+    }
+}
+
+/// The hash over everything that was published, as a summary has it.
+pub(crate) fn state_hash(reports: &[RoleReport]) -> String {
+    format!("{:016x}", combine(hashes(reports).iter().map(|(_, hash)| hash.last)))
+}
+
+/// The hashes of all signals, in the order of their names.
+fn hashes(reports: &[RoleReport]) -> Vec<(&String, &Checkpoints)> {
+    let written = reports.iter().flat_map(|report| &report.written);
+    let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
+    links.sort_by_key(|(service, _)| *service);
+    links
+}
+
+impl Summary {
+    /// Draws up the summary of a run that began at `started`.
+    pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
+        let Judged { latencies, books, criteria, accepted, verdict } = Judged::new(scenario, outcome);
         Self {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
@@ -250,7 +282,7 @@ impl Summary {
             domain: outcome.domain.clone(),
             signal: outcome.signal,
             accepted,
-            verdict: verdict(accepted, criteria.is_empty(), interrupted),
+            verdict,
             criteria,
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
@@ -357,9 +389,7 @@ impl LinkCounters {
 
 impl State {
     fn new(reports: &[RoleReport], books: &Accounting) -> Self {
-        let written = reports.iter().flat_map(|report| &report.written);
-        let mut links: Vec<_> = written.filter_map(|link| Some((&link.service, link.hash.as_ref()?))).collect();
-        links.sort_by_key(|(service, _)| *service);
+        let links = hashes(reports);
         let stride = links.iter().map(|(_, hash)| hash.stride).max().unwrap_or(1);
         let count = links.iter().map(|(_, hash)| hash.hashes.len()).min().unwrap_or(0);
         let mut checkpoints: Vec<(u64, u64)> = (0..count)

@@ -71,6 +71,8 @@ pub struct MetricScore {
     pub peak_tick: Option<u64>,
     /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
     pub settled_at_s: Option<f64>,
+    /// The integral of its square over the run: (its unit)² s; a tick at which it could not be scored adds nothing.
+    pub ise: f64,
     /// What is accepted; infinite without a limit.
     #[serde(skip)]
     limit: f64,
@@ -251,6 +253,7 @@ impl<R: Rig> Scoring<R> {
             peak: None,
             peak_tick: None,
             settled_at_s: None,
+            ise: 0.0,
             limit: scenario.accept.metric_max.get(*name).copied().unwrap_or(f64::INFINITY),
             last_above: None,
         };
@@ -297,6 +300,7 @@ impl<R: Rig> Scoring<R> {
         let time_s = tick as f64 * self.tick_s;
         for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
             metric.take(tick, value, &self.accept, time_s);
+            metric.ise += if value.is_nan() { 0.0 } else { value * value * self.tick_s };
         }
         if !self.incidents.is_empty()
             && !self.within()

@@ -1,8 +1,10 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
+use super::campaign;
 use super::scenario::{Change, load};
 use super::{Exit, fail, say};
 use crate::analysis::{Claim, apart, claims, digits};
+use crate::campaign::Campaign;
 use crate::config::Scenario;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -11,7 +13,7 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Shipped scenarios' names, files (x.toml, ./x), or - for stdin
+    /// Names of shipped scenarios or campaigns, files (x.toml, ./x), or - for stdin
     #[arg(required = true, value_name = "SCENARIO")]
     files: Vec<PathBuf>,
     /// Override any key of the scenarios
@@ -34,9 +36,8 @@ Examples:
 pub fn check(arguments: &Arguments) -> Exit {
     let mut exit = Exit::Ok;
     for path in &arguments.files {
-        match load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument))) {
-            Ok(scenario) => {
-                let text = if arguments.json { json(path, &scenario) } else { tell(path, &scenario) };
+        match checked(arguments, path) {
+            Ok(text) => {
                 if let Err(gone) = say(&text) {
                     return gone;
                 }
@@ -45,6 +46,35 @@ pub fn check(arguments: &Arguments) -> Exit {
         }
     }
     exit
+}
+
+/// What there is to say of a scenario, or of a campaign.
+fn checked(arguments: &Arguments, path: &Path) -> Result<String, String> {
+    if campaign::is_meant(path) {
+        let campaign = campaign::load(path, &arguments.set)?;
+        return Ok(if arguments.json { campaign_json(path, &campaign) } else { tell_campaign(path, &campaign) });
+    }
+    let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
+    Ok(if arguments.json { json(path, &scenario) } else { tell(path, &scenario) })
+}
+
+fn campaign_json(path: &Path, campaign: &Campaign) -> String {
+    let value = serde_json::json!({
+        "schema": "corotate/check/v1",
+        "file": path.display().to_string(),
+        "campaign": campaign.name(),
+        "identity": campaign.identity(),
+        "cases": campaign.cases(),
+        "axes": campaign.table().axes,
+    });
+    format!("{value}\n")
+}
+
+/// The campaign with its scenario in it: the whole is a campaign file.
+fn tell_campaign(path: &Path, campaign: &Campaign) -> String {
+    let cases = campaign.cases();
+    let words = if cases == 1 { "1 case".to_owned() } else { format!("{cases} cases") };
+    format!("# {}: valid, {words}, identity {}\n{}\n", path.display(), campaign.identity(), campaign.to_toml())
 }
 
 /// What is claimed of a scenario, for programs.

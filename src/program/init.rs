@@ -1,7 +1,7 @@
-//! `corotate init`: print a shipped scenario, or the list of them.
+//! `corotate init`: print a shipped scenario or campaign, or the list of them.
 
 use super::scenario::{title, unknown};
-use super::{Exit, fail, say, scenarios};
+use super::{Exit, campaigns, fail, say, scenarios};
 
 /// Layout version of the list.
 const SCHEMA: &str = "corotate/scenarios/v1";
@@ -10,10 +10,10 @@ const SCHEMA: &str = "corotate/scenarios/v1";
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// Name of a scenario that ships with the program
+    /// Name of a scenario or campaign that ships with the program
     #[arg(required_unless_present = "list")]
     name: Option<String>,
-    /// List the scenarios that ship with the program, a line each
+    /// List the scenarios and campaigns that ship with the program, a line each
     #[arg(long, conflicts_with = "name")]
     list: bool,
     /// Print the list as one JSON object (corotate/scenarios/v1)
@@ -31,7 +31,7 @@ pub fn init(arguments: &Arguments) -> Exit {
     let Some(name) = &arguments.name else {
         return say(&list(arguments.json)).map_or_else(|exit| exit, |()| Exit::Ok);
     };
-    match scenarios().iter().find(|(known, _)| known == name) {
+    match scenarios().iter().chain(campaigns()).find(|(known, _)| known == name) {
         Some((_, text)) => say(text).map_or_else(|exit| exit, |()| Exit::Ok),
         None => fail(Exit::Usage, &unknown(name)),
     }
@@ -40,9 +40,11 @@ pub fn init(arguments: &Arguments) -> Exit {
 fn list(json: bool) -> String {
     if json {
         let entry = |(name, text): &(&str, &str)| serde_json::json!({ "name": name, "title": title(text) });
-        let entries: Vec<_> = scenarios().iter().map(entry).collect();
-        return format!("{}\n", serde_json::json!({ "schema": SCHEMA, "scenarios": entries }));
+        let [scenarios, campaigns] = [scenarios(), campaigns()].map(|all| all.iter().map(entry).collect::<Vec<_>>());
+        let list = serde_json::json!({ "schema": SCHEMA, "scenarios": scenarios, "campaigns": campaigns });
+        return format!("{list}\n");
     }
-    let width = scenarios().iter().map(|(name, _)| name.len()).max().unwrap_or(0);
-    scenarios().iter().map(|(name, text)| format!("{name:<width$}  {}\n", title(text))).collect()
+    let all = || scenarios().iter().chain(campaigns());
+    let width = all().map(|(name, _)| name.len()).max().unwrap_or(0);
+    all().map(|(name, text)| format!("{name:<width$}  {}\n", title(text))).collect()
 }

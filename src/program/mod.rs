@@ -8,6 +8,7 @@
 
 mod bench;
 mod bridge;
+mod campaign;
 mod check;
 mod color;
 mod data;
@@ -29,6 +30,7 @@ mod run;
 mod scenario;
 mod schema;
 mod seat;
+mod sweep;
 mod watch;
 
 use crate::bench::Row;
@@ -62,6 +64,8 @@ struct Arguments {
 enum Command {
     /// Run a scenario to its end and tell how it went
     Run(run::Arguments),
+    /// Run a campaign: one scenario many times, varied; on all cores
+    Sweep(sweep::Arguments),
     /// Validate scenarios; print what may be claimed of their loops
     Check(check::Arguments),
     /// Print a commented scenario to start from, or list them
@@ -208,6 +212,7 @@ fn say(text: &str) -> Result<(), Exit> {
 pub struct Program {
     rigs: Vec<RigKind>,
     scenarios: Vec<(&'static str, &'static str)>,
+    campaigns: Vec<(&'static str, &'static str)>,
 }
 
 impl Program {
@@ -236,6 +241,13 @@ impl Program {
     #[must_use]
     pub fn scenario(mut self, name: &'static str, text: &'static str) -> Self {
         self.scenarios.push((name, text));
+        self
+    }
+
+    /// Adds a campaign that ships with the program, by its name and its text, as [`scenario`](Self::scenario) does a scenario.
+    #[must_use]
+    pub fn campaign(mut self, name: &'static str, text: &'static str) -> Self {
+        self.campaigns.push((name, text));
         self
     }
 
@@ -278,6 +290,7 @@ impl Program {
     fn begin(self) {
         assert!(register(self.rigs), "a program comes before any scenario is read");
         let _ = SCENARIOS.set(self.scenarios);
+        let _ = CAMPAIGNS.set(self.campaigns);
         // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
         let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
         tell_defects();
@@ -296,6 +309,13 @@ static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 /// The scenarios that ship with this program.
 fn scenarios() -> &'static [(&'static str, &'static str)] {
     SCENARIOS.get().map_or(&[], Vec::as_slice)
+}
+
+static CAMPAIGNS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
+
+/// The campaigns that ship with this program.
+fn campaigns() -> &'static [(&'static str, &'static str)] {
+    CAMPAIGNS.get().map_or(&[], Vec::as_slice)
 }
 
 /// What the program was called with.
@@ -334,6 +354,7 @@ fn obey(command: Option<Command>) -> Exit {
     match command {
         None => run::run(&run::Arguments::default()),
         Some(Command::Run(arguments)) => run::run(&arguments),
+        Some(Command::Sweep(arguments)) => sweep::sweep(&arguments),
         Some(Command::Check(arguments)) => check::check(&arguments),
         Some(Command::Init(arguments)) => init::init(&arguments),
         Some(Command::New(arguments)) => new::new(&arguments),

@@ -1,7 +1,8 @@
 //! `corotate run`: one scenario from file to verdict.
 
+use super::campaign;
 use super::color::{Color, paint};
-use super::scenario::{Change, load, stem};
+use super::scenario::{Change, changed, load, stem};
 use super::{Exit, fail, foxglove, name, print, remark};
 use crate::config::{ClockKind, RunId, Scenario};
 use crate::doctor::Machine;
@@ -28,6 +29,9 @@ pub struct Arguments {
     /// A shipped scenario's name, a file (x.toml, ./x), or - for stdin
     #[arg(value_name = "SCENARIO")]
     file: Option<PathBuf>,
+    /// Run this case of a campaign; SCENARIO is the campaign's name or file
+    #[arg(long, value_name = "N", requires = "file")]
+    case: Option<u64>,
     /// What drives the ticks
     #[arg(long, value_name = "CLOCK", value_parser = ["realtime", "lockstep", "in-process"])]
     clock: Option<String>,
@@ -110,7 +114,13 @@ impl Arguments {
     }
 
     fn scenario(&self) -> Result<Scenario, Failure> {
-        let loaded = load(self.file.as_deref(), self.changes());
+        let loaded = match (self.case, &self.file) {
+            (Some(case), Some(file)) => campaign::load(file, &[]).and_then(|campaign| {
+                let document = campaign::case(&campaign, case)?;
+                changed(document, self.changes()).map_err(|error| error.to_string())
+            }),
+            _ => load(self.file.as_deref(), self.changes()),
+        };
         let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))

@@ -2,8 +2,9 @@
 //!
 //! Must not judge what it reads: [`crate::config`] does.
 
-use super::{name, scenarios};
-use crate::config::{ConfigError, Document, Scenario, nearest, read_text};
+use super::{campaigns, name, scenarios};
+use crate::campaign::{Shipped, is_campaign};
+use crate::config::{ConfigError, Document, Scenario, is_name, nearest, read_text};
 use std::borrow::Cow;
 use std::fs::File;
 use std::io;
@@ -36,38 +37,57 @@ impl Change<'_> {
 
 /// The scenario that is meant, with changes; the program's first where none is named.
 pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'a>>) -> Result<Scenario, String> {
-    let (text, origin) = text(given)?;
-    let resolved = Document::parse(&text, &origin).and_then(|mut document| {
-        changes.into_iter().try_for_each(|change| change.apply(&mut document))?;
-        Scenario::of(document)
+    let shipped = |name: &str| {
+        let (_, text) = scenarios().iter().find(|(known, _)| *known == name).ok_or_else(|| unknown(name))?;
+        Ok(Cow::Borrowed(*text))
+    };
+    let first = || first().ok_or("this program has no scenario of its own; name a scenario file");
+    let (text, origin) = match given {
+        Some(given) => text(given, &shipped)?,
+        None => text(Path::new(first()?), &shipped)?,
+    };
+    let resolved = Document::parse(&text, &origin).and_then(|document| {
+        if is_campaign(&document) {
+            return Err(ConfigError::Value {
+                place: document.place("base"),
+                key: "base".to_owned(),
+                reason: "makes it a campaign; run it with `corotate sweep`, or one case of it with --case N".to_owned(),
+            });
+        }
+        changed(document, changes)
     });
     resolved.map_err(|error| quoting(&error.to_string(), &origin, &text))
 }
 
-/// The text of the scenario that is meant, and what errors call it.
-fn text(given: Option<&Path>) -> Result<(Cow<'static, str>, String), String> {
-    let shipped = |name: &str| {
-        let (_, text) = scenarios().iter().find(|(known, _)| *known == name).ok_or_else(|| unknown(name))?;
-        Ok((Cow::Borrowed(*text), format!("{name}.toml")))
-    };
+/// The scenario of a document with changes.
+pub fn changed<'a>(
+    mut document: Document,
+    changes: impl IntoIterator<Item = Change<'a>>,
+) -> Result<Scenario, ConfigError> {
+    changes.into_iter().try_for_each(|change| change.apply(&mut document))?;
+    Scenario::of(document)
+}
+
+/// The text that is meant, by the name under which it is shipped, by its path or from standard input; and what errors call it.
+pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, String), String> {
+    let shipped = |name: &str| Ok((shipped(name)?, format!("{name}.toml")));
     let read = |text: Result<String, ConfigError>, origin: &Path| match text {
         Ok(text) => Ok((Cow::Owned(text), origin.display().to_string())),
         Err(error) => Err(error.to_string()),
     };
     let refuse = |path: &Path, error: io::Error| ConfigError::Read { path: path.to_owned(), reason: error.to_string() };
-    match (given, given.and_then(name_in)) {
-        (None, _) => shipped(first().ok_or("this program has no scenario of its own; name a scenario file")?),
-        (Some(_), Some(STANDARD_INPUT)) => read(read_text(io::stdin().lock(), Path::new(STDIN)), Path::new(STDIN)),
-        (Some(_), Some(name)) => shipped(name),
-        (Some(path), None) => {
-            let file = File::open(path).map_err(|error| refuse(path, error));
-            read(file.and_then(|file| read_text(file, path)), path)
+    match name_in(given) {
+        Some(STANDARD_INPUT) => read(read_text(io::stdin().lock(), Path::new(STDIN)), Path::new(STDIN)),
+        Some(name) => shipped(name),
+        None => {
+            let file = File::open(given).map_err(|error| refuse(given, error));
+            read(file.and_then(|file| read_text(file, given)), given)
         }
     }
 }
 
 /// What errors say, and below each the line of the text that it is about.
-fn quoting(errors: &str, origin: &str, text: &str) -> String {
+pub fn quoting(errors: &str, origin: &str, text: &str) -> String {
     let quote = |error: &str| {
         let (number, _) = error.strip_prefix(origin)?.strip_prefix(':')?.split_once(':')?;
         let number: usize = number.parse().ok()?;
@@ -80,7 +100,7 @@ fn quoting(errors: &str, origin: &str, text: &str) -> String {
 
 /// What is given, unless it is a file's path: a file of a shipped scenario's name must not change what that name means.
 fn name_in(given: &Path) -> Option<&str> {
-    given.to_str().filter(|text| !text.contains('/') && !text.ends_with(".toml"))
+    given.to_str().filter(|text| is_name(text))
 }
 
 fn first() -> Option<&'static str> {
@@ -98,6 +118,9 @@ pub fn stem(given: Option<&Path>) -> String {
 
 /// What to say of a name that no scenario has.
 pub fn unknown(name: &str) -> String {
+    if campaigns().iter().any(|(known, _)| *known == name) {
+        return format!("`{name}` is a campaign; run it with `corotate sweep {name}`, or one case of it with --case N");
+    }
     let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
     let end = if remedy.ends_with('?') { "" } else { "." };

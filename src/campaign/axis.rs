@@ -1,0 +1,284 @@
+//! The axes of a campaign: as typed, with their checks, and the value of each at a point.
+//!
+//! Must not know which case a point belongs to.
+
+use super::draw;
+use super::table::{Axis, AxisKind, Parameter};
+use crate::config::{Checks, Document};
+use serde::{Deserialize, Serialize};
+use toml::Value;
+
+/// The most values of one axis.
+const MAX_POINTS: u64 = 1_000_000;
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawAxis {
+    pub key: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label: Option<String>,
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub factor: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub values: Option<Vec<Value>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub names: Option<Vec<String>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub range: Option<RawRange>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub random: Option<RawRandom>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawRange {
+    pub from: Value,
+    pub to: Value,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub points: Option<u64>,
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub log: bool,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RawRandom {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub uniform: Option<[Value; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_uniform: Option<[Value; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub normal: Option<[Value; 2]>,
+}
+
+fn is_false(flag: &bool) -> bool {
+    !flag
+}
+
+/// An axis, ready to be asked.
+#[derive(Debug, Clone)]
+pub(super) struct Varied {
+    pub axis: Axis,
+    /// Whether its values are factors of what the scenario has.
+    pub factor: bool,
+    /// Where the campaign names it.
+    pub place: String,
+    spread: Spread,
+}
+
+/// How values are spread.
+#[derive(Debug, Clone)]
+enum Spread {
+    Values(Vec<Value>),
+    /// Without points, it is drawn from.
+    Range {
+        ends: [f64; 2],
+        points: Option<u64>,
+        log: bool,
+        whole: bool,
+    },
+    Normal {
+        mean: f64,
+        deviation: f64,
+        whole: bool,
+    },
+}
+
+/// A number, and whether it is a whole one.
+pub(super) fn number(value: &Value) -> Option<(f64, bool)> {
+    match value {
+        Value::Integer(number) => Some((*number as f64, true)),
+        Value::Float(number) => Some((*number, false)),
+        _ => None,
+    }
+}
+
+impl Varied {
+    /// Checks an axis; none if it was refused.
+    pub fn resolve(raw: &RawAxis, index: usize, document: &Document, checks: &mut Checks<'_>) -> Option<Self> {
+        let at = format!("axis[{index}]");
+        let given = [raw.values.is_some(), raw.range.is_some(), raw.random.is_some()];
+        let one = given.iter().filter(|given| **given).count() == 1;
+        checks
+            .require(one, &at, || "takes its values from one of values, range and random; give one of them".to_owned());
+        checks.require(!raw.key.trim().is_empty(), &format!("{at}.key"), || {
+            "is empty; name a key of the scenario, as --set does".to_owned()
+        });
+        let spread = match (&raw.values, &raw.range, &raw.random) {
+            _ if !one => return None,
+            (Some(values), ..) => Spread::values(values, raw.names.as_deref(), &at, checks)?,
+            (_, Some(range), _) => Spread::range(range, &format!("{at}.range"), checks)?,
+            (.., random) => Spread::random(random.as_ref()?, &format!("{at}.random"), checks)?,
+        };
+        checks.require(raw.names.is_none() || raw.values.is_some(), &format!("{at}.names"), || {
+            "are names of values, and there is no list of these; remove it".to_owned()
+        });
+        let mut varied = Self {
+            axis: Axis {
+                key: raw.key.trim().replace('[', ".").replace(']', ""),
+                label: raw.label.clone(),
+                kind: spread.kind(),
+                values: Vec::new(),
+            },
+            factor: raw.factor,
+            place: document.place(&at),
+            spread,
+        };
+        let numbers = (0..varied.points().unwrap_or(0)).all(|point| number(&varied.at(point)).is_some());
+        checks.require(!raw.factor || numbers, &format!("{at}.factor"), || {
+            "factors are numbers, and some value is none; give numbers, or remove it".to_owned()
+        });
+        let named = |point: u64| match raw.names.as_ref().and_then(|names| names.get(point as usize)) {
+            Some(name) => Parameter::Word(name.clone()),
+            None => parameter(&varied.at(point)),
+        };
+        varied.axis.values = (0..varied.points().unwrap_or(0)).map(named).collect();
+        Some(varied)
+    }
+
+    /// How many values it has; none where they are drawn.
+    pub fn points(&self) -> Option<u64> {
+        match &self.spread {
+            Spread::Values(values) => Some(values.len() as u64),
+            Spread::Range { points, .. } => *points,
+            Spread::Normal { .. } => None,
+        }
+    }
+
+    /// The value of this number, where values are not drawn.
+    pub fn at(&self, point: u64) -> Value {
+        match &self.spread {
+            Spread::Values(values) => values[point as usize].clone(),
+            Spread::Range { points, .. } => {
+                let last = points.unwrap_or(1).saturating_sub(1);
+                self.between(if last == 0 { 0.0 } else { point as f64 / last as f64 })
+            }
+            Spread::Normal { mean, whole, .. } => value(*mean, *whole),
+        }
+    }
+
+    /// The value that belongs to a number in (0, 1), and its position if it has one.
+    pub fn drawn(&self, unit: f64) -> (Value, Option<u64>) {
+        if let Some(points) = self.points() {
+            let point = ((unit * points as f64) as u64).min(points - 1);
+            return (self.at(point), Some(point));
+        }
+        let drawn = match &self.spread {
+            Spread::Normal { mean, deviation, whole } => value(mean + deviation * draw::normal(unit), *whole),
+            // Whole numbers are as likely at the ends as in between.
+            Spread::Range { ends: [from, to], log: false, whole: true, .. } => {
+                value((from + unit * (to - from + 1.0)).floor().min(*to), true)
+            }
+            _ => self.between(unit),
+        };
+        (drawn, None)
+    }
+
+    /// The parameter that a value is shown as.
+    pub fn shown(&self, value: &Value, point: Option<u64>) -> Parameter {
+        let known = point.and_then(|point| self.axis.values.get(point as usize));
+        known.cloned().unwrap_or_else(|| parameter(value))
+    }
+
+    /// What lies at a part of the way from one end of the range to the other; the ends are met exactly.
+    fn between(&self, part: f64) -> Value {
+        let Spread::Range { ends: [from, to], log, whole, .. } = &self.spread else { return Value::Boolean(false) };
+        let number = match part {
+            0.0 => *from,
+            1.0 => *to,
+            _ if *log => libm::exp(libm::log(*from) + part * (libm::log(*to) - libm::log(*from))),
+            _ => from + part * (to - from),
+        };
+        value(number, *whole)
+    }
+}
+
+impl Spread {
+    fn kind(&self) -> AxisKind {
+        match self {
+            Self::Values(_) => AxisKind::Values,
+            Self::Range { log: true, .. } => AxisKind::Log,
+            Self::Range { .. } => AxisKind::Linear,
+            Self::Normal { .. } => AxisKind::Normal,
+        }
+    }
+
+    fn values(values: &[Value], names: Option<&[String]>, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
+        let enough = (1..=MAX_POINTS as usize).contains(&values.len());
+        checks.require(enough, &format!("{at}.values"), || {
+            format!("{} values are no axis; give 1 to {MAX_POINTS}", values.len())
+        });
+        checks.require(names.is_none_or(|names| names.len() == values.len()), &format!("{at}.names"), || {
+            format!("{} names are not one for each of {} values", names.map_or(0, <[_]>::len), values.len())
+        });
+        enough.then(|| Self::Values(values.to_vec()))
+    }
+
+    fn range(raw: &RawRange, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
+        let (ends, whole) = ends([&raw.from, &raw.to], at, raw.log, checks)?;
+        let points = raw.points;
+        checks.require(points.is_none_or(|points| (2..=MAX_POINTS).contains(&points)), &format!("{at}.points"), || {
+            format!("{} is no number of points from one end to the other; give 2 to {MAX_POINTS}", points.unwrap_or(0))
+        });
+        let steps = points.unwrap_or(2).saturating_sub(1).max(1) as f64;
+        let even = !whole || raw.log || points.is_none() || ((ends[1] - ends[0]) / steps).fract() == 0.0;
+        checks.require(even, &format!("{at}.points"), || {
+            "whole numbers are not so many even steps apart; give another number of points, or numbers as 1.0"
+                .to_owned()
+        });
+        Some(Self::Range { ends, points: points.map(|points| points.clamp(2, MAX_POINTS)), log: raw.log, whole })
+    }
+
+    fn random(raw: &RawRandom, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
+        match (&raw.uniform, &raw.log_uniform, &raw.normal) {
+            (Some([from, to]), None, None) => {
+                let (ends, whole) = ends([from, to], &format!("{at}.uniform"), false, checks)?;
+                Some(Self::Range { ends, points: None, log: false, whole })
+            }
+            (None, Some([from, to]), None) => {
+                let (ends, whole) = ends([from, to], &format!("{at}.log_uniform"), true, checks)?;
+                Some(Self::Range { ends, points: None, log: true, whole })
+            }
+            (None, None, Some(normal)) => {
+                let at = format!("{at}.normal");
+                let [Some((mean, whole)), Some((deviation, also))] = [number(&normal[0]), number(&normal[1])] else {
+                    checks.refuse(&at, "takes two numbers; give mean and standard deviation");
+                    return None;
+                };
+                checks.positive(&at, deviation);
+                Some(Self::Normal { mean, deviation, whole: whole && also })
+            }
+            _ => {
+                checks.refuse(at, "follows one distribution; give one of uniform, log_uniform and normal");
+                None
+            }
+        }
+    }
+}
+
+/// The ends of a range, and whether they are whole numbers.
+pub(super) fn ends(given: [&Value; 2], at: &str, log: bool, checks: &mut Checks<'_>) -> Option<([f64; 2], bool)> {
+    let [Some((from, whole)), Some((to, also))] = given.map(number) else {
+        checks.refuse(at, "goes from a number to a number; give two");
+        return None;
+    };
+    checks.require(from < to, at, || format!("{from} is not below {to}; give the lower end first"));
+    checks.require(!log || from > 0.0, at, || format!("no factor leads from {from} upwards; give ends above zero"));
+    Some(([from, to], whole && also)).filter(|_| from < to && (!log || from > 0.0))
+}
+
+/// A number as a scenario has it.
+pub(super) fn value(number: f64, whole: bool) -> Value {
+    if whole { Value::Integer(number.round() as i64) } else { Value::Float(number) }
+}
+
+/// A value as tables show it.
+pub(super) fn parameter(value: &Value) -> Parameter {
+    match value {
+        Value::Boolean(flag) => Parameter::Flag(*flag),
+        Value::Integer(number) => Parameter::Whole(*number),
+        Value::Float(number) => Parameter::Number(*number),
+        Value::String(word) => Parameter::Word(word.clone()),
+        other => Parameter::Word(other.to_string()),
+    }
+}

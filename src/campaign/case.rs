@@ -1,0 +1,178 @@
+//! One piece of a campaign's work: a case is run, or a point of a margin searched. Any caller may do any piece, anywhere.
+//!
+//! Must not fail: what cannot be run is a row that says why.
+
+use super::file::{Campaign, Case, in_thread};
+use super::journal::Entry;
+use super::margin::Searched;
+use super::table::{End, MarginPoint, Metric, Row, Statistic};
+use crate::analysis::claims;
+use crate::config::{ClockKind, ConfigError, Document, Scenario};
+use crate::launch::{self, Action, Judged, Launch, MetricScore, Outcome, state_hash};
+use std::sync::atomic::AtomicUsize;
+use toml::Value;
+
+/// What came of a scenario.
+pub(super) enum Ran {
+    /// It was run.
+    Ended(Box<(Scenario, Outcome)>),
+    /// It is none.
+    Invalid(ConfigError),
+    /// It could not be run.
+    Failed(launch::LaunchError),
+}
+
+impl Campaign {
+    /// Runs a case; none if there is none of this number, or if `signal` asked for the end before the case's. Under every clock that
+    /// loses no sample the row is the same.
+    pub fn run(&self, number: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Row> {
+        let case = self.case(number)?;
+        let ran = run(self.document(&case), clock, signal)?;
+        Some(self.row(&case, &ran))
+    }
+
+    /// How many pieces of work there are: every case, and then every point of every margin.
+    pub(super) fn pieces(&self) -> u64 {
+        self.cases() + self.margins().iter().map(|searched| self.points(searched)).sum::<u64>()
+    }
+
+    /// Does a piece of work.
+    pub(super) fn work(&self, piece: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Entry> {
+        let Some(mut point) = piece.checked_sub(self.cases()) else {
+            return self.run(piece, clock, signal).map(Entry::Row);
+        };
+        for (margin, searched) in self.margins().iter().enumerate() {
+            let points = self.points(searched);
+            if point < points {
+                let point = self.search(searched, &self.case_at(searched, point)?, clock, signal)?;
+                return Some(Entry::Margin { margin, point });
+            }
+            point -= points;
+        }
+        None
+    }
+
+    /// The piece of work that an entry tells of, if it is one of this campaign's.
+    pub(super) fn piece(&self, entry: &Entry) -> Option<u64> {
+        match entry {
+            Entry::Row(row) => Some(row.case).filter(|case| *case < self.cases()),
+            Entry::Margin { margin, point } => {
+                let before: u64 = self.margins().get(..*margin)?.iter().map(|searched| self.points(searched)).sum();
+                let point = self.point(self.margins().get(*margin)?, point.case)?;
+                Some(self.cases() + before + point)
+            }
+        }
+    }
+
+    fn search(&self, searched: &Searched, case: &Case, clock: ClockKind, signal: &AtomicUsize) -> Option<MarginPoint> {
+        let holds = |value: Value| {
+            let ran = run(self.document_with(case, Some((searched, &value))), clock, signal)?;
+            Some(searched.such_that.holds(&self.row(case, &ran)))
+        };
+        let found = searched.search(holds)?;
+        Some(MarginPoint {
+            case: case.number,
+            parameters: searched.parameters(case),
+            value: found.value,
+            bracket: found.bracket,
+            runs: found.runs,
+        })
+    }
+
+    fn row(&self, case: &Case, ran: &Ran) -> Row {
+        let row = Row {
+            case: case.number,
+            seed: case.seed,
+            parameters: case.parameters.clone(),
+            accepted: None,
+            verdict: "not judged: it did not run".to_owned(),
+            exit: End::Invalid,
+            reason: None,
+            settled_at_s: None,
+            metrics: vec![None; self.metrics().len()],
+            executed: 0,
+            missed: 0,
+            starved: 0,
+            safe: 0,
+            lost: 0,
+            injected: 0,
+            hash: String::new(),
+            predicted_rate_per_s: None,
+        };
+        match ran {
+            Ran::Invalid(error) => Row { reason: Some(error.to_string()), ..row },
+            Ran::Failed(error) => Row { exit: End::Failed, reason: Some(error.to_string()), ..row },
+            Ran::Ended(ended) => self.ended(row, &ended.0, &ended.1),
+        }
+    }
+
+    fn ended(&self, row: Row, scenario: &Scenario, outcome: &Outcome) -> Row {
+        let Judged { books, accepted, verdict, .. } = Judged::new(scenario, outcome);
+        let score = &outcome.score;
+        let stopped = outcome.incidents.iter().find(|incident| incident.action == Action::Stopped);
+        let (exit, reason) = match stopped {
+            Some(incident) => (End::Stopped, Some(incident.to_string())),
+            None if !books.balanced => (End::Failed, Some(books.problems.join("; "))),
+            None if score.faulted_ticks > 0 => {
+                (End::Lost, Some(format!("a body came to the end of its model: lost at {} ticks", score.faulted_ticks)))
+            }
+            None => (End::Completed, None),
+        };
+        let ticks = |of: fn(&crate::telemetry::Ticks) -> u64| books.roles.values().map(of).sum();
+        Row {
+            accepted,
+            verdict,
+            exit,
+            reason,
+            settled_at_s: settled_at_s(scenario, &score.metrics),
+            metrics: self.metrics().iter().map(|metric| value(metric, &score.metrics)).collect(),
+            executed: ticks(|ticks| ticks.executed),
+            missed: ticks(|ticks| ticks.missed),
+            starved: ticks(|ticks| ticks.starved),
+            safe: ticks(|ticks| ticks.safe),
+            lost: score.faulted_ticks,
+            injected: books.injected_faults,
+            hash: state_hash(&outcome.reports),
+            predicted_rate_per_s: self.rate().then(|| predicted_rate_per_s(scenario)).flatten(),
+            ..row
+        }
+    }
+}
+
+/// Runs a scenario that was made; none if `signal` asked for the end before its own.
+fn run(document: Result<Document, ConfigError>, clock: ClockKind, signal: &AtomicUsize) -> Option<Ran> {
+    let scenario = match document.and_then(in_thread) {
+        Ok(scenario) => Scenario { clock, ..scenario },
+        Err(error) => return Some(Ran::Invalid(error)),
+    };
+    let mut silent = |_: &launch::Progress<'_>| {};
+    match launch::run(&scenario, &mut Launch::new(signal, &mut silent)) {
+        Ok(outcome) if outcome.signal != 0 => None,
+        Ok(outcome) => Some(Ran::Ended(Box::new((scenario, outcome)))),
+        Err(error) => Some(Ran::Failed(error)),
+    }
+}
+
+/// When the last metric that has a limit came within it for good; none if one never did, or none has one.
+fn settled_at_s(scenario: &Scenario, metrics: &[MetricScore]) -> Option<f64> {
+    let limited = metrics.iter().filter(|metric| scenario.accept.metric_max.contains_key(&metric.name));
+    let times: Option<Vec<f64>> = limited.map(|metric| metric.settled_at_s).collect();
+    times?.into_iter().reduce(f64::max)
+}
+
+fn value(metric: &Metric, scores: &[MetricScore]) -> Option<f64> {
+    let score = scores.iter().find(|score| score.name == metric.metric)?;
+    let value = match metric.statistic {
+        Statistic::Last => Some(score.last),
+        Statistic::SettledMax => score.settled_max,
+        Statistic::Peak => score.peak,
+        Statistic::Ise => Some(score.ise),
+    };
+    value.filter(|value| value.is_finite())
+}
+
+/// The slowest rate that is claimed of the loop; none if there is a body of which none is.
+fn predicted_rate_per_s(scenario: &Scenario) -> Option<f64> {
+    let rates: Option<Vec<f64>> = claims(scenario).iter().map(|claim| claim.loop_rate_per_s).collect();
+    rates?.into_iter().reduce(f64::min)
+}

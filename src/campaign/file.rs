@@ -1,0 +1,472 @@
+//! Campaign files: text as typed, then a [`Campaign`] as resolved, of which any case can be asked.
+//!
+//! Every error says where (file, line, key), why, and what to do. Must not run anything.
+
+use super::axis::{self, RawAxis, Varied};
+use super::draw::{self, SOBOL_AXES, SOBOL_POINTS};
+use super::margin::{RawMargin, Searched};
+use super::table::{Metric, Parameter, Statistic, Table};
+use crate::config::{Checks, ConfigError, Document, Scenario, is_name, read_text};
+use crate::fault;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
+use std::fs::File;
+use std::path::Path;
+use toml::Value;
+use xxhash_rust::xxh3::xxh3_64;
+
+/// The most cases of a campaign.
+const MAX_CASES: u64 = 1_000_000_000;
+/// Of so many cases one must be valid.
+const TRIED: u64 = 64;
+/// Bits of a case's seed: every program that reads tables has numbers of so many.
+const SEED_BITS: u32 = 53;
+/// What there is to say of a file that is none.
+const SCENARIO: &str = "scenario";
+/// The quantities of a fault of which none is no fault at all.
+const AMOUNTS: [&str; 5] = ["probability", "ticks", "delay_ticks", "stall_ms", "deviation"];
+
+/// Gives the text of a shipped scenario by its name, or says that there is none.
+pub type Shipped<'a> = &'a dyn Fn(&str) -> Result<Cow<'static, str>, String>;
+
+/// A campaign: a scenario, what is varied of it, and how.
+#[derive(Debug, Clone)]
+pub struct Campaign {
+    name: String,
+    base: String,
+    document: Document,
+    axes: Vec<Varied>,
+    samples: Option<(Sampling, u64)>,
+    repeats: u64,
+    seed: u64,
+    rate: bool,
+    margins: Vec<Searched>,
+    cases: u64,
+    metrics: Vec<Metric>,
+    resolved: String,
+}
+
+/// One case: its number, and what follows from that.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Case {
+    /// From 0.
+    pub number: u64,
+    /// The scenario's seed.
+    pub seed: u64,
+    /// The values of the axes, as tables show them.
+    pub parameters: Vec<Parameter>,
+    values: Vec<Value>,
+}
+
+/// How samples are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Sampling {
+    #[default]
+    Random,
+    LatinHypercube,
+    Sobol,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Raw {
+    name: String,
+    base: String,
+    #[serde(default = "one")]
+    seed: u64,
+    #[serde(default = "one")]
+    repeats: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    samples: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sampling: Option<Sampling>,
+    #[serde(default)]
+    rate: bool,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    axis: Vec<RawAxis>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    margin: Vec<RawMargin>,
+}
+
+fn one() -> u64 {
+    1
+}
+
+/// Whether a document is a campaign's, and no scenario's.
+pub(crate) fn is_campaign(document: &Document) -> bool {
+    document.has("base") && !document.has("rig")
+}
+
+impl Campaign {
+    /// Reads a file; scenarios that it names by a path lie beside it.
+    ///
+    /// # Errors
+    /// [`ConfigError`], with the place, the reason and the remedy.
+    pub fn load(path: &Path, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
+        Self::of(Document::read(path)?, overrides, shipped)
+    }
+
+    /// The same from a text; `origin` stands for the file in error messages.
+    ///
+    /// # Errors
+    /// [`ConfigError`].
+    pub fn parse(text: &str, origin: &str, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
+        Self::of(Document::parse(text, origin)?, overrides, shipped)
+    }
+
+    /// The same from a document; `overrides` are of the scenario, as `--set` has them.
+    pub(crate) fn of(mut file: Document, overrides: &[String], shipped: Shipped<'_>) -> Result<Self, ConfigError> {
+        // What belongs to the scenario is read by whoever reads scenarios.
+        let (inner, set) = (file.take(SCENARIO), file.take("set"));
+        let mut faults = file.split_off(&["fault"]);
+        let raw: Raw = file.read_into()?;
+        let mut document = match inner {
+            Some(inner) => inner,
+            None => base(&raw.base, &file, shipped)?,
+        };
+        document.append("fault", &mut faults);
+        if let Some(set) = set {
+            merge(&mut document, &set)?;
+        }
+        overrides.iter().try_for_each(|argument| document.set(argument))?;
+        let mut checks = Checks::new(&file);
+        check(&raw, &mut checks);
+        let axes: Vec<Option<Varied>> =
+            raw.axis.iter().enumerate().map(|(index, axis)| Varied::resolve(axis, index, &file, &mut checks)).collect();
+        check_keys(&raw, &mut checks);
+        let resolved = axes.iter().flatten().cloned().collect::<Vec<_>>();
+        for (index, axis) in axes.iter().enumerate() {
+            let drawn = axis.as_ref().is_some_and(|axis| axis.points().is_none());
+            let asked = raw.samples.is_some() || raw.axis[index].range.is_none();
+            checks.require(!drawn || asked, &format!("axis[{index}].range.points"), || {
+                "is missing; add it, or draw from the range with samples = N".to_owned()
+            });
+        }
+        let margin =
+            |(index, margin): (usize, &RawMargin)| Searched::resolve(margin, index, &file, &resolved, &mut checks);
+        let margins: Vec<Searched> = raw.margin.iter().enumerate().filter_map(margin).collect();
+        let points = resolved.iter().map(|axis| axis.points().unwrap_or(1));
+        let points = raw.samples.or_else(|| points.fold(Some(1_u64), |all, points| all?.checked_mul(points)));
+        let cases = points.and_then(|points| points.checked_mul(raw.repeats)).filter(|cases| *cases <= MAX_CASES);
+        checks.require(cases.is_some(), "name", || {
+            format!("has more than {MAX_CASES} cases; take fewer values, or samples = N of them")
+        });
+        let cases = checks.finish(cases)?;
+        let samples = raw.samples.map(|samples| (raw.sampling.unwrap_or_default(), samples));
+        let mut campaign = Self {
+            name: raw.name.clone(),
+            base: raw.base.clone(),
+            axes: resolved,
+            samples,
+            repeats: raw.repeats,
+            seed: raw.seed,
+            rate: raw.rate,
+            margins,
+            cases,
+            metrics: Vec::new(),
+            resolved: text(&raw, &document),
+            document,
+        };
+        campaign.metrics = campaign.try_cases()?;
+        Ok(campaign)
+    }
+
+    /// The metrics of the first of some cases that is valid.
+    ///
+    /// # Errors
+    /// That of the first case, if none is: then a key does not exist, or no case would run.
+    fn try_cases(&self) -> Result<Vec<Metric>, ConfigError> {
+        let tried = self.cases.min(TRIED);
+        let mut first = None;
+        // Spread over the campaign: neighbours have most in common.
+        for index in 0..tried {
+            let case = self.case((u128::from(index) * u128::from(self.cases) / u128::from(tried)) as u64);
+            match self.scenario(&case.expect("it is one of the cases")) {
+                Ok(scenario) => return Ok(metrics(&scenario)),
+                Err(error) => first = first.or(Some(error)),
+            }
+        }
+        Err(first.expect("a campaign has a case"))
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// How many cases it has.
+    pub fn cases(&self) -> u64 {
+        self.cases
+    }
+
+    /// Whether the certificate's rate is predicted for every case.
+    pub(super) fn rate(&self) -> bool {
+        self.rate
+    }
+
+    pub(super) fn metrics(&self) -> &[Metric] {
+        &self.metrics
+    }
+
+    pub(super) fn margins(&self) -> &[Searched] {
+        &self.margins
+    }
+
+    /// The campaign as a file that resolves to itself: with its scenario in it.
+    pub fn to_toml(&self) -> &str {
+        &self.resolved
+    }
+
+    /// What its cases follow from, as a hash: the same for the same campaign, whatever its file is called.
+    pub fn identity(&self) -> String {
+        format!("{:016x}", xxh3_64(self.resolved.as_bytes()))
+    }
+
+    /// Its table without rows.
+    pub fn table(&self) -> Table {
+        Table {
+            name: self.name.clone(),
+            base: self.base.clone(),
+            axes: self.axes.iter().map(|varied| varied.axis.clone()).collect(),
+            metrics: self.metrics.clone(),
+            cases: self.cases,
+            rows: Vec::new(),
+            margins: self.margins.iter().map(|searched| searched.margin.clone()).collect(),
+        }
+    }
+
+    /// A case; none if there is none of this number.
+    pub fn case(&self, number: u64) -> Option<Case> {
+        if number >= self.cases {
+            return None;
+        }
+        let mut seed = fault::seed(self.seed, number) >> (u64::BITS - SEED_BITS);
+        let (mut values, mut parameters) = (Vec::new(), Vec::new());
+        let sample = number / self.repeats;
+        for (index, axis) in self.axes.iter().enumerate() {
+            let (value, point) = match (self.samples, axis.points()) {
+                (Some((Sampling::Random, _)), _) => axis.drawn(draw::independent(self.seed, index, sample)),
+                (Some((Sampling::LatinHypercube, samples)), _) => {
+                    axis.drawn(draw::latin_hypercube(self.seed, index, sample, samples))
+                }
+                (Some((Sampling::Sobol, _)), _) => axis.drawn(draw::sobol(self.seed, index, sample)),
+                (None, None) => axis.drawn(draw::independent(self.seed, index, number)),
+                (None, Some(points)) => {
+                    let point = number / self.stride(index) % points;
+                    (axis.at(point), Some(point))
+                }
+            };
+            if let ("seed", Value::Integer(given)) = (axis.axis.key.as_str(), &value) {
+                seed = u64::try_from(*given).unwrap_or(seed);
+            }
+            parameters.push(axis.shown(&value, point));
+            values.push(value);
+        }
+        Some(Case { number, seed, parameters, values })
+    }
+
+    /// The case at a point of a margin, of [`points`](Self::points) there are: that with the first value of the key, if it is an
+    /// axis.
+    pub(super) fn case_at(&self, searched: &Searched, point: u64) -> Option<Case> {
+        let moved = searched.axis.filter(|_| self.samples.is_none());
+        let number = moved.map_or(point, |moved| {
+            let stride = self.stride(moved);
+            point / stride * stride * self.axes[moved].points().unwrap_or(1) + point % stride
+        });
+        self.case(number)
+    }
+
+    /// The point of a margin that a case stands for.
+    pub(super) fn point(&self, searched: &Searched, case: u64) -> Option<u64> {
+        let Some(moved) = searched.axis.filter(|_| self.samples.is_none()) else {
+            return Some(case).filter(|case| *case < self.cases);
+        };
+        let stride = self.stride(moved);
+        let round = stride * self.axes[moved].points().unwrap_or(1);
+        Some(case / round * stride + case % stride).filter(|_| case < self.cases && case % round < stride)
+    }
+
+    /// How many cases lie between two values of an axis, where all combinations are run.
+    fn stride(&self, axis: usize) -> u64 {
+        self.axes[axis + 1..].iter().map(|axis| axis.points().unwrap_or(1)).product::<u64>() * self.repeats
+    }
+
+    /// How many points a margin has.
+    pub(super) fn points(&self, searched: &Searched) -> u64 {
+        let moved = searched.axis.filter(|_| self.samples.is_none());
+        self.cases / moved.and_then(|moved| self.axes[moved].points()).unwrap_or(1)
+    }
+
+    /// The scenario of a case, as a document: what is varied has its values.
+    pub(crate) fn document(&self, case: &Case) -> Result<Document, ConfigError> {
+        self.document_with(case, None)
+    }
+
+    /// The same with a margin's key at a value.
+    pub(super) fn document_with(
+        &self,
+        case: &Case,
+        moved: Option<(&Searched, &Value)>,
+    ) -> Result<Document, ConfigError> {
+        let mut document = self.document.clone();
+        let seed = i64::try_from(case.seed).expect("a seed has few bits");
+        document.put("seed", Value::Integer(seed), "the case's seed")?;
+        for (index, (axis, value)) in self.axes.iter().zip(&case.values).enumerate() {
+            if moved.is_none_or(|(searched, _)| searched.axis != Some(index)) {
+                put(&mut document, &axis.axis.key, axis.factor, value, &axis.place)?;
+            }
+        }
+        if let Some((searched, value)) = moved {
+            let factor = searched.axis.is_some_and(|axis| self.axes[axis].factor);
+            put(&mut document, &searched.margin.key, factor, value, &searched.place)?;
+        }
+        let keys = self.axes.iter().map(|axis| &axis.axis.key).chain(moved.map(|(searched, _)| &searched.margin.key));
+        let mut off: Vec<usize> = keys.filter_map(|key| fault_that_is_off(&document, key)).collect();
+        off.sort_unstable();
+        off.dedup();
+        off.iter().rev().for_each(|number| document.remove_element("fault", *number));
+        Ok(document)
+    }
+
+    /// The scenario of a case, to be run in one thread.
+    ///
+    /// # Errors
+    /// [`ConfigError`] where the values make no scenario.
+    pub fn scenario(&self, case: &Case) -> Result<Scenario, ConfigError> {
+        in_thread(self.document(case)?)
+    }
+}
+
+/// A scenario that is to be run in one thread, whatever its file says of clocks and recordings.
+pub(super) fn in_thread(mut document: Document) -> Result<Scenario, ConfigError> {
+    document.put("clock", "in-process".into(), "a campaign's clock")?;
+    document.put("record", false.into(), "a campaign records nothing")?;
+    Scenario::of(document)
+}
+
+/// The number of the fault that an axis has switched off: one of which there is nothing.
+fn fault_that_is_off(document: &Document, key: &str) -> Option<usize> {
+    let (number, amount) = key.strip_prefix("fault.")?.split_once('.')?;
+    let off = AMOUNTS.contains(&amount) && axis::number(document.get(key)?)?.0 == 0.0;
+    number.parse().ok().filter(|_| off)
+}
+
+/// Puts a value where an axis has it: a number for a list of numbers is each of them, a factor is one of what is there.
+fn put(document: &mut Document, key: &str, factor: bool, value: &Value, place: &str) -> Result<(), ConfigError> {
+    let there = document.get(key);
+    let times = |there: &Value| {
+        let ((there, whole), (factor, _)) = (axis::number(there)?, axis::number(value)?);
+        Some(axis::value(there * factor, whole && (there * factor).fract() == 0.0))
+    };
+    let each = |make: &dyn Fn(&Value) -> Option<Value>| match there {
+        Some(Value::Array(list)) => list.iter().map(make).collect::<Option<Vec<_>>>().map(Value::Array),
+        Some(there) => make(there),
+        None => None,
+    };
+    let put = if factor {
+        each(&times).ok_or_else(|| ConfigError::Value {
+            place: place.to_owned(),
+            key: key.to_owned(),
+            reason: "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]"
+                .into(),
+        })?
+    } else {
+        let list = matches!(there, Some(Value::Array(_))) && axis::number(value).is_some();
+        let filled = list.then(|| each(&|there| axis::number(there).map(|_| value.clone()))).flatten();
+        filled.unwrap_or_else(|| value.clone())
+    };
+    document.put(key, put, place)
+}
+
+/// The scenario that a campaign varies.
+fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, ConfigError> {
+    let refuse = |reason: String| ConfigError::Value { place: file.place("base"), key: "base".to_owned(), reason };
+    if is_name(name) {
+        return Document::parse(&shipped(name).map_err(refuse)?, &format!("{name}.toml"));
+    }
+    let path = file.directory().join(name);
+    let text =
+        File::open(&path).map_err(|error| refuse(format!("{}: {error}; name a scenario file", path.display())))?;
+    Document::parse(&read_text(text, &path)?, &path.display().to_string())
+}
+
+/// Puts every value of a table of changes where its path says.
+fn merge(document: &mut Document, set: &Document) -> Result<(), ConfigError> {
+    fn put(document: &mut Document, set: &Document, table: &toml::Table, path: &str) -> Result<(), ConfigError> {
+        for (key, value) in table {
+            let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+            match value {
+                Value::Table(inner) if !inner.is_empty() => put(document, set, inner, &path)?,
+                value => document.put(&path, value.clone(), &set.place(&path))?,
+            }
+        }
+        Ok(())
+    }
+    put(document, set, set.table(), "")
+}
+
+/// The campaign as a file that needs no other.
+fn text(raw: &Raw, document: &Document) -> String {
+    let mut table = toml::Table::try_from(raw).expect("a campaign of plain values is TOML");
+    table.insert(SCENARIO.to_owned(), Value::Table(document.table().clone()));
+    toml::to_string(&table).expect("a campaign of plain values is TOML")
+}
+
+/// The columns that a scenario's metrics make.
+fn metrics(scenario: &Scenario) -> Vec<Metric> {
+    let of = |metric: &'static str| {
+        Statistic::ALL.map(|statistic| Metric {
+            name: format!("{metric}.{}", statistic.name()),
+            metric: metric.to_owned(),
+            statistic,
+        })
+    };
+    scenario.rig.metrics().into_iter().flat_map(of).collect()
+}
+
+fn check(raw: &Raw, checks: &mut Checks<'_>) {
+    let named = (1..=32).contains(&raw.name.len())
+        && raw.name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+    checks.require(named, "name", || format!("`{}` cannot name files; use 1 to 32 of a-z, 0-9 and -", raw.name));
+    checks.require((1..=MAX_CASES).contains(&raw.repeats), "repeats", || {
+        format!("{} is no number of runs of one point; give 1 to {MAX_CASES}", raw.repeats)
+    });
+    let samples = raw.samples.unwrap_or(1);
+    checks.require((1..=MAX_CASES).contains(&samples), "samples", || {
+        format!("{samples} are no samples; give 1 to {MAX_CASES}, or leave it out for all combinations")
+    });
+    checks.require(raw.sampling.is_none() || raw.samples.is_some(), "sampling", || {
+        "says how samples are drawn, and all combinations are run; add samples = N, or remove it".to_owned()
+    });
+    if raw.sampling == Some(Sampling::Sobol) {
+        checks.require(raw.axis.len() <= SOBOL_AXES, "sampling", || {
+            format!(
+                "Sobol's sequence has {SOBOL_AXES} axes here, and there are {}; take latin-hypercube",
+                raw.axis.len()
+            )
+        });
+        checks.require(samples <= SOBOL_POINTS, "samples", || format!("give at most {SOBOL_POINTS}"));
+    }
+}
+
+/// No key may be varied twice, nor what lies in another.
+fn check_keys(raw: &Raw, checks: &mut Checks<'_>) {
+    for (index, axis) in raw.axis.iter().enumerate() {
+        let within = |other: &RawAxis| {
+            let (own, other) = (format!("{}.", axis.key.trim()), format!("{}.", other.key.trim()));
+            own.starts_with(&other) || other.starts_with(&own)
+        };
+        if let Some(other) = raw.axis[..index].iter().find(|other| within(other)) {
+            checks.refuse(&format!("axis[{index}].key"), format!("`{}` is varied already, by another axis", other.key));
+        }
+    }
+}
+
+impl Searched {
+    /// The parameters of a case that a margin leaves as they are.
+    pub(super) fn parameters(&self, case: &Case) -> Vec<Option<Parameter>> {
+        let kept = case.parameters.iter().enumerate();
+        kept.map(|(index, parameter)| (self.axis != Some(index)).then(|| parameter.clone())).collect()
+    }
+}

@@ -1,0 +1,220 @@
+//! The tables of a campaign that is done: CSV, Parquet with the feature, and a summary. The same bytes, whoever did the work.
+//!
+//! Must not hold the rows: they pass from the journal to the files.
+
+use super::file::Campaign;
+use super::journal::{Entry, Journal};
+use super::sweep::SweepError;
+use super::table::{End, Parameter, Row, Table};
+use crate::files;
+use serde::Serialize;
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+/// The campaign as a file that needs no other.
+pub(super) const CAMPAIGN: &str = "campaign.toml";
+/// The rows.
+const CASES: &str = "cases.csv";
+#[cfg(feature = "parquet")]
+const CASES_PARQUET: &str = "cases.parquet";
+/// What they come to, and the margins.
+const SUMMARY: &str = "summary.json";
+/// Layout version of the summary.
+const SCHEMA: &str = "corotate/sweep/v1";
+/// Columns before the parameters, between them and the metrics, and after these.
+const FIRST: [&str; 2] = ["case", "seed"];
+const VERDICT: [&str; 5] = ["accepted", "verdict", "exit", "reason", "settled_at_s"];
+const LAST: [&str; 8] = ["executed", "missed", "starved", "safe", "lost", "injected", "hash", "predicted_rate_per_s"];
+
+/// What the rows come to.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct Counts {
+    /// Rows.
+    pub rows: u64,
+    /// Cases whose criteria hold.
+    pub accepted: u64,
+    /// Cases of which some criterion does not.
+    pub not_accepted: u64,
+    /// Cases that could not be judged.
+    pub not_judged: u64,
+    /// How many cases ended how; only what occurred.
+    pub exits: BTreeMap<&'static str, u64>,
+    /// Points of margins.
+    pub margin_points: u64,
+}
+
+impl Counts {
+    fn take(&mut self, row: &Row) {
+        self.rows += 1;
+        *match row.accepted {
+            Some(true) => &mut self.accepted,
+            Some(false) => &mut self.not_accepted,
+            None => &mut self.not_judged,
+        } += 1;
+        *self.exits.entry(row.exit.name()).or_default() += 1;
+    }
+}
+
+#[derive(Serialize)]
+struct Summary<'a> {
+    schema: &'static str,
+    version: &'static str,
+    revision: &'static str,
+    identity: String,
+    shard: Option<[u64; 2]>,
+    counts: &'a Counts,
+    #[serde(flatten)]
+    table: &'a Table,
+}
+
+/// Writes the tables into the directory of a campaign whose journal is whole.
+pub(super) fn write(
+    directory: &Path,
+    campaign: &Campaign,
+    shard: Option<[u64; 2]>,
+    journal: &Journal,
+) -> Result<Counts, SweepError> {
+    let (mut table, mut counts) = (campaign.table(), Counts::default());
+    let mut kinds = vec![None; table.axes.len()];
+    let columns = columns(&table);
+    let mut failure = None;
+    write_file(&directory.join(CASES), |out| {
+        let mut csv = csv::Writer::from_writer(out);
+        csv.write_record(&columns)?;
+        for entry in journal.entries().map_err(io::Error::other)? {
+            match entry {
+                Ok(Entry::Row(row)) => {
+                    counts.take(&row);
+                    kinds
+                        .iter_mut()
+                        .zip(&row.parameters)
+                        .for_each(|(kind, one)| *kind = Some(Kind::of(one).with(*kind)));
+                    csv.write_record(record(&row))?;
+                }
+                Ok(Entry::Margin { margin, point }) => {
+                    counts.margin_points += 1;
+                    table.margins[margin].points.push(point);
+                }
+                Err(error) => {
+                    failure = Some(error);
+                    break;
+                }
+            }
+        }
+        csv.flush()
+    })?;
+    if let Some(error) = failure {
+        return Err(error.into());
+    }
+    #[cfg(feature = "parquet")]
+    {
+        let kinds = kinds.into_iter().map(|kind| kind.unwrap_or(Kind::Word)).collect();
+        let rows = journal.entries()?.filter_map(|entry| match entry {
+            Ok(Entry::Row(row)) => Some(Ok(row)),
+            Ok(Entry::Margin { .. }) => None,
+            Err(error) => Some(Err(io::Error::other(error))),
+        });
+        write_file(&directory.join(CASES_PARQUET), |out| super::parquet::write(out, &table, kinds, rows))?;
+    }
+    let summary = Summary {
+        schema: SCHEMA,
+        version: env!("CARGO_PKG_VERSION"),
+        revision: env!("COROTATE_REVISION"),
+        identity: campaign.identity(),
+        shard,
+        counts: &counts,
+        table: &table,
+    };
+    write_file(&directory.join(SUMMARY), |out| {
+        serde_json::to_writer_pretty(&mut *out, &summary)?;
+        writeln!(out)
+    })?;
+    Ok(counts)
+}
+
+/// Writes a file beside its place and puts it there when it is whole.
+pub(super) fn write_file(
+    path: &Path,
+    content: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> Result<(), SweepError> {
+    let part = path.with_extension("part");
+    let attempt = || {
+        let mut out = BufWriter::new(files::create(&part)?);
+        content(&mut out)?;
+        out.flush()?;
+        drop(out);
+        fs::rename(&part, path)
+    };
+    attempt().map_err(|source| SweepError::Write { path: path.to_owned(), source })
+}
+
+/// The names of all columns, in the order of both tables.
+pub(super) fn columns(table: &Table) -> Vec<String> {
+    let owned = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    let axes = table.axes.iter().map(|axis| axis.key.clone()).collect();
+    let metrics = table.metrics.iter().map(|metric| metric.name.clone()).collect();
+    [owned(&FIRST), axes, owned(&VERDICT), metrics, owned(&LAST)].concat()
+}
+
+fn record(row: &Row) -> Vec<String> {
+    let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
+    let mut record = vec![row.case.to_string(), row.seed.to_string()];
+    record.extend(row.parameters.iter().map(Parameter::to_string));
+    record.push(row.accepted.map_or(String::new(), |accepted| accepted.to_string()));
+    record.extend([row.verdict.clone(), row.exit.name().to_owned(), row.reason.clone().unwrap_or_default()]);
+    record.push(number(row.settled_at_s));
+    record.extend(row.metrics.iter().map(|value| number(*value)));
+    record.extend(
+        [row.executed, row.missed, row.starved, row.safe, row.lost, row.injected].map(|count| count.to_string()),
+    );
+    record.extend([row.hash.clone(), number(row.predicted_rate_per_s)]);
+    record
+}
+
+/// What the values of an axis have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Flag,
+    Whole,
+    Number,
+    Word,
+}
+
+impl Kind {
+    fn of(parameter: &Parameter) -> Self {
+        match parameter {
+            Parameter::Flag(_) => Self::Flag,
+            Parameter::Whole(_) => Self::Whole,
+            Parameter::Number(_) => Self::Number,
+            Parameter::Word(_) => Self::Word,
+        }
+    }
+
+    fn with(self, other: Option<Self>) -> Self {
+        match (self, other) {
+            (kind, None) => kind,
+            (kind, Some(other)) if kind == other => kind,
+            (Self::Whole | Self::Number, Some(Self::Whole | Self::Number)) => Self::Number,
+            _ => Self::Word,
+        }
+    }
+}
+
+/// The cases that fared worst and could be run, the worst first: lost or stopped, then not accepted, then those with the largest
+/// first metric.
+pub fn worst(table: &Table, count: usize) -> Vec<u64> {
+    let first = table.metrics.iter().position(|metric| metric.statistic == super::table::Statistic::SettledMax);
+    let badness = |row: &&Row| {
+        let ended = row.exit != End::Completed;
+        let size = first.and_then(|first| row.metrics[first]).unwrap_or(f64::INFINITY);
+        // Of numbers not below zero the order is that of their bits.
+        (Reverse((ended, row.accepted == Some(false), size.to_bits())), row.case)
+    };
+    let mut rows: Vec<&Row> =
+        table.rows.iter().filter(|row| row.exit != End::Invalid && row.exit != End::Failed).collect();
+    rows.sort_by_key(badness);
+    rows.iter().take(count).map(|row| row.case).collect()
+}

@@ -1,0 +1,50 @@
+//! Which campaign a command means, as `scenario` does for scenarios.
+//!
+//! Must not judge what it reads: [`crate::campaign`] does.
+
+use super::scenario::{quoting, text, unknown};
+use super::{campaigns, scenarios};
+use crate::campaign::{Campaign, is_campaign};
+use crate::config::{Document, is_name, nearest};
+use std::borrow::Cow;
+use std::path::Path;
+
+/// The campaign that is meant, with changes of its scenario.
+pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, String> {
+    let (text, origin) = text(given, &|name| {
+        let found = campaigns().iter().find(|(known, _)| *known == name);
+        found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| no_campaign(name))
+    })?;
+    let base = |name: &str| {
+        let found = scenarios().iter().find(|(known, _)| *known == name);
+        found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| unknown(name))
+    };
+    let campaign = Campaign::parse(&text, &origin, overrides, &base);
+    campaign.map_err(|error| quoting(&error.to_string(), &origin, &text))
+}
+
+/// The scenario of a case.
+pub fn case(campaign: &Campaign, number: u64) -> Result<Document, String> {
+    let cases = campaign.cases();
+    let case = campaign.case(number);
+    let case = case.ok_or_else(|| format!("--case {number}: `{}` has cases 0 to {}", campaign.name(), cases - 1))?;
+    campaign.document(&case).map_err(|error| error.to_string())
+}
+
+/// Whether a name or a file is a campaign's.
+pub fn is_meant(given: &Path) -> bool {
+    match given.to_str().filter(|text| is_name(text)) {
+        Some(name) => campaigns().iter().any(|(known, _)| *known == name),
+        None => Document::read(given).is_ok_and(|document| is_campaign(&document)),
+    }
+}
+
+fn no_campaign(name: &str) -> String {
+    if scenarios().iter().any(|(known, _)| *known == name) {
+        return format!("`{name}` is a scenario and no campaign; run it with `corotate run {name}`");
+    }
+    let known: Vec<&str> = campaigns().iter().map(|(name, _)| *name).collect();
+    let remedy = nearest(name, &known);
+    let end = if remedy.ends_with('?') { "" } else { "." };
+    format!("there is no campaign `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml")
+}
