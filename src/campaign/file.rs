@@ -2,7 +2,8 @@
 //!
 //! Every error says where (file, line, key), why, and what to do. Must not run anything.
 
-use super::axis::{self, RawAxis, Varied};
+use super::apply::{EVERY, fault_that_is_off, put};
+use super::axis::{RawAxis, Varied};
 use super::draw::{self, SOBOL_AXES, SOBOL_POINTS};
 use super::margin::{RawMargin, Searched};
 use super::table::{Metric, Parameter, Statistic, Table};
@@ -20,12 +21,9 @@ const MAX_CASES: u64 = 1_000_000_000;
 /// Of so many cases one must be valid.
 const TRIED: u64 = 64;
 /// Bits of a case's seed: every program that reads tables has numbers of so many.
-const SEED_BITS: u32 = 53;
-/// What there is to say of a file that is none.
+pub(super) const SEED_BITS: u32 = 53;
+/// The table of a campaign that has its scenario in it.
 const SCENARIO: &str = "scenario";
-/// The quantities of a fault of which none is no fault at all.
-const AMOUNTS: [&str; 5] = ["probability", "ticks", "delay_ticks", "stall_ms", "deviation"];
-
 /// Gives the text of a shipped scenario by its name, or says that there is none.
 pub type Shipped<'a> = &'a dyn Fn(&str) -> Result<Cow<'static, str>, String>;
 
@@ -61,7 +59,7 @@ pub struct Case {
 /// How samples are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-enum Sampling {
+pub(super) enum Sampling {
     #[default]
     Random,
     LatinHypercube,
@@ -70,21 +68,21 @@ enum Sampling {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Raw {
+pub(super) struct Raw {
     name: String,
     base: String,
     #[serde(default = "one")]
-    seed: u64,
+    pub seed: u64,
     #[serde(default = "one")]
     repeats: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
-    samples: Option<u64>,
+    pub samples: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    sampling: Option<Sampling>,
+    pub sampling: Option<Sampling>,
     #[serde(default)]
     rate: bool,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    axis: Vec<RawAxis>,
+    pub axis: Vec<RawAxis>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     margin: Vec<RawMargin>,
 }
@@ -188,6 +186,12 @@ impl Campaign {
             }
         }
         Err(first.expect("a campaign has a case"))
+    }
+
+    /// The same with other axes, of which so many samples are drawn.
+    #[cfg(test)]
+    pub(super) fn with_axes(self, axes: Vec<Varied>, samples: Option<(Sampling, u64)>, seed: u64) -> Self {
+        Self { axes, samples, seed, cases: samples.map_or(self.cases, |(_, samples)| samples), ..self }
     }
 
     /// Its name.
@@ -345,40 +349,6 @@ pub(super) fn in_thread(mut document: Document) -> Result<Scenario, ConfigError>
     Scenario::of(document)
 }
 
-/// The number of the fault that an axis has switched off: one of which there is nothing.
-fn fault_that_is_off(document: &Document, key: &str) -> Option<usize> {
-    let (number, amount) = key.strip_prefix("fault.")?.split_once('.')?;
-    let off = AMOUNTS.contains(&amount) && axis::number(document.get(key)?)?.0 == 0.0;
-    number.parse().ok().filter(|_| off)
-}
-
-/// Puts a value where an axis has it: a number for a list of numbers is each of them, a factor is one of what is there.
-fn put(document: &mut Document, key: &str, factor: bool, value: &Value, place: &str) -> Result<(), ConfigError> {
-    let there = document.get(key);
-    let times = |there: &Value| {
-        let ((there, whole), (factor, _)) = (axis::number(there)?, axis::number(value)?);
-        Some(axis::value(there * factor, whole && (there * factor).fract() == 0.0))
-    };
-    let each = |make: &dyn Fn(&Value) -> Option<Value>| match there {
-        Some(Value::Array(list)) => list.iter().map(make).collect::<Option<Vec<_>>>().map(Value::Array),
-        Some(there) => make(there),
-        None => None,
-    };
-    let put = if factor {
-        each(&times).ok_or_else(|| ConfigError::Value {
-            place: place.to_owned(),
-            key: key.to_owned(),
-            reason: "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]"
-                .into(),
-        })?
-    } else {
-        let list = matches!(there, Some(Value::Array(_))) && axis::number(value).is_some();
-        let filled = list.then(|| each(&|there| axis::number(there).map(|_| value.clone()))).flatten();
-        filled.unwrap_or_else(|| value.clone())
-    };
-    document.put(key, put, place)
-}
-
 /// The scenario that a campaign varies.
 fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, ConfigError> {
     let refuse = |reason: String| ConfigError::Value { place: file.place("base"), key: "base".to_owned(), reason };
@@ -450,16 +420,18 @@ fn check(raw: &Raw, checks: &mut Checks<'_>) {
     }
 }
 
-/// No key may be varied twice, nor what lies in another.
+/// No key may be varied twice, nor be put where another has been varied: what lies in a table comes after the table.
 fn check_keys(raw: &Raw, checks: &mut Checks<'_>) {
     for (index, axis) in raw.axis.iter().enumerate() {
-        let within = |other: &RawAxis| {
-            let (own, other) = (format!("{}.", axis.key.trim()), format!("{}.", other.key.trim()));
-            own.starts_with(&other) || other.starts_with(&own)
-        };
-        if let Some(other) = raw.axis[..index].iter().find(|other| within(other)) {
-            checks.refuse(&format!("axis[{index}].key"), format!("`{}` is varied already, by another axis", other.key));
+        let covers = |other: &&RawAxis| format!("{}.", other.key.trim()).starts_with(&format!("{}.", axis.key.trim()));
+        let key = format!("axis[{index}].key");
+        if let Some(other) = raw.axis[..index].iter().find(covers) {
+            checks.refuse(&key, format!("`{}` is varied already, by an axis before it; vary it after this", other.key));
         }
+        let every = axis.key.trim().ends_with(EVERY);
+        checks.require(!every || axis.factor, &key, || {
+            format!("`{}` is every number of a table, which have a factor in common; add factor = true", axis.key)
+        });
     }
 }
 

@@ -3,6 +3,7 @@
 //! A case is a pure function of the campaign's text and the case's number: the same for ever, on every machine, under every
 //! clock. Must not print, nor know how a command line looks.
 
+mod apply;
 mod axis;
 mod case;
 mod draw;
@@ -14,6 +15,8 @@ mod parquet;
 mod results;
 mod sweep;
 mod table;
+#[cfg(test)]
+mod tests;
 
 pub(crate) use file::is_campaign;
 pub use file::{Campaign, Case, Shipped};
@@ -23,4 +26,9 @@ pub use sweep::{NoShard, Shard, Sweep, SweepError, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};
 
 /// The campaigns that ship with the program: name and text.
-pub const SHIPPED: [(&str, &str); 1] = [("timing-map", include_str!("../../config/campaigns/timing-map.toml"))];
+pub const SHIPPED: [(&str, &str); 4] = [
+    ("timing-map", include_str!("../../config/campaigns/timing-map.toml")),
+    ("inertia-error", include_str!("../../config/campaigns/inertia-error.toml")),
+    ("noise-filter", include_str!("../../config/campaigns/noise-filter.toml")),
+    ("start", include_str!("../../config/campaigns/start.toml")),
+];
