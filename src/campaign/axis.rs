@@ -121,7 +121,7 @@ impl Varied {
                 values: Vec::new(),
             },
             factor: raw.factor,
-            place: document.place(&at),
+            place: document.place(&format!("{at}.key")),
             spread,
         };
         let numbers = (0..varied.points().unwrap_or(0)).all(|point| number(&varied.at(point)).is_some());

@@ -2,7 +2,7 @@
 //!
 //! Must not fail: what cannot be run is a row that says why.
 
-use super::file::{Campaign, Case, in_thread};
+use super::file::{Campaign, Case, resolved};
 use super::journal::Entry;
 use super::margin::Searched;
 use super::table::{End, MarginPoint, Metric, Row, Statistic};
@@ -141,8 +141,8 @@ impl Campaign {
 
 /// Runs a scenario that was made; none if `signal` asked for the end before its own.
 fn run(document: Result<Document, ConfigError>, clock: ClockKind, signal: &AtomicUsize) -> Option<Ran> {
-    let scenario = match document.and_then(in_thread) {
-        Ok(scenario) => Scenario { clock, ..scenario },
+    let scenario = match document.and_then(|document| resolved(document, clock)) {
+        Ok(scenario) => scenario,
         Err(error) => return Some(Ran::Invalid(error)),
     };
     let mut silent = |_: &launch::Progress<'_>| {};

@@ -7,7 +7,7 @@ use super::axis::{RawAxis, Varied};
 use super::draw::{self, SOBOL_AXES, SOBOL_POINTS};
 use super::margin::{RawMargin, Searched};
 use super::table::{Metric, Parameter, Statistic, Table};
-use crate::config::{Checks, ConfigError, Document, Scenario, is_name, read_text};
+use crate::config::{Checks, ClockKind, ConfigError, Document, Scenario, is_name, read_text};
 use crate::fault;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -338,13 +338,13 @@ impl Campaign {
     /// # Errors
     /// [`ConfigError`] where the values make no scenario.
     pub fn scenario(&self, case: &Case) -> Result<Scenario, ConfigError> {
-        in_thread(self.document(case)?)
+        resolved(self.document(case)?, ClockKind::InProcess)
     }
 }
 
-/// A scenario that is to be run in one thread, whatever its file says of clocks and recordings.
-pub(super) fn in_thread(mut document: Document) -> Result<Scenario, ConfigError> {
-    document.put("clock", "in-process".into(), "a campaign's clock")?;
+/// The scenario of a document under a clock, whatever its own is; nothing is recorded.
+pub(super) fn resolved(mut document: Document, clock: ClockKind) -> Result<Scenario, ConfigError> {
+    document.put("clock", clock.name().into(), "a campaign's clock")?;
     document.put("record", false.into(), "a campaign records nothing")?;
     Scenario::of(document)
 }

@@ -100,7 +100,7 @@ impl Searched {
             key: key.clone(),
         };
         let axis = axes.iter().position(|varied| varied.axis.key == key);
-        Some(Self { margin, such_that: raw.such_that, axis, place: document.place(&at), whole })
+        Some(Self { margin, such_that: raw.such_that, axis, place: document.place(&format!("{at}.key")), whole })
     }
 
     /// Halves the range until it is narrow enough; none if `holds` has no answer any more.

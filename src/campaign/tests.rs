@@ -71,7 +71,10 @@ fn all_combinations_come_in_their_order_each_with_its_own_seed() {
 #[test]
 fn a_case_is_the_same_for_ever() {
     let case = campaign(COMBINED).case(11).unwrap();
-    assert_eq!((case.seed, case.parameters[2].clone()), (7_887_410_569_048_683, Parameter::Number(0.014_944_523_804_348_63)));
+    assert_eq!(
+        (case.seed, case.parameters[2].clone()),
+        (7_887_410_569_048_683, Parameter::Number(0.014_944_523_804_348_63))
+    );
 }
 
 #[test]
@@ -176,9 +179,9 @@ fn mistakes_are_told_with_place_and_remedy() {
         // What fails in every case is no row.
         (
             refused("[[axis]]\nkey = \"controller.gain\"\nvalues = [1.0, 2.0]"),
-            "map.toml:3: controller.gain: unknown key; did you mean `gain_per_s`?",
+            "map.toml:4: controller.gain: unknown key; did you mean `gain_per_s`?",
         ),
-        (refused("[[axis]]\nkey = \"fault.0.ticks\"\nvalues = [1]"), "map.toml:3: fault"),
+        (refused("[[axis]]\nkey = \"fault.0.ticks\"\nvalues = [1]"), "map.toml:4: fault"),
         (refused("[[axis]]\nkey = \"name\"\nfactor = true\nvalues = [2]"), "name: is no number in the scenario"),
         (refused("[set]\ntick_hz = -1.0"), "map.toml:4: tick_hz: -1 Hz is outside"),
     ] {

@@ -1,0 +1,365 @@
+//! `corotate sweep` as it is used: interrupted, killed, spread over shards, and held against an exact solution.
+
+mod common;
+
+use common::{Bench, Done, await_some};
+use corotate::campaign::{End, Row, Table};
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+const SIGINT: i32 = 2;
+const SIGKILL: i32 = 9;
+
+/// Ten gains, two rates of the observer; short, so that a debug build is quick.
+const MAP: &str = r#"
+name = "map"
+base = "rigid-pair"
+
+[set]
+duration_s = 1.0
+accept = { settled_by_s = 0.8, sync_error_rad_s_max = 0.3 }
+
+[[axis]]
+key = "controller.gain_per_s"
+range = { from = 1.0, to = 20.0, points = 10, log = true }
+
+[[axis]]
+key = "observer.decay_rate_per_s"
+values = [6.0, 12.0]
+
+[[margin]]
+find = "smallest"
+key = "controller.gain_per_s"
+from = 0.1
+to = 20.0
+tolerance = 0.5
+"#;
+
+fn bench(campaign: &str) -> Bench {
+    let bench = Bench::new();
+    fs::write(bench.path("map.toml"), campaign).unwrap();
+    bench
+}
+
+fn sweep(bench: &Bench, arguments: &[&str]) -> Done {
+    let done = bench.run(&[&["sweep", "map.toml"], arguments].concat());
+    assert_eq!(done.code, Some(0), "{done:?}");
+    done
+}
+
+/// The files of results that are the same for the same campaign.
+fn results(directory: &Path) -> Vec<(&'static str, Vec<u8>)> {
+    let names = ["campaign.toml", "cases.csv", "summary.json"].into_iter();
+    let names = names.chain(cfg!(feature = "parquet").then_some("cases.parquet"));
+    names.map(|name| (name, fs::read(directory.join(name)).unwrap())).collect()
+}
+
+fn assert_same(bench: &Bench, directory: &str, reference: &str) {
+    for ((name, found), (_, expected)) in
+        results(&bench.path(directory)).into_iter().zip(results(&bench.path(reference)))
+    {
+        assert!(found == expected, "{directory}/{name} is not as in {reference}");
+    }
+}
+
+#[test]
+fn the_table_is_the_same_whoever_makes_it() {
+    let bench = bench(MAP);
+    let told = sweep(&bench, &["--out", "one", "--threads", "1"]);
+    assert!(told.stdout.contains("22 cases and margins"), "{told:?}");
+    assert!(told.stdout.contains("smallest controller.gain_per_s such that accepted"), "{told:?}");
+    sweep(&bench, &["--out", "two", "--threads", "3", "-q"]);
+    assert_same(&bench, "two", "one");
+    let table = Table::read(&bench.path("one")).unwrap();
+    assert_eq!((table.rows.len() as u64, table.cases, table.margins[0].points.len()), (20, 20, 2));
+    assert!(table.rows.iter().all(|row| row.exit == End::Completed && row.executed == 4 * 1001));
+    let accepted = |row: &&Row| row.accepted == Some(true);
+    for point in &table.margins[0].points {
+        let [holds, not] = point.bracket.map(Option::unwrap);
+        assert!(point.parameters[0].is_none() && (holds - not).abs() <= 0.5);
+        let decay = point.parameters[1].as_ref().unwrap();
+        let beside = table.rows.iter().filter(|row| row.parameters[1] == *decay);
+        let lowest = beside.filter(accepted).map(|row| row.parameters[0].number().unwrap()).reduce(f64::min).unwrap();
+        assert!(not <= lowest && lowest <= 1.4 * holds + 0.5, "{lowest} is beside {point:?}");
+    }
+    // Done is done.
+    let again = sweep(&bench, &["--out", "one"]);
+    assert!(again.stdout.contains("all of them done before"), "{again:?}");
+    assert_same(&bench, "one", "two");
+}
+
+#[test]
+fn shards_put_together_are_the_whole() {
+    let bench = bench(MAP);
+    sweep(&bench, &["--out", "whole", "-q"]);
+    for index in 0..3 {
+        sweep(&bench, &["--out", &format!("part-{index}"), "--shard", &format!("{index}/3"), "-q"]);
+    }
+    let missing = bench.run(&["sweep", "merge", "part-0", "part-2", "--out", "few"]);
+    assert_eq!(missing.code, Some(2), "{missing:?}");
+    assert!(missing.stderr.contains("7 of 22 pieces of work are missing"), "{missing:?}");
+    let merged = bench.run(&["sweep", "merge", "part-2", "part-0", "part-1", "--out", "merged"]);
+    assert_eq!(merged.code, Some(0), "{merged:?}");
+    assert_same(&bench, "merged", "whole");
+    let shard = bench.run(&["sweep", "map.toml", "--out", "part-0", "--shard", "1/3"]);
+    assert!(shard.code == Some(2) && shard.stderr.contains("holds shard 0/3 of campaign `map`"), "{shard:?}");
+}
+
+/// Killed in the midst of it, with half a line in the journal, and started again.
+#[test]
+fn what_is_killed_goes_on_and_ends_with_the_same_table() {
+    let bench = bench(&MAP.replace("points = 10", "points = 60"));
+    sweep(&bench, &["--out", "whole", "-q"]);
+    let journal = bench.path("killed/journal");
+    let lines = || fs::read(&journal).unwrap_or_default().iter().filter(|byte| **byte == b'\n').count();
+    let mut done = 1;
+    for _ in 0..3 {
+        let running = bench.start(&["sweep", "map.toml", "--out", "killed", "--threads", "1"]);
+        await_some(|| (lines() > done + 5).then_some(()));
+        running.signal(SIGKILL);
+        assert_eq!(running.wait().signal, Some(SIGKILL));
+        done = lines();
+        assert!(done < 120, "it was killed before its end: {done}");
+        let mut torn = fs::read(&journal).unwrap();
+        torn.extend(b"0123456789abcdef {\"row\":{\"case\":");
+        fs::write(&journal, torn).unwrap();
+    }
+    let told = sweep(&bench, &["--out", "killed"]);
+    assert!(told.stdout.contains("of them done before"), "{told:?}");
+    assert_same(&bench, "killed", "whole");
+}
+
+#[test]
+fn ctrl_c_ends_in_order_and_says_how_to_go_on() {
+    let bench = bench(&MAP.replace("points = 10", "points = 200"));
+    let running = bench.start(&["sweep", "map.toml", "--threads", "1"]);
+    let runs = bench.path("runs");
+    let journal = || fs::read_dir(&runs).ok()?.next()?.ok().map(|entry| entry.path().join("journal"));
+    await_some(|| fs::read(journal()?).ok().filter(|bytes| bytes.iter().filter(|byte| **byte == b'\n').count() > 3));
+    running.signal(SIGINT);
+    let done = running.wait();
+    assert_eq!(done.code, Some(130), "{done:?}");
+    assert!(done.stderr.contains("go on with `corotate sweep map.toml --out runs/"), "{done:?}");
+    let directory = journal().unwrap();
+    let directory = directory.parent().unwrap();
+    assert!(!directory.join("cases.csv").exists());
+    let rows = Table::read(directory).unwrap().rows.len();
+    assert!((2..400).contains(&rows), "{rows}");
+    // The newest is found, and none of another campaign.
+    let done = bench.run(&["sweep", "map.toml", "--resume", "--json"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+    assert_eq!((&summary["counts"]["rows"], &summary["cases"]), (&400.into(), &400.into()));
+    assert_eq!(
+        summary["directory"].as_str().map(|path| bench.path(path)),
+        Some(bench.path("runs").join(directory.file_name().unwrap()))
+    );
+    let other = bench.run(&["sweep", "map.toml", "--set", "tick_hz=500", "--resume"]);
+    assert!(other.code == Some(2) && other.stderr.contains("has no results of this campaign `map`"), "{other:?}");
+}
+
+#[test]
+fn a_case_is_reproduced_under_other_clocks() {
+    let bench = bench(MAP);
+    sweep(&bench, &["--out", "map", "-q"]);
+    let table = Table::read(&bench.path("map")).unwrap();
+    for (file, case, clock) in
+        [("map.toml", 17, "in-process"), ("map.toml", 4, "lockstep"), ("map/campaign.toml", 11, "lockstep")]
+    {
+        let case_number = case.to_string();
+        let done = bench.run(&["run", file, "--case", &case_number, "--clock", clock, "--json", "--out", "run"]);
+        assert!(matches!(done.code, Some(0 | 3)), "{done:?}");
+        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        let row = &table.rows[case];
+        assert_eq!(summary["state"]["hash"].as_str(), Some(&*row.hash), "case {case}");
+        assert_eq!(summary["accepted"].as_bool(), row.accepted);
+        assert_eq!(summary["score"]["metrics"][0]["ise"].as_f64(), row.metrics[3]);
+    }
+    // A few cases in lockstep have the rows that they have in one thread.
+    let few = MAP.replace("points = 10", "points = 2");
+    fs::write(bench.path("map.toml"), &few[..few.find("[[margin]]").unwrap()]).unwrap();
+    sweep(&bench, &["--out", "thread", "-q"]);
+    sweep(&bench, &["--out", "lockstep", "--clock", "lockstep", "--threads", "1", "-q"]);
+    assert_same(&bench, "lockstep", "thread");
+    let none = bench.run(&["run", "map.toml", "--case", "4"]);
+    assert!(none.code == Some(2) && none.stderr.contains("--case 4: `map` has cases 0 to 3"), "{none:?}");
+    let unnamed = bench.run(&["run", "map.toml"]);
+    assert!(unnamed.code == Some(2) && unnamed.stderr.contains("makes it a campaign"), "{unnamed:?}");
+}
+
+/// What is not valid, and what comes to the end of its model, is a row.
+#[test]
+fn a_case_that_fails_is_a_row_and_not_the_end() {
+    let campaign = r#"
+name = "map"
+base = "orbit-rendezvous"
+[set]
+duration_s = 6.0
+accept = {}
+[[axis]]
+key = "follower.0.initial_radius_du"
+values = [-1.0, 9.9, 1.2]
+[[axis]]
+key = "follower.0.initial_velocity_du_s"
+values = [[2.0, 0.0]]
+"#;
+    let bench = bench(campaign);
+    let told = sweep(&bench, &["--out", "map"]);
+    assert!(told.stdout.contains("invalid 1"), "{told:?}");
+    let rows = Table::read(&bench.path("map")).unwrap().rows;
+    assert_eq!(rows[0].exit, End::Invalid);
+    assert!(
+        rows[0].reason.as_ref().unwrap().starts_with("map.toml:8: follower[0].initial_radius_du: -1"),
+        "{:?}",
+        rows[0]
+    );
+    assert!(rows[0].hash.is_empty() && rows[0].accepted.is_none());
+    assert_eq!((rows[1].exit, rows[1].accepted), (End::Lost, Some(false)), "{:?}", rows[1]);
+    assert!(rows[1].lost > 0 && rows[1].metrics[2].is_none(), "{:?}", rows[1]);
+    let csv = fs::read_to_string(bench.path("map/cases.csv")).unwrap();
+    let first: Vec<&str> = csv.lines().next().unwrap().split(',').collect();
+    assert_eq!(first[..4], ["case", "seed", "follower.0.initial_radius_du", "follower.0.initial_velocity_du_s"]);
+}
+
+#[test]
+fn a_directory_of_anybody_else_is_refused() {
+    let bench = bench(MAP);
+    fs::create_dir(bench.path("full")).unwrap();
+    fs::write(bench.path("full/letter.txt"), "dear").unwrap();
+    let done = bench.run(&["sweep", "map.toml", "--out", "full"]);
+    assert!(done.code == Some(2) && done.stderr.contains("full is not empty, and no campaign's"), "{done:?}");
+    assert_eq!(fs::read_dir(bench.path("full")).unwrap().count(), 1);
+    sweep(&bench, &["--out", "map", "-q"]);
+    let other = bench.run(&["sweep", "map.toml", "--set", "seed=5", "--out", "map"]);
+    assert!(other.code == Some(2) && other.stderr.contains("holds campaign `map` ("), "{other:?}");
+    let none = bench.run(&["sweep", "merge", "full", "--out", "merged"]);
+    assert!(none.code == Some(1) && none.stderr.contains("full/journal"), "{none:?}");
+    // A key that there is not is told before anything runs.
+    fs::write(bench.path("map.toml"), MAP.replace("gain_per_s", "gain")).unwrap();
+    let unknown = bench.run(&["sweep", "map.toml", "--out", "new"]);
+    assert!(
+        unknown.code == Some(2) && unknown.stderr.contains("map.toml:10: controller.gain: unknown key; did you mean"),
+        "{unknown:?}"
+    );
+    assert!(!bench.path("new").exists());
+}
+
+#[test]
+fn the_worst_are_recorded() {
+    let bench = bench(MAP);
+    let done = sweep(&bench, &["--out", "map", "--record", "2"]);
+    assert!(done.stderr.contains("case 0 is recorded in map/case-0"), "{done:?}");
+    let table = Table::read(&bench.path("map")).unwrap();
+    let error = |case: u64| table.rows[case as usize].metrics[1].unwrap();
+    let recorded: Vec<u64> =
+        (0..table.cases).filter(|case| bench.path(&format!("map/case-{case}/run.mcap")).exists()).collect();
+    assert_eq!(recorded.len(), 2);
+    let best = recorded.iter().map(|case| error(*case)).fold(f64::INFINITY, f64::min);
+    assert!((0..table.cases).filter(|case| !recorded.contains(case)).all(|case| error(case) <= best));
+    let summary = fs::read(bench.path(&format!("map/case-{}/summary.json", recorded[0]))).unwrap();
+    let summary: serde_json::Value = serde_json::from_slice(&summary).unwrap();
+    assert_eq!(summary["state"]["hash"].as_str(), Some(&*table.rows[recorded[0] as usize].hash));
+}
+
+#[test]
+fn shipped_campaigns_go_by_name() {
+    let bench = Bench::new();
+    let list = bench.run(&["init", "--list"]);
+    for name in ["timing-map", "inertia-error", "noise-filter", "start"] {
+        assert!(list.stdout.contains(&format!("{name} ")), "{list:?}");
+        let text = bench.run(&["init", name]);
+        assert_eq!(text.code, Some(0), "{text:?}");
+        let checked = bench.run(&["check", name, "--json"]);
+        let told: serde_json::Value = serde_json::from_str(&checked.stdout).unwrap();
+        assert!(told["campaign"] == name && told["cases"].as_u64() > Some(60), "{told}");
+    }
+    let run = bench.run(&["run", "timing-map"]);
+    assert!(run.code == Some(2) && run.stderr.contains("corotate sweep timing-map"), "{run:?}");
+    let sweep = bench.run(&["sweep", "rigid-pair"]);
+    assert!(sweep.code == Some(2) && sweep.stderr.contains("corotate run rigid-pair"), "{sweep:?}");
+    let misspelt = bench.run(&["sweep", "timing-mop"]);
+    assert!(misspelt.stderr.contains("did you mean `timing-map`?"), "{misspelt:?}");
+}
+
+/// A leader at rest and a follower that turns slowly: products of rates vanish, and what is left of the loop is the difference
+/// equation of an integrator under a proportional law that acts one tick late, p(k+1) = p(k) − h g p(k−1). Its solution is exact, and
+/// so is the integral of its square.
+#[test]
+fn a_linear_case_costs_what_its_difference_equation_says() {
+    let campaign = r#"
+name = "map"
+base = "rigid-pair"
+[set]
+duration_s = 2.0
+accept = {}
+leader.initial_rate_rad_s = [0.0, 0.0, 0.0]
+follower = [{ name = "follower", initial_rate_rad_s = [2e-4, -3e-4, 1e-4] }]
+[[axis]]
+key = "controller.gain_per_s"
+values = [0.5, 4.0, 40.0, 150.0, 240.0, 300.0, 700.0]
+"#;
+    let bench = bench(campaign);
+    sweep(&bench, &["--out", "map", "-q"]);
+    let table = Table::read(&bench.path("map")).unwrap();
+    let column = table.metrics.iter().position(|metric| metric.name == "sync_error_rad_s.ise").unwrap();
+    let (h, ticks, start) = (1e-3, 2001, 2e-4_f64.hypot(3e-4).hypot(1e-4));
+    for row in &table.rows {
+        let gain = row.parameters[0].number().unwrap();
+        let (found, exact) = (row.metrics[column].unwrap(), h * start * start * squares(h * gain, ticks));
+        println!("gain {gain}: {found:e}, exactly {exact:e}: {:+.1e}", found / exact - 1.0);
+        assert!((found / exact - 1.0).abs() < 1e-2, "gain {gain}: {found:e} is not {exact:e}");
+    }
+}
+
+/// The sum of the first squares of the solution of x(k+1) = x(k) − c x(k−1) with x(0) = x(1) = 1: by the roots of r² − r + c, which
+/// may be complex, as sums of geometric series.
+fn squares(c: f64, terms: i32) -> f64 {
+    type Complex = (f64, f64);
+    let times = |a: Complex, b: Complex| (a.0 * b.0 - a.1 * b.1, a.0 * b.1 + a.1 * b.0);
+    let over = |a: Complex, b: Complex| {
+        let size = b.0 * b.0 + b.1 * b.1;
+        let product = times(a, (b.0, -b.1));
+        (product.0 / size, product.1 / size)
+    };
+    let root = if c < 0.25 { ((0.25 - c).sqrt(), 0.0) } else { (0.0, (c - 0.25).sqrt()) };
+    let (r, s): (Complex, Complex) = ((0.5 + root.0, root.1), (0.5 - root.0, -root.1));
+    // x(k) = a r^k + b s^k, with a + b = 1 and a r + b s = 1.
+    let a = over((1.0 - s.0, -s.1), (r.0 - s.0, r.1 - s.1));
+    let b = (1.0 - a.0, -a.1);
+    let power = |base: Complex| (0..terms).fold((1.0, 0.0), |power, _| times(power, base));
+    let series = |base: Complex| {
+        let end = power(base);
+        over((1.0 - end.0, -end.1), (1.0 - base.0, -base.1))
+    };
+    let part = |factor: Complex, base: Complex| times(factor, series(base)).0;
+    part(times(a, a), times(r, r)) + 2.0 * part(times(a, b), times(r, s)) + part(times(b, b), times(s, s))
+}
+
+/// The script for a Slurm array, with processes of this machine in the place of its nodes.
+#[test]
+fn the_slurm_script_runs_shards_and_puts_them_together() {
+    let bench = bench(MAP);
+    sweep(&bench, &["--out", "whole", "-q"]);
+    let programs = bench.path("programs");
+    fs::create_dir(&programs).unwrap();
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_corotate"), programs.join("corotate")).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/slurm-array.sh");
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
+    let task = |index: u32| {
+        let mut command: Command = bench.command_of("bash".as_ref());
+        command.arg(&script).args(["map.toml", "results", "3"]).env("PATH", &path);
+        command.env("SLURM_ARRAY_TASK_ID", index.to_string()).env("SLURM_CPUS_PER_TASK", "1");
+        common::Running::new(&mut command)
+    };
+    let tasks: Vec<_> = (0..3).map(task).collect();
+    for task in tasks {
+        let done = task.wait();
+        assert_eq!(done.code, Some(0), "{done:?}");
+    }
+    let mut merge = bench.command_of("bash".as_ref());
+    merge.arg(&script).args(["merge", "results"]).env("PATH", &path);
+    let done = common::Running::new(&mut merge).wait();
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert_same(&bench, "results/whole", "whole");
+}
