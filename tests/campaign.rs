@@ -18,7 +18,7 @@ base = "rigid-pair"
 
 [set]
 duration_s = 1.0
-accept = { settled_by_s = 0.8, sync_error_rad_s_max = 0.3 }
+accept = { settled_by_s = 0.8, sync_error_rad_s_max = 0.3, estimate_error_rad_s_max = 1.0 }
 
 [[axis]]
 key = "controller.gain_per_s"
