@@ -3,10 +3,12 @@
 mod common;
 
 use common::{Bench, Done, await_some};
-use corotate::campaign::{End, Row, Table};
+use corotate::campaign::{Campaign, End, Entry, Row, Table};
+use corotate::config::ClockKind;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
+use std::sync::atomic::AtomicUsize;
 
 const SIGINT: i32 = 2;
 const SIGKILL: i32 = 9;
@@ -89,6 +91,31 @@ fn the_table_is_the_same_whoever_makes_it() {
     assert_same(&bench, "one", "two");
 }
 
+/// What Python's executors do: pieces of work done anywhere, and put together from what they came to.
+#[test]
+fn work_that_others_did_makes_the_same_table() {
+    let bench = bench(MAP);
+    sweep(&bench, &["--out", "whole", "-q"]);
+    let nothing = |name: &str| Err(format!("there is no `{name}`"));
+    let campaign = Campaign::load(&bench.path("whole/campaign.toml"), &[], &nothing).unwrap();
+    let no_signal = AtomicUsize::new(0);
+    let work = |piece| campaign.work(piece, ClockKind::InProcess, &no_signal).unwrap();
+    let entries: Vec<String> =
+        (0..campaign.pieces()).rev().map(|piece| serde_json::to_string(&work(piece)).unwrap()).collect();
+    let parsed = || entries.iter().map(|entry| serde_json::from_str::<Entry>(entry).unwrap());
+    assert!(campaign.work(campaign.pieces(), ClockKind::InProcess, &no_signal).is_none());
+    assert!(campaign.assemble(parsed().skip(1), &bench.path("made")).is_err(), "one is missing");
+    let swept = campaign.assemble(parsed(), &bench.path("made")).unwrap();
+    assert_eq!((swept.done, swept.counts.unwrap().rows), (22, 20));
+    assert_same(&bench, "made", "whole");
+    let mut other = work(3);
+    if let Entry::Row(row) = &mut other {
+        row.hash = "0".repeat(16);
+    }
+    let error = campaign.assemble([other], &bench.path("made")).unwrap_err().to_string();
+    assert!(error.contains("its case 3 is another"), "{error}");
+}
+
 #[test]
 fn shards_put_together_are_the_whole() {
     let bench = bench(MAP);
@@ -98,7 +125,7 @@ fn shards_put_together_are_the_whole() {
     }
     let missing = bench.run(&["sweep", "merge", "part-0", "part-2", "--out", "few"]);
     assert_eq!(missing.code, Some(2), "{missing:?}");
-    assert!(missing.stderr.contains("7 of 22 pieces of work are missing"), "{missing:?}");
+    assert!(missing.stderr.contains("7 of 22 cases and points of margins are missing, number 1 first"), "{missing:?}");
     let merged = bench.run(&["sweep", "merge", "part-2", "part-0", "part-1", "--out", "merged"]);
     assert_eq!(merged.code, Some(0), "{merged:?}");
     assert_same(&bench, "merged", "whole");

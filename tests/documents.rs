@@ -220,6 +220,7 @@ pages! {
     quickstart: "docs/quickstart.md",
     claims: "docs/claims.md",
     concepts: "docs/concepts.md",
+    campaigns: "docs/campaigns.md",
     commands_page: "docs/commands.md",
     foreign_role: "docs/foreign-role.md",
     formats: "docs/formats.md",

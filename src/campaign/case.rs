@@ -1,4 +1,4 @@
-//! One piece of a campaign's work: a case is run, or a point of a margin searched. Any caller may do any piece, anywhere.
+//! One piece of a campaign's work: a case is run, or a point of a margin searched. Anybody may do any piece, anywhere.
 //!
 //! Must not fail: what cannot be run is a row that says why.
 
@@ -32,12 +32,13 @@ impl Campaign {
     }
 
     /// How many pieces of work there are: every case, and then every point of every margin.
-    pub(super) fn pieces(&self) -> u64 {
+    pub fn pieces(&self) -> u64 {
         self.cases() + self.margins().iter().map(|searched| self.points(searched)).sum::<u64>()
     }
 
-    /// Does a piece of work.
-    pub(super) fn work(&self, piece: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Entry> {
+    /// Does a piece of work, anywhere: what comes of it is handed to [`assemble`](Self::assemble). None if there is none of this number,
+    /// or if `signal` asked for the end before its own.
+    pub fn work(&self, piece: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Entry> {
         let Some(mut point) = piece.checked_sub(self.cases()) else {
             return self.run(piece, clock, signal).map(Entry::Row);
         };
@@ -146,7 +147,8 @@ fn run(document: Result<Document, ConfigError>, clock: ClockKind, signal: &Atomi
         Err(error) => return Some(Ran::Invalid(error)),
     };
     let mut silent = |_: &launch::Progress<'_>| {};
-    match launch::run(&scenario, &mut Launch::new(signal, &mut silent)) {
+    let mut launch = Launch { checkpoints: false, ..Launch::new(signal, &mut silent) };
+    match launch::run(&scenario, &mut launch) {
         Ok(outcome) if outcome.signal != 0 => None,
         Ok(outcome) => Some(Ran::Ended(Box::new((scenario, outcome)))),
         Err(error) => Some(Ran::Failed(error)),

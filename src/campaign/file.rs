@@ -144,8 +144,8 @@ impl Campaign {
         let margin =
             |(index, margin): (usize, &RawMargin)| Searched::resolve(margin, index, &file, &resolved, &mut checks);
         let margins: Vec<Searched> = raw.margin.iter().enumerate().filter_map(margin).collect();
-        let points = resolved.iter().map(|axis| axis.points().unwrap_or(1));
-        let points = raw.samples.or_else(|| points.fold(Some(1_u64), |all, points| all?.checked_mul(points)));
+        let mut points = resolved.iter().map(|axis| axis.points().unwrap_or(1));
+        let points = raw.samples.or_else(|| points.try_fold(1_u64, u64::checked_mul));
         let cases = points.and_then(|points| points.checked_mul(raw.repeats)).filter(|cases| *cases <= MAX_CASES);
         checks.require(cases.is_some(), "name", || {
             format!("has more than {MAX_CASES} cases; take fewer values, or samples = N of them")

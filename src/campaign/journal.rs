@@ -104,14 +104,19 @@ impl Head {
     }
 }
 
-/// Any other line: a finished piece of work.
+/// A finished piece of work, as a line of the journal has it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Entry {
+pub enum Entry {
     /// A case.
     Row(Row),
-    /// A point of a margin, by the margin's position in the table.
-    Margin { margin: usize, point: MarginPoint },
+    /// A point of a margin.
+    Margin {
+        /// The margin's position in the table.
+        margin: usize,
+        /// The point.
+        point: MarginPoint,
+    },
 }
 
 /// A line with its hash and its end.

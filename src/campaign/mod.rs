@@ -20,7 +20,7 @@ mod tests;
 
 pub(crate) use file::is_campaign;
 pub use file::{Campaign, Case, Shipped};
-pub use journal::JournalError;
+pub use journal::{Entry, JournalError};
 pub use results::{Counts, worst};
 pub use sweep::{NoShard, Shard, Sweep, SweepError, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};

@@ -6,6 +6,7 @@
 use super::file::Campaign;
 use super::journal::{Entry, FILE, Head, Journal, JournalError, Reader};
 use super::results::{self, CAMPAIGN, Counts};
+use super::table::{MarginPoint, Row};
 use crate::config::{ClockKind, ConfigError};
 use crate::files;
 use crate::system::remedy;
@@ -18,8 +19,6 @@ use std::sync::mpsc::sync_channel;
 
 /// Results that wait for the journal, per thread.
 const WAITING: usize = 2;
-/// How many numbers of missing pieces are told.
-const TOLD: usize = 5;
 
 /// How a campaign is run.
 pub struct Sweep<'a> {
@@ -103,15 +102,15 @@ pub enum SweepError {
     },
     /// Pieces of work are missing.
     #[error(
-        "{count} of {all} pieces of work are missing, {first} among them; run the shards to their end, and name them all"
+        "{count} of {all} cases and points of margins are missing, number {first} first; run the shards to their end, and name them all"
     )]
     Missing {
         /// How many.
         count: u64,
         /// Of how many.
         all: u64,
-        /// The first.
-        first: String,
+        /// The first, of the cases and then of the points of margins.
+        first: u64,
     },
     /// Two directories tell different things of one case.
     #[error("{}: its case {case} is another than that of a directory before it; do both machines have the same processor?", path.display())]
@@ -214,45 +213,57 @@ impl Campaign {
 /// # Errors
 /// [`SweepError`], also where a case is missing or is in two directories and not the same.
 pub fn merge(directories: &[PathBuf], out: &Path) -> Result<Swept, SweepError> {
-    let mut merged: Option<(Campaign, Journal, Head)> = None;
+    let Some(first) = directories.first() else { return Ok(Swept { done: 0, all: 0, counts: None }) };
+    let head = Reader::open(first)?.head().of_all();
+    // It names no other file.
+    let unknown = |name: &str| Err(format!("the campaign has its scenario in it, and names `{name}`"));
+    let campaign = Campaign::load(&first.join(CAMPAIGN), &[], &unknown)?;
+    let mut journal = campaign.open(out, Shard::ALL)?;
     for directory in directories {
         let mut reader = Reader::open(directory)?;
-        let head = reader.head().of_all();
-        if merged.is_none() {
-            // It names no other file.
-            let unknown = |name: &str| Err(format!("there is no scenario in {CAMPAIGN}, but the name `{name}`"));
-            let campaign = Campaign::load(&directory.join(CAMPAIGN), &[], &unknown)?;
-            let journal = campaign.open(out, Shard::ALL)?;
-            merged = Some((campaign, journal, head.clone()));
-        }
-        let (campaign, journal, first) = merged.as_mut().expect("it has just been made");
-        if head != *first || head.identity != campaign.identity() {
-            return Err(SweepError::Mixed { first: directories[0].clone(), other: directory.clone() });
+        if reader.head().of_all() != head || head.identity != campaign.identity() {
+            return Err(SweepError::Mixed { first: first.clone(), other: directory.clone() });
         }
         while let Some(entry) = reader.next()? {
-            let Some(piece) = campaign.piece(&entry) else { continue };
-            let known = if journal.has(piece) { journal.lines()?.of(piece)? } else { None };
-            match known {
-                None => journal.add(piece, &entry)?,
-                Some(known) if known == entry => {}
-                Some(_) => {
-                    let case = match entry {
-                        Entry::Row(row) => row.case,
-                        Entry::Margin { point, .. } => point.case,
-                    };
-                    return Err(SweepError::Disagree { path: directory.clone(), case });
-                }
-            }
+            campaign.take(&mut journal, &entry, directory)?;
         }
     }
-    let Some((campaign, journal, _)) = merged else { return Ok(Swept { done: 0, all: 0, counts: None }) };
-    let (done, all) = (journal.done(), campaign.pieces());
-    if done < all {
-        let missing = (0..all).filter(|piece| !journal.has(*piece)).take(TOLD);
-        let first = missing.map(|piece| format!("{piece}")).collect::<Vec<_>>().join(", ");
-        return Err(SweepError::Missing { count: all - done, all, first });
+    campaign.finish(out, &journal)
+}
+
+impl Campaign {
+    /// Makes the tables of a campaign whose work was done by others, wherever: of all [`pieces`](Campaign::pieces), in any order. The
+    /// directory is made, or has what an earlier run of the same campaign left.
+    ///
+    /// # Errors
+    /// [`SweepError`], also where a piece is missing, or is there twice and not the same.
+    pub fn assemble(&self, entries: impl IntoIterator<Item = Entry>, directory: &Path) -> Result<Swept, SweepError> {
+        let mut journal = self.open(directory, Shard::ALL)?;
+        entries.into_iter().try_for_each(|entry| self.take(&mut journal, &entry, directory))?;
+        self.finish(directory, &journal)
     }
-    Ok(Swept { done, all, counts: Some(results::write(out, &campaign, None, &journal)?) })
+
+    /// Writes an entry down that comes `from` a directory, unless it is there.
+    fn take(&self, journal: &mut Journal, entry: &Entry, from: &Path) -> Result<(), SweepError> {
+        let Some(piece) = self.piece(entry) else { return Ok(()) };
+        if !journal.has(piece) {
+            return Ok(journal.add(piece, entry)?);
+        }
+        if journal.lines()?.of(piece)?.is_some_and(|known| known == *entry) {
+            return Ok(());
+        }
+        let (Entry::Row(Row { case, .. }) | Entry::Margin { point: MarginPoint { case, .. }, .. }) = *entry;
+        Err(SweepError::Disagree { path: from.to_owned(), case })
+    }
+
+    /// Writes the tables, if all is done.
+    fn finish(&self, directory: &Path, journal: &Journal) -> Result<Swept, SweepError> {
+        let (done, all) = (journal.done(), self.pieces());
+        if let Some(first) = (0..all).find(|piece| !journal.has(*piece)) {
+            return Err(SweepError::Missing { count: all - done, all, first });
+        }
+        Ok(Swept { done, all, counts: Some(results::write(directory, self, None, journal)?) })
+    }
 }
 
 #[cfg(test)]

@@ -45,12 +45,7 @@ fn is_plain(scenario: &Scenario, launch: &Launch<'_>) -> bool {
 
 /// Runs a scenario; none if it has to be run by the nodes.
 pub(crate) fn run_rig<R: Rig>(rig: &R, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
-    is_plain(scenario, launch).then(|| Run::new(rig, scenario).run(launch)).flatten()
-}
-
-/// The hash of a signal of this run.
-fn hash(scenario: &Scenario) -> StateHash {
-    StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick)
+    is_plain(scenario, launch).then(|| Run::new(rig, scenario, launch.checkpoints).run(launch)).flatten()
 }
 
 /// Where the command of a tick lies, and where that lay which is applied then.
@@ -72,7 +67,11 @@ struct Run<'a, R: Rig> {
 }
 
 impl<'a, R: Rig> Run<'a, R> {
-    fn new(rig: &R, scenario: &'a Scenario) -> Self {
+    fn new(rig: &R, scenario: &'a Scenario, checkpoints: bool) -> Self {
+        let hash = || match checkpoints {
+            true => StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick),
+            false => StateHash::without_checkpoints(),
+        };
         let body = |(index, info): (usize, &crate::rig::BodyInfo)| Driven {
             plant: Plant::new(rig.body(index), scenario.actuation(info.driven), scenario.tick_s()),
             measurement: Measurement::<R>::default(),
@@ -82,9 +81,9 @@ impl<'a, R: Rig> Run<'a, R> {
                 measurement_guard: rig.measurement_guard(index, true),
                 command_guard: rig.command_guard(index),
                 commands: vec![Command::<R>::default(); scenario.actuation_delay_ticks as usize],
-                hash: hash(scenario),
+                hash: hash(),
             }),
-            hashes: [hash(scenario), hash(scenario)],
+            hashes: [hash(), hash()],
         };
         let bodies: Vec<Driven<R>> = rig.bodies().iter().enumerate().map(body).collect();
         Self {
@@ -94,7 +93,7 @@ impl<'a, R: Rig> Run<'a, R> {
             observer: Observer::new(rig.estimator(), scenario.tick_s()),
             measurement_guard: rig.measurement_guard(0, false),
             estimate: Estimate::<R>::default(),
-            estimate_hash: hash(scenario),
+            estimate_hash: hash(),
             estimate_guard: rig.estimate_guard(),
             scoring: Scoring::new(rig, scenario),
         }

@@ -59,6 +59,8 @@ pub struct Launch<'a> {
     pub foxglove: Option<SocketAddr>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
+    /// Whether the hash is kept of the ticks on the way too, by which two runs are compared; a run in one thread may do without.
+    pub checkpoints: bool,
     /// The signal that asked the run to end; 0 while none has.
     pub signal: &'a AtomicUsize,
     /// Called now and then.
@@ -75,6 +77,7 @@ impl<'a> Launch<'a> {
             results: None,
             foxglove: None,
             require_realtime: false,
+            checkpoints: true,
             signal,
             progress,
         }

@@ -221,6 +221,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
             results: std::fs::canonicalize(&directory).ok(),
             foxglove: arguments.foxglove,
             require_realtime: arguments.require_rt,
+            checkpoints: true,
             signal: &signal,
             progress: &mut |progress| screen.show(progress),
         },
