@@ -281,3 +281,85 @@ impl Lines<'_> {
         content(&self.line).ok_or_else(|| JournalError::Foreign { path: path() })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::campaign::Find;
+    use crate::campaign::table::tests::table;
+    use proptest::prelude::*;
+
+    fn entry(case: u64) -> Entry {
+        Entry::Row(Row { case, ..table().rows[0].clone() })
+    }
+
+    fn place(entry: &Entry) -> Option<u64> {
+        let Entry::Row(row) = entry else { return None };
+        Some(row.case)
+    }
+
+    fn open(directory: &Path) -> Result<Journal, JournalError> {
+        Journal::open(directory, &Head::new("01".to_owned(), None, &table()), 8, place)
+    }
+
+    fn cases(journal: &Journal) -> Vec<u64> {
+        journal.entries().unwrap().map(|entry| place(&entry.unwrap()).unwrap()).collect()
+    }
+
+    proptest! {
+        /// Wherever the end of a journal is lost, or a byte of it is another: what is whole before that stays, and is gone on with.
+        #[test]
+        fn what_is_whole_survives_whatever_happens_to_the_rest(cut: prop::sample::Index, flipped: bool) {
+            let directory = tempfile::tempdir().unwrap();
+            let mut journal = open(directory.path()).unwrap();
+            for case in [5, 0, 3] {
+                journal.add(case, &entry(case)).unwrap();
+            }
+            prop_assert_eq!(cases(&journal), [0, 3, 5]);
+            drop(journal);
+            let path = directory.path().join(FILE);
+            let mut bytes = std::fs::read(&path).unwrap();
+            let ends: Vec<usize> = (0..bytes.len()).filter(|at| bytes[*at] == b'\n').collect();
+            let cut = ends[0] + 1 + cut.index(bytes.len() - ends[0] - 1);
+            if flipped { bytes[cut] ^= 1 } else { bytes.truncate(cut) }
+            std::fs::write(&path, &bytes).unwrap();
+            let whole = ends.iter().filter(|end| **end < cut).count() - 1;
+            let mut journal = open(directory.path()).unwrap();
+            prop_assert_eq!(journal.done(), whole as u64);
+            journal.add(7, &entry(7)).unwrap();
+            let mut expected = [5, 0, 3][..whole].to_vec();
+            expected.push(7);
+            expected.sort_unstable();
+            prop_assert_eq!(cases(&journal), expected);
+        }
+    }
+
+    #[test]
+    fn a_journal_that_was_killed_at_its_first_line_begins_anew() {
+        let directory = tempfile::tempdir().unwrap();
+        let head = line(&Head::new("01".to_owned(), None, &table()));
+        for bytes in [&b""[..], &head.as_bytes()[..head.len() / 2]] {
+            std::fs::write(directory.path().join(FILE), bytes).unwrap();
+            assert_eq!(open(directory.path()).unwrap().done(), 0);
+        }
+    }
+
+    #[test]
+    fn only_its_own_is_gone_on_with_and_by_one_at_a_time() {
+        let directory = tempfile::tempdir().unwrap();
+        let journal = open(directory.path()).unwrap();
+        assert!(matches!(open(directory.path()), Err(JournalError::Busy { .. })));
+        drop(journal);
+        for (identity, shard) in [("02", None), ("01", Some([0, 2]))] {
+            let other = Head::new(identity.to_owned(), shard, &table());
+            let refused = Journal::open(directory.path(), &other, 8, place);
+            assert!(matches!(refused, Err(JournalError::Other { .. })), "{identity}");
+        }
+        let mut margins = table();
+        margins.margins[0].find = Find::Smallest;
+        assert!(Journal::open(directory.path(), &Head::new("01".to_owned(), None, &margins), 8, place).is_err());
+        std::fs::write(directory.path().join(FILE), "letter\n").unwrap();
+        assert!(matches!(open(directory.path()), Err(JournalError::Foreign { .. })));
+        assert_eq!(std::fs::read(directory.path().join(FILE)).unwrap(), b"letter\n");
+    }
+}

@@ -157,3 +157,43 @@ fn there<T: Copy>(values: &[Option<T>]) -> Vec<T> {
 fn levels<T>(values: &[Option<T>]) -> Vec<i16> {
     values.iter().map(|value| i16::from(value.is_some())).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::campaign::table::tests::table;
+    use parquet::file::reader::{FileReader, SerializedFileReader};
+    use parquet::record::Field;
+
+    /// Every column by its name, with its type and with null where there is nothing.
+    #[test]
+    fn rows_are_read_back_as_they_were() {
+        let table = table();
+        let mut other = table.rows[0].clone();
+        (other.accepted, other.parameters) = (None, vec![Parameter::Whole(2)]);
+        let mut file = tempfile::tempfile().unwrap();
+        let rows = [table.rows[0].clone(), other].map(Ok);
+        write(&mut file, &table, vec![Kind::Number], rows.into_iter()).unwrap();
+        let read = SerializedFileReader::new(file).unwrap();
+        let read: Vec<_> = read.get_row_iter(None).unwrap().map(Result::unwrap).collect();
+        assert_eq!(read.len(), 2);
+        let field =
+            |row: usize, name: &str| read[row].get_column_iter().find(|(known, _)| *known == name).unwrap().1.clone();
+        for (row, name, expected) in [
+            (0, "case", Field::Long(3)),
+            (0, "controller.gain_per_s", Field::Double(0.1 + 0.2)),
+            (1, "controller.gain_per_s", Field::Double(2.0)),
+            (0, "accepted", Field::Bool(true)),
+            (1, "accepted", Field::Null),
+            (0, "reason", Field::Null),
+            (0, "exit", Field::Str("completed".into())),
+            (0, "sync_error_rad_s.last", Field::Double(1e-300)),
+            (0, "sync_error_rad_s.settled_max", Field::Null),
+            (1, "hash", Field::Str("00ff00ff00ff00ff".into())),
+        ] {
+            assert_eq!(field(row, name), expected, "{name}");
+        }
+        let names: Vec<String> = read[0].get_column_iter().map(|(name, _)| name.clone()).collect();
+        assert_eq!(names, columns(&table));
+    }
+}

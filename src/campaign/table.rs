@@ -280,10 +280,11 @@ impl Table {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    pub(crate) fn table() -> Table {
+    /// A table with something of everything.
+    pub fn table() -> Table {
         let metric = |statistic: Statistic| Metric {
             name: format!("sync_error_rad_s.{}", statistic.name()),
             metric: "sync_error_rad_s".to_owned(),
