@@ -144,10 +144,10 @@ fn init_lists_what_ships() {
     let list = bench.run(&["init", "--list"]).stdout;
     let told = json(&bench.run(&["init", "--list", "--json"]));
     assert_eq!(told["schema"], "corotate/scenarios/v1");
-    assert_eq!(list.lines().count(), corotate::config::SHIPPED.len());
-    for ((line, (name, _)), entry) in
-        list.lines().zip(corotate::config::SHIPPED).zip(told["scenarios"].as_array().unwrap())
-    {
+    let shipped = corotate::config::SHIPPED.into_iter().chain(corotate::campaign::SHIPPED);
+    let entries = ["scenarios", "campaigns"].into_iter().flat_map(|kind| told[kind].as_array().unwrap());
+    assert_eq!((list.lines().count(), entries.clone().count()), (shipped.clone().count(), shipped.clone().count()));
+    for ((line, (name, _)), entry) in list.lines().zip(shipped).zip(entries) {
         assert!(line.starts_with(&format!("{name} ")) && line.chars().count() <= 80, "{line}");
         assert_eq!(entry["name"], name);
         let title = entry["title"].as_str().unwrap();

@@ -15,7 +15,7 @@ use std::io::{self, Write};
 use std::sync::Arc;
 
 /// Rows of one group.
-const GROUP: usize = 65_536;
+const GROUP: usize = 8192;
 
 /// The values of a column that wait for their group.
 enum Column {

@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 /// Options of `corotate sweep`.
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES, args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(disable_help_subcommand = true)]
 pub struct Arguments {
     #[command(subcommand)]
     merge: Option<Merge>,
@@ -27,7 +28,7 @@ pub struct Arguments {
     /// Override a key of the scenario, in every case
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Directory for the results, new or of the same campaign, which is then gone on with [default: runs/<utc>-<name>]
+    /// Directory, new or to go on with [default: runs/<utc>-<name>]
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     out: Option<PathBuf>,
     /// Go on with the newest results of this campaign in runs/
@@ -36,13 +37,13 @@ pub struct Arguments {
     /// How many cases run at a time [default: one per core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=4096))]
     threads: Option<u16>,
-    /// Run every N-th piece of work alone, from the I-th, counted from 0
+    /// Run every N-th case alone, from the I-th, from 0
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
     /// What drives the ticks: lockstep is for few cases
-    #[arg(long, value_name = "CLOCK", value_parser = ["in-process", "lockstep"], default_value = "in-process")]
+    #[arg(long, value_name = "CLOCK", value_parser = ["in-process", "lockstep"], default_value = "in-process", hide_short_help = true)]
     clock: String,
-    /// Run the N worst cases once more and record every sample of them
+    /// Run the N worst once more, with every sample recorded
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
     record: usize,
     /// Print the summary as JSON, all else on stderr
