@@ -104,15 +104,19 @@ fn work_that_others_did_makes_the_same_table() {
         (0..campaign.pieces()).rev().map(|piece| serde_json::to_string(&work(piece)).unwrap()).collect();
     let parsed = || entries.iter().map(|entry| serde_json::from_str::<Entry>(entry).unwrap());
     assert!(campaign.work(campaign.pieces(), ClockKind::InProcess, &no_signal).is_none());
-    assert!(campaign.assemble(parsed().skip(1), &bench.path("made")).is_err(), "one is missing");
-    let swept = campaign.assemble(parsed(), &bench.path("made")).unwrap();
+    let mut collection = campaign.clone().collect(&bench.path("made")).unwrap();
+    parsed().skip(1).for_each(|entry| collection.add(&entry).unwrap());
+    assert_eq!(collection.left(), [campaign.pieces() - 1]);
+    assert!(collection.finish().is_err(), "one is missing");
+    parsed().for_each(|entry| collection.add(&entry).unwrap());
+    let swept = collection.finish().unwrap();
     assert_eq!((swept.done, swept.counts.unwrap().rows), (22, 20));
     assert_same(&bench, "made", "whole");
     let mut other = work(3);
     if let Entry::Row(row) = &mut other {
         row.hash = "0".repeat(16);
     }
-    let error = campaign.assemble([other], &bench.path("made")).unwrap_err().to_string();
+    let error = collection.add(&other).unwrap_err().to_string();
     assert!(error.contains("its case 3 is another"), "{error}");
 }
 

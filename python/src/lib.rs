@@ -7,6 +7,7 @@ mod recording;
 mod run;
 mod seat;
 mod steps;
+mod sweep;
 
 use pyo3::prelude::*;
 
@@ -27,7 +28,10 @@ fn _corotate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(logs::thrust, module)?)?;
     module.add_class::<seat::Ticks>()?;
     module.add_class::<steps::Steps>()?;
+    module.add_class::<sweep::Cases>()?;
+    module.add_class::<sweep::Results>()?;
     module.add_class::<recording::Recording>()?;
     module.add("CorotateError", module.py().get_type::<run::CorotateError>())?;
+    module.add("build", corotate::campaign::BUILD)?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))
 }

@@ -27,7 +27,7 @@ pub fn failed(error: impl Display) -> PyErr {
     CorotateError::new_err(error.to_string())
 }
 
-fn refused(error: impl Display) -> PyErr {
+pub fn refused(error: impl Display) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 

@@ -36,7 +36,7 @@ impl Campaign {
         self.cases() + self.margins().iter().map(|searched| self.points(searched)).sum::<u64>()
     }
 
-    /// Does a piece of work, anywhere: what comes of it is handed to [`assemble`](Self::assemble). None if there is none of this number,
+    /// Does a piece of work, anywhere: what comes of it is [collected](Self::collect). None if there is none of this number,
     /// or if `signal` asked for the end before its own.
     pub fn work(&self, piece: u64, clock: ClockKind, signal: &AtomicUsize) -> Option<Entry> {
         let Some(mut point) = piece.checked_sub(self.cases()) else {

@@ -22,8 +22,11 @@ pub(crate) use file::is_campaign;
 pub use file::{Campaign, Case, Shipped};
 pub use journal::{Entry, JournalError};
 pub use results::{Counts, worst};
-pub use sweep::{NoShard, Shard, Sweep, SweepError, Swept, merge};
+pub use sweep::{Collection, NoShard, Shard, Sweep, SweepError, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};
+
+/// Version and revision: the results of one campaign come from one build.
+pub const BUILD: &str = concat!(env!("CARGO_PKG_VERSION"), " ", env!("COROTATE_REVISION"));
 
 /// The campaigns that ship with the program: name and text.
 pub const SHIPPED: [(&str, &str); 4] = [

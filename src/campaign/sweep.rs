@@ -217,52 +217,76 @@ pub fn merge(directories: &[PathBuf], out: &Path) -> Result<Swept, SweepError> {
     let head = Reader::open(first)?.head().of_all();
     // It names no other file.
     let unknown = |name: &str| Err(format!("the campaign has its scenario in it, and names `{name}`"));
-    let campaign = Campaign::load(&first.join(CAMPAIGN), &[], &unknown)?;
-    let mut journal = campaign.open(out, Shard::ALL)?;
+    let mut whole = Campaign::load(&first.join(CAMPAIGN), &[], &unknown)?.collect(out)?;
     for directory in directories {
         let mut reader = Reader::open(directory)?;
-        if reader.head().of_all() != head || head.identity != campaign.identity() {
+        if reader.head().of_all() != head || head.identity != whole.campaign.identity() {
             return Err(SweepError::Mixed { first: first.clone(), other: directory.clone() });
         }
         while let Some(entry) = reader.next()? {
-            campaign.take(&mut journal, &entry, directory)?;
+            whole.take(&entry, directory)?;
         }
     }
-    campaign.finish(out, &journal)
+    whole.finish()
+}
+
+/// The results of a campaign whose work is done by others, wherever, as they come in.
+pub struct Collection {
+    campaign: Campaign,
+    directory: PathBuf,
+    journal: Journal,
 }
 
 impl Campaign {
-    /// Makes the tables of a campaign whose work was done by others, wherever: of all [`pieces`](Campaign::pieces), in any order. The
-    /// directory is made, or has what an earlier run of the same campaign left.
+    /// Opens a directory for results, which is made, or has what an earlier run of the same campaign left. Nobody else can write to
+    /// it as long as it is open.
     ///
     /// # Errors
-    /// [`SweepError`], also where a piece is missing, or is there twice and not the same.
-    pub fn assemble(&self, entries: impl IntoIterator<Item = Entry>, directory: &Path) -> Result<Swept, SweepError> {
-        let mut journal = self.open(directory, Shard::ALL)?;
-        entries.into_iter().try_for_each(|entry| self.take(&mut journal, &entry, directory))?;
-        self.finish(directory, &journal)
+    /// [`SweepError`].
+    pub fn collect(self, directory: &Path) -> Result<Collection, SweepError> {
+        let journal = self.open(directory, Shard::ALL)?;
+        Ok(Collection { campaign: self, directory: directory.to_owned(), journal })
+    }
+}
+
+impl Collection {
+    /// The [pieces of work](Campaign::pieces) that are not done.
+    pub fn left(&self) -> Vec<u64> {
+        (0..self.campaign.pieces()).filter(|piece| !self.journal.has(*piece)).collect()
     }
 
-    /// Writes an entry down that comes `from` a directory, unless it is there.
-    fn take(&self, journal: &mut Journal, entry: &Entry, from: &Path) -> Result<(), SweepError> {
-        let Some(piece) = self.piece(entry) else { return Ok(()) };
-        if !journal.has(piece) {
-            return Ok(journal.add(piece, entry)?);
+    /// Writes down what [came of a piece](Campaign::work), unless it is there.
+    ///
+    /// # Errors
+    /// [`SweepError::Disagree`] if it is there and not the same; [`SweepError::Journal`].
+    pub fn add(&mut self, entry: &Entry) -> Result<(), SweepError> {
+        self.take(entry, Path::new("what came"))
+    }
+
+    /// The same of an entry that comes `from` a directory.
+    fn take(&mut self, entry: &Entry, from: &Path) -> Result<(), SweepError> {
+        let Some(piece) = self.campaign.piece(entry) else { return Ok(()) };
+        if !self.journal.has(piece) {
+            return Ok(self.journal.add(piece, entry)?);
         }
-        if journal.lines()?.of(piece)?.is_some_and(|known| known == *entry) {
+        if self.journal.lines()?.of(piece)?.is_some_and(|known| known == *entry) {
             return Ok(());
         }
         let (Entry::Row(Row { case, .. }) | Entry::Margin { point: MarginPoint { case, .. }, .. }) = *entry;
         Err(SweepError::Disagree { path: from.to_owned(), case })
     }
 
-    /// Writes the tables, if all is done.
-    fn finish(&self, directory: &Path, journal: &Journal) -> Result<Swept, SweepError> {
-        let (done, all) = (journal.done(), self.pieces());
-        if let Some(first) = (0..all).find(|piece| !journal.has(*piece)) {
+    /// Writes the tables.
+    ///
+    /// # Errors
+    /// [`SweepError`], also where a piece is missing.
+    pub fn finish(&self) -> Result<Swept, SweepError> {
+        let (done, all) = (self.journal.done(), self.campaign.pieces());
+        if let Some(first) = (0..all).find(|piece| !self.journal.has(*piece)) {
             return Err(SweepError::Missing { count: all - done, all, first });
         }
-        Ok(Swept { done, all, counts: Some(results::write(directory, self, None, journal)?) })
+        let counts = results::write(&self.directory, &self.campaign, None, &self.journal)?;
+        Ok(Swept { done, all, counts: Some(counts) })
     }
 }
 

@@ -16,10 +16,11 @@ from .logs import HiddenRate, Identified, OrbitHold, Synchronizer, identify
 from .recording import Recording
 from .run import Run, certificate, run, shipped
 from .seat import Seat
+from .sweep import Sweep, sweep
 
 __all__ = [
-    "CorotateError", "Env", "HiddenRate", "Identified", "OrbitHold", "Recording", "Run", "Seat", "Synchronizer", "__version__",
-    "certificate", "identify", "run", "shipped", "to_control",
+    "CorotateError", "Env", "HiddenRate", "Identified", "OrbitHold", "Recording", "Run", "Seat", "Sweep", "Synchronizer",
+    "__version__", "certificate", "identify", "run", "shipped", "sweep", "to_control",
 ]
 
 # Roles of a run are processes of this interpreter with this package.
