@@ -9,12 +9,18 @@ use toml::Value;
 /// How a key ends that is every number of a table.
 pub(super) const EVERY: &str = ".*";
 /// The quantities of a fault of which none is no fault at all.
-const AMOUNTS: [&str; 5] = ["probability", "ticks", "delay_ticks", "stall_ms", "deviation"];
+const AMOUNTS: [&str; 7] =
+    ["probability", "ticks", "delay_ticks", "jitter_ticks", "stall_ms", "deviation", "weakly_hard.misses"];
+/// Of these two, one alone is a delay.
+const LATENESS: [&str; 2] = ["delay_ticks", "jitter_ticks"];
 
 /// The number of the fault that an axis has switched off: one of which there is nothing.
 pub(super) fn fault_that_is_off(document: &Document, key: &str) -> Option<usize> {
     let (number, amount) = key.strip_prefix("fault.")?.split_once('.')?;
-    let off = AMOUNTS.contains(&amount) && axis::number(document.get(key)?)?.0 == 0.0;
+    let none =
+        |name: &str| axis::number(document.get(&format!("fault.{number}.{name}"))?).map(|(value, _)| value == 0.0);
+    let late = LATENESS.contains(&amount) && LATENESS.iter().any(|name| none(name) == Some(false));
+    let off = AMOUNTS.contains(&amount) && none(amount)? && !late;
     number.parse().ok().filter(|_| off)
 }
 
@@ -60,4 +66,23 @@ fn times(there: &Value, factor: &Value) -> Option<Value> {
     }
     let ((number, whole), (factor, _)) = (axis::number(there)?, axis::number(factor)?);
     Some(axis::value(number * factor, whole && (number * factor).fract() == 0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_of_which_nothing_is_left_is_off_and_no_other() {
+        let off = |fault: &str, key: &str| {
+            let document = Document::parse(&format!("[[fault]]\nkind = \"delay\"\n{fault}\n"), "x").unwrap();
+            fault_that_is_off(&document, &format!("fault.0.{key}")).is_some()
+        };
+        assert!(off("delay_ticks = 0", "delay_ticks") && off("probability = 0.0", "probability"));
+        assert!(!off("delay_ticks = 1", "delay_ticks") && !off("from_tick = 0", "from_tick") && !off("", "ticks"));
+        assert!(off("weakly_hard = { misses = 0 }", "weakly_hard.misses"));
+        assert!(!off("delay_ticks = 0\njitter_ticks = 2", "delay_ticks"), "jitter is left");
+        assert!(!off("delay_ticks = 2\njitter_ticks = 0", "jitter_ticks"), "the constant part is left");
+        assert!(off("delay_ticks = 0\njitter_ticks = 0", "jitter_ticks"));
+    }
 }
