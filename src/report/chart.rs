@@ -5,21 +5,15 @@
 
 use super::axis::Axis;
 use super::columns::{Column, Columns, Corners, Extremes};
+use super::frame::{BOTTOM, Frame, HEIGHT, LEFT, RIGHT, TOP, WIDE, WIDTH};
 use super::html::escape;
 use std::fmt::Write;
 
-/// Pictures over time have one of two sizes, each with these margins, so that one drawing of the marks serves all of a size.
-const WIDTH: f64 = 640.0;
-const HEIGHT: f64 = 250.0;
-const LEFT: f64 = 64.0;
-const RIGHT: f64 = 22.0;
-const TOP: f64 = 18.0;
-/// A picture as wide as the page, and what is named above it: a row of names, and the width of a letter in it.
-const WIDE: f64 = 1200.0;
+/// A picture over time as wide as the page, and what is named above it: a row of names, and the width of a letter in it.
+/// Pictures over time have one of two sizes, so that one drawing of the marks serves all of a size.
 const WIDE_HEIGHT: f64 = 400.0;
 const ROW: f64 = 12.0;
 const LETTER: f64 = 5.6;
-const BOTTOM: f64 = 42.0;
 /// Side of a picture of a plane.
 const SQUARE: f64 = 420.0;
 /// The darkest shade of a strip; 0 is the lightest.
@@ -139,14 +133,6 @@ pub fn range<'a>(all: impl IntoIterator<Item = &'a Columns<Extremes>>, positive:
     (low, high)
 }
 
-/// Where a picture's axes lie.
-#[derive(Debug, Clone, Copy)]
-struct Frame {
-    width: f64,
-    height: f64,
-    top: f64,
-}
-
 /// Marks are drawn once in each size that pictures over time have.
 #[derive(Debug, Clone, Copy)]
 pub enum Size {
@@ -162,130 +148,13 @@ impl Size {
             Self::Half => Frame::TIME,
             Self::Whole(rows) => {
                 let top = TOP + rows as f64 * ROW;
-                Frame { width: WIDE, height: WIDE_HEIGHT + top, top }
+                Frame::sized(WIDE, WIDE_HEIGHT + top, top)
             }
         }
     }
 
     fn name(self) -> &'static str {
         if matches!(self, Self::Half) { "half" } else { "whole" }
-    }
-}
-
-impl Frame {
-    const TIME: Self = Self { width: WIDTH, height: HEIGHT, top: TOP };
-
-    fn x(&self, axis: &Axis, value: f64) -> f64 {
-        LEFT + axis.place(value) * (self.width - LEFT - RIGHT)
-    }
-
-    fn y(&self, axis: &Axis, value: f64) -> f64 {
-        self.foot() - axis.place(value) * (self.foot() - self.top)
-    }
-
-    fn foot(&self) -> f64 {
-        self.height - BOTTOM
-    }
-
-    fn open(&self, title: &str) -> String {
-        let (w, h, title) = (self.width, self.height, escape(title));
-        format!("<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\">")
-    }
-
-    /// Opens a picture whose lines a reader may look at closely: where its axes lie, and from what to what they go.
-    fn open_over_time(&self, title: &str, x: &Axis, y: &Axis) -> String {
-        let ([x0, x1], [y0, y1], title) = (x.ends(), y.ends(), escape(title));
-        let (w, h, top, plot_w, plot_h) = (self.width, self.height, self.top, self.plot_width(), self.plot_height());
-        let scale = if y.is_logarithmic() { "log" } else { "linear" };
-        format!(
-            "<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\" class=\"time\" \
-             data-plot=\"{LEFT} {top} {plot_w} {plot_h}\" data-x=\"{x0} {x1}\" data-y=\"{y0} {y1}\" data-scale=\"{scale}\">"
-        )
-    }
-
-    fn plot_width(&self) -> f64 {
-        self.width - LEFT - RIGHT
-    }
-
-    fn plot_height(&self) -> f64 {
-        self.foot() - self.top
-    }
-
-    /// Grid, labels and frame.
-    fn axes(&self, x: &Axis, y: &Axis, svg: &mut String) {
-        self.time_axis(x, svg);
-        let (top, right, foot) = (self.top, self.width - RIGHT, self.foot());
-        for (value, label) in &y.ticks {
-            let at = self.y(y, *value);
-            let _ = write!(svg, "<path class=\"grid\" d=\"M{LEFT} {at:.1}H{right}\"/>");
-            let (beside, below, label) = (LEFT - 6.0, at + 4.0, escape(label));
-            let _ = write!(svg, "<text x=\"{beside}\" y=\"{below:.1}\" text-anchor=\"end\">{label}</text>");
-        }
-        let (middle, below, label) = ((LEFT + right) / 2.0, self.height - 8.0, escape(&x.label));
-        let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        // The name of the upright axis.
-        let (middle, label) = ((top + foot) / 2.0, escape(&y.label));
-        let turn = format!("rotate(-90 14 {middle})");
-        let _ = write!(
-            svg,
-            "<text class=\"name\" x=\"14\" y=\"{middle}\" text-anchor=\"middle\" transform=\"{turn}\">{label}</text>"
-        );
-        self.frame(svg);
-    }
-
-    /// The grid of the level axis, with its labels.
-    fn time_axis(&self, x: &Axis, svg: &mut String) {
-        let (top, foot) = (self.top, self.foot());
-        svg.push_str("<g class=\"ticks\">");
-        for (value, label) in &x.ticks {
-            let at = self.x(x, *value);
-            let _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {top}V{foot}\"/>");
-            let (below, label) = (foot + 15.0, escape(label));
-            let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        }
-        svg.push_str("</g>");
-    }
-
-    fn frame(&self, svg: &mut String) {
-        let (top, width, height) = (self.top, self.plot_width(), self.plot_height());
-        let _ = write!(svg, "<rect class=\"frame\" x=\"{LEFT}\" y=\"{top}\" width=\"{width}\" height=\"{height}\"/>");
-    }
-
-    /// Draws lines and marks in a window of their own, which cuts off what lies beyond the axes.
-    fn window(&self, draw: impl FnOnce(&mut String), svg: &mut String) {
-        let (top, width, height) = (self.top, self.plot_width(), self.plot_height());
-        let _ = write!(
-            svg,
-            "<svg class=\"plot\" x=\"{LEFT}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" \
-             viewBox=\"{LEFT} {top} {width} {height}\" preserveAspectRatio=\"none\">"
-        );
-        draw(svg);
-        svg.push_str("</svg>");
-    }
-
-    fn line(&self, line: &Line, x: &Axis, y: &Axis, svg: &mut String) {
-        let mut path = String::new();
-        for part in &line.parts {
-            let (mut last, mut count) = (String::new(), 0);
-            for point in part {
-                let at = format!("{:.1} {:.1}", self.x(x, point.0), self.y(y, point.1));
-                if at != last {
-                    path.push(if count == 0 { 'M' } else { 'L' });
-                    path.push_str(&at);
-                    (last, count) = (at, count + 1);
-                }
-            }
-            if count == 1 {
-                // A single point is seen as a dot.
-                path.push_str("h.1");
-            }
-        }
-        let (class, label) = (line.class, escape(&line.label));
-        let _ = write!(svg, "<path class=\"line {class}\" data-label=\"{label}\" d=\"{path}\"/>");
-        if let (true, Some(first)) = (line.dot, line.parts.first().and_then(|part| part.first())) {
-            let (at_x, at_y, class) = (self.x(x, first.0), self.y(y, first.1), line.class);
-            let _ = write!(svg, "<circle class=\"dot {class}\" cx=\"{at_x:.1}\" cy=\"{at_y:.1}\" r=\"4\"/>");
-        }
     }
 }
 
@@ -349,7 +218,7 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
         let middle = (low[i] + high[i]) / 2.0;
         Axis::linear(names[i], middle - half, middle + half)
     };
-    let frame = Frame { width: SQUARE + LEFT + RIGHT, height: SQUARE + TOP + BOTTOM, top: TOP };
+    let frame = Frame::sized(SQUARE + LEFT + RIGHT, SQUARE + TOP + BOTTOM, TOP);
     let (x, y) = (axis(0), axis(1));
     let mut picture = draw(&frame, title, &x, &y, lines);
     if centre {
@@ -424,7 +293,7 @@ fn numbers(x: &Axis, marks: &Marks, svg: &mut String) {
 
 /// What every fault and every incident is, above a large picture, each in the lowest row that has room; and how many rows.
 fn names(x: &Axis, marks: &Marks) -> (usize, String) {
-    let frame = Frame { width: WIDE, height: WIDE_HEIGHT, top: TOP };
+    let frame = Frame::sized(WIDE, WIDE_HEIGHT, TOP);
     let faults = marks.faults.iter().map(|(from, _, number, what)| (*from, "number", format!("{number} {what}")));
     let incidents = marks.incidents.iter().map(|(time, what)| (*time, "number bad", format!("▾ {what}")));
     let mut all: Vec<(f64, &str, String)> = faults.chain(incidents).collect();

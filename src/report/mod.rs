@@ -13,7 +13,7 @@
 //! | `pair` | the same for two runs over each other |
 //! | `pictures` | which pictures the samples give |
 //! | `tables` | the tables of the summary |
-//! | `axis`, `chart` | pictures as SVG |
+//! | `axis`, `frame`, `chart` | pictures as SVG |
 //! | `html`, `page` | the page |
 //! | `pdf` | figures as PDF, with the feature |
 //!
@@ -23,6 +23,7 @@ mod axis;
 mod chart;
 mod columns;
 mod counterpart;
+mod frame;
 mod hidden;
 mod html;
 mod model;

@@ -45,12 +45,12 @@ pub struct Section {
 pub enum Block {
     /// A paragraph.
     Text(String),
-    /// Rows under a head. Cells that are numbers stand to the right.
+    /// Rows under a head. Cells that are numbers stand to the right; one between backticks is a command.
     Table {
         /// What it is, if the heading does not say.
         caption: String,
         /// The names of its columns.
-        head: Vec<&'static str>,
+        head: Vec<String>,
         /// The rows.
         rows: Vec<Vec<String>>,
     },
@@ -60,6 +60,13 @@ pub enum Block {
     Scale(Vec<String>),
     /// A text to be opened.
     Details(String, String),
+}
+
+impl Block {
+    /// A table.
+    pub fn table<H: Into<String>>(caption: &str, head: Vec<H>, rows: Vec<Vec<String>>) -> Self {
+        Self::Table { caption: caption.to_owned(), head: head.into_iter().map(H::into).collect(), rows }
+    }
 }
 
 /// Draws up a report, with the fields that are asked for by name.

@@ -122,7 +122,7 @@ fn block(block: &Block, html: &mut String) {
     }
 }
 
-fn table(caption: &str, head: &[&str], rows: &[Vec<String>], html: &mut String) {
+fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String) {
     html.push_str("<div class=\"table\"><table>\n");
     if !caption.is_empty() {
         let _ = writeln!(html, "<caption>{}</caption>", escape(caption));
@@ -141,7 +141,9 @@ fn table(caption: &str, head: &[&str], rows: &[Vec<String>], html: &mut String) 
     for row in rows {
         html.push_str("<tr>");
         for (cell, class) in row.iter().zip(&classes) {
-            let _ = write!(html, "<td{class}>{}</td>", escape(cell));
+            let command = cell.strip_prefix('`').and_then(|cell| cell.strip_suffix('`'));
+            let told = command.map_or_else(|| escape(cell), |command| format!("<code>{}</code>", escape(command)));
+            let _ = write!(html, "<td{class}>{told}</td>");
         }
         html.push_str("</tr>\n");
     }

@@ -156,7 +156,7 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
             rows.push(row);
         }
     }
-    let table = Block::Table { caption: String::new(), head: vec!["", "A", "B"], rows };
+    let table = Block::table("", vec!["", "A", "B"], rows);
     Section { id: "verdict", title: "What was told of them", blocks: vec![table] }
 }
 
@@ -199,7 +199,7 @@ fn differences(compared: Option<&Result<Comparison, String>>, tick_s: f64) -> Se
             };
             let rows = found.signals.iter().map(row).collect();
             let head = vec!["signal", "ticks of both", "only A", "only B", "differs from tick", "largest", "at", "rms"];
-            blocks.push(Block::Table { caption: "Signals that both have".to_owned(), head, rows });
+            blocks.push(Block::table("Signals that both have", head, rows));
             for (which, names) in NAMES.iter().zip(&found.only).filter(|(_, names)| !names.is_empty()) {
                 blocks.push(Block::Text(format!("Only {which} has {}.", names.join(", "))));
             }
@@ -325,5 +325,5 @@ fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
     let places: Vec<(String, String)> = rows.iter().map(|row| (row[0].clone(), row[1].clone())).collect();
     rows.sort_by_key(|row| places.iter().position(|place| place.0 == row[0] && place.1 == row[1]));
     let head = vec!["role", "stage", "run", "count", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
-    Block::Table { caption: String::new(), head, rows }
+    Block::table("", head, rows)
 }

@@ -313,19 +313,17 @@ fn rescored(source: &Source, traces: &Traces) -> Block {
             told.and_then(|told| told.settled_at_s).map_or("–".to_owned(), digits),
         ]
     };
-    Block::Table {
-        caption: format!("Metrics, {} ticks scored with every sample", traces.scored_ticks),
-        head: vec![
-            "metric",
-            "at the end (recording)",
-            "at the end (run)",
-            "largest settled (recording)",
-            "largest settled (run)",
-            "peak (run)",
-            "within from, s",
-        ],
-        rows: traces.metrics.iter().map(row).collect(),
-    }
+    let head = vec![
+        "metric",
+        "at the end (recording)",
+        "at the end (run)",
+        "largest settled (recording)",
+        "largest settled (run)",
+        "peak (run)",
+        "within from, s",
+    ];
+    let caption = format!("Metrics, {} ticks scored with every sample", traces.scored_ticks);
+    Block::table(&caption, head, traces.metrics.iter().map(row).collect())
 }
 
 fn lyapunov(of: &rig::Lyapunov, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {

@@ -71,7 +71,7 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
             blocks.push(Block::Text("The scenario has no criteria: nothing is judged.".to_owned()));
         } else {
             let head = vec!["criterion of [accept]", "value", "limit", "verdict"];
-            blocks.push(Block::Table { caption: String::new(), head, rows });
+            blocks.push(Block::table("", head, rows));
         }
         blocks.extend(summary.notes.iter().map(|note| Block::Text(format!("Note: {note}."))));
         if summary.signal != 0 {
@@ -102,7 +102,7 @@ fn unseen(traces: &Traces, tick_s: f64) -> Block {
     };
     let head = vec!["status", "ticks", "bands", "first from, s", "last until, s"];
     let caption = "What the estimate lacked".to_owned();
-    Block::Table { caption, head, rows: traces.unseen.keys().map(row).collect() }
+    Block::table(&caption, head, traces.unseen.keys().map(row).collect())
 }
 
 /// What went wrong, and what was made to.
@@ -124,7 +124,7 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
          role sent no sample."
     )));
     let head = vec!["number", "from, s", "ticks", "fault", "role"];
-    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Scripted faults".to_owned(), head, rows }));
+    blocks.extend((!rows.is_empty()).then(|| Block::table("Scripted faults", head, rows)));
     blocks.extend(traces.map(|traces| unseen(traces, tick_s)));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
     let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), digits);
@@ -138,7 +138,7 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     };
     let rows: Vec<_> = incidents.iter().map(row).collect();
     let head = vec!["at, s", "role", "cause", "what was done", "back after, s", "recovered after, s"];
-    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption: "Incidents".to_owned(), head, rows }));
+    blocks.extend((!rows.is_empty()).then(|| Block::table("Incidents", head, rows)));
     if let Some(traces) = traces {
         let (_, ticks) = traces.missing();
         blocks.push(Block::Text(format!("Ticks of which a role sent no sample, all roles together: {ticks}.")));
@@ -150,7 +150,7 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
         };
         let rows = watchdog.watched.iter().map(row).collect();
         let head = vec!["watched", "bound", "largest", "judged", "beyond", "first at, s"];
-        blocks.push(Block::Table { caption: "Watchdog".to_owned(), head, rows });
+        blocks.push(Block::table("Watchdog", head, rows));
         if let Some(tick) = watchdog.latched_at_tick {
             blocks.push(Block::Text(format!("The safe command was latched at {} s.", seconds(tick))));
         }
@@ -167,7 +167,7 @@ pub fn latencies(source: &Source) -> Block {
     };
     let rows = source.summary.iter().flat_map(|summary| &summary.latencies).map(row).collect();
     let head = vec!["role", "stage", "count", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
-    Block::Table { caption: String::new(), head, rows }
+    Block::table("", head, rows)
 }
 
 fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
@@ -194,7 +194,7 @@ pub fn books(source: &Source) -> Section {
             blocks.push(Block::Text(format!("No books of {unbooked}: its signals are counted by their readers.")));
         }
         let rows = books.roles.iter().map(ticks_row).collect();
-        blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
+        blocks.push(Block::table("Ticks", roles.to_vec(), rows));
         let row = |link: &super::summary::Link| {
             let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
             let void = format!("{}, {}", told(link.void.0), link.void.1);
@@ -222,10 +222,10 @@ pub fn books(source: &Source) -> Section {
             "stale",
             "rejected",
         ];
-        blocks.push(Block::Table { caption: "Samples".to_owned(), head, rows });
+        blocks.push(Block::table("Samples", head, rows));
     } else if let Some(end) = source.recording.as_ref().and_then(|recording| recording.info().end.as_ref()) {
         let rows = end.ticks.iter().map(ticks_row).collect();
-        blocks.push(Block::Table { caption: "Ticks".to_owned(), head: roles.to_vec(), rows });
+        blocks.push(Block::table("Ticks", roles.to_vec(), rows));
     }
     blocks.extend(recorded(source));
     if let Some((summary, state)) = source.summary.as_ref().map(|summary| (summary, &summary.state)) {
@@ -259,7 +259,7 @@ fn recorded(source: &Source) -> Vec<Block> {
         };
         let rows = end.signals.iter().map(row).collect();
         let head = vec!["signal", "recorded", "void", "extra", "published", "lost"];
-        blocks.push(Block::Table { caption: "Recording".to_owned(), head, rows });
+        blocks.push(Block::table("Recording", head, rows));
     }
     blocks
 }
@@ -286,7 +286,7 @@ pub fn certificate(source: &Source) -> Section {
         let rows: Vec<_> = certificate.conditions.iter().map(row).collect();
         blocks.push(match rows.is_empty() {
             true => Block::Text(format!("{caption}: its rig proves nothing of the law in continuous time.")),
-            false => Block::Table { caption, head: vec!["condition", "value", "required", ""], rows },
+            false => Block::table(&caption, vec!["condition", "value", "required", ""], rows),
         });
         blocks.push(Block::Text(told_of_loop(certificate)));
         // Why no rate is claimed is told already.
@@ -303,7 +303,7 @@ pub fn certificate(source: &Source) -> Section {
     }
     let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(limit.value)]).collect();
     let caption = "What samples are held against".to_owned();
-    blocks.extend((!rows.is_empty()).then(|| Block::Table { caption, head: vec!["limit", "value"], rows }));
+    blocks.extend((!rows.is_empty()).then(|| Block::table(&caption, vec!["limit", "value"], rows)));
     Section { id: "certificate", title: "Certificate", blocks }
 }
 
@@ -346,7 +346,7 @@ pub fn machine(source: &Source) -> Section {
         blocks.push(Block::Text("No privileges were asked for.".to_owned()));
     } else {
         let head = vec!["role", "privilege", "asked for", "", "reason"];
-        blocks.push(Block::Table { caption: "Privileges".to_owned(), head, rows });
+        blocks.push(Block::table("Privileges", head, rows));
     }
     if let Some(run) = source.run() {
         blocks.push(Block::Text(format!("Run {run}.")));

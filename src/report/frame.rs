@@ -1,0 +1,160 @@
+//! Where a picture's axes lie, and what is drawn by them: grid, labels, lines.
+//!
+//! Must not know what a picture is of.
+
+use super::axis::Axis;
+use super::chart::Line;
+use super::html::escape;
+use std::fmt::Write;
+
+/// Small pictures, and the margins of all.
+pub const WIDTH: f64 = 640.0;
+pub const HEIGHT: f64 = 250.0;
+pub const LEFT: f64 = 64.0;
+pub const RIGHT: f64 = 22.0;
+pub const TOP: f64 = 18.0;
+pub const BOTTOM: f64 = 42.0;
+/// The width of a picture as wide as the page.
+pub const WIDE: f64 = 1200.0;
+
+/// Where a picture's axes lie: its size, and the margins around them.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame {
+    pub width: f64,
+    pub height: f64,
+    pub top: f64,
+    pub left: f64,
+    pub right: f64,
+}
+
+impl Frame {
+    /// A small picture over time.
+    pub const TIME: Self = Self::sized(WIDTH, HEIGHT, TOP);
+
+    /// With the usual margins at its sides.
+    pub const fn sized(width: f64, height: f64, top: f64) -> Self {
+        Self { width, height, top, left: LEFT, right: RIGHT }
+    }
+
+    /// Where a value of the level axis is.
+    pub fn x(&self, axis: &Axis, value: f64) -> f64 {
+        self.left + axis.place(value) * self.plot_width()
+    }
+
+    /// Where a value of the upright axis is.
+    pub fn y(&self, axis: &Axis, value: f64) -> f64 {
+        self.foot() - axis.place(value) * (self.foot() - self.top)
+    }
+
+    /// The foot of the plot.
+    pub fn foot(&self) -> f64 {
+        self.height - BOTTOM
+    }
+
+    /// Opens a picture.
+    pub fn open(&self, title: &str) -> String {
+        let (w, h, title) = (self.width, self.height, escape(title));
+        format!("<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\">")
+    }
+
+    /// Opens a picture whose lines a reader may look at closely: where its axes lie, and from what to what they go.
+    pub fn open_over_time(&self, title: &str, x: &Axis, y: &Axis) -> String {
+        let ([x0, x1], [y0, y1], title) = (x.ends(), y.ends(), escape(title));
+        let Self { width, height, top, left, .. } = self;
+        let (plot_w, plot_h) = (self.plot_width(), self.plot_height());
+        let scale = if y.is_logarithmic() { "log" } else { "linear" };
+        format!(
+            "<svg viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{title}\" class=\"time\" \
+             data-plot=\"{left} {top} {plot_w} {plot_h}\" data-x=\"{x0} {x1}\" data-y=\"{y0} {y1}\" data-scale=\"{scale}\">"
+        )
+    }
+
+    /// The width between the margins.
+    pub fn plot_width(&self) -> f64 {
+        self.width - self.left - self.right
+    }
+
+    /// The height between the margins.
+    pub fn plot_height(&self) -> f64 {
+        self.foot() - self.top
+    }
+
+    /// Grid, labels and frame.
+    pub fn axes(&self, x: &Axis, y: &Axis, svg: &mut String) {
+        self.time_axis(x, svg);
+        let (left, top, right, foot) = (self.left, self.top, self.width - self.right, self.foot());
+        for (value, label) in &y.ticks {
+            let at = self.y(y, *value);
+            let _ = write!(svg, "<path class=\"grid\" d=\"M{left} {at:.1}H{right}\"/>");
+            let (beside, below, label) = (left - 6.0, at + 4.0, escape(label));
+            let _ = write!(svg, "<text x=\"{beside}\" y=\"{below:.1}\" text-anchor=\"end\">{label}</text>");
+        }
+        let (middle, below, label) = ((left + right) / 2.0, self.height - 8.0, escape(&x.label));
+        let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
+        // The name of the upright axis.
+        let (middle, label) = ((top + foot) / 2.0, escape(&y.label));
+        let turn = format!("rotate(-90 14 {middle})");
+        let _ = write!(
+            svg,
+            "<text class=\"name\" x=\"14\" y=\"{middle}\" text-anchor=\"middle\" transform=\"{turn}\">{label}</text>"
+        );
+        self.frame(svg);
+    }
+
+    /// The grid of the level axis, with its labels.
+    pub fn time_axis(&self, x: &Axis, svg: &mut String) {
+        let (top, foot) = (self.top, self.foot());
+        svg.push_str("<g class=\"ticks\">");
+        for (value, label) in &x.ticks {
+            let at = self.x(x, *value);
+            let _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {top}V{foot}\"/>");
+            let (below, label) = (foot + 15.0, escape(label));
+            let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
+        }
+        svg.push_str("</g>");
+    }
+
+    /// The edge of the plot.
+    pub fn frame(&self, svg: &mut String) {
+        let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
+        let _ = write!(svg, "<rect class=\"frame\" x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\"/>");
+    }
+
+    /// Draws lines and marks in a window of their own, which cuts off what lies beyond the axes.
+    pub fn window(&self, draw: impl FnOnce(&mut String), svg: &mut String) {
+        let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
+        let _ = write!(
+            svg,
+            "<svg class=\"plot\" x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" \
+             viewBox=\"{left} {top} {width} {height}\" preserveAspectRatio=\"none\">"
+        );
+        draw(svg);
+        svg.push_str("</svg>");
+    }
+
+    /// Draws a line.
+    pub fn line(&self, line: &Line, x: &Axis, y: &Axis, svg: &mut String) {
+        let mut path = String::new();
+        for part in &line.parts {
+            let (mut last, mut count) = (String::new(), 0);
+            for point in part {
+                let at = format!("{:.1} {:.1}", self.x(x, point.0), self.y(y, point.1));
+                if at != last {
+                    path.push(if count == 0 { 'M' } else { 'L' });
+                    path.push_str(&at);
+                    (last, count) = (at, count + 1);
+                }
+            }
+            if count == 1 {
+                // A single point is seen as a dot.
+                path.push_str("h.1");
+            }
+        }
+        let (class, label) = (line.class, escape(&line.label));
+        let _ = write!(svg, "<path class=\"line {class}\" data-label=\"{label}\" d=\"{path}\"/>");
+        if let (true, Some(first)) = (line.dot, line.parts.first().and_then(|part| part.first())) {
+            let (at_x, at_y, class) = (self.x(x, first.0), self.y(y, first.1), line.class);
+            let _ = write!(svg, "<circle class=\"dot {class}\" cx=\"{at_x:.1}\" cy=\"{at_y:.1}\" r=\"4\"/>");
+        }
+    }
+}
