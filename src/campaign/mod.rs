@@ -21,6 +21,7 @@ mod tests;
 pub(crate) use file::is_campaign;
 pub use file::{Campaign, Case, Shipped};
 pub use journal::{Entry, JournalError};
+pub(crate) use results::CAMPAIGN;
 pub use results::{Counts, worst};
 pub use sweep::{Collection, NoShard, Shard, Sweep, SweepError, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};

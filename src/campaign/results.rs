@@ -15,7 +15,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 /// The campaign as a file that needs no other.
-pub(super) const CAMPAIGN: &str = "campaign.toml";
+pub(crate) const CAMPAIGN: &str = "campaign.toml";
 /// The rows.
 const CASES: &str = "cases.csv";
 #[cfg(feature = "parquet")]

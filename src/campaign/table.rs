@@ -250,6 +250,11 @@ pub struct MarginPoint {
 }
 
 impl Table {
+    /// Whether a directory holds the results of a campaign.
+    pub fn is_in(directory: &Path) -> bool {
+        directory.join(journal::FILE).is_file()
+    }
+
     /// Reads the results of a campaign from its directory, all of them or as many as there are.
     ///
     /// # Errors

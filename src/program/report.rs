@@ -1,7 +1,8 @@
-//! `corotate report`: a run, or a recording, as one page; or two over each other.
+//! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
 
 use super::record;
 use super::{Exit, fail, latest, remark, say};
+use crate::campaign::JournalError;
 use crate::report::{ReportError, report as compose, report_pair};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
@@ -13,7 +14,7 @@ use std::{fs, io};
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// A run's directory, or a recording [default: runs/latest]
+    /// A run's directory, a recording, or a campaign's directory [default: runs/latest]
     run: Option<PathBuf>,
     /// Another, to be drawn over the first: the page shows both, and where they differ first
     other: Option<PathBuf>,
@@ -50,6 +51,7 @@ Examples:
   corotate report runs/pair        runs/pair/report.html
   corotate report runs/pair/run.mcap --out motion.html
                                    the recording alone
+  corotate report runs/map         a campaign: maps, margins, worst cases
   corotate report runs/before runs/after
                                    both over each other, in comparison.html";
 
@@ -116,12 +118,15 @@ fn exit_of(error: &ReportError) -> Exit {
         ReportError::Read { .. }
         | ReportError::Write { .. }
         | ReportError::Counterpart { .. }
+        | ReportError::Campaign(JournalError::Read { .. })
         | ReportError::Pdf { .. } => Exit::Failure,
         ReportError::Nothing { .. }
         | ReportError::NoRun { .. }
         | ReportError::Summary { .. }
         | ReportError::Latency { .. }
         | ReportError::TwoRuns { .. }
+        | ReportError::Campaign(_)
+        | ReportError::CampaignWith { .. }
         | ReportError::Field { .. }
         | ReportError::Scenario(_) => Exit::Usage,
     }

@@ -6,6 +6,13 @@ const TIME_LABELS: f64 = 10.0;
 /// Of a logarithmic axis no more than so many decades below its top are shown.
 const DECADES: f64 = 36.0;
 
+/// With fewer labels than this a logarithmic axis has some between its decades.
+const FEW: usize = 3;
+/// A name on an axis has at most so many letters, each so many px wide and high.
+const NAME: usize = 14;
+const LETTER: f64 = 6.9;
+const LINE: f64 = 17.0;
+
 /// Values that differ by less than this part of them are told by what they differ by.
 const SAME: f64 = 1e-3;
 /// From here to there values are told without an exponent.
@@ -69,6 +76,44 @@ impl Axis {
         Self { label: label.to_owned(), low, high, logarithmic: true, ticks }.in_values()
     }
 
+    /// A logarithmic axis from one positive value to another, with labels between the decades where there are few of these.
+    pub fn log_between(label: &str, low: f64, high: f64) -> Self {
+        let mut axis = Self::decades(label, (low, high));
+        let (bottom, top) = (low.log10(), high.log10());
+        if !(bottom.is_finite() && top.is_finite() && top - bottom > 1e-9) {
+            return axis;
+        }
+        (axis.low, axis.high) = (bottom, top);
+        let (low, high) = (low * (1.0 - 1e-9), high * (1.0 + 1e-9));
+        let within = |value: &f64| (low..=high).contains(value);
+        axis.ticks.retain(|(value, _)| within(value));
+        if axis.ticks.len() < FEW && top - bottom < 3.0 && low >= SMALL && high <= LARGE {
+            let decades = (bottom.floor() as i32..=top.floor() as i32).map(|exponent| 10_f64.powi(exponent));
+            let values = decades.flat_map(|decade| [1.0, 2.0, 5.0].map(|m| m * decade)).filter(within);
+            axis.ticks = values.map(|value| (value, format!("{}", (value * 1e6).round() / 1e6))).collect();
+        }
+        if axis.ticks.len() < 2 {
+            (axis.label, axis.ticks) = linear_ticks(label, low, high, LABELS);
+            axis.ticks.retain(|(value, _)| within(value));
+        }
+        axis
+    }
+
+    /// An axis of so many equal places, each with a name; every so-manyth is written so that letters find room in `room` px.
+    pub fn names(label: &str, names: &[String], room: f64, across: bool) -> Self {
+        let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).min(NAME);
+        let each = if across { LETTER * (longest as f64 + 1.5) } else { LINE };
+        let stride = (each * names.len() as f64 / room).ceil().max(1.0) as usize;
+        let tick = |(place, name): (usize, &String)| (place as f64, shortened(name));
+        Self {
+            label: label.to_owned(),
+            low: -0.5,
+            high: names.len().max(1) as f64 - 0.5,
+            logarithmic: false,
+            ticks: names.iter().enumerate().step_by(stride).map(tick).collect(),
+        }
+    }
+
     /// An axis of 1/(1 − p), labelled by p in percent.
     pub fn percentiles(greatest: f64) -> Self {
         let greatest = greatest.max(10.0);
@@ -118,6 +163,14 @@ impl Axis {
     pub fn foot(&self) -> f64 {
         if self.logarithmic { 10_f64.powf(self.low) } else { self.low }
     }
+}
+
+/// A name that finds room on an axis.
+fn shortened(name: &str) -> String {
+    if name.chars().count() <= NAME {
+        return name.to_owned();
+    }
+    name.chars().take(NAME - 1).chain(['…']).collect()
 }
 
 /// A range that can be divided: neither empty nor beyond what a difference holds.
@@ -176,7 +229,7 @@ fn decimals(step: f64) -> usize {
 }
 
 /// 0.01 to 1000 as they are, the others with an exponent.
-fn power_of_ten(exponent: i32) -> String {
+pub fn power_of_ten(exponent: i32) -> String {
     if (-2..=3).contains(&exponent) {
         return format!("{}", 10_f64.powi(exponent));
     }

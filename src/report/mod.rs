@@ -1,4 +1,4 @@
-//! A run as one page that is looked at: pictures and tables in a single file of HTML that needs nothing beside it.
+//! A run, or a campaign, as one page that is looked at: pictures and tables in a single file of HTML that needs nothing beside it.
 //!
 //! | file | duty |
 //! |---|---|
@@ -13,6 +13,7 @@
 //! | `pair` | the same for two runs over each other |
 //! | `pictures` | which pictures the samples give |
 //! | `tables` | the tables of the summary |
+//! | `campaign` | another page: the table of a campaign |
 //! | `axis`, `frame`, `chart` | pictures as SVG |
 //! | `html`, `page` | the page |
 //! | `pdf` | figures as PDF, with the feature |
@@ -20,6 +21,7 @@
 //! Must not judge a run: verdicts are those of its summary. Must not leave out silently: what is missing is said.
 
 mod axis;
+mod campaign;
 mod chart;
 mod columns;
 mod counterpart;
@@ -41,6 +43,7 @@ mod traces;
 pub use hidden::{HiddenFacts, HiddenPage};
 pub(crate) use traces::{Traces, trace_rig};
 
+use crate::campaign::{JournalError, Table};
 use crate::config::{ConfigError, RunId};
 use crate::record::RecordError;
 use source::Source;
@@ -104,6 +107,17 @@ pub enum ReportError {
     /// The recording cannot be used.
     #[error(transparent)]
     Record(#[from] RecordError),
+    /// The results of a campaign cannot be read.
+    #[error(transparent)]
+    Campaign(#[from] JournalError),
+    /// A campaign has a page of its own.
+    #[error("{} holds a campaign, which is shown alone and has no fields; give it without {with}", path.display())]
+    CampaignWith {
+        /// The directory.
+        path: PathBuf,
+        /// What it was given with.
+        with: &'static str,
+    },
     /// There is no such field.
     #[error("the recording shows no field `{name}`; it has: {known}")]
     Field {
@@ -204,16 +218,27 @@ impl Report {
     }
 }
 
-/// Makes a page of a run's directory, or of a recording alone, with the fields that are `shown` by name, such as
+/// Makes a page of a run's directory, of a recording alone, or of a campaign's directory; of a run with the fields that are `shown` by name, such as
 /// `leader/estimate.omega_rad_s` or `leader/estimate.omega_rad_s[2]`.
 ///
 /// # Errors
 /// [`ReportError`].
 pub fn report(path: &Path, shown: &[String]) -> Result<Report, ReportError> {
+    if Table::is_in(path) {
+        return campaign(path, shown);
+    }
     let source = Source::open(path)?;
     let model = model::model(&source, shown)?;
     let damaged = source.recording.as_ref().is_some_and(|recording| recording.damage().is_some());
     Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged })
+}
+
+fn campaign(directory: &Path, shown: &[String]) -> Result<Report, ReportError> {
+    if !shown.is_empty() {
+        return Err(ReportError::CampaignWith { path: directory.to_owned(), with: "--show" });
+    }
+    let model = campaign::model(&Table::read(directory)?, directory);
+    Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged: false })
 }
 
 /// Makes a page of two runs over each other, with the fields that are `shown` by name.
@@ -221,6 +246,9 @@ pub fn report(path: &Path, shown: &[String]) -> Result<Report, ReportError> {
 /// # Errors
 /// [`ReportError`].
 pub fn report_pair(a: &Path, b: &Path, shown: &[String]) -> Result<Report, ReportError> {
+    if let Some(path) = [a, b].into_iter().find(|path| Table::is_in(path)) {
+        return Err(ReportError::CampaignWith { path: path.to_owned(), with: "another" });
+    }
     let (a, b) = (Source::open(a)?, Source::open(b)?);
     let model = pair::model(&a, &b, shown)?;
     let damaged = [&a, &b].iter().filter_map(|source| source.recording.as_ref()).any(|r| r.damage().is_some());

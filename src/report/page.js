@@ -2,7 +2,7 @@
 /* Drag to look at a part; double click to see all again. Without this script the page is whole. */
 "use strict";
 (() => {
-  const SVG = document.querySelector("svg").namespaceURI;
+  const SVG = document.querySelector("svg")?.namespaceURI;
   const numbers = (text) => text.split(" ").map(Number);
   const charts = [...document.querySelectorAll("svg.time")].map((svg) => {
     const [left, top, width, height] = numbers(svg.dataset.plot);
@@ -68,6 +68,16 @@
     const now = time[0] + whole * (time[1] - time[0]);
     chart.readout.textContent = [`t = ${now.toPrecision(4)} s`, ...texts.filter(Boolean)].join("; ");
   };
+  /* What a cell or a case is, under its picture, also where nothing hovers. */
+  for (const svg of document.querySelectorAll("figure > svg:not(.time)")) {
+    if (!svg.querySelector("title")) continue;
+    const readout = document.createElement("span");
+    readout.className = "readout";
+    svg.parentNode.querySelector("figcaption").append(readout);
+    const tell = ({ target }) => { readout.textContent = target.querySelector(":scope > title")?.textContent || ""; };
+    svg.addEventListener("pointerover", tell);
+    svg.addEventListener("pointerdown", tell);
+  }
   for (const chart of charts) {
     const { svg, left, top, width, height } = chart;
     const cursor = element("path", { class: "cursor" });

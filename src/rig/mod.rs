@@ -15,6 +15,7 @@ pub use any::AnyRig;
 pub use delay::{ACTUATION_DELAY_MAX, DelayLine, Due, InFlight};
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
+pub(crate) use pictures::named;
 pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
 pub use registry::{RigKind, register, shipped};
 pub(crate) use registry::{resolve, sections, shapes, tables};

@@ -115,7 +115,7 @@ const UNITS: [(&str, &str); 21] = [
 ];
 
 /// A field's name as words, and its unit: `load_torque_n_m` is `load torque` in `N m`, `speed_rad_s` is `speed` in `rad/s`.
-fn named(field: &str) -> (String, String) {
+pub(crate) fn named(field: &str) -> (String, String) {
     let parts: Vec<&str> = field.split('_').collect();
     // A name has at least one word before its unit.
     let words = 1 + parts[1..].iter().rposition(|part| unit(part).is_none()).map_or(0, |last| last + 1);

@@ -1,0 +1,160 @@
+//! Margins: how far a key can go, at every point that was searched, in a table and along an axis of numbers.
+//!
+//! Must not put a margin where its bracket has only one end: then it is beyond what was searched, and that is said.
+
+use super::facts::Facts;
+use super::shades::{by_factors, range};
+use super::spread::shown;
+use crate::analysis::digits;
+use crate::campaign::{Find, Margin, MarginPoint, Parameter};
+use crate::report::axis::Axis;
+use crate::report::chart::{Line, Picture};
+use crate::report::frame::{Frame, LEFT, RIGHT, TOP, WIDTH};
+use crate::report::model::{Block, Section};
+use std::fmt::Write;
+
+/// A table has at most so many rows.
+const ROWS: usize = 200;
+/// A picture has at most so many lines: one per value of a second axis.
+const LINES: usize = 4;
+const CLASSES: [&str; LINES] = ["b d0", "o d1", "g d3", "p d4"];
+const HEIGHT: f64 = 300.0;
+
+/// The margins of a campaign; none if none is searched for.
+pub fn section(facts: &Facts<'_>) -> Option<Section> {
+    let margins = &facts.table.margins;
+    let blocks: Vec<Block> = margins.iter().flat_map(|margin| blocks(facts, margin)).collect();
+    (!margins.is_empty()).then_some(Section { id: "margins", title: "Margins", blocks })
+}
+
+fn blocks(facts: &Facts<'_>, margin: &Margin) -> Vec<Block> {
+    let [from, to] = margin.range.map(digits);
+    let which = if margin.find == Find::Largest { "largest" } else { "smallest" };
+    let text = format!(
+        "The {which} {} between {from} and {to} at which a case is {}: the range is halved until the bracket is at most {} wide. \
+         Where that changes more than once, one change is found.",
+        margin.key,
+        margin.such_that,
+        digits(margin.tolerance)
+    );
+    let mut blocks = vec![Block::Text(text)];
+    if margin.points.is_empty() {
+        blocks.push(Block::Text("No point of it has been searched yet.".to_owned()));
+        return blocks;
+    }
+    blocks.extend(picture(facts, margin).map(|figure| Block::Figures(vec![figure])));
+    blocks.push(table(facts, margin));
+    if margin.points.len() > ROWS {
+        blocks.push(Block::Text(format!(
+            "The first {ROWS} of {} points; the others are not shown.",
+            margin.points.len()
+        )));
+    }
+    blocks
+}
+
+/// The axes on which a margin's points lie.
+fn axes(facts: &Facts<'_>, margin: &Margin) -> Vec<usize> {
+    let known = |axis: &usize| margin.points.iter().any(|point| at(point, *axis).is_some());
+    (0..facts.spreads.len()).filter(|axis| facts.spreads[*axis].varies()).filter(known).collect()
+}
+
+fn at(point: &MarginPoint, axis: usize) -> Option<&Parameter> {
+    point.parameters.get(axis)?.as_ref()
+}
+
+fn table(facts: &Facts<'_>, margin: &Margin) -> Block {
+    let axes = axes(facts, margin);
+    let names = axes.iter().map(|axis| facts.spreads[*axis].name.clone());
+    let others = ["margin", "holds at", "not at", "bracket", "runs"].map(str::to_owned);
+    let head: Vec<String> = ["case".to_owned()].into_iter().chain(names).chain(others).collect();
+    let number = |value: Option<f64>| value.map_or("–".to_owned(), digits);
+    let row = |point: &MarginPoint| {
+        let [good, bad] = point.bracket;
+        let width = good.zip(bad).map(|(good, bad)| (good - bad).abs());
+        let value = match (point.value, bad) {
+            (None, _) => "none in the range".to_owned(),
+            (Some(value), None) => format!("beyond {}", digits(value)),
+            (Some(value), Some(_)) => digits(value),
+        };
+        let mut row = vec![point.case.to_string()];
+        row.extend(axes.iter().map(|axis| at(point, *axis).map_or("–".to_owned(), shown)));
+        row.extend([value, number(good), number(bad), number(width), point.runs.to_string()]);
+        row
+    };
+    Block::table(&margin.key, head, margin.points.iter().take(ROWS).map(row).collect())
+}
+
+/// A margin along an axis of numbers, a line for each value of another.
+fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
+    let axes = axes(facts, margin);
+    let across = *axes.iter().find(|axis| facts.spreads[**axis].is_numeric())?;
+    let second = axes.iter().copied().find(|axis| *axis != across);
+    let all = margin.points.iter().flat_map(|point| point.bracket.into_iter().chain([point.value])).flatten();
+    let (low, high) = range(all.clone(), false)?;
+    let y = match range(all, true).filter(|_| low >= 0.0) {
+        Some((low, high)) if by_factors(low, high) => {
+            Axis::decades(&format!("{}, logarithmic", margin.key), (low, high))
+        }
+        _ => Axis::around(&margin.key, (low, high)),
+    };
+    let x = facts.spreads[across].number_axis();
+    let frame = Frame { width: WIDTH, height: HEIGHT, top: TOP, left: LEFT, right: RIGHT };
+    let title = format!("margin of {} along {}", margin.key, facts.spreads[across].name);
+    let mut svg = frame.open(&title);
+    frame.axes(&x, &y, &mut svg);
+    let cells = second.map(|axis| facts.spreads[axis].cells(LINES));
+    let (mut lines, mut open) = (Vec::new(), 0);
+    for group in 0..cells.map_or(1, |cells| cells.count) {
+        let of = |point: &&MarginPoint| match (second, cells) {
+            (Some(axis), Some(cells)) => at(point, axis).and_then(|value| cells.of(value)) == Some(group),
+            _ => true,
+        };
+        let mut points: Vec<(f64, &MarginPoint)> =
+            margin.points.iter().filter(of).filter_map(|point| Some((at(point, across)?.number()?, point))).collect();
+        points.sort_by(|one, other| one.0.total_cmp(&other.0));
+        let class = CLASSES[group % LINES];
+        for (place, point) in &points {
+            let [good, bad] = point.bracket;
+            let place = frame.x(&x, *place);
+            if let (Some(good), Some(bad)) = (good, bad) {
+                let (from, to) = (frame.y(&y, good), frame.y(&y, bad));
+                let _ = write!(
+                    svg,
+                    "<path class=\"line {class}\" d=\"M{:.1} {from:.1}h6m-3 0V{to:.1}m-3 0h6\"/>",
+                    place - 3.0
+                );
+            } else if let Some(end) = good.or(bad) {
+                let at = frame.y(&y, end);
+                let up = (margin.find == Find::Largest) == good.is_some();
+                let tip = if up { at - 9.0 } else { at + 9.0 };
+                let _ = write!(
+                    svg,
+                    "<path class=\"arrow {class}\" d=\"M{:.1} {at:.1}h10L{place:.1} {tip:.1}z\"/>",
+                    place - 5.0
+                );
+                open += 1;
+            }
+        }
+        let name = match (second, cells) {
+            (Some(axis), Some(cells)) => format!("{} = {}", facts.spreads[axis].name, cells.name(group)),
+            _ => "margin".to_owned(),
+        };
+        // Several margins at one place, as seeds give them, are points and no line.
+        let apart = points.windows(2).all(|pair| pair[0].0 < pair[1].0);
+        let places = points.iter().filter_map(|(place, point)| Some((*place, point.value?)));
+        let parts = if apart { vec![places.collect()] } else { places.map(|place| vec![place]).collect() };
+        lines.push(Line { class, label: name, parts, dot: false });
+    }
+    lines.iter().for_each(|line| frame.line(line, &x, &y, &mut svg));
+    svg.push_str("</svg>");
+    let mut caption = "The margin, with its bracket: it holds at one end, and does not at the other.".to_owned();
+    if open > 0 {
+        let _ = write!(caption, " A triangle is a margin that is beyond the range ({open} points).");
+    }
+    if axes.len() > 2 {
+        caption += " Other axes are varied too: their points are in the same lines.";
+    }
+    let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
+    Some((Picture { svg, title, legend }, caption))
+}
