@@ -157,9 +157,9 @@ pub fn share<'r>(rows: impl IntoIterator<Item = &'r Row>) -> Option<f64> {
     part(rows.into_iter().filter_map(|row| row.accepted))
 }
 
-/// The part of the cases that were run for which a rate is claimed.
+/// The part of the cases for which a rate is claimed: for none whose scenario is refused, as one whose loop is unstable is.
 pub fn claimed_share<'r>(rows: impl IntoIterator<Item = &'r Row>) -> Option<f64> {
-    part(rows.into_iter().filter(|row| ran(row)).map(claimed))
+    part(rows.into_iter().filter(|row| row.exit != End::Failed).map(claimed))
 }
 
 fn part(flags: impl Iterator<Item = bool>) -> Option<f64> {
