@@ -13,6 +13,7 @@
 //! | [`sample`](mod@sample) | the fixed-size samples that travel between roles | yes, `no_std` |
 //! | [`state`] | what a state machine remembers, as words: written, read back, counted | yes, `no_std` |
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
+//! | [`rate`] | the observers and the law of angular velocities, as roles | yes, `no_std` |
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
 //! | `rig` | the registry: which plant, observer and law belong together | no |
 //! | `config` | scenario files: as typed, then as resolved | no |
@@ -52,6 +53,7 @@ pub mod fault;
 pub mod identify;
 pub mod model;
 pub mod observe;
+pub mod rate;
 pub mod role;
 pub mod sample;
 pub mod state;

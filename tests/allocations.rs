@@ -10,7 +10,7 @@ use corotate::runtime::{
     DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, Service, build_rig, depths, private_ledger, serve, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
-use corotate::serial::{Device, Hello};
+use corotate::serial::{BodySeat, Device, Hello};
 use corotate::telemetry::RoleReport;
 use corotate::with_shipped_rig;
 use rustix::fd::OwnedFd;
@@ -202,7 +202,7 @@ fn line() -> (OwnedFd, PathBuf) {
 /// A device that is a body of the scenario, until the other end hangs up.
 fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
     with_shipped_rig!(scenario.rig, rig => {
-        let (mut device, mut bytes) = (Device::new("test", |_: &Hello<'_>| Some(rig.body(index))), [0; 512]);
+        let (mut device, mut bytes) = (Device::new("test", |hello: &Hello<'_>| Some(BodySeat::new(rig.body(index), hello))), [0; 512]);
         while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
             device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));
         }
@@ -212,10 +212,12 @@ fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
 /// The link to that device, greeted.
 fn linked(scenario: &Scenario, index: usize, path: &Path) -> RoleImpl {
     let body = scenario.rig.bodies()[index].name.to_string();
-    let seat = DeviceSeat { domain: PathBuf::new(), body, path: path.to_owned(), baud: None, patience_s: 60.0 };
-    let mut link = DeviceLink::open(&seat, scenario, 1).unwrap();
+    let roles = vec![body];
+    let seat = DeviceSeat { domain: PathBuf::new(), roles, path: path.to_owned(), baud: None, patience_s: 60.0 };
+    let role = RoleId::Plant(index);
+    let mut link = DeviceLink::open(&seat, scenario, &[role], 1).unwrap();
     assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
-    RoleImpl::Device(index, Box::new(link))
+    RoleImpl::Device(role, Vec::new(), Box::new(link))
 }
 
 fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Count)> {

@@ -7,9 +7,11 @@ mod serial_device;
 
 use common::{Bench, Done, Running, await_some, shipped};
 use corotate::config::Scenario;
-use corotate::role::SingleBody;
+use corotate::rig::Rig;
 use corotate::runtime::Line;
-use corotate::serial::{Decoder, Device, Hello, MAX_FRAME, encode};
+use corotate::serial::{
+    BodySeat, ControllerSeat, Decoder, Device, FlightSeat, Hello, MAX_FRAME, ObserverSeat, Seat, encode,
+};
 use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
@@ -163,14 +165,10 @@ impl Powered {
         Self::new(move |on| live(&path, &mut Device::new(NAME, Follower::asked_for), on))
     }
 
-    /// A device that is a body of any rig.
-    fn of_rig(path: &Path, scenario: Scenario, body: usize) -> Self {
+    /// A device with any role of any rig.
+    fn of_rig(path: &Path, scenario: Scenario, role: &'static str) -> Self {
         let path = path.to_owned();
-        Self::new(move |on| {
-            with_shipped_rig!(scenario.rig, rig => {
-                live(&path, &mut Device::new("any", |_: &Hello<'_>| Some(corotate::rig::Rig::body(rig, body))), on)
-            })
-        })
+        Self::new(move |on| with_shipped_rig!(scenario.rig, rig => any_role(rig, role, &path, on)))
     }
 }
 
@@ -182,8 +180,47 @@ impl Drop for Powered {
     }
 }
 
+/// The role of this name, or the body; controllers are of one driven body.
+fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
+    let asked = |hello: &Hello<'_>| assert_eq!(hello.role, role);
+    match role {
+        "observer" => live(
+            path,
+            &mut Device::new("any", |hello| {
+                asked(hello);
+                Some(ObserverSeat::new(rig.estimator(), hello))
+            }),
+            on,
+        ),
+        "controller" => live(
+            path,
+            &mut Device::new("any", |hello| {
+                asked(hello);
+                Some(ControllerSeat::new([rig.law(1)]))
+            }),
+            on,
+        ),
+        "observer controller" => live(
+            path,
+            &mut Device::new("any", |hello| {
+                asked(hello);
+                Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello))
+            }),
+            on,
+        ),
+        _ => live(
+            path,
+            &mut Device::new("any", |hello| {
+                asked(hello);
+                Some(BodySeat::new(rig.body(1), hello))
+            }),
+            on,
+        ),
+    }
+}
+
 /// A device keeps its state while its line is cut and joined again.
-fn live<B: SingleBody, M: FnMut(&Hello<'_>) -> Option<B>>(path: &Path, device: &mut Device<B, M>, on: &AtomicBool) {
+fn live<S: Seat, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &mut Device<S, M>, on: &AtomicBool) {
     while on.load(Ordering::Relaxed) {
         match Line::open(path, None) {
             Ok(mut line) => serve(&mut line, device, on),
@@ -194,15 +231,25 @@ fn live<B: SingleBody, M: FnMut(&Hello<'_>) -> Option<B>>(path: &Path, device: &
 
 /// Starts a run whose follower somebody else is; gives its domain too.
 fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
-    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--external", "follower"];
-    let running = bench.start(&[&common[..], arguments].concat());
-    bench.await_role("controller");
+    start_without(bench, file, &["follower"], arguments)
+}
+
+/// The same for any roles.
+fn start_without(bench: &Bench, file: &Path, roles: &[&str], arguments: &[&str]) -> (Running, PathBuf) {
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
+    let external: Vec<&str> = roles.iter().flat_map(|role| ["--external", *role]).collect();
+    let running = bench.start(&[&common[..], &external, arguments].concat());
+    bench.await_role("leader");
     (running, bench.domains().remove(0))
 }
 
 fn bridge(bench: &Bench, path: &Path, domain: &Path, arguments: &[&str]) -> Running {
+    bridge_of(bench, "follower", path, domain, arguments)
+}
+
+fn bridge_of(bench: &Bench, roles: &str, path: &Path, domain: &Path, arguments: &[&str]) -> Running {
     let (path, domain) = (path.to_str().unwrap(), domain.to_str().unwrap());
-    let common = ["bridge", "--serial", path, "--body", "follower", "--domain", domain];
+    let common = ["bridge", "--serial", path, "--role", roles, "--domain", domain];
     bench.start(&[&common[..], arguments].concat())
 }
 
@@ -274,9 +321,143 @@ fn a_device_may_be_the_body_of_any_rig() {
     let arguments = ["--clock", "lockstep", "--duration", "5", "--set", "accept={}"];
     let scenario = Scenario::load(&shipped("orbit-rendezvous"), &[]).unwrap();
     let scenario = Scenario::parse(&scenario.to_toml(), "test", &["duration_s=5".to_owned(), "accept={}".to_owned()]);
-    let _device = Powered::of_rig(&cable.device.path, scenario.unwrap(), 1);
+    let _device = Powered::of_rig(&cable.device.path, scenario.unwrap(), "follower");
     let with_device = run_with(&bench, "orbit-rendezvous", &cable.host.path, &arguments);
     assert_eq!(with_device["state"]["hash"], bench.summary("orbit-rendezvous", &arguments)["state"]["hash"]);
+}
+
+/// The seats that a device can have beside a body's, as the command line names them and as a device hears them.
+const COMPUTERS: [(&[&str], &str); 3] = [
+    (&["observer"], "observer"),
+    (&["controller"], "controller"),
+    (&["observer", "controller"], "observer controller"),
+];
+
+/// Runs a shipped scenario with a device in the seats of these roles.
+fn run_roles(bench: &Bench, scenario: &str, roles: &[&str], path: &Path, arguments: &[&str]) -> Value {
+    let (run, domain) = start_without(bench, &shipped(scenario), roles, arguments);
+    let bridge = bridge_of(bench, &roles.join(","), path, &domain, &[]);
+    let (run, bridge) = (run.wait(), bridge.wait());
+    assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
+    bench.assert_clean(&[domain]);
+    summary(&run)
+}
+
+fn short(scenario: &str, arguments: &[&str]) -> Scenario {
+    let overrides: Vec<String> = arguments.iter().map(|argument| (*argument).to_owned()).collect();
+    Scenario::parse(&std::fs::read_to_string(shipped(scenario)).unwrap(), "test", &overrides).unwrap()
+}
+
+/// What computes sits behind the line, what moves is simulated here: processor in the loop.
+#[test]
+fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
+    let bench = Bench::new();
+    for name in ["rigid-pair", "orbit-rendezvous"] {
+        let arguments = ["--clock", "lockstep", "--duration", "3", "--set", "accept={}"];
+        let built_in = bench.summary(name, &arguments);
+        for (roles, role) in COMPUTERS {
+            let cable = Cable::new(CLEAN);
+            let _device = Powered::of_rig(&cable.device.path, short(name, &["duration_s=3", "accept={}"]), role);
+            let with_device = run_roles(&bench, name, roles, &cable.host.path, &arguments);
+            assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"], "{name}: {role}");
+            assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"], "{name}: {role}");
+            assert_eq!(number(&with_device["lines"][roles[0]]["handshakes"]), 1, "{with_device:#}");
+        }
+    }
+}
+
+/// The leader's measurements that are dropped, and a follower's, come to such a device as to ours.
+#[test]
+fn in_lockstep_a_flight_computer_on_a_faulty_line_that_misses_samples_gives_the_same_bits() {
+    let bench = Bench::new();
+    let faults = Faults { drop: 3e-4, corrupt: 3e-4, garbage: 3e-4, delay: Duration::from_millis(2), pieces: true };
+    let cable = Cable::new(faults);
+    let lost = "fault=[{kind=\"drop\", role=\"leader\", from_tick=100, ticks=3}, {kind=\"out-of-range\", value=1e3, role=\"leader\", \
+                from_tick=300, ticks=2}, {kind=\"drop\", role=\"follower\", from_tick=200, ticks=30}]";
+    let arguments = [&LOCKSTEP[..], &["--set", "accept={}", "--set", lost]].concat();
+    let scenario = short("rigid-pair", &["duration_s=10", "tick_hz=100", "accept={}"]);
+    let _device = Powered::of_rig(&cable.device.path, scenario, "observer controller");
+    let with_device = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &arguments);
+    let built_in = bench.summary("rigid-pair", &arguments);
+    assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"]);
+    assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"]);
+    assert!(number(&built_in["books"]["injected_faults"]) >= 33, "{}", built_in["books"]);
+    let line = &with_device["lines"]["observer"];
+    println!("{line}");
+    assert!(number(&line["repeats"]) > 20 && number(&line["crc_errors"]) > 5, "{line}");
+}
+
+#[test]
+fn in_real_time_a_flight_computer_synchronises() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let scenario = short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]);
+    let _device = Powered::of_rig(&cable.device.path, scenario, "observer controller");
+    let summary = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &REALTIME);
+    let (error, roles) = (sync_error(&summary), &summary["books"]["roles"]);
+    println!("{error:e} rad/s; {roles}; line {}", summary["lines"]["observer"]);
+    for role in ["observer", "controller"] {
+        assert_eq!(number(&roles[role]["executed"]) + number(&roles[role]["missed"]), 801);
+    }
+    let limit = if number(&summary["books"]["missed_ticks"]) < 200 { 1e-6 } else { 1.0 };
+    assert!(error < limit, "{error:e}: {summary:#}");
+    let serial = summary["latencies"].as_array().unwrap().iter().find(|stage| stage["stage"] == "serial").unwrap();
+    assert_eq!(
+        (&serial["role"], number(&serial["count"])),
+        (&Value::from("observer"), number(&roles["observer"]["executed"]))
+    );
+}
+
+/// The plants have their expiry, whoever is to command them.
+#[test]
+fn a_flight_computer_that_falls_silent_leaves_its_plants_safe_and_another_one_takes_its_seat() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let flight = |path: &Path| {
+        Powered::of_rig(path, short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]), "observer controller")
+    };
+    let device = flight(&cable.device.path);
+    let roles = ["observer", "controller"];
+    let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &roles, &REALTIME);
+    let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &["--patience", "0.5"]);
+    cable.await_ticks();
+    drop(device);
+    let first = first.wait();
+    assert_eq!(first.code, Some(1), "{first:?}");
+    assert!(first.stderr.contains("has not answered"), "{first:?}");
+    let _device = flight(&cable.device.path);
+    let second = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
+    let (run, second) = (run.wait(), second.wait());
+    assert_eq!(second.code, Some(0), "{second:?} {run:?}");
+    let summary = summary(&run);
+    let books = &summary["books"]["roles"];
+    println!("{books}");
+    assert!(number(&books["follower"]["safe"]) > 0, "{books}");
+    assert!(number(&books["controller"]["missed"]) > 20, "{books}");
+    let error = sync_error(&summary);
+    let limit = if number(&summary["books"]["missed_ticks"]) < 600 { 1e-3 } else { 1.0 };
+    assert!(error < limit, "{error:e}: {summary:#}");
+    bench.assert_clean(&[domain]);
+}
+
+#[test]
+fn a_killed_bridge_of_a_flight_computer_can_be_started_again() {
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let arguments = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "60", "--set", "accept={}"];
+    let scenario = short("rigid-pair", &["duration_s=60", "tick_hz=100", "accept={}"]);
+    let _device = Powered::of_rig(&cable.device.path, scenario, "observer controller");
+    let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &["observer", "controller"], &arguments);
+    let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
+    cable.await_ticks();
+    first.signal(9);
+    assert_eq!(first.wait().signal, Some(9));
+    let second = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
+    let (run, second) = (run.wait(), second.wait());
+    assert_eq!(second.code, Some(0), "{second:?} {run:?}");
+    let with_device = summary(&run);
+    assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
+    bench.assert_clean(&[domain]);
 }
 
 #[test]
@@ -440,14 +621,14 @@ fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], co
 #[test]
 fn a_device_of_another_version_is_refused_by_both_versions() {
     let other = |path: &Path| Some(impostor(path, |_| framed(&[9, 0, 2, 0, 0])));
-    refused(other, &[], 2, &["protocol version 9", "this program version 1", "update the older"]);
+    refused(other, &[], 2, &["protocol version 9", "this program version 2", "update the older"]);
 }
 
 #[test]
 fn a_device_of_another_rig_is_refused_by_both_types() {
     let orbit = |path: &Path| {
         let scenario = Scenario::load(&shipped("orbit-rendezvous"), &[]).unwrap();
-        Some(Powered::of_rig(path, scenario, 1))
+        Some(Powered::of_rig(path, scenario, "follower"))
     };
     refused(orbit, &[], 2, &["corotate/orbit/command/v1", "corotate/rigid-body/command/v2"]);
 }
@@ -483,7 +664,7 @@ fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
     std::fs::write(&file, "no line").unwrap();
     let ask = |path: &Path, body: &str, domain: &Path| {
         let (path, domain) = (path.to_str().unwrap(), domain.to_str().unwrap());
-        let done = bench.run(&["bridge", "--serial", path, "--body", body, "--domain", domain]);
+        let done = bench.run(&["bridge", "--serial", path, "--role", body, "--domain", domain]);
         assert_eq!(done.code, Some(2), "{done:?}");
         done.stderr
     };
@@ -491,7 +672,7 @@ fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
         assert!(ask(path, "follower", &domain).contains("not a terminal device"));
     }
     assert!(ask(&bench.path("none"), "follower", &domain).contains("plugged in"));
-    assert!(ask(&port.path, "leader", &domain).contains("a driven body only"));
+    assert!(ask(&port.path, "leader", &domain).contains("one driven body"));
     assert!(ask(&port.path, "nobody", &domain).contains("there is no role `nobody`"));
     assert!(ask(&port.path, "follower", &bench.path("none")).contains("not the domain of a run"));
     let _held = Line::open(&port.path, None).unwrap();

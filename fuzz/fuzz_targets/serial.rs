@@ -3,7 +3,7 @@
 
 use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Rig, RigidBodyRig};
-use corotate::serial::{Device, Hello, Host, MAX_FRAME, Terms, decode, encode};
+use corotate::serial::{FlightSeat, Device, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
 
@@ -13,8 +13,11 @@ thread_local! {
 
 fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>().expect("the first shipped scenario is of rigid bodies");
-    let mut device = Device::new("fuzz", |_: &Hello<'_>| Some(rig.body(1)));
-    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), measurement_length: 64, truth_length: 56 });
+    let seat = |hello: &Hello<'_>| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello));
+    let mut device = Device::new("fuzz", seat);
+    let mut outputs = [0; 32];
+    (outputs[0], outputs[1]) = (64, 56);
+    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1, version_1: true });
     let mut frame = [0; MAX_FRAME];
     for (index, piece) in pieces.iter().enumerate() {
         let now_ns = index as u64 * 1_000_000;
@@ -32,7 +35,7 @@ fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
         for &byte in bytes.iter().chain(&said) {
             let _ = host.push(byte, now_ns);
         }
-        host.request(index as u64, None, now_ns);
+        host.request(index as u64, Samples::default(), now_ns);
     }
 }
 

@@ -3,8 +3,8 @@
 use super::fault::{self, ScriptedFault};
 use super::raw::{Launch, Policy, Raw};
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
-use crate::control::WatchBounds;
-use crate::rig::{self, ACTUATION_DELAY_MAX, AnyRig, Context};
+use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
+use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
 use serde::Deserialize;
 use std::collections::BTreeMap;

@@ -3,6 +3,7 @@
 mod adaptation;
 mod certificate;
 mod fleet;
+mod in_flight;
 mod orbit_certificate;
 mod orbit_hold;
 mod synchronizer;
@@ -11,6 +12,7 @@ mod watchdog;
 pub use adaptation::InertiaAdaptation;
 pub use certificate::{Certificate, Condition};
 pub use fleet::FleetLaw;
+pub use in_flight::{ACTUATION_DELAY_MAX, InFlight};
 pub use orbit_certificate::OrbitCertificate;
 pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::{Synchronizer, limited};

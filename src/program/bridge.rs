@@ -1,5 +1,6 @@
-//! `corotate bridge`: a device behind a serial line, in a follower's seat.
+//! `corotate bridge`: a device behind a serial line, in a role's seat.
 
+use super::qemu::Board;
 use super::role::{die_with, terminated_by_signals};
 use super::{Exit, fail, say};
 use crate::launch::line_words;
@@ -12,14 +13,20 @@ use std::path::PathBuf;
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
-    #[arg(long, value_name = "PATH")]
-    serial: PathBuf,
+    #[arg(long, value_name = "PATH", required_unless_present = "qemu", conflicts_with = "qemu")]
+    serial: Option<PathBuf>,
+    /// Run this program for a board in QEMU, with its UART as the line; QEMU ends with the bridge
+    #[arg(long, value_name = "ELF")]
+    qemu: Option<PathBuf>,
+    /// The board that QEMU is to be
+    #[arg(long, value_name = "NAME", default_value = "mps2-an386", requires = "qemu")]
+    machine: String,
     /// Its speed, bit/s [default: as it is]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
     baud: Option<u32>,
-    /// The driven body whose seat the device takes
-    #[arg(long, value_name = "NAME")]
-    body: String,
+    /// The role whose seat the device takes: a driven body's name, observer, controller, or observer,controller
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required = true, alias = "body")]
+    role: Vec<String>,
     /// The run's domain, as `corotate run --external NAME` prints it
     #[arg(long, value_name = "DIR")]
     domain: PathBuf,
@@ -40,7 +47,8 @@ const SCHEMA: &str = "corotate/bridge/v1";
 const EXAMPLES: &str = "\
 Example:
   corotate run pair.toml --external follower      prints DIR
-  corotate bridge --serial /dev/ttyACM0 --body follower --domain DIR";
+  corotate bridge --serial /dev/ttyACM0 --role follower --domain DIR
+  corotate bridge --qemu firmware.elf --role observer,controller --domain DIR";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;
@@ -56,21 +64,30 @@ pub fn bridge(arguments: &Arguments) -> Exit {
 fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
     arguments.parent.map_or(Ok(()), die_with)?;
     let terminated = terminated_by_signals()?;
+    let mut board = arguments.qemu.as_ref().map(|elf| Board::start(elf, &arguments.machine)).transpose();
+    let board = board.as_mut().map_err(|error| fail(Exit::Usage, error))?.as_mut();
+    let path =
+        board.as_ref().map_or_else(|| arguments.serial.clone().unwrap_or_default(), |board| board.line().to_owned());
     let seat = DeviceSeat {
         domain: arguments.domain.clone(),
-        body: arguments.body.clone(),
-        path: arguments.serial.clone(),
+        roles: arguments.role.clone(),
+        path,
         baud: arguments.baud,
         patience_s: arguments.patience,
     };
-    let welcomed = |device: &str| tell(format_args!("{} on {}: {device}", seat.body, seat.path.display()));
-    let counters = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
+    let role = seat.roles.join(",");
+    let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
+    let served = run_bridge(&seat, &terminated, welcomed);
+    let counters = served.map_err(|error| match board.and_then(Board::ended) {
+        Some(ended) => fail(exit_of(&error), &format!("{ended}: {error}")),
+        None => fail(exit_of(&error), &error),
+    })?;
     match counters {
         Some(counters) if arguments.json => {
-            let object = serde_json::json!({ "schema": SCHEMA, "body": seat.body, "line": counters });
+            let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters });
             say(&format!("{object}\n"))?;
         }
-        Some(counters) => tell(line_words(&seat.body, &counters)),
+        Some(counters) => tell(line_words(&role, &counters)),
         None => {}
     }
     Ok(Exit::Ok)
@@ -78,7 +95,7 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
 
 fn exit_of(error: &RoleError) -> Exit {
     match error {
-        RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::NotDriven { .. } => {
+        RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::NoDevice { .. } => {
             Exit::Usage
         }
         // A device that should be there and does not answer is a failure; one that is not what was asked for is usage.

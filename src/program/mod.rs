@@ -22,6 +22,7 @@ mod identify;
 mod init;
 mod latest;
 mod new;
+mod qemu;
 mod record;
 mod replay;
 mod report;
@@ -80,7 +81,7 @@ enum Command {
     Observer(role::Arguments),
     /// Take the controller's seat in a run
     Controller(role::Arguments),
-    /// Put a device behind a serial line into a driven body's seat in a run
+    /// Put a device behind a serial line into a role's seat in a run
     Bridge(bridge::Arguments),
     /// Record every sample of a running loop to a file
     Record(record::Arguments),
@@ -113,6 +114,9 @@ enum Command {
     /// Take the other end of a hop that is measured
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
+    /// Become QEMU, and die with a bridge
+    #[command(hide = true)]
+    Emulate(qemu::Arguments),
     /// Clean up after processes of a run that were killed, and after its launcher
     #[command(hide = true)]
     Janitor(JanitorArguments),
@@ -378,6 +382,7 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Completions(arguments)) => help::completions(&arguments),
         Some(Command::Man(arguments)) => help::man(&arguments),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
+        Some(Command::Emulate(arguments)) => qemu::emulate(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),
     }
 }

@@ -475,13 +475,17 @@ impl Screen {
     fn by_hand(&self, role: &str, domain: &Path) -> String {
         let (name, domain) = (name(), domain.display());
         match role {
-            "observer" | "controller" => format!("{name} {role} --domain {domain}"),
+            "observer" | "controller" if !self.fleets.is_empty() => format!("{name} {role} --domain {domain}"),
+            "observer" | "controller" => format!(
+                "{name} {role} --domain {domain}\nor put a device there with\n  \
+                 {name} bridge --serial PATH --role {role} --domain {domain}"
+            ),
             body if body == "leader" || self.fleets.iter().any(|fleet| fleet == body) => {
                 format!("{name} plant --body {body} --domain {domain}")
             }
             body => format!(
                 "{name} plant --body {body} --domain {domain}\nor put a device there with\n  \
-                 {name} bridge --serial PATH --body {body} --domain {domain}"
+                 {name} bridge --serial PATH --role {body} --domain {domain}"
             ),
         }
     }

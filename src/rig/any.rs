@@ -10,7 +10,7 @@ use crate::config::{Fields, Scenario, fields};
 use crate::launch::{Launch, Outcome, Scorer, run_directly, score_rig};
 use crate::record::{RecordError, Recording};
 use crate::report::{Traces, trace_rig};
-use crate::runtime::{DeviceError, DeviceLink, DeviceSeat, Port, ReadyNode, RoleId, RoleImpl, build_rig, ports_of_rig};
+use crate::runtime::{Port, ReadyNode, RoleId, RoleImpl, build_rig, ports_of_rig};
 use crate::telemetry::Ledger;
 use crate::watch::Judge;
 use std::any::Any;
@@ -39,7 +39,6 @@ pub(crate) trait Face: Any + Send + Sync {
         bus: AnyBus<'_>,
         ledger: &Ledger,
     ) -> Result<ReadyNode, BusError>;
-    fn device(&self, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError>;
     fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
     fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>;
     fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
@@ -103,10 +102,6 @@ impl<R: Rig> Face for R {
             AnyBus::Memory(bus) => build_rig(self, scenario, occupant, bus, ledger),
             AnyBus::Shared(bus) => build_rig(self, scenario, occupant, bus, ledger),
         }
-    }
-
-    fn device(&self, seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<DeviceLink, DeviceError> {
-        DeviceLink::of_rig(self, seat, scenario, run)
     }
 
     fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError> {

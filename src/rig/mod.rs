@@ -12,7 +12,7 @@ mod rigid_body;
 mod simple;
 
 pub use any::AnyRig;
-pub use delay::{ACTUATION_DELAY_MAX, DelayLine, Due, InFlight};
+pub use delay::{DelayLine, Due};
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub(crate) use pictures::named;

@@ -4,14 +4,16 @@
 //! what its samples mean.
 
 use super::line::{Line, LineError};
-use super::node::{RoleId, RoleImpl};
-use super::process::{RoleError, find_role, in_domain, join};
+use super::node::{RoleId, RoleImpl, ports};
+use super::process::{RoleError, find_role, in_domain, join, require_process, take_ledger};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
-use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::Rearm;
-use crate::sample::{Sample, content_length};
-use crate::serial::{Answer, Heard, Hello, Host, LineCounters, Refuse, Terms, VERSION};
+use crate::sample::Stamp;
+use crate::serial::{
+    Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Refuse, Samples, Terms, VERSION,
+    fits_version_1,
+};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -32,8 +34,8 @@ const FRAME_OVERHEAD: u64 = 14;
 pub struct DeviceSeat {
     /// The domain's directory.
     pub domain: PathBuf,
-    /// The driven body's name.
-    pub body: String,
+    /// The role's name: a driven body's, `observer` or `controller`; or both of these.
+    pub roles: Vec<String>,
     /// The device's serial line.
     pub path: PathBuf,
     /// Its speed, bit/s; as it is, if none.
@@ -84,7 +86,8 @@ pub enum DeviceError {
     },
     /// It speaks another protocol version.
     #[error(
-        "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
+        "the device on {} speaks protocol version {theirs} and this program version {VERSION} (and 1 with a driven body of \
+         short samples); update the older of the two",
         path.display()
     )]
     Version {
@@ -93,13 +96,28 @@ pub enum DeviceError {
         /// The device's version.
         theirs: u8,
     },
+    /// What it would have to say is too much for a message.
+    #[error(
+        "`{role}` reads {read} and writes {written} bytes in {samples} samples per tick, and a message holds {MAX_CONTENT} \
+         bytes in {MAX_SAMPLES} samples, whose names take {MAX_NAMES} bytes; no device can have this seat: drive fewer bodies"
+    )]
+    TooLong {
+        /// The role.
+        role: String,
+        /// Bytes of the samples that it reads.
+        read: usize,
+        /// The same of those that it writes.
+        written: usize,
+        /// The number of samples in the longer message.
+        samples: usize,
+    },
     /// It refuses to take part.
-    #[error("the device on {} refuses to be `{body}`: {reason}", path.display())]
+    #[error("the device on {} refuses to be `{role}`: {reason}", path.display())]
     Refused {
         /// The line.
         path: PathBuf,
-        /// The body.
-        body: String,
+        /// The role.
+        role: String,
         /// Its reason, and what to do.
         reason: String,
     },
@@ -114,28 +132,12 @@ struct Greeting {
     last_tick: u64,
     timeout_ticks: u64,
     manual_rearm: bool,
-    body: String,
-    command: &'static str,
-    measurement: &'static str,
-    truth: &'static str,
+    role: String,
+    reads: String,
+    writes: String,
 }
 
 impl Greeting {
-    fn new<R: Rig>(_rig: &R, scenario: &Scenario, body: &str, run: u64) -> Self {
-        Self {
-            run,
-            realtime: scenario.clock == ClockKind::Realtime,
-            period_ns: scenario.period_ns,
-            last_tick: scenario.last_tick,
-            timeout_ticks: scenario.command_timeout_ticks,
-            manual_rearm: scenario.rearm == Rearm::Manual,
-            body: body.to_owned(),
-            command: Command::<R>::TYPE_NAME,
-            measurement: Measurement::<R>::TYPE_NAME,
-            truth: Truth::<R>::TYPE_NAME,
-        }
-    }
-
     fn hello(&self) -> Hello<'_> {
         Hello {
             run: self.run,
@@ -144,11 +146,50 @@ impl Greeting {
             last_tick: self.last_tick,
             timeout_ticks: self.timeout_ticks,
             manual_rearm: self.manual_rearm,
-            body: &self.body,
-            command: self.command,
-            measurement: self.measurement,
-            truth: self.truth,
+            role: &self.role,
+            reads: &self.reads,
+            writes: &self.writes,
         }
+    }
+}
+
+/// The samples that pass over the line: type names, and bytes after the stamp.
+struct Layouts {
+    reads: Vec<(&'static str, usize)>,
+    writes: Vec<(&'static str, usize)>,
+}
+
+impl Layouts {
+    /// Those of a role, or of observer and controller together, which keep the estimate to themselves.
+    fn of(scenario: &Scenario, roles: &[RoleId]) -> Self {
+        let mut layouts = Self { reads: Vec::new(), writes: Vec::new() };
+        for role in roles {
+            let ports = ports(scenario, *role);
+            let kept = usize::from(roles.len() > 1 && *role == RoleId::Controller);
+            let layout = |port: &super::node::Port| (port.type_name, port.size - size_of::<Stamp>());
+            layouts.reads.extend(ports.reads.iter().skip(kept).map(layout));
+            layouts.writes.extend(ports.writes.iter().map(layout));
+        }
+        layouts
+    }
+
+    fn lengths(of: &[(&'static str, usize)]) -> Vec<usize> {
+        of.iter().map(|(_, length)| *length).collect()
+    }
+
+    fn names(of: &[(&'static str, usize)]) -> String {
+        of.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(" ")
+    }
+
+    /// Refuses what no message could hold.
+    fn check(&self, role: &str) -> Result<(), DeviceError> {
+        let [read, written]: [usize; 2] = [&self.reads, &self.writes].map(|of| Self::lengths(of).iter().sum());
+        let samples = self.reads.len().max(self.writes.len());
+        let names = Self::names(&self.reads).len().max(Self::names(&self.writes).len());
+        if read.max(written) > MAX_CONTENT || samples > MAX_SAMPLES || names > MAX_NAMES {
+            return Err(DeviceError::TooLong { role: role.to_owned(), read, written, samples });
+        }
+        Ok(())
     }
 }
 
@@ -157,40 +198,62 @@ pub struct DeviceLink {
     line: Line,
     host: Host,
     greeting: Greeting,
+    /// Bytes of each sample that the device reads, in order.
+    inputs: Vec<usize>,
     patience_ns: u64,
     reopen_ns: u64,
 }
 
 impl DeviceLink {
-    /// Opens the line to a device that is to be a body of a scenario; `run` tells this run from others.
+    /// Opens the line to a device that is to have these roles of a scenario; `run` tells this run from others.
     ///
     /// # Errors
-    /// [`DeviceError::Line`], [`DeviceError::TooSlow`] and [`DeviceError::Delayed`].
-    pub fn open(seat: &DeviceSeat, scenario: &Scenario, run: u64) -> Result<Self, DeviceError> {
-        scenario.rig.face().device(seat, scenario, run)
-    }
-
-    pub(crate) fn of_rig<R: Rig>(
-        rig: &R,
-        seat: &DeviceSeat,
-        scenario: &Scenario,
-        run: u64,
-    ) -> Result<Self, DeviceError> {
-        let (command, measurement) = (content_length::<Command<R>>(), content_length::<Measurement<R>>());
-        if scenario.actuation_delay_ticks > 1 {
+    /// [`DeviceError::Line`], [`DeviceError::Delayed`], [`DeviceError::TooLong`] and [`DeviceError::TooSlow`].
+    pub fn open(seat: &DeviceSeat, scenario: &Scenario, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
+        let body = matches!(roles, [RoleId::Plant(_)]);
+        if body && scenario.actuation_delay_ticks > 1 {
             return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
         }
-        check_speed(seat.baud, scenario, command + measurement)?;
-        let greeting = Greeting::new(rig, scenario, &seat.body, run);
+        let layouts = Layouts::of(scenario, roles);
+        let role = roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(" ");
+        layouts.check(&role)?;
+        let (inputs, written) = (Layouts::lengths(&layouts.reads), Layouts::lengths(&layouts.writes));
+        check_speed(seat.baud, scenario, inputs.iter().chain(&written).sum())?;
+        let realtime = scenario.clock == ClockKind::Realtime;
+        let mut outputs = [0; MAX_SAMPLES];
+        outputs.iter_mut().zip(&written).for_each(|(output, length)| *output = *length as u16);
         let terms = Terms {
             run,
-            period_ns: greeting.realtime.then_some(scenario.period_ns),
-            measurement_length: measurement,
-            truth_length: content_length::<Truth<R>>(),
+            period_ns: realtime.then_some(scenario.period_ns),
+            outputs,
+            // A measurement, or an estimate. A controller may withhold any command.
+            required: u32::from(roles != [RoleId::Controller]),
+            version_1: body && fits_version_1(&inputs, &written),
+        };
+        let greeting = Greeting {
+            run,
+            realtime,
+            period_ns: scenario.period_ns,
+            last_tick: scenario.last_tick,
+            timeout_ticks: scenario.command_timeout_ticks,
+            manual_rearm: scenario.rearm == Rearm::Manual,
+            role,
+            reads: Layouts::names(&layouts.reads),
+            writes: Layouts::names(&layouts.writes),
         };
         let patience_ns = (seat.patience_s * 1e9) as u64;
         let line = Line::open(&seat.path, seat.baud)?;
-        Ok(Self { line, host: Host::new(terms), greeting, patience_ns, reopen_ns: 0 })
+        Ok(Self { line, host: Host::new(terms), greeting, inputs, patience_ns, reopen_ns: 0 })
+    }
+
+    /// Bytes of each sample that the device reads, in order.
+    pub(super) fn inputs(&self) -> &[usize] {
+        &self.inputs
+    }
+
+    /// Bytes of each sample that the device writes, in order.
+    pub(super) fn outputs(&self) -> Vec<usize> {
+        self.host.terms().outputs.iter().map(|length| usize::from(*length)).take_while(|length| *length > 0).collect()
     }
 
     /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first.
@@ -216,8 +279,8 @@ impl DeviceLink {
 
     /// Asks for a tick from now on.
     #[inline]
-    pub fn request(&mut self, tick: u64, command: Option<&[u8]>, now_ns: u64) {
-        self.host.request(tick, command, now_ns);
+    pub fn request(&mut self, tick: u64, samples: Samples<'_>, now_ns: u64) {
+        self.host.request(tick, samples, now_ns);
     }
 
     /// Asks no more for the tick at hand.
@@ -335,15 +398,15 @@ fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError
     let detail = printable(refuse.detail);
     let reason = match refuse.reason {
         Reason::Samples => format!(
-            "it knows samples of type `{detail}`, and this run has `{}`, `{}` and `{}`; give it the program for this rig \
-             and version",
-            greeting.command, greeting.measurement, greeting.truth
+            "it knows samples of type `{detail}`, and here it would read `{}` and write `{}`; give it the program for this \
+             rig and version, or name another role with --role",
+            greeting.reads, greeting.writes
         ),
-        Reason::Version | Reason::Body | Reason::NotGreeted => {
-            format!("{detail}; give it the program for this body, or name another one with --body")
+        Reason::Version | Reason::Role | Reason::NotGreeted => {
+            format!("{detail}; give it the program for this role, or name another one with --role")
         }
     };
-    DeviceError::Refused { path: line.path().to_owned(), body: greeting.body.clone(), reason }
+    DeviceError::Refused { path: line.path().to_owned(), role: greeting.role.clone(), reason }
 }
 
 /// Whether a tick and its answer have room in the period.
@@ -359,20 +422,28 @@ fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result
     Ok(())
 }
 
-/// The seat's body, if a device can be it.
-fn driven(scenario: &Scenario, name: &str) -> Result<usize, RoleError> {
+/// The seat's roles, in the order of a tick, if a device can have them: one that travels in samples of fixed size, or observer
+/// and controller together.
+fn roles(scenario: &Scenario, names: &[String]) -> Result<Vec<RoleId>, RoleError> {
+    let mut roles = names.iter().map(|name| find_role(scenario, name)).collect::<Result<Vec<_>, _>>()?;
+    roles.sort_by_key(|role| *role == RoleId::Controller);
     let bodies = scenario.rig.bodies();
-    match find_role(scenario, name)? {
-        RoleId::Plant(index) if bodies[index].driven && bodies[index].fleet.is_none() => Ok(index),
-        _ => {
-            let single = bodies.iter().filter(|body| body.driven && body.fleet.is_none());
-            let driven = single.map(|body| &*body.name).collect::<Vec<_>>();
-            Err(RoleError::NotDriven { role: name.to_owned(), driven: driven.join(", ") })
-        }
+    let single = |index: usize| bodies[index].fleet.is_none();
+    let fits = match roles[..] {
+        [RoleId::Plant(index)] => bodies[index].driven && single(index),
+        [RoleId::Observer] => true,
+        [RoleId::Controller] | [RoleId::Observer, RoleId::Controller] => (0..bodies.len()).all(single),
+        _ => false,
+    };
+    if fits {
+        return Ok(roles);
     }
+    let driven = bodies.iter().filter(|body| body.driven && body.fleet.is_none()).map(|body| &*body.name);
+    let driven = driven.collect::<Vec<_>>().join(", ");
+    Err(RoleError::NoDevice { roles: names.join(","), driven })
 }
 
-/// Puts a device into the seat of a driven body and serves it to the end of the run. `welcomed` is told the device's name.
+/// Puts a device into a role's seat and serves it to the end of the run. `welcomed` is told the device's name.
 /// Gives the line's counters, if a run was served.
 ///
 /// # Errors
@@ -383,13 +454,17 @@ pub fn run_bridge(
     welcomed: impl FnOnce(&str),
 ) -> Result<Option<LineCounters>, RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
-    let index = driven(&scenario, &seat.body)?;
+    let roles = roles(&scenario, &seat.roles)?;
+    roles.iter().try_for_each(|role| require_process(&scenario, *role))?;
     // A bridge that is started again in the same run finds a device that knows it.
     let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
-    let mut link = DeviceLink::open(seat, &scenario, run)?;
+    let mut link = DeviceLink::open(seat, &scenario, &roles, run)?;
     let Some(name) = link.greet(terminated)? else { return Ok(None) };
     welcomed(&name);
-    let (mut counters, occupant) = (None, RoleImpl::Device(index, Box::new(link)));
-    in_domain(&domain, &scenario, occupant, terminated, |report| counters = report.line)?;
+    let (last, others) = roles.split_last().expect("a seat has a role");
+    let others = others.iter().map(|other| Ok((*other, take_ledger(&domain, &scenario, *other)?)));
+    let others = others.collect::<Result<_, RoleError>>()?;
+    let (mut counters, occupant) = (None, RoleImpl::Device(*last, others, Box::new(link)));
+    in_domain(&domain, &scenario, occupant, terminated, |report| counters = counters.or(report.line))?;
     Ok(counters)
 }

@@ -14,6 +14,7 @@ mod node;
 mod privileges;
 mod process;
 mod seat;
+mod share;
 
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use compute::{Compute, ComputedTick};

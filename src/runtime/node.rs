@@ -19,6 +19,7 @@ use super::compute::Computing;
 use super::disturb::{Disturbance, Interruptions, LateSamples};
 use super::hooks::{self, Failpoint};
 use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
+use super::share::{Computer, Share};
 use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::{Clock, Grid};
@@ -34,6 +35,8 @@ use crate::telemetry::{
 use plant::PlantNode;
 use std::path::Path;
 
+/// Between two looks at a device's line, ns.
+const LOOK_NS: u64 = 50_000;
 /// An upper bound on the state of a role, bytes, but for samples and what is remembered of them.
 const RECORD_BYTES: usize = 8 << 10;
 /// So many times the size of what a role reads and writes is remembered at the most: samples made, bodies, guards.
@@ -472,13 +475,25 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
         Seat { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
     };
     match occupant {
-        RoleImpl::Device(index, link) => {
+        RoleImpl::Device(RoleId::Plant(index), _, link) => {
             let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
             return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
         }
+        RoleImpl::Device(role, others, link) if others.is_empty() => {
+            let computer = Computer::Device(Share::all(link));
+            return role_node(rig, &seat(&(role, ledger.reopened())), Some(computer));
+        }
+        RoleImpl::Device(_, _, link) => {
+            let shares = roles.iter().zip(Share::both(link));
+            let open = |(of, share): (&(RoleId, Ledger), _)| {
+                Ok((of.0, role_node(rig, &seat(of), Some(Computer::Device(share)))?))
+            };
+            let nodes = shares.map(open).collect::<Result<_, BusError>>()?;
+            return Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)));
+        }
         RoleImpl::Computed(role, compute) => {
             let computing = Computing::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
-            return role_node(rig, &seat(&(role, ledger.reopened())), Some(computing));
+            return role_node(rig, &seat(&(role, ledger.reopened())), Some(Computer::Function(computing)));
         }
         RoleImpl::Role(..) => {}
     }
@@ -494,18 +509,25 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
 fn role_node<R: Rig, B: Bus + 'static>(
     rig: &R,
     seat: &Seat<'_, B>,
-    computing: Option<Computing>,
+    computer: Option<Computer>,
 ) -> Result<ReadyNode, BusError> {
     Ok(match seat.role {
         RoleId::Plant(index) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {
-                None => Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat, computing)?),
+                None => {
+                    // A device in its place has a node of its own.
+                    let function = match computer {
+                        Some(Computer::Function(function)) => Some(function),
+                        Some(Computer::Device(_)) | None => None,
+                    };
+                    Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat, function)?)
+                }
                 Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, seat, None)?),
             }
         }
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat, computing)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat, computing)?),
+        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat, computer)?),
+        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat, computer)?),
     })
 }
 

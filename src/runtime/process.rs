@@ -79,11 +79,14 @@ pub enum RoleError {
         /// The scenario of its run.
         scenario: PathBuf,
     },
-    /// The role is no body that a device could be.
-    #[error("a device can be a driven body only, no fleet, and `{role}` is none; this scenario has: {driven}")]
-    NotDriven {
+    /// No device could have this role.
+    #[error(
+        "a device can be one driven body (here: {driven}), the observer, the controller, or observer,controller, and none \
+         that serves a fleet; `{roles}` is none of these"
+    )]
+    NoDevice {
         /// As given.
-        role: String,
+        roles: String,
         /// The driven bodies that are no fleets.
         driven: String,
     },
@@ -254,7 +257,7 @@ pub(crate) fn open_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) ->
 }
 
 /// The same, to be written by this process alone.
-fn take_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
+pub(super) fn take_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
 

@@ -7,7 +7,7 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
 /// The longest payload, bytes.
-pub const MAX_PAYLOAD: usize = 508;
+pub const MAX_PAYLOAD: usize = 1020;
 /// The longest frame on the line, delimiters included, bytes.
 pub const MAX_FRAME: usize = MAX_BLOCK + 2;
 /// CRC-32 as in zlib, Ethernet and PNG: reflected polynomial 0x04C11DB7, begun with and inverted by 0xFFFFFFFF.
@@ -19,7 +19,7 @@ const MAX_CHECKED: usize = MAX_PAYLOAD + CRC_BYTES;
 const MAX_BLOCK: usize = cobs::max_encoding_length(MAX_CHECKED);
 const DELIMITER: u8 = 0;
 
-const _: () = assert!(MAX_CHECKED == 512 && MAX_FRAME == 517);
+const _: () = assert!(MAX_CHECKED == 1024 && MAX_FRAME == 1031);
 
 /// The payload is longer than [`MAX_PAYLOAD`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -219,7 +219,7 @@ mod tests {
 
         /// Garbage takes no frame with it, wherever it ends: every frame brings its own delimiters.
         #[test]
-        fn every_frame_between_garbage_is_found(parts in prop::collection::vec((prop::collection::vec(any::<u8>(), 0..700), payload()), 1..8)) {
+        fn every_frame_between_garbage_is_found(parts in prop::collection::vec((prop::collection::vec(any::<u8>(), 0..1200), payload()), 1..8)) {
             let bytes: Vec<u8> = parts.iter().flat_map(|(garbage, payload)| [garbage.clone(), frame(payload)].concat()).collect();
             let (found, _) = decode(&bytes);
             let sent: Vec<&Vec<u8>> = parts.iter().map(|(_, payload)| payload).collect();

@@ -4,7 +4,11 @@
 //! do I/O, nor look at a clock: both are handed in.
 
 use super::frame::{Decoder, MAX_FRAME, MAX_PAYLOAD, encode};
-use super::message::{Answer, Hello, MAX_CONTENT, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, write};
+use super::message::{
+    Answer, Hello, MAX_CONTENT, MAX_SAMPLES, Message, ParseError, Reason, Refuse, Samples, Tick, VERSION, Welcome,
+    parse, write,
+};
+use super::v1;
 use serde::{Deserialize, Serialize};
 
 /// Between two greetings, ns.
@@ -79,24 +83,36 @@ pub struct Terms {
     pub run: u64,
     /// The period where ticks follow the clock, ns.
     pub period_ns: Option<u64>,
-    /// Bytes of a measurement's content.
-    pub measurement_length: usize,
-    /// Bytes of a truth's content.
-    pub truth_length: usize,
+    /// Bytes of each sample in an answer, in order; 0 beyond the last.
+    pub outputs: [u16; MAX_SAMPLES],
+    /// Bit i: sample i is in every answer.
+    pub required: u32,
+    /// Whether a device of version 1 will do: for a body whose samples it could take.
+    pub version_1: bool,
+}
+
+impl Terms {
+    /// Whether an answer has what was agreed upon.
+    fn hold(&self, samples: &Samples<'_>) -> bool {
+        let lengths = self.outputs.iter().enumerate().filter(|(index, _)| samples.present >> index & 1 == 1);
+        let (total, whole) =
+            lengths.fold((0, true), |(total, whole), (_, length)| (total + usize::from(*length), whole && *length > 0));
+        whole && total == samples.bytes.len() && samples.present & self.required == self.required
+    }
 }
 
 /// The request at hand.
 struct Request {
     tick: u64,
-    command: [u8; MAX_CONTENT],
-    /// Bytes of the command, if there is one.
-    length: Option<usize>,
+    present: u32,
+    inputs: [u8; MAX_CONTENT],
+    length: usize,
     /// When it is to be sent (again), ns, and how often it was.
     due_ns: u64,
     sent: u32,
-    /// When and in which frame it was sent last, ns.
-    sent_ns: u64,
-    sequence: u32,
+    /// When and in which frame it was sent first and last, ns.
+    first: (u64, u32),
+    last: (u64, u32),
 }
 
 /// The host of one device in one run.
@@ -104,6 +120,10 @@ pub struct Host {
     terms: Terms,
     decoder: Decoder,
     frame: [u8; MAX_FRAME],
+    /// Where the samples of an answer in version 1 are put together.
+    room: [u8; MAX_CONTENT],
+    /// The version that is spoken.
+    version: u8,
     sequence: u32,
     /// The device's highest sequence number.
     heard: Option<u32>,
@@ -127,6 +147,8 @@ impl Host {
             terms,
             decoder: Decoder::default(),
             frame: [0; MAX_FRAME],
+            room: [0; MAX_CONTENT],
+            version: VERSION,
             sequence: 0,
             heard: None,
             greeted: false,
@@ -145,14 +167,13 @@ impl Host {
         self.greeted
     }
 
-    /// Asks for a tick from now on, with the content of its command, which is at most [`MAX_CONTENT`] bytes.
-    pub fn request(&mut self, tick: u64, command: Option<&[u8]>, now_ns: u64) {
-        let mut kept = [0; MAX_CONTENT];
-        let length = command.and_then(|content| {
-            kept.get_mut(..content.len())?.copy_from_slice(content);
-            Some(content.len())
-        });
-        let request = Request { tick, command: kept, length, due_ns: now_ns, sent: 0, sent_ns: now_ns, sequence: 0 };
+    /// Asks for a tick from now on, with its samples, which take at most [`MAX_CONTENT`] bytes.
+    pub fn request(&mut self, tick: u64, samples: Samples<'_>, now_ns: u64) {
+        let (mut inputs, length) = ([0; MAX_CONTENT], samples.bytes.len().min(MAX_CONTENT));
+        inputs[..length].copy_from_slice(&samples.bytes[..length]);
+        let present = samples.present;
+        let sending = (now_ns, 0);
+        let request = Request { tick, present, inputs, length, due_ns: now_ns, sent: 0, first: sending, last: sending };
         self.request = Some(request);
     }
 
@@ -179,13 +200,16 @@ impl Host {
         let request = self.request.as_mut().filter(|request| now_ns >= request.due_ns)?;
         // Twice as long after each time: a line that is too slow for what is asked of it must not be asked more.
         request.due_ns = now_ns + (repeat_ns << request.sent.min(8)).min(LONGEST_REPEAT_NS.max(repeat_ns));
-        (request.sent_ns, request.sequence) = (now_ns, sequence);
+        request.last = (now_ns, sequence);
+        if request.sent == 0 {
+            request.first = request.last;
+        }
         request.sent += 1;
         self.counters.repeats += u64::from(request.sent > 1);
         self.silent += 1;
         self.silent_since_ns.get_or_insert(now_ns);
-        let (tick, command, length) = (request.tick, request.command, request.length);
-        Some(self.say(Message::Tick(Tick { tick, command: length.map(|length| &command[..length]) })))
+        let (tick, present, inputs, length) = (request.tick, request.present, request.inputs, request.length);
+        Some(self.say(Message::Tick(Tick { tick, inputs: Samples { present, bytes: &inputs[..length] } })))
     }
 
     /// The frame that ends the run for the device.
@@ -195,10 +219,18 @@ impl Host {
 
     /// Takes a byte that has arrived, and tells what it completes.
     pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<Heard<'_>> {
-        let Self { terms, decoder, heard, counters, .. } = self;
-        let (sequence, message) = match parse(decoder.push(byte)?) {
+        let Self { terms, decoder, heard, counters, version, room, .. } = self;
+        let payload = decoder.push(byte)?;
+        let parsed = if *version == VERSION { parse(payload) } else { v1::parse(payload, room) };
+        let (sequence, message) = match parsed {
             Ok(said) => said,
-            Err(ParseError::Version(version)) => return Some(Heard::OtherVersion(version)),
+            Err(ParseError::Version(theirs)) if terms.version_1 && matches!(theirs, v1::VERSION | VERSION) => {
+                // What it says in its own version is said again once it was greeted in that.
+                (*version, *heard) = (theirs, None);
+                (self.greeted, self.silent, self.greet_due_ns) = (false, 0, now_ns);
+                return None;
+            }
+            Err(ParseError::Version(theirs)) => return Some(Heard::OtherVersion(theirs)),
             Err(ParseError::Malformed) => {
                 counters.malformed += 1;
                 return None;
@@ -235,9 +267,7 @@ impl Host {
             Message::Refuse(refusal) => return Some(Heard::Refused(refusal)),
             Message::Answer(answer) => {
                 note(heard, counters, sequence);
-                let lengths = (answer.measurement.len(), answer.truth.len());
-                if lengths != (terms.measurement_length, terms.truth_length) && lengths != (terms.measurement_length, 0)
-                {
+                if !terms.hold(&answer.outputs) {
                     counters.malformed += 1;
                     return None;
                 }
@@ -246,8 +276,10 @@ impl Host {
                 match self.request.take_if(|request| request.tick == answer.tick) {
                     Some(request) => {
                         self.answered = Some(answer.tick);
-                        if request.sequence == answer.echo {
-                            smooth(&mut self.round_trip_ns, now_ns.saturating_sub(request.sent_ns));
+                        // Of a slow device the answer to the first request comes after the second was sent.
+                        let sent = [request.last, request.first].into_iter().find(|(_, frame)| *frame == answer.echo);
+                        if let Some((sent_ns, _)) = sent {
+                            smooth(&mut self.round_trip_ns, now_ns.saturating_sub(sent_ns));
                         }
                         return Some(Heard::Answer(answer));
                     }
@@ -290,6 +322,16 @@ impl Host {
         self.silent_since_ns = None;
     }
 
+    /// What was agreed upon.
+    pub fn terms(&self) -> &Terms {
+        &self.terms
+    }
+
+    /// The version of the protocol that is spoken.
+    pub fn version(&self) -> u8 {
+        self.version
+    }
+
     /// The counters.
     pub fn counters(&self) -> LineCounters {
         let frames = self.decoder.counters();
@@ -317,7 +359,8 @@ impl Host {
 
     fn say(&mut self, message: Message<'_>) -> &[u8] {
         let mut payload = [0; MAX_PAYLOAD];
-        let frame = write(self.sequence, message, &mut payload)
+        let written = if self.version == VERSION { write } else { v1::write };
+        let frame = written(self.sequence, message, &mut payload)
             .and_then(|payload| encode(payload, &mut self.frame))
             .expect("every message whose texts and contents are within their limits fits into a frame");
         self.sequence = self.sequence.wrapping_add(1);

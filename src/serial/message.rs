@@ -7,11 +7,15 @@ use crate::role::CommandEvent;
 use serde::{Deserialize, Serialize};
 
 /// The version of this protocol: the first byte of every payload, in all versions.
-pub const VERSION: u8 = 1;
-/// The most bytes of a sample after its stamp: 30 fields. Two of them fit into one [`Answer`].
-pub const MAX_CONTENT: usize = 240;
+pub const VERSION: u8 = 2;
+/// The most bytes of samples in a [`Tick`] or an [`Answer`]: 120 fields.
+pub const MAX_CONTENT: usize = 960;
+/// The most samples in either.
+pub const MAX_SAMPLES: usize = 32;
 /// The longest name or reason in a message, bytes.
 pub const MAX_TEXT: usize = 64;
+/// The longest list of type names in a message, bytes.
+pub const MAX_NAMES: usize = 448;
 
 /// What is said on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -25,7 +29,7 @@ pub enum Message<'a> {
     Refuse(Refuse<'a>),
     /// Host: a tick is due.
     Tick(Tick<'a>),
-    /// Device: what it measured at that tick.
+    /// Device: what it makes of that tick.
     Answer(Answer<'a>),
     /// Host: go to the safe command now.
     Stop,
@@ -42,18 +46,16 @@ pub struct Hello<'a> {
     pub period_ns: u64,
     /// The last tick of the run; the first is 0.
     pub last_tick: u64,
-    /// After so many ticks in a row without a command the device goes to its safe command. At least 1.
+    /// After so many ticks in a row without a command a body goes to its safe command. At least 1.
     pub timeout_ticks: u64,
     /// Whether the safe command is for good (until another run), or ends with the next command.
     pub manual_rearm: bool,
-    /// The body whose seat the device takes.
-    pub body: &'a str,
-    /// The versioned type name of the samples in [`Tick::command`].
-    pub command: &'a str,
-    /// That of [`Answer::measurement`].
-    pub measurement: &'a str,
-    /// That of [`Answer::truth`].
-    pub truth: &'a str,
+    /// The seat that the device takes: a body's name, `observer`, `controller`, or `observer controller` for both.
+    pub role: &'a str,
+    /// The versioned type names of the samples in [`Tick::inputs`], in order, with a blank between two.
+    pub reads: &'a str,
+    /// Those of [`Answer::outputs`].
+    pub writes: &'a str,
 }
 
 /// A device that takes part.
@@ -74,8 +76,8 @@ pub enum Reason {
     Version,
     /// The samples are of other types.
     Samples,
-    /// The device is another body, or not fit for it.
-    Body,
+    /// The device has another role, or is not fit for it.
+    Role,
     /// It was not greeted since it began: greet it.
     NotGreeted,
 }
@@ -89,14 +91,24 @@ pub struct Refuse<'a> {
     pub detail: &'a str,
 }
 
+/// Some of the samples that were agreed upon, each as the bytes after its stamp.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Samples<'a> {
+    /// Bit i: sample i is there.
+    pub present: u32,
+    /// Those that are there, one after another.
+    pub bytes: &'a [u8],
+}
+
 /// A tick that is due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tick<'a> {
     /// The tick k.
     pub tick: u64,
-    /// The content of the command computed from measurement k − 1, if it came in time; acts from k on.
+    /// What is known in time and believed: for a body the command computed from measurement k − 1, which acts from k on; for
+    /// the others the samples of tick k.
     #[serde(borrow)]
-    pub command: Option<&'a [u8]>,
+    pub inputs: Samples<'a>,
 }
 
 /// The answer to a tick.
@@ -106,12 +118,11 @@ pub struct Answer<'a> {
     pub echo: u32,
     /// Its tick.
     pub tick: u64,
-    /// What became of the command.
+    /// What became of a body's command; of all others that none was due.
     pub event: CommandEvent,
-    /// The content of the measurement: the state at this tick, under the command that now acts.
-    pub measurement: &'a [u8],
-    /// The content of the truth; empty where a device knows no more than its sensors do.
-    pub truth: &'a [u8],
+    /// What the device says of this tick: of a body the state at k under the command that now acts.
+    #[serde(borrow)]
+    pub outputs: Samples<'a>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -180,16 +191,16 @@ mod tests {
 
     #[test]
     fn a_tick_lies_in_its_payload_as_documented() {
-        let tick = Tick { tick: 300, command: Some(&[9, 8, 7]) };
+        let tick = Tick { tick: 300, inputs: Samples { present: 0b10, bytes: &[9, 8, 7] } };
         let sequence = [0x81, 0x84, 0x8c, 0x20];
-        let expected = [&[VERSION][..], &sequence, &[3], &[0xac, 0x02], &[1, 3, 9, 8, 7]].concat();
+        let expected = [&[VERSION][..], &sequence, &[3], &[0xac, 0x02], &[2, 3, 9, 8, 7]].concat();
         assert_eq!(written(Message::Tick(tick)), expected);
-        let without = Message::Tick(Tick { tick: 0, command: None });
-        assert_eq!(written(without), [&[VERSION][..], &sequence, &[3, 0, 0]].concat());
+        let without = Message::Tick(Tick { tick: 0, inputs: Samples::default() });
+        assert_eq!(written(without), [&[VERSION][..], &sequence, &[3, 0, 0, 0]].concat());
         assert_eq!(written(Message::Stop), [&[VERSION][..], &sequence, &[5]].concat());
         let event = CommandEvent::Safe;
-        let answer = Answer { echo: 1, tick: 2, event, measurement: &[4; 8], truth: &[] };
-        let expected = [&[VERSION][..], &sequence, &[4, 1, 2, 5, 8], &[4; 8], &[0]].concat();
+        let answer = Answer { echo: 1, tick: 2, event, outputs: Samples { present: 1, bytes: &[4; 8] } };
+        let expected = [&[VERSION][..], &sequence, &[4, 1, 2, 5, 1, 8], &[4; 8]].concat();
         assert_eq!(written(Message::Answer(answer)), expected);
     }
 
@@ -197,7 +208,8 @@ mod tests {
     #[test]
     fn what_is_written_is_read_back() {
         let most = u64::MAX;
-        let content = [255; MAX_CONTENT];
+        let samples = Samples { present: u32::MAX, bytes: &[255; MAX_CONTENT] };
+        let names = &LONG.repeat(MAX_NAMES / MAX_TEXT);
         let hello = Hello {
             run: most,
             realtime: true,
@@ -205,23 +217,16 @@ mod tests {
             last_tick: most,
             timeout_ticks: most,
             manual_rearm: true,
-            body: LONG,
-            command: LONG,
-            measurement: LONG,
-            truth: LONG,
+            role: LONG,
+            reads: names,
+            writes: names,
         };
         for message in [
             Message::Hello(hello),
             Message::Welcome(Welcome { run: most, next_tick: most, device: LONG }),
             Message::Refuse(Refuse { reason: Reason::NotGreeted, detail: LONG }),
-            Message::Tick(Tick { tick: most, command: Some(&content) }),
-            Message::Answer(Answer {
-                echo: u32::MAX,
-                tick: most,
-                event: CommandEvent::Safe,
-                measurement: &content,
-                truth: &content,
-            }),
+            Message::Tick(Tick { tick: most, inputs: samples }),
+            Message::Answer(Answer { echo: u32::MAX, tick: most, event: CommandEvent::Safe, outputs: samples }),
             Message::Stop,
         ] {
             let mut payload = [0; MAX_PAYLOAD];
@@ -236,8 +241,8 @@ mod tests {
     #[test]
     fn another_version_is_told_from_nonsense() {
         let mut stop = written(Message::Stop);
-        stop[0] = 2;
-        assert_eq!(parse(&stop), Err(ParseError::Version(2)));
+        stop[0] = 9;
+        assert_eq!(parse(&stop), Err(ParseError::Version(9)));
         assert_eq!(parse(&[]), Err(ParseError::Malformed));
         assert_eq!(parse(&[VERSION, 0, 77]), Err(ParseError::Malformed));
         let trailing = [written(Message::Stop), vec![0]].concat();

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
-use crate::sample::{RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
+use crate::sample::{Message as _, RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
 use proptest::prelude::*;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
@@ -41,6 +41,10 @@ impl Body for Spinner {
     }
 }
 
+const WRITES: &str = "corotate/rigid-body/measurement/v1 corotate/rigid-body/truth/v1";
+const MEASUREMENT: usize = content_length::<RateMeasurement>();
+const TRUTH: usize = content_length::<RateTruth>();
+
 fn spinner() -> Spinner {
     Spinner { rate: 1.0, applied: 0.0 }
 }
@@ -53,10 +57,9 @@ fn hello(run: u64, realtime: bool) -> Hello<'static> {
         last_tick: 1000,
         timeout_ticks: TIMEOUT_TICKS,
         manual_rearm: false,
-        body: "follower",
-        command: RateCommand::TYPE_NAME,
-        measurement: RateMeasurement::TYPE_NAME,
-        truth: RateTruth::TYPE_NAME,
+        role: "follower",
+        reads: RateCommand::TYPE_NAME,
+        writes: WRITES,
     }
 }
 
@@ -64,10 +67,56 @@ fn command(value: f64) -> RateCommand {
     RateCommand { acceleration_rad_s2: [value, 0.0, 0.0], ..RateCommand::default() }
 }
 
-type Make = fn(&Hello<'_>) -> Option<Spinner>;
+type Make = fn(&Hello<'_>) -> Option<BodySeat<Spinner>>;
+type Spinning = Device<BodySeat<Spinner>, Make>;
 
-fn device() -> Device<Spinner, Make> {
-    Device::new("spinner 1", |_| Some(spinner()))
+fn device() -> Spinning {
+    Device::new("spinner 1", |hello| Some(BodySeat::new(spinner(), hello)))
+}
+
+/// A device of version 1, as far as a line without faults asks for it.
+#[derive(Default)]
+struct Older {
+    decoder: Decoder,
+    plant: Option<Plant<Spinner>>,
+}
+
+impl Older {
+    fn receive(&mut self, bytes: &[u8], mut send: impl FnMut(&[u8])) {
+        let Self { decoder, plant } = self;
+        let mut say = |said: v1::Said<'_>| {
+            let mut payload = [0; MAX_PAYLOAD];
+            let envelope = v1::Envelope { version: v1::VERSION, sequence: 0, said };
+            send(encode(postcard::to_slice(&envelope, &mut payload).unwrap(), &mut [0; MAX_FRAME]).unwrap());
+        };
+        decoder.feed(bytes, |payload| match postcard::from_bytes::<v1::Envelope<'_>>(payload) {
+            _ if payload[0] != v1::VERSION => {
+                say(v1::Said::Refuse(Refuse { reason: Reason::Version, detail: "another version" }));
+            }
+            Ok(v1::Envelope { said: v1::Said::Hello(hello), .. }) => {
+                assert_eq!((hello.body, hello.command), ("follower", RateCommand::TYPE_NAME));
+                assert_eq!((hello.measurement, hello.truth), (RateMeasurement::TYPE_NAME, RateTruth::TYPE_NAME));
+                let actuation =
+                    Actuation { driven: true, delay_ticks: 1, timeout_ticks: hello.timeout_ticks, rearm: Rearm::Auto };
+                plant.get_or_insert_with(|| Plant::new(spinner(), actuation, hello.period_ns as f64 / 1e9));
+                say(v1::Said::Welcome(Welcome { run: hello.run, next_tick: 0, device: "spinner 0" }));
+            }
+            Ok(v1::Envelope { said: v1::Said::Tick { tick, command }, sequence, .. }) => {
+                let plant = plant.as_mut().unwrap();
+                let mut taken = RateCommand::default();
+                taken.stamp.tick = tick.saturating_sub(1);
+                let there = command.is_some_and(|content| taken.set_content(content));
+                let event = plant.command(tick, there.then_some(&taken));
+                let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
+                plant.measure(&Stamp::default(), &mut measurement);
+                plant.truth(&Stamp::default(), &mut truth);
+                plant.advance(1);
+                let (measurement, truth) = (measurement.content(), truth.content());
+                say(v1::Said::Answer { echo: sequence, tick, event, measurement, truth });
+            }
+            other => panic!("{:?}", other.map(|envelope| envelope.sequence)),
+        });
+    }
 }
 
 /// What befalls the bytes of a line, per byte.
@@ -83,7 +132,9 @@ const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0 };
 /// Both ends, the line between them, and a clock that somebody else moves.
 struct Rig {
     host: Host,
-    device: Device<Spinner, Make>,
+    device: Spinning,
+    /// In the place of the device.
+    older: Option<Older>,
     hello: Hello<'static>,
     faults: Faults,
     random: Pcg64,
@@ -105,11 +156,12 @@ impl Rig {
         let terms = Terms {
             run: hello.run,
             period_ns: hello.realtime.then_some(PERIOD_NS),
-            measurement_length: content_length::<RateMeasurement>(),
-            truth_length: content_length::<RateTruth>(),
+            outputs: std::array::from_fn(|index| [MEASUREMENT, TRUTH].get(index).map_or(0, |length| *length as u16)),
+            required: 1,
+            version_1: true,
         };
         let random = Pcg64::seed_from_u64(seed);
-        Self { host: Host::new(terms), device: device(), hello, faults, random, now_ns: 1, cut: false }
+        Self { host: Host::new(terms), device: device(), older: None, hello, faults, random, now_ns: 1, cut: false }
     }
 
     fn damage(&mut self, bytes: &[u8]) -> Vec<u8> {
@@ -138,7 +190,10 @@ impl Rig {
             up.extend_from_slice(frame);
         }
         let (up, mut down) = (self.damage(&up), Vec::new());
-        self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame));
+        match &mut self.older {
+            Some(older) => older.receive(&up, |frame| down.extend_from_slice(frame)),
+            None => self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame)),
+        }
         self.device.elapse(self.now_ns);
         let down = self.damage(&down);
         self.hear(&down)
@@ -154,7 +209,8 @@ impl Rig {
                 Heard::OtherVersion(version) => Event::OtherVersion(version),
                 Heard::Answer(answer) => {
                     let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
-                    assert!(measurement.set_content(answer.measurement) && truth.set_content(answer.truth));
+                    let (measured, true_one) = answer.outputs.bytes.split_at(MEASUREMENT);
+                    assert!(measurement.set_content(measured) && truth.set_content(true_one));
                     Event::Answer(answer.tick, answer.event, measurement, truth)
                 }
             });
@@ -180,7 +236,8 @@ impl Rig {
     /// Asks for a tick and gives the answer.
     fn ask(&mut self, tick: u64, value: Option<f64>, ns: u64) -> Option<Event> {
         let command = value.map(command);
-        self.host.request(tick, command.as_ref().map(crate::sample::Message::content), self.now_ns);
+        let bytes = command.as_ref().map_or(&[][..], crate::sample::Message::content);
+        self.host.request(tick, Samples { present: u32::from(value.is_some()), bytes }, self.now_ns);
         let end_ns = self.now_ns + ns;
         while self.now_ns < end_ns {
             let events = self.step();
@@ -231,6 +288,23 @@ fn a_device_answers_as_the_built_in_plant_does() {
     );
 }
 
+/// It refuses what it does not speak, and is asked in its own words from there on.
+#[test]
+fn a_device_of_version_1_answers_as_any() {
+    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
+    rig.older = Some(Older::default());
+    for (tick, expected) in (0..).zip(built_in(50)) {
+        assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 1_000_000_000), Some(expected));
+    }
+    assert_eq!((rig.host.version(), rig.host.counters().handshakes, rig.host.counters().repeats), (1, 1, 0));
+    // It is replaced by a new one, which does not speak that any more.
+    rig.older = None;
+    let Some(Event::Answer(50, CommandEvent::Applied, ..)) = rig.ask(50, Some(0.0), 3_600_000_000_000) else {
+        panic!()
+    };
+    assert_eq!((rig.host.version(), rig.host.counters().restarts), (VERSION, 1));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     /// Without a clock every request is repeated until it is answered: no fault of the line is seen in the answers.
@@ -258,6 +332,33 @@ fn a_faulty_line_is_seen_in_the_books() {
         "{counters:?}"
     );
     assert!(counters.sequence_gaps > 10 && counters.frames_sent > 330 && counters.late == 0, "{counters:?}");
+}
+
+/// A device that takes 20 ms is not asked twice for ever, where 5 ms are the least patience.
+#[test]
+fn a_slow_device_is_asked_once_per_tick_after_a_while() {
+    const SLOW_STEPS: usize = 200;
+    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
+    let mut line = std::collections::VecDeque::from(vec![Vec::new(); SLOW_STEPS]);
+    let (mut tick, mut asked) = (0, Vec::new());
+    rig.host.request(0, Samples::default(), rig.now_ns);
+    while tick < 40 {
+        rig.now_ns += STEP_NS;
+        let mut up = Vec::new();
+        while let Some(frame) = rig.host.due(rig.now_ns, &rig.hello) {
+            up.extend_from_slice(frame);
+        }
+        let mut down = Vec::new();
+        rig.device.receive(&up, rig.now_ns, |frame| down.extend_from_slice(frame));
+        line.push_back(down);
+        let down = line.pop_front().unwrap();
+        if rig.hear(&down).iter().any(|event| matches!(event, Event::Answer(..))) {
+            asked.push(rig.host.counters().repeats);
+            tick += 1;
+            rig.host.request(tick, Samples::default(), rig.now_ns);
+        }
+    }
+    assert!(asked[9] > 5 && asked[39] == asked[29], "{asked:?}");
 }
 
 #[test]
@@ -381,16 +482,21 @@ fn another_run_begins_at_the_initial_state() {
 
 #[test]
 fn who_does_not_fit_is_refused_by_name() {
-    let mut other = hello(1, true);
-    other.command = "corotate/rigid-body/command/v0";
-    let mut rig = Rig::new(other, CLEAN, 1);
-    let refused = Event::Refused(Reason::Samples, RateCommand::TYPE_NAME.to_owned());
-    assert_eq!(rig.until(PERIOD_NS), Some(refused));
+    let measurement = RateMeasurement::TYPE_NAME;
+    for (reads, writes, own) in [
+        ("corotate/rigid-body/command/v0", WRITES, RateCommand::TYPE_NAME),
+        ("corotate/rigid-body/command/v2 more", WRITES, "fewer samples"),
+        (RateCommand::TYPE_NAME, measurement, RateTruth::TYPE_NAME),
+        ("", "", RateCommand::TYPE_NAME),
+    ] {
+        let mut rig = Rig::new(Hello { reads, writes, ..hello(1, true) }, CLEAN, 1);
+        assert_eq!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Samples, own.to_owned())));
+    }
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.device = Device::new("none", |_| None);
-    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Body, _))));
+    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Role, _))));
     let mut rig = Rig::new(Hello { timeout_ticks: 0, ..hello(1, true) }, CLEAN, 1);
-    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Body, _))));
+    assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Role, _))));
 }
 
 /// The bytes of a Stop in the words of another version.
@@ -411,14 +517,14 @@ fn another_version_is_refused_by_both_ends() {
 fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
-    rig.host.request(0, None, rig.now_ns);
+    rig.host.request(0, Samples::default(), rig.now_ns);
     let asked = rig.host.due(rig.now_ns, &rig.hello).unwrap().to_vec();
     let mut answer = Vec::new();
     rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
     rig.host.give_up();
     assert!(rig.hear(&answer).is_empty());
     rig.ask(1, Some(1.0), PERIOD_NS).unwrap();
-    rig.host.request(2, None, rig.now_ns);
+    rig.host.request(2, Samples::default(), rig.now_ns);
     let asked = rig.host.due(rig.now_ns, &rig.hello).unwrap().to_vec();
     let mut answer = Vec::new();
     rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
@@ -430,8 +536,8 @@ fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
 
 /// A frame of the device with this sequence number, which is no answer to anything that is asked.
 fn frame_of(sequence: u32) -> Vec<u8> {
-    let measurement = [0; content_length::<RateMeasurement>()];
-    let answer = Answer { echo: 0, tick: 1000, event: CommandEvent::Held, measurement: &measurement, truth: &[] };
+    let outputs = Samples { present: 1, bytes: &[0; MEASUREMENT] };
+    let answer = Answer { echo: 0, tick: 1000, event: CommandEvent::Held, outputs };
     let mut payload = [0; MAX_PAYLOAD];
     let payload = write(sequence, Message::Answer(answer), &mut payload).unwrap();
     encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec()
@@ -497,38 +603,48 @@ proptest! {
 fn an_answer_of_another_length_is_none() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
-    rig.host.request(0, None, rig.now_ns);
+    rig.host.request(0, Samples::default(), rig.now_ns);
     let mut payload = [0; MAX_PAYLOAD];
-    let (good, bad) = ([0; content_length::<RateMeasurement>()], [0; 8]);
-    for (measurement, truth, expected) in [(&bad[..], &bad[..], 0), (&good, &bad, 0), (&good, &[], 1)] {
-        let answer = Answer { echo: 0, tick: 0, event: CommandEvent::NotDue, measurement, truth };
+    let zeros = [0; MEASUREMENT + TRUTH];
+    let cases = [
+        (0b11, 16, 0),
+        (0b11, MEASUREMENT, 0),
+        (0b10, TRUTH, 0),
+        (0b101, MEASUREMENT, 0),
+        (0, 0, 0),
+        (0b01, MEASUREMENT, 1),
+    ];
+    for (present, length, expected) in cases {
+        let outputs = Samples { present, bytes: &zeros[..length] };
+        let answer = Answer { echo: 0, tick: 0, event: CommandEvent::NotDue, outputs };
         let payload = write(0, Message::Answer(answer), &mut payload).unwrap();
         let frame = encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec();
         let mut heard = 0;
         frame.iter().for_each(|byte| heard += usize::from(rig.host.push(*byte, rig.now_ns).is_some()));
         assert_eq!(heard, expected);
     }
-    assert_eq!(rig.host.counters().malformed, 2);
+    assert_eq!(rig.host.counters().malformed, 5);
 }
 
 #[test]
 fn a_real_device_tells_no_truth() {
-    let mut device = device().without_truth();
+    let seat = |hello: &Hello<'_>| Some(BodySeat::new(spinner(), hello).without_truth());
+    let mut device = Device::new("real", seat);
     let mut payload = [0; MAX_PAYLOAD];
     let mut lengths = Vec::new();
     for (sequence, message) in
-        [(0, Message::Hello(hello(1, true))), (1, Message::Tick(Tick { tick: 3, command: None }))]
+        [(0, Message::Hello(hello(1, true))), (1, Message::Tick(Tick { tick: 3, inputs: Samples::default() }))]
     {
         let payload = write(sequence, message, &mut payload).unwrap();
         device.receive(encode(payload, &mut [0; MAX_FRAME]).unwrap(), 0, |frame| {
             decode(frame, |message| {
                 if let Ok((_, Message::Answer(answer))) = message {
-                    lengths.push((answer.tick, answer.measurement.len(), answer.truth.len()));
+                    lengths.push((answer.tick, answer.outputs.present, answer.outputs.bytes.len()));
                 }
             });
         });
     }
-    assert_eq!(lengths, [(3, content_length::<RateMeasurement>(), 0)]);
+    assert_eq!(lengths, [(3, 1, MEASUREMENT)]);
 }
 
 proptest! {

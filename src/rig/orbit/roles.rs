@@ -2,10 +2,10 @@
 //!
 //! Must not compute what `model`, `observe` and `control` compute.
 
-use crate::control::OrbitHold;
+use crate::control::{InFlight, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use crate::rig::{FilterDesign, InFlight};
+use crate::rig::FilterDesign;
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use crate::state::persist_fields;

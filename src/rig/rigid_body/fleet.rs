@@ -5,9 +5,9 @@
 
 use super::RigidBodyRig;
 use super::limits::Motion;
-use crate::control::FleetLaw;
+use crate::control::{FleetLaw, InFlight};
 use crate::model::{RigidBody, flow_all, uniform};
-use crate::rig::{Fleet, InFlight};
+use crate::rig::Fleet;
 use crate::role::{Body, Bounds, Guard, Law, Pursuit};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
@@ -83,7 +83,7 @@ impl RateFleet {
             initial,
             law: FleetLaw::new(law, acceleration_max_rad_s2),
             learned: controller.learned,
-            delay_ticks: if controller.predict { rig.actuation_delay_ticks } else { 1 },
+            delay_ticks: rig.predicted_ticks(&controller),
             bounds: rig.limits.bounds(&rig.sensed(index), rig.tick_s),
             motion: rig.sensed(index).motion(rig.tick_s),
             acceleration_max_rad_s2,

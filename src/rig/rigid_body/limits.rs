@@ -3,9 +3,9 @@
 //! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
 
 use super::MAX_TURN_RAD;
-use super::observer::ALL;
 use crate::config::Checks;
 use crate::model::RigidBody;
+use crate::rate::ALL;
 use crate::rig::{Figure, SURE_DEVIATIONS};
 use crate::role::{Bounds, Guard, Plausible, Pursuit};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};

@@ -5,35 +5,29 @@
 
 mod config;
 mod fleet;
-mod identifier;
-mod law;
-mod learner;
 mod limits;
-mod observer;
 mod plant;
 mod playback;
 mod resolve;
 
+pub use crate::rate::{HiddenObserver, KalmanObserver, Learner, RateLaw, RateObserver};
 pub use fleet::RateFleet;
-pub use law::RateLaw;
-pub use learner::Learner;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
-pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
 pub use plant::RatePlant;
 
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, InFlight, Inputs, Lyapunov,
-    Monitor, Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, Inputs, Lyapunov, Monitor,
+    Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
 };
 use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer};
+use crate::control::{Certificate, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
 use crate::observe::{HiddenRate, RateNoise};
+use crate::rate::{ALL, Parts, RateLawDesign};
 use crate::sample::{FleetTruth, RateCommand, RateEstimate, RateTruth, status};
 use fleet::farthest;
 use limits::{Limits, Sensed};
 use nalgebra::{Vector1, Vector3};
-use observer::ALL;
 use plant::Outage;
 use playback::Playback;
 use std::sync::Arc;
@@ -77,7 +71,7 @@ pub struct RigidBodyRig {
 #[derive(Debug, Clone)]
 enum ObserverDesign {
     Hidden { relation: HiddenRate, filter: FilterDesign<1>, guess_rad_s: f64 },
-    Learner(learner::Parts),
+    Learner(Parts),
 }
 
 /// The controller's parameters.
@@ -188,9 +182,9 @@ impl RigidBodyRig {
         if controller.predict { 0 } else { self.actuation_delay_ticks }
     }
 
-    /// What a law that predicts has on its way.
-    fn in_flight<U>(&self, controller: &ControllerDesign, blank: impl Fn() -> U) -> InFlight<U> {
-        InFlight::new(if controller.predict { self.actuation_delay_ticks } else { 1 }, blank)
+    /// Over how many ticks the law predicts, if it does.
+    fn predicted_ticks(&self, controller: &ControllerDesign) -> u64 {
+        if controller.predict { self.actuation_delay_ticks } else { 1 }
     }
 
     fn certify(&self) -> Option<Certificate> {
@@ -343,16 +337,16 @@ impl Rig for RigidBodyRig {
 
     fn law(&self, _index: usize) -> RateLaw {
         let (law, controller) = self.synchronizer();
-        RateLaw {
+        RateLaw::new(&RateLawDesign {
             law,
-            adaptation: InertiaAdaptation::new(controller.adaptation_gain),
+            adaptation_gain: controller.adaptation_gain,
             certificate: self.certificate,
-            supplied: Vector3::ith(self.supplied(), 1.0),
+            supplied: self.supplied(),
             learned: controller.learned,
             acceleration_max_rad_s2: self.limits.acceleration_rad_s2,
-            in_flight: self.in_flight(&controller, || [0.0; 3]),
             tick_s: self.tick_s,
-        }
+            predicted_ticks: self.predicted_ticks(&controller),
+        })
     }
 
     /// A law acts on all components; an observer says itself which it needs.

@@ -3,14 +3,14 @@
 //! Must name the key and the remedy of everything it refuses, all at once.
 
 use super::config::{self, Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
-use super::identifier::Identifier;
 use super::limits::{Circumstances, Limits};
 use super::plant::Outage;
 use super::playback::{self, Playback};
-use super::{ControllerDesign, ObserverDesign, RigidBodyRig, learner};
+use super::{ControllerDesign, ObserverDesign, RigidBodyRig};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
+use crate::rate::{Identifier, Parts};
 use crate::rig::{BodyInfo, Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::{Matrix3, Vector1, Vector3};
 use std::sync::Arc;
@@ -228,7 +228,7 @@ fn design_observer(
                 return None;
             };
             let identifier = design_identifier(&raw.leader, observer, inertia, notes, checks)?;
-            Some(ObserverDesign::Learner(learner::Parts { identifier, decay_rate_per_s, floor_rad_s }))
+            Some(ObserverDesign::Learner(Parts { identifier, decay_rate_per_s, floor_rad_s }))
         }
     }
 }

@@ -3,7 +3,8 @@
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
 use super::{
-    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
+    restore,
 };
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
@@ -13,12 +14,9 @@ use crate::runtime::bridge::DeviceLink;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
-use crate::serial::{Answer, LineCounters, MAX_CONTENT};
+use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
-
-/// Between two looks at the line, ns.
-const LOOK_NS: u64 = 50_000;
 
 /// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -53,9 +51,10 @@ impl<R: Rig> Reply<R> {
     /// The lengths are those agreed upon: the host's end drops other answers.
     fn take(&mut self, answer: &Answer<'_>) {
         self.event = answer.event;
-        self.measurement.set_content(answer.measurement);
+        let (measurement, truth) = answer.outputs.bytes.split_at(content_length::<Measurement<R>>());
+        self.measurement.set_content(measurement);
         // What a device does not know, its sensors say.
-        if !self.truth.set_content(answer.truth) {
+        if !self.truth.set_content(truth) {
             copy_fields(&self.measurement, &mut self.truth);
         }
     }
@@ -63,11 +62,6 @@ impl<R: Rig> Reply<R> {
 
 impl<R: Rig, B: Bus> BridgeNode<R, B> {
     pub fn open(rig: &R, index: usize, link: Box<DeviceLink>, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        const {
-            assert!(content_length::<Command<R>>() <= MAX_CONTENT);
-            assert!(content_length::<Measurement<R>>() <= MAX_CONTENT);
-            assert!(content_length::<Truth<R>>() <= MAX_CONTENT);
-        }
         let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
         let measurement = seat.output(body, Signal::Measurement)?;
         let truth = seat.output(body, Signal::Truth)?;
@@ -117,7 +111,8 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         let found = tick > 0 && self.command.seek(tick - 1)? == Seek::Found;
         let command = self.command.sample().filter(|_| found);
         self.command_origin_ns = command.map(|command| command.stamp().origin_ns);
-        self.link.request(tick, command.map(Message::content), now_ns);
+        let samples = command.map_or(Samples::default(), |command| Samples { present: 1, bytes: command.content() });
+        self.link.request(tick, samples, now_ns);
         (self.asked, self.asked_ns) = (true, now_ns);
         Ok(())
     }

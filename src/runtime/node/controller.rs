@@ -2,17 +2,19 @@
 
 use super::ports::driven;
 use super::{
-    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
+    restore,
 };
 use crate::bus::{Bus, BusError, Carried, Signal};
-use crate::clock::{Clock, Grid};
+use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::role::{Controller, Guard, Law};
-use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
+use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
@@ -89,10 +91,10 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         silent: bool,
         (clock, began_ns): (Clock, u64),
         starved: &mut bool,
-        computed: Option<(&Computing, usize)>,
+        computed: Option<(&Computer, usize)>,
     ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
-        self.ready &= !silent;
+        self.ready &= !silent && computed.is_none_or(|(computing, index)| computing.has(index));
         let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
             self.command.stage_void(estimate.stamp().tick);
             return Ok(began_ns);
@@ -159,7 +161,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     interruptions: Interruptions,
     ledger: Ledger,
     /// What computes the commands in the place of the laws, if that is somebody else.
-    computing: Option<Computing>,
+    computing: Option<Computer>,
     /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
     look: usize,
     /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
@@ -172,7 +174,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computing>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computer>) -> Result<Self, BusError> {
         let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
         // In the order of the counters: everything written, then everything read; fleets last.
         let written = |(_, body)| seat.output(body, Signal::Command);
@@ -219,7 +221,9 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, NodeError> {
         if self.estimate.seek(self.counters.next())? == Seek::NotYet {
-            if self.clock == Clock::Monotonic {
+            if let Some(tick) = self.computing.as_ref().and_then(Computer::lacks) {
+                self.offer(tick, overdue)?;
+            } else if self.clock == Clock::Monotonic {
                 // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
                 // rule.
                 self.look_ahead()?;
@@ -238,6 +242,19 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             complete &= fleet.gather(tick)?;
         }
         Ok(complete || overdue)
+    }
+
+    /// Gives a device that makes the estimate too the measurements of a tick, once it is known of all of them what has become of
+    /// them.
+    fn offer(&mut self, tick: u64, overdue: bool) -> Result<(), NodeError> {
+        let mut complete = true;
+        for channel in &mut self.channels {
+            complete &= channel.gather(tick)?;
+        }
+        if let Some(computing) = self.computing.as_mut().filter(|_| complete || overdue) {
+            computing.offer(std::iter::once(None).chain(self.channels.iter().map(Channel::words)));
+        }
+        Ok(())
     }
 
     /// Takes what has come for one channel, each time for another.
@@ -328,24 +345,31 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn execute(&mut self) -> Result<Poll, NodeError> {
         self.received_ns = self.clock.now_ns();
-        if let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick)
-            && self.interruptions.misses(tick)
-        {
-            return self.miss(tick);
+        let Some(stamp) = self.estimate.sample().map(|estimate| *estimate.stamp()) else { return Ok(Poll::Waiting) };
+        if self.interruptions.misses(stamp.tick) {
+            return self.miss(stamp.tick);
+        }
+        if let Some(computing) = &mut self.computing {
+            let singles = self.channels.iter().map(Channel::words);
+            let fleets = self.fleets.iter().map(Channel::words);
+            let estimate = std::iter::once(self.estimate.sample().map(Message::words));
+            match computing.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
+                Computed::Done => self.received_ns = computing.asked_ns(stamp.tick).unwrap_or(self.received_ns),
+                Computed::Waiting => return Ok(Poll::Waiting),
+                Computed::Missed => {
+                    self.skip_to(stamp.tick + 1);
+                    return Ok(Poll::Missed);
+                }
+            }
+            if computing.restarted() {
+                self.counters.disturbed(stamp.tick);
+            }
         }
         if self.watchdog.active() {
             self.watch();
         }
         let Some(estimate) = self.estimate.sample() else { return Ok(Poll::Waiting) };
-        let stamp = *estimate.stamp();
         let silent = self.watchdog.latched_at().is_some();
-        if let Some(computing) = &mut self.computing {
-            let singles = self.channels.iter().map(|channel| channel.words());
-            let fleets = self.fleets.iter().map(|fleet| fleet.words());
-            let inputs: Vec<Option<&[u64]>> =
-                [Some(estimate.words())].into_iter().chain(singles).chain(fleets).collect();
-            computing.tick(stamp.tick, &inputs)?;
-        }
         let clock = self.clock;
         let mut began_ns = self.received_ns;
         let mut starved = false;
@@ -393,6 +417,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(AcceptedTicks::Due(grid));
+            self.computing.iter_mut().for_each(|computing| computing.start(grid));
             self.channels.iter_mut().for_each(|channel| channel.measurement.expect(AcceptedTicks::Due(grid)));
             self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(AcceptedTicks::Due(grid)));
         }
@@ -428,7 +453,10 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let tick = self.counters.next();
-        if self.lacks_estimate() {
+        if self.computing.as_ref().is_some_and(Computer::pending) {
+            // What it waits for comes over a line.
+            sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
+        } else if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;
         } else if let Some(late) = self.channels.iter_mut().find(|channel| channel.late(tick).is_some()) {
             late.measurement.sleep(until_ns)?;
@@ -486,7 +514,14 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn stages(&self) -> Vec<StageReport> {
-        StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+        let mut stages = StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)]);
+        let line = self.computing.as_ref().and_then(Computer::line);
+        stages.extend(line.into_iter().flat_map(|(_, serial)| StageReport::all(&[("serial", &serial)])));
+        stages
+    }
+
+    fn line(&self) -> Option<LineCounters> {
+        self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
     }
 }
 

@@ -1,16 +1,18 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
 use super::{
-    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
+    restore,
 };
 use crate::bus::{Bus, BusError, Signal};
-use crate::clock::{Clock, Grid};
+use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
-use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
+use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 
@@ -33,7 +35,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     interruptions: Interruptions,
     ledger: Ledger,
     /// What computes the estimate in the place of the observer, if that is somebody else.
-    computing: Option<Computing>,
+    computing: Option<Computer>,
     instants: Instants,
     hop: Latency,
     step: Latency,
@@ -41,7 +43,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computing>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computer>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0];
         let estimate = seat.output(leader, Signal::Estimate)?;
         Ok(Self {
@@ -62,14 +64,24 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
 
     #[inline]
     fn execute(&mut self) -> Result<Poll, NodeError> {
-        let received = self.clock.now_ns();
+        let mut received = self.clock.now_ns();
         let (measurement, rejected) = (self.measurement.sample(), self.measurement.rejected());
         let Some(stamp) = measurement.map(Message::stamp).or(rejected).copied() else { return self.pass_over() };
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
         }
         if let Some(computing) = &mut self.computing {
-            computing.tick(stamp.tick, &[measurement.map(Message::words)])?;
+            match computing.tick(stamp.tick, [measurement.map(Message::words)].into_iter())? {
+                Computed::Done => received = computing.asked_ns(stamp.tick).unwrap_or(received),
+                Computed::Waiting => return Ok(Poll::Waiting),
+                Computed::Missed => {
+                    self.skip_to(stamp.tick + 1);
+                    return Ok(Poll::Missed);
+                }
+            }
+            if computing.restarted() {
+                self.counters.disturbed(stamp.tick);
+            }
         }
         let (observer, computing, clock) = (&mut self.observer, &self.computing, self.clock);
         let mut done = 0;
@@ -140,6 +152,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.measurement.expect(AcceptedTicks::Due(grid));
+            self.computing.iter_mut().for_each(|computing| computing.start(grid));
         }
         self.estimate.dispatch()?;
         self.estimate.finish()?;
@@ -169,7 +182,12 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
-        self.measurement.sleep(until_ns)?;
+        if self.computing.as_ref().is_some_and(Computer::pending) {
+            // What it waits for comes over a line.
+            sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
+        } else {
+            self.measurement.sleep(until_ns)?;
+        }
         Ok(true)
     }
 
@@ -213,7 +231,14 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn stages(&self) -> Vec<StageReport> {
-        StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)])
+        let mut stages = StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)]);
+        let line = self.computing.as_ref().and_then(Computer::line);
+        stages.extend(line.into_iter().flat_map(|(_, serial)| StageReport::all(&[("serial", &serial)])));
+        stages
+    }
+
+    fn line(&self) -> Option<LineCounters> {
+        self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
     }
 }
 

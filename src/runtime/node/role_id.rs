@@ -72,24 +72,23 @@ pub enum RoleImpl {
     Role(RoleId, Vec<(RoleId, Ledger)>),
     /// This program's node, whose samples a function computes.
     Computed(RoleId, Box<dyn Compute>),
-    /// A device, as the driven body with this index.
-    Device(usize, Box<DeviceLink>),
+    /// A device: a role, with others in the same device, as above.
+    Device(RoleId, Vec<(RoleId, Ledger)>, Box<DeviceLink>),
 }
 
 impl RoleImpl {
     /// The seat.
     pub fn role(&self) -> RoleId {
         match self {
-            Self::Role(role, _) | Self::Computed(role, _) => *role,
-            Self::Device(index, _) => RoleId::Plant(*index),
+            Self::Role(role, _) | Self::Computed(role, _) | Self::Device(role, ..) => *role,
         }
     }
 
     /// Its roles with their ledgers, in the order of a tick; `ledger` is that of the seat.
     pub(in crate::runtime) fn books(&self, ledger: &Ledger) -> Vec<(RoleId, Ledger)> {
         let others = match self {
-            Self::Role(_, others) => &others[..],
-            Self::Computed(..) | Self::Device(..) => &[],
+            Self::Role(_, others) | Self::Device(_, others, _) => &others[..],
+            Self::Computed(..) => &[],
         };
         let others = others.iter().map(|(role, ledger)| (*role, ledger.reopened()));
         others.chain([(self.role(), ledger.reopened())]).collect()

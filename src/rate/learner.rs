@@ -7,6 +7,7 @@
 use super::identifier::Identifier;
 use super::observer::{ALL, HiddenObserver, Knowledge, filter, seen};
 use crate::observe::{HiddenRate, RateSample};
+use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
 use nalgebra::Vector3;
@@ -23,7 +24,7 @@ const SUPPLIER_WORDS: usize = 11;
 
 /// What a [`Learner`] is made of.
 #[derive(Debug, Clone)]
-pub(super) struct Parts {
+pub struct Parts {
     /// The identifier at its initial guess.
     pub identifier: Identifier,
     /// Decay rate of a supplied component, 1/s.
@@ -55,7 +56,8 @@ struct Supplier {
 }
 
 impl Learner {
-    pub(super) fn new(parts: Parts) -> Self {
+    /// One that has learned nothing yet.
+    pub fn new(parts: Parts) -> Self {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
             identifier: parts.identifier.clone(),
@@ -67,12 +69,12 @@ impl Learner {
         }
     }
 
-    pub(super) fn start(&mut self, measurement: &RateMeasurement) {
+    pub(crate) fn start(&mut self, measurement: &RateMeasurement) {
         *self = Self::new(self.parts.clone());
         self.last = seen(measurement);
     }
 
-    pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+    pub(crate) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         match (0..3).find(|component| measurement.valid >> component & 1 == 0) {
             None => self.learn(measurement, dt_s),
             Some(lost) => self.supply(lost, measurement, dt_s),
@@ -143,7 +145,7 @@ impl Learner {
         }
     }
 
-    pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
+    pub(crate) fn write(&self, status: u64, out: &mut RateEstimate) {
         let a = self.identifier.coefficients();
         let supplier = self.supplier.as_ref();
         Knowledge::new(a).write(&self.rate(), out);

@@ -1,32 +1,65 @@
 //! The synchronising law of one follower, with its certificate computed live.
 
-use crate::control::{Certificate, InertiaAdaptation, Synchronizer, limited};
-use crate::rig::InFlight;
+use crate::control::{Certificate, InFlight, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use crate::state::persist_fields;
+use core::hint::black_box;
 use nalgebra::Vector3;
-use std::hint::black_box;
+
+/// What a follower's law is made of.
+#[derive(Debug, Clone)]
+pub struct RateLawDesign {
+    /// The law itself.
+    pub law: Synchronizer,
+    /// How fast it learns that the follower has another inertia; 0: not at all.
+    pub adaptation_gain: f64,
+    /// What is proven of it; none where the observer is not the papers' filter: V is published as 0 then.
+    pub certificate: Option<Certificate>,
+    /// The component that the observer supplies, 0 to 2.
+    pub supplied: usize,
+    /// Whether it works with the coefficients that the observer has learned.
+    pub learned: bool,
+    /// No component is asked to be larger, rad/s²: the actuators would refuse it.
+    pub acceleration_max_rad_s2: f64,
+    /// The period h, s.
+    pub tick_s: f64,
+    /// Over how many ticks a law that predicts does so: those between a measurement and the tick from which its command acts.
+    pub predicted_ticks: u64,
+}
 
 /// The synchronising law of one follower.
 #[derive(Debug)]
 pub struct RateLaw {
-    pub(super) law: Synchronizer,
-    pub(super) adaptation: InertiaAdaptation,
-    /// None where the observer is not the papers' filter: V is published as 0 then.
-    pub(super) certificate: Option<Certificate>,
+    law: Synchronizer,
+    adaptation: InertiaAdaptation,
+    certificate: Option<Certificate>,
     /// 1 for the component that the observer supplies, 0 for the others.
-    pub(super) supplied: Vector3<f64>,
-    /// Whether the law works with the coefficients that the observer has learned.
-    pub(super) learned: bool,
-    /// No component is asked to be larger: the actuators would refuse it.
-    pub(super) acceleration_max_rad_s2: f64,
-    pub(super) tick_s: f64,
+    supplied: Vector3<f64>,
+    learned: bool,
+    acceleration_max_rad_s2: f64,
+    tick_s: f64,
     /// What a law that predicts has sent and what does not act yet, rad/s².
-    pub(super) in_flight: InFlight<[f64; 3]>,
+    in_flight: InFlight<[f64; 3]>,
 }
 
 impl RateLaw {
+    /// A law that has learned nothing and sent nothing yet.
+    pub fn new(design: &RateLawDesign) -> Self {
+        let RateLawDesign { adaptation_gain, certificate, supplied, learned, acceleration_max_rad_s2, tick_s, .. } =
+            *design;
+        Self {
+            law: design.law,
+            adaptation: InertiaAdaptation::new(adaptation_gain),
+            certificate,
+            supplied: Vector3::from_fn(|row, _| f64::from(u8::from(row == supplied))),
+            learned,
+            acceleration_max_rad_s2,
+            tick_s,
+            in_flight: InFlight::new(design.predicted_ticks, || [0.0; 3]),
+        }
+    }
+
     /// Reference and follower moved on, tick by tick, under what is on its way.
     #[inline(never)]
     fn further(

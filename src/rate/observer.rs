@@ -1,4 +1,4 @@
-//! The observers of this rig: which components are measured, which one is supplied, and from what.
+//! The observers: which components are measured, which one is supplied, and from what.
 
 use super::learner::Learner;
 use crate::model::RigidBody;
@@ -12,7 +12,7 @@ use crate::state::{Persist, Words};
 use nalgebra::{Vector1, Vector3};
 
 /// All components of a vector.
-pub(super) const ALL: u64 = 0b111;
+pub(crate) const ALL: u64 = 0b111;
 
 /// An observer of this rig.
 #[derive(Debug)]
@@ -32,14 +32,11 @@ impl Estimator for RateObserver {
 
     #[inline]
     fn usable(&self, measurement: &RateMeasurement) -> bool {
-        // 0·x is 0 unless x is not finite; without a branch for every value.
-        let nothing = |values: &[f64; 3]| values[0] * 0.0 + values[1] * 0.0 + values[2] * 0.0;
-        let needed = match self {
-            Self::Hidden(observer) => measurement.valid & observer.needed == observer.needed,
-            Self::Kalman(observer) => measurement.valid & observer.needed() == observer.needed(),
-            Self::Learner(_) => (measurement.valid & ALL).count_ones() >= 2,
-        };
-        needed && nothing(&measurement.omega_rad_s) + nothing(&measurement.applied_rad_s2) == 0.0
+        match self {
+            Self::Hidden(observer) => observer.usable(measurement),
+            Self::Kalman(observer) => finite(measurement) && measurement.valid & observer.needed() == observer.needed(),
+            Self::Learner(_) => finite(measurement) && (measurement.valid & ALL).count_ones() >= 2,
+        }
     }
 
     fn start(&mut self, measurement: &RateMeasurement) {
@@ -86,6 +83,13 @@ impl Estimator for RateObserver {
     }
 }
 
+/// 0·x is 0 unless x is not finite; without a branch for every value.
+#[inline]
+fn finite(measurement: &RateMeasurement) -> bool {
+    let nothing = |values: &[f64; 3]| values[0] * 0.0 + values[1] * 0.0 + values[2] * 0.0;
+    nothing(&measurement.omega_rad_s) + nothing(&measurement.applied_rad_s2) == 0.0
+}
+
 impl Persist for RateObserver {
     fn persist<W: Words>(&mut self, words: &mut W) {
         match self {
@@ -98,7 +102,7 @@ impl Persist for RateObserver {
 
 /// What a measurement tells the relations. Components that are not valid are 0.
 #[inline]
-pub(super) fn seen(measurement: &RateMeasurement) -> RateSample {
+pub(crate) fn seen(measurement: &RateMeasurement) -> RateSample {
     RateSample { rate_rad_s: measurement.omega_rad_s.into(), torque_rad_s2: measurement.applied_rad_s2.into() }
 }
 
@@ -123,7 +127,7 @@ pub struct HiddenObserver {
 
 impl HiddenObserver {
     /// An observer of the component that `relation` tells of a body with the given coefficients, which starts at `guess`.
-    pub(super) fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>) -> Self {
+    pub fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>) -> Self {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
             relation,
@@ -139,17 +143,46 @@ impl HiddenObserver {
         }
     }
 
-    fn start(&mut self, measurement: &RateMeasurement) {
-        self.begin(self.guess, seen(measurement), status::INITIAL);
-    }
-
     /// Begins anew from a known estimate at a known instant.
-    pub(super) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
+    pub(crate) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
         (self.filter, self.innovation, self.status) = (filter, 0.0, status);
         self.keep(&at, self.relation.regressor(&at));
     }
 
-    pub(super) fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
+    fn keep(&mut self, sample: &RateSample, regressor: Regressor) {
+        (self.last, self.rate) = (regressor, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
+    }
+
+    /// What the last step did: bits of [`status`].
+    pub(crate) fn status(&self) -> u64 {
+        self.status
+    }
+
+    /// The hidden component as the last step reconstructs it, less the estimate, rad/s.
+    pub(crate) fn innovation(&self) -> f64 {
+        self.innovation
+    }
+
+    /// The angular velocity with the supplied component in its place, rad/s.
+    pub(crate) fn rate(&self) -> Vector3<f64> {
+        self.rate
+    }
+}
+
+impl Estimator for HiddenObserver {
+    type Measurement = RateMeasurement;
+    type Estimate = RateEstimate;
+
+    #[inline]
+    fn usable(&self, measurement: &RateMeasurement) -> bool {
+        finite(measurement) && measurement.valid & self.needed == self.needed
+    }
+
+    fn start(&mut self, measurement: &RateMeasurement) {
+        self.begin(self.guess, seen(measurement), status::INITIAL);
+    }
+
+    fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let sample = seen(measurement);
         let to = self.relation.regressor(&sample);
         if self.interval.length() != dt_s {
@@ -169,11 +202,7 @@ impl HiddenObserver {
         self.keep(&sample, to);
     }
 
-    fn keep(&mut self, sample: &RateSample, regressor: Regressor) {
-        (self.last, self.rate) = (regressor, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
-    }
-
-    /// [`Estimator::step_usual`]: as long as the last one, with all that is needed in the measurement.
+    /// As long as the last one, with all that is needed in the measurement.
     #[inline(always)]
     fn step_usual(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
         let ([x, y, z], [u, v, w]) = (measurement.omega_rad_s, measurement.applied_rad_s2);
@@ -201,23 +230,8 @@ impl HiddenObserver {
         self.rate = self.body.flow(&self.rate, &self.relation.torque(&self.last), dt_s);
     }
 
-    /// What the last step did: bits of [`status`].
-    pub(super) fn status(&self) -> u64 {
-        self.status
-    }
-
-    /// The hidden component as the last step reconstructs it, less the estimate, rad/s.
-    pub(super) fn innovation(&self) -> f64 {
-        self.innovation
-    }
-
-    /// The angular velocity with the supplied component in its place, rad/s.
-    pub(super) fn rate(&self) -> Vector3<f64> {
-        self.rate
-    }
-
     #[inline(always)]
-    pub(super) fn write(&self, status: u64, out: &mut RateEstimate) {
+    fn write(&self, status: u64, out: &mut RateEstimate) {
         self.body.write(&self.rate, out);
         out.innovation_rad_s = self.innovation;
         out.excitation = 0.0;
@@ -238,7 +252,7 @@ impl Persist for HiddenObserver {
 
 /// What coefficients say of a body. Where they are known it is computed once.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Knowledge {
+pub(crate) struct Knowledge {
     coefficients: Vector3<f64>,
     closure: f64,
     inertia_ratios: [f64; 2],
@@ -269,7 +283,7 @@ impl Knowledge {
 }
 
 /// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
-pub(super) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> Filter<1> {
+pub(crate) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> Filter<1> {
     Filter::First(InvariantFilter::new(Vector1::new(decay_rate_per_s), Vector1::new(estimate_rad_s)))
 }
 
@@ -291,7 +305,7 @@ pub struct KalmanObserver {
 
 impl KalmanObserver {
     /// An observer of component `hidden` (0 to 2) of a body with the given coefficients.
-    pub(super) fn new(
+    pub fn new(
         coefficients: Vector3<f64>,
         noise: RateNoise,
         hidden: usize,

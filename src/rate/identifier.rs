@@ -7,7 +7,7 @@ use nalgebra::{SVector, Vector1, Vector3};
 
 /// An identifier with its estimate.
 #[derive(Debug, Clone)]
-pub(super) struct Identifier {
+pub struct Identifier {
     kind: Kind,
     /// The slowest decay rate of its error, per unit of excitation.
     slowest_decay: f64,

@@ -1,0 +1,69 @@
+//! The board: `mps2-an386` (Cortex-M4F) and `mps2-an500` (Cortex-M7), which QEMU has. Another board goes here, and in `memory.x`.
+//!
+//! Two things are asked of it: bytes on a line, and a time that goes on where no byte arrives.
+
+use core::sync::atomic::{AtomicU32, Ordering};
+use cortex_m::Peripherals;
+use cortex_m::peripheral::syst::SystClkSource;
+use cortex_m_rt::exception;
+
+/// UART0, a CMSDK UART: data, state (bit 0: full, bit 1: a byte has come), control (bit 0: send, bit 1: receive), divisor.
+const UART0: *mut u32 = 0x4000_4000 as *mut u32;
+const DATA: usize = 0;
+const STATE: usize = 1;
+const CONTROL: usize = 2;
+const DIVISOR: usize = 4;
+const CLOCK_HZ: u32 = 25_000_000;
+const BAUD: u32 = 1_000_000;
+
+static MILLISECONDS: AtomicU32 = AtomicU32::new(0);
+
+#[exception]
+fn SysTick() {
+    MILLISECONDS.fetch_add(1, Ordering::Relaxed);
+}
+
+/// The board in use.
+pub struct Board;
+
+impl Board {
+    /// Starts line and time.
+    pub fn start(mut core: Peripherals) -> Self {
+        write(DIVISOR, CLOCK_HZ / BAUD);
+        write(CONTROL, 0b11);
+        core.SYST.set_clock_source(SystClkSource::Core);
+        core.SYST.set_reload(CLOCK_HZ / 1000 - 1);
+        core.SYST.clear_current();
+        core.SYST.enable_counter();
+        core.SYST.enable_interrupt();
+        Self
+    }
+
+    /// The next byte of the line, if one has come.
+    pub fn read(&mut self) -> Option<u8> {
+        (read(STATE) & 0b10 != 0).then(|| read(DATA) as u8)
+    }
+
+    /// Sends bytes, and waits for as long as that takes.
+    pub fn write(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            while read(STATE) & 0b01 != 0 {}
+            write(DATA, u32::from(*byte));
+        }
+    }
+
+    /// Time since the start, ns; it begins anew after 49 days.
+    pub fn now_ns(&self) -> u64 {
+        u64::from(MILLISECONDS.load(Ordering::Relaxed)) * 1_000_000
+    }
+}
+
+fn read(register: usize) -> u32 {
+    // SAFETY: a register of the UART of this board, which nobody else touches.
+    unsafe { UART0.add(register).read_volatile() }
+}
+
+fn write(register: usize, value: u32) {
+    // SAFETY: as above.
+    unsafe { UART0.add(register).write_volatile(value) }
+}
