@@ -25,6 +25,7 @@ const ELSEWHERE: [(&str, &str); 23] = [
     ("corotate run tests/hil/pair.toml --clock lockstep", "it waits for a partner; tests/hil.rs"),
     ("$(tests/hil/venv) tests/hil/follower.py", "tests/hil.rs"),
     ("corotate bridge --serial", "it needs a device; tests/serial.rs"),
+    ("corotate bridge --qemu", "it needs firmware; tests/board"),
     ("socat", "it goes on until it is ended; tests/serial.rs has a line of its own"),
     ("cargo run --release --example serial_device", "it needs a line; tests/serial.rs"),
     ("corotate watch --once", "beside a run, below"),

@@ -1,18 +1,22 @@
 //! The board: `mps2-an386` (Cortex-M4F) and `mps2-an500` (Cortex-M7), which QEMU has. Another board goes here, and in `memory.x`.
 //!
-//! Two things are asked of it: bytes on a line, and a time that goes on where no byte arrives.
+//! Three things are asked of it: bytes on a line, a time that goes on where no byte arrives, and to wait for either.
 
 use core::sync::atomic::{AtomicU32, Ordering};
-use cortex_m::Peripherals;
 use cortex_m::peripheral::syst::SystClkSource;
+use cortex_m::{Peripherals, asm, interrupt};
 use cortex_m_rt::exception;
 
-/// UART0, a CMSDK UART: data, state (bit 0: full, bit 1: a byte has come), control (bit 0: send, bit 1: receive), divisor.
+/// UART0, a CMSDK UART: data, state (bit 0: full, bit 1: a byte has come), control (bits 0 and 1: send, receive; bit 3:
+/// interrupt when a byte comes), interrupts (cleared by ones), divisor.
 const UART0: *mut u32 = 0x4000_4000 as *mut u32;
 const DATA: usize = 0;
 const STATE: usize = 1;
 const CONTROL: usize = 2;
+const INTERRUPTS: usize = 3;
 const DIVISOR: usize = 4;
+/// The number of its interrupt.
+const RECEIVED: u32 = 0;
 const CLOCK_HZ: u32 = 25_000_000;
 const BAUD: u32 = 1_000_000;
 
@@ -23,6 +27,12 @@ fn SysTick() {
     MILLISECONDS.fetch_add(1, Ordering::Relaxed);
 }
 
+/// A byte has come: whoever waits looks.
+#[exception]
+unsafe fn DefaultHandler(_: i16) {
+    write(INTERRUPTS, 0b11);
+}
+
 /// The board in use.
 pub struct Board;
 
@@ -30,7 +40,9 @@ impl Board {
     /// Starts line and time.
     pub fn start(mut core: Peripherals) -> Self {
         write(DIVISOR, CLOCK_HZ / BAUD);
-        write(CONTROL, 0b11);
+        write(CONTROL, 0b1011);
+        // SAFETY: its handler is above, and it shares nothing.
+        unsafe { core.NVIC.iser[0].write(1 << RECEIVED) };
         core.SYST.set_clock_source(SystClkSource::Core);
         core.SYST.set_reload(CLOCK_HZ / 1000 - 1);
         core.SYST.clear_current();
@@ -42,6 +54,17 @@ impl Board {
     /// The next byte of the line, if one has come.
     pub fn read(&mut self) -> Option<u8> {
         (read(STATE) & 0b10 != 0).then(|| read(DATA) as u8)
+    }
+
+    /// Waits for a byte, or for time to go on.
+    pub fn wait(&mut self) {
+        // What comes between the look and the sleep ends the sleep.
+        interrupt::disable();
+        if read(STATE) & 0b10 == 0 {
+            asm::wfi();
+        }
+        // SAFETY: they were on.
+        unsafe { interrupt::enable() };
     }
 
     /// Sends bytes, and waits for as long as that takes.

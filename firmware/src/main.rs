@@ -21,8 +21,9 @@ fn main() -> ! {
     let mut board = Board::start(core);
     let mut device = Device::new(role::NAME, role::seat);
     loop {
+        board.wait();
         let now_ns = board.now_ns();
-        if let Some(byte) = board.read() {
+        while let Some(byte) = board.read() {
             device.receive(&[byte], now_ns, |frame| board.write(frame));
         }
         device.elapse(now_ns);

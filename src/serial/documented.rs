@@ -31,13 +31,10 @@ fn shown() -> Vec<(String, Vec<u8>, Vec<u8>)> {
 
 /// Every message, as the document has it.
 fn messages() -> Vec<(&'static str, Vec<u8>)> {
-    let mut command = RateCommand::default();
-    command.acceleration_rad_s2 = [0.5, -1.0, 0.25];
-    let mut measurement = RateMeasurement { valid: 7, ..RateMeasurement::default() };
-    measurement.omega_rad_s = [1.0, -0.5, 0.0];
-    measurement.applied_rad_s2 = command.acceleration_rad_s2;
-    let mut truth = RateTruth::default();
-    (truth.omega_rad_s, truth.applied_rad_s2) = (measurement.omega_rad_s, measurement.applied_rad_s2);
+    let (omega_rad_s, applied_rad_s2) = ([1.0, -0.5, 0.0], [0.5, -1.0, 0.25]);
+    let command = RateCommand { acceleration_rad_s2: applied_rad_s2, ..RateCommand::default() };
+    let measurement = RateMeasurement { omega_rad_s, applied_rad_s2, valid: 7, ..RateMeasurement::default() };
+    let truth = RateTruth { omega_rad_s, applied_rad_s2, ..RateTruth::default() };
     let whole = [measurement.content(), truth.content()].concat();
     let hello = Hello {
         run: 300,

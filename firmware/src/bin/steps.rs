@@ -1,6 +1,7 @@
-//! How many instructions a step takes, for a machine on which one instruction takes one nanosecond (`-icount shift=0`).
+//! How many instructions a step takes, for a machine on which one instruction takes one nanosecond (`-icount shift=0`), and how
+//! much stack the flight computer.
 //!
-//! Prints a line per step to the UART. The loop is that of `config/rigid-pair.toml`, its bodies simulated here too.
+//! Prints a line per figure to the UART. The loop is that of `config/rigid-pair.toml`, its bodies simulated here too.
 
 #![no_std]
 #![no_main]
@@ -9,9 +10,10 @@ use core::fmt::{self, Write};
 use core::hint::black_box;
 use corotate::model::RigidBody;
 use corotate::role::{Controller, Observer};
-use corotate::sample::{RateCommand, RateEstimate, RateMeasurement};
+use corotate::sample::{Message as _, RateCommand, RateEstimate, RateMeasurement};
+use corotate::serial::{Device, Hello, MAX_FRAME, MAX_PAYLOAD, Message, Samples, Tick, encode, write};
 use corotate_firmware::board::Board;
-use corotate_firmware::{halt, pair};
+use corotate_firmware::{flight, halt, pair};
 use cortex_m::peripheral::SYST;
 use cortex_m_rt::entry;
 use nalgebra::Vector3;
@@ -61,6 +63,71 @@ fn measurement(tick: u64, rate: &Vector3<f64>, applied: &Vector3<f64>, valid: u6
     measurement
 }
 
+const MEASUREMENT: usize = 64;
+/// Of the stack, bytes are marked that the device may reach.
+const MARKED: usize = 64 << 10;
+const MARK: u32 = 0x5ac3_3ca5;
+/// Left alone below the caller's frame.
+const MARGIN: usize = 256;
+
+/// Marks the stack below the caller's frame.
+#[inline(never)]
+fn mark() -> usize {
+    let here = cortex_m::register::msp::read() as usize - MARGIN;
+    for address in (here - MARKED..here).step_by(4) {
+        // SAFETY: below the stack pointer nothing is in use, and no interrupt comes.
+        unsafe { (address as *mut u32).write_volatile(MARK) };
+    }
+    here
+}
+
+/// How many bytes of the stack were used below `top` since it was marked from `here` on.
+fn used(top: usize, here: usize) -> usize {
+    let mut address = here - MARKED;
+    // SAFETY: memory of the stack, which is only read.
+    while address < here && unsafe { (address as *const u32).read_volatile() } == MARK {
+        address += 4;
+    }
+    top - address
+}
+
+fn frame<'a>(message: Message<'_>, room: &'a mut [u8; MAX_FRAME]) -> Option<&'a [u8]> {
+    let mut payload = [0; MAX_PAYLOAD];
+    let payload = write(0, message, &mut payload).ok()?;
+    encode(payload, room).ok()
+}
+
+/// The flight computer behind its line: from the first byte of a request to the last of the answer.
+#[inline(never)]
+fn exchange() -> Option<u32> {
+    let mut device = Device::new(flight::NAME, flight::seat);
+    let (mut room, mut counted, mut measuring) = ([0; MAX_FRAME], Counted::default(), Counted::default());
+    let hello = Hello {
+        run: 1,
+        realtime: false,
+        period_ns: 1_000_000,
+        last_tick: TICKS,
+        timeout_ticks: 20,
+        manual_rearm: false,
+        role: "observer controller",
+        reads: "corotate/rigid-body/measurement/v1 corotate/rigid-body/measurement/v1",
+        writes: "corotate/rigid-body/estimate/v2 corotate/rigid-body/command/v2",
+    };
+    device.receive(frame(Message::Hello(hello), &mut room)?, 0, |_| {});
+    let mut answered = 0;
+    for tick in 0..TICKS {
+        let phase = tick as f64 * TICK_S;
+        let rate = Vector3::new(0.6 + 0.1 * phase, -0.4 + 0.2 * phase, 0.0);
+        let mut bytes = [0; 2 * MEASUREMENT];
+        bytes[..MEASUREMENT].copy_from_slice(measurement(tick, &rate, &Vector3::zeros(), 0b011).content());
+        bytes[MEASUREMENT..].copy_from_slice(measurement(tick, &rate, &Vector3::zeros(), 0b111).content());
+        let asked = frame(Message::Tick(Tick { tick, inputs: Samples { present: 0b11, bytes: &bytes } }), &mut room)?;
+        measuring.time(tick >= FIRST, || ());
+        counted.time(tick >= FIRST, || device.receive(asked, 0, |_| answered += 1));
+    }
+    (answered == TICKS).then(|| counted.mean(&measuring))
+}
+
 fn run(board: &mut Board) -> Option<()> {
     let body = RigidBody::new(&pair::inertia()?);
     let (mut leader, mut follower) = (Vector3::from(pair::LEADER_RATE_RAD_S), Vector3::from(pair::FOLLOWER_RATE_RAD_S));
@@ -98,7 +165,14 @@ fn main() -> ! {
     core.SYST.disable_interrupt();
     core.SYST.set_reload(RELOAD);
     core.SYST.clear_current();
-    let _ = run(&mut board);
+    let top = cortex_m::register::msp::read() as usize;
+    let here = mark();
+    let exchanged = exchange();
+    let stack = used(top, here);
+    if let Some(exchanged) = exchanged {
+        let _ = writeln!(Text(&mut board), "exchange {exchanged}\nstack {stack}");
+        let _ = run(&mut board);
+    }
     board.write(b"end\n");
     halt::halt()
 }
