@@ -12,16 +12,18 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// A command by its first words, and where else it is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 23] = [
+const ELSEWHERE: [(&str, &str); 26] = [
     ("cargo run --release", "tests/run builds it so; `run` without arguments is run here"),
     ("tests/run", "it runs this test"),
     ("cargo install --path . --locked", "tests/run"),
     ("cargo build --release --features", "tests/run builds with them"),
+    ("cargo build --release", "for a board, in firmware/; tests/board"),
     ("cargo bench --bench", "tests/run, short"),
     ("corotate bench", "five minutes; tests/bench.rs, some rows"),
     ("cargo test --release --features hooks --test claims", "tests/claims.rs"),
     ("corotate run config/rigid-pair.toml --external follower", "it waits for a partner; tests/hil.rs"),
     ("corotate run rigid-pair --external follower", "it waits for a partner; tests/hil.rs and tests/serial.rs"),
+    ("corotate run rigid-pair --clock lockstep --external", "it waits for a partner; tests/board"),
     ("corotate run tests/hil/pair.toml --clock lockstep", "it waits for a partner; tests/hil.rs"),
     ("$(tests/hil/venv) tests/hil/follower.py", "tests/hil.rs"),
     ("corotate bridge --serial", "it needs a device; tests/serial.rs"),

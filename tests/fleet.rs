@@ -164,8 +164,11 @@ fn a_fleet_may_be_started_by_hand_and_is_no_device() {
     assert_eq!((&told["writes"][1]["slice"], &told["writes"][1]["size"]), (&true.into(), &(8 * (6 + 6 * 50)).into()));
     assert_eq!((&told["health"]["slice"], &told["reads"][0]["slice"]), (&false.into(), &true.into()));
     let domain = seat.parent().unwrap().to_str().unwrap();
-    let refused = bench.run(&["bridge", "--serial", "/dev/null", "--body", "fleet", "--domain", domain]);
-    assert!(refused.code == Some(2) && refused.stderr.contains("no fleet, and `fleet` is none"), "{refused:?}");
+    let refused = bench.run(&["bridge", "--serial", "/dev/null", "--role", "fleet", "--domain", domain]);
+    assert!(
+        refused.code == Some(2) && refused.stderr.contains("and none that serves a fleet; `fleet` is none"),
+        "{refused:?}"
+    );
     let served = bench.run(&["plant", "--body", "fleet", "--domain", domain]);
     assert_eq!(served.code, Some(0), "{served:?}");
     let done = running.wait();

@@ -353,11 +353,11 @@ fn short(scenario: &str, arguments: &[&str]) -> Scenario {
 fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
     let bench = Bench::new();
     for name in ["rigid-pair", "orbit-rendezvous"] {
-        let arguments = ["--clock", "lockstep", "--duration", "3", "--set", "accept={}"];
+        let arguments = ["--clock", "lockstep", "--duration", "1", "--set", "accept={}"];
         let built_in = bench.summary(name, &arguments);
         for (roles, role) in COMPUTERS {
             let cable = Cable::new(CLEAN);
-            let _device = Powered::of_rig(&cable.device.path, short(name, &["duration_s=3", "accept={}"]), role);
+            let _device = Powered::of_rig(&cable.device.path, short(name, &["duration_s=1", "accept={}"]), role);
             let with_device = run_roles(&bench, name, roles, &cable.host.path, &arguments);
             assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"], "{name}: {role}");
             assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"], "{name}: {role}");
@@ -406,6 +406,43 @@ fn in_real_time_a_flight_computer_synchronises() {
         (&serial["role"], number(&serial["count"])),
         (&Value::from("observer"), number(&roles["observer"]["executed"]))
     );
+}
+
+/// What a flight computer does not answer in time is missed, and the next tick is asked for.
+#[test]
+fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
+    const PAUSE: Duration = Duration::from_millis(300);
+    let bench = Bench::new();
+    let cable = Cable::new(CLEAN);
+    let (path, scenario) =
+        (cable.device.path.clone(), short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]));
+    let _device = Powered::new(move |on| {
+        with_shipped_rig!(scenario.rig, rig => {
+            let seat = |hello: &Hello<'_>| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello));
+            let (mut line, mut device) = (Line::open(&path, None).unwrap(), Device::new("sleepy", seat));
+            let (mut bytes, mut answers) = ([0; 512], 0);
+            while on.load(Ordering::Relaxed) {
+                let count = line.read(&mut bytes);
+                device.receive(&bytes[..count], 0, |frame| {
+                    answers += 1;
+                    if answers == 200 {
+                        std::thread::sleep(PAUSE);
+                    }
+                    line.write(frame);
+                });
+                std::thread::sleep(NAP);
+            }
+        })
+    });
+    let summary = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &REALTIME);
+    let books = &summary["books"]["roles"];
+    println!("{books}; line {}", summary["lines"]["observer"]);
+    assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
+    for role in ["observer", "controller"] {
+        assert!(number(&books[role]["missed"]) >= 28, "{books}");
+        // A machine that withholds the processor misses more; whoever does not go on misses nearly all of 801.
+        assert!(number(&books[role]["executed"]) > 300, "{books}");
+    }
 }
 
 /// The plants have their expiry, whoever is to command them.

@@ -3,7 +3,7 @@
 
 use corotate::config::{SHIPPED, Scenario};
 use corotate::rig::{Rig, RigidBodyRig};
-use corotate::serial::{FlightSeat, Device, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
+use corotate::serial::{Device, FlightSeat, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
 

@@ -358,7 +358,7 @@ fn a_slow_device_is_asked_once_per_tick_after_a_while() {
             rig.host.request(tick, Samples::default(), rig.now_ns);
         }
     }
-    assert!(asked[9] > 5 && asked[39] == asked[29], "{asked:?}");
+    assert!(asked[0] > 0 && asked[39] == asked[9], "{asked:?}");
 }
 
 #[test]

@@ -78,16 +78,21 @@ impl GroupNode {
                 RunCondition::Now { .. } if !timed => RunCondition::Arrived,
                 condition => condition,
             };
+            let mut missed = false;
             while member.node.next_tick() <= tick {
                 // Who catches up executes several ticks here, and a link holds one sample at a time.
                 member.finish_tick()?;
                 match member.node.poll(condition)? {
                     Poll::Executed => member.executed = true,
-                    Poll::Missed => {}
+                    Poll::Missed => missed = true,
                     Poll::Waiting => break,
                 }
             }
             let next = member.node.next_tick();
+            if missed {
+                // What it did not send nobody behind it will have.
+                return self.pass_over(index, next);
+            }
             complete &= next > tick;
             if next > tick + 1 && member.executed && !timed {
                 return self.pass_over(index, next - 1);
@@ -104,8 +109,8 @@ impl GroupNode {
         Ok(Poll::Waiting)
     }
 
-    /// A member has executed a later tick: for those behind it, what they waited for will never come, and the later tick has a
-    /// cutoff of its own.
+    /// A member has executed a later tick, or missed this one: for those behind it, what they waited for will never come, and the
+    /// next tick has a cutoff of its own.
     #[cold]
     fn pass_over(&mut self, index: usize, tick: u64) -> Result<Poll, NodeError> {
         for Member { node, .. } in &mut self.members[index + 1..] {
