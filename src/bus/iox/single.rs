@@ -152,20 +152,25 @@ impl<S: Sample> IoxReader<S> {
         BusError::Receive { service: self.topic.to_string(), reason }
     }
 
-    /// Takes the next sample from the queue, unless the lane has had it.
+    /// Takes the next sample from the queue that the lane has not had.
     fn receive(&mut self) -> Result<bool, BusError> {
-        let received = match self.pending.take() {
-            Some(sample) => sample,
-            None => match self.subscriber.receive() {
-                Ok(Some(sample)) => sample,
-                Ok(None) => return Ok(false),
-                Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
-            },
+        let (received, key) = loop {
+            let received = match self.pending.take() {
+                Some(sample) => sample,
+                None => match self.subscriber.receive() {
+                    Ok(Some(sample)) => sample,
+                    Ok(None) => return Ok(false),
+                    Err(error) => return Err(self.failed(cause::reason(|| format!("{error:?}")))),
+                },
+            };
+            let key = key(&received.payload().0);
+            match &self.lane {
+                Lane::Open(latest) if key <= self::key(latest.sample()) => {}
+                _ => break (received, key),
+            }
         };
-        let key = key(&received.payload().0);
         let (generation, _) = key;
         match &mut self.lane {
-            Lane::Open(latest) if key <= self::key(latest.sample()) => return Ok(false),
             Lane::Open(latest) if generation > latest.generation() => self.lane = Lane::Wanted { generation },
             // Warm-up tells nothing of its writer.
             Lane::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
@@ -237,6 +242,8 @@ impl<S: Sample> Read<S> for IoxReader<S> {
         // Or the first look at the queue, once the lane is open, would connect to its writer in the midst of the loop. What
         // is wrong with it is told by that look.
         let _ = self.subscriber.update_connections();
+        // Whoever looks once per tick would find a new writer of the signal only after so many ticks.
+        self.idle = u32::MAX;
         if let Lane::Wanted { generation } = self.lane {
             match LatestReader::open(&self.node, &self.topic, generation) {
                 Some(latest) => self.lane = Lane::Open(latest),
@@ -289,6 +296,23 @@ mod tests {
                 sleeps += 1;
             }
             assert!(sleeps <= 2, "tick {tick}: {sleeps} sleeps in 2 ms");
+        }
+    }
+
+    /// A reader that looks once per tick, and never sleeps on the signal.
+    #[test]
+    fn a_successor_is_found_at_the_first_look_after_a_refresh() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
+        for generation in 1..4 {
+            let mut writer = bus.writer::<RateCommand>(&fast(), generation).unwrap();
+            send(&mut writer, generation, generation);
+            reader.refresh();
+            assert!(reader.advance().unwrap(), "generation {generation}");
+            reader.refresh();
+            send(&mut writer, 10 * generation, generation);
+            assert!(reader.advance().unwrap() && matches!(reader.current, Current::InLane), "generation {generation}");
         }
     }
 
