@@ -10,7 +10,7 @@ use corotate::runtime::{
     DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, Service, build_rig, depths, private_ledger, serve, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
-use corotate::serial::{BodySeat, Device, Hello};
+use corotate::serial::{BodySeat, Device, FlightSeat, Hello, Seat};
 use corotate::telemetry::RoleReport;
 use corotate::with_shipped_rig;
 use rustix::fd::OwnedFd;
@@ -199,36 +199,46 @@ fn line() -> (OwnedFd, PathBuf) {
     (far, PathBuf::from(name.to_str().unwrap()))
 }
 
-/// A device that is a body of the scenario, until the other end hangs up.
-fn device(scenario: &Scenario, index: usize, far: &OwnedFd) {
-    with_shipped_rig!(scenario.rig, rig => {
-        let (mut device, mut bytes) = (Device::new("test", |hello: &Hello<'_>| Some(BodySeat::new(rig.body(index), hello))), [0; 512]);
-        while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
-            device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));
-        }
+/// A device with these roles of the scenario, until the other end hangs up.
+fn device(scenario: &Scenario, roles: &[RoleId], far: &OwnedFd) {
+    with_shipped_rig!(scenario.rig, rig => match roles {
+        [RoleId::Plant(index)] => live(|hello| Some(BodySeat::new(rig.body(*index), hello)), far),
+        _ => live(|hello| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello)), far),
     })
 }
 
-/// The link to that device, greeted.
-fn linked(scenario: &Scenario, index: usize, path: &Path) -> RoleImpl {
-    let body = scenario.rig.bodies()[index].name.to_string();
-    let roles = vec![body];
-    let seat = DeviceSeat { domain: PathBuf::new(), roles, path: path.to_owned(), baud: None, patience_s: 60.0 };
-    let role = RoleId::Plant(index);
-    let mut link = DeviceLink::open(&seat, scenario, &[role], 1).unwrap();
-    assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
-    RoleImpl::Device(role, Vec::new(), Box::new(link))
+fn live<S: Seat>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
+    let (mut device, mut bytes) = (Device::new("test", seat), [0; 512]);
+    while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
+        device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));
+    }
 }
 
-fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Count)> {
+/// The link to that device, greeted.
+fn linked(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
+    let names = roles.iter().map(|role| role.name(scenario).to_owned()).collect();
+    let seat = DeviceSeat { domain: PathBuf::new(), roles: names, path: path.to_owned(), baud: None, patience_s: 60.0 };
+    let mut link = DeviceLink::open(&seat, scenario, roles, 1).unwrap();
+    assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
+    let (last, others) = roles.split_last().unwrap();
+    let others = others.iter().map(|other| (*other, private_ledger(scenario, *other))).collect();
+    RoleImpl::Device(*last, others, Box::new(link))
+}
+
+/// What every process counts; a device has the roles given, if there are any.
+fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport, Count)> {
     let processes = format!("launch.processes={processes}");
     // So slow that a device is heard on any machine.
-    let (tick, duration) = if with_device { ("tick_hz=200", "duration_s=4") } else { ("tick_hz=1000", "duration_s=1") };
+    let (tick, duration) =
+        if in_device.is_empty() { ("tick_hz=1000", "duration_s=1") } else { ("tick_hz=200", "duration_s=4") };
     let overrides = ["clock=realtime", tick, duration, "accept={}", "fault=[]", "watchdog={}", &processes];
     let overrides = overrides.map(str::to_owned);
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
     let domain = OwnedDomain::create(0).unwrap();
-    let hosts = RoleId::all(&scenario).into_iter().filter(|role| role.host(&scenario) == *role);
+    // All roles of a device are in the process of the last.
+    let elsewhere = &in_device[..in_device.len().saturating_sub(1)];
+    let hosts = RoleId::all(&scenario).into_iter();
+    let hosts = hosts.filter(|role| role.host(&scenario) == *role && !elsewhere.contains(role));
     let (roles, (far, path)) = (hosts.collect::<Vec<_>>(), line());
     std::thread::scope(|scope| {
         let (scenario, domain, path) = (&scenario, &domain, &path);
@@ -236,9 +246,9 @@ fn counts(text: &str, with_device: bool, processes: &str) -> Vec<(RoleReport, Co
         let threads: Vec<_> = roles
             .iter()
             .map(|role| match role {
-                RoleId::Plant(index @ 1) if with_device => {
-                    by_device = Some(scope.spawn(|| device(scenario, *index, &far)));
-                    scope.spawn(move || count_role(scenario, linked(scenario, *index, path), domain))
+                role if in_device.last() == Some(role) => {
+                    by_device = Some(scope.spawn(|| device(scenario, in_device, &far)));
+                    scope.spawn(move || count_role(scenario, linked(scenario, in_device, path), domain))
                 }
                 role => scope.spawn(move || {
                     let others = role.hosted(scenario).into_iter().filter(|other| other != role);
@@ -272,7 +282,7 @@ fn assert_none(name: &str, counts: Vec<(RoleReport, Count)>) {
 #[test]
 fn no_role_allocates_between_its_first_tick_and_its_last() {
     for (name, text) in corotate::config::SHIPPED {
-        assert_none(name, counts(text, false, "[]"));
+        assert_none(name, counts(text, &[], "[]"));
     }
 }
 
@@ -284,7 +294,7 @@ fn neither_does_a_process_of_several_roles() {
         ("[['leader', 'controller'], ['follower', 'observer']]", 2),
         ("[['leader', 'follower', 'observer', 'controller']]", 1),
     ] {
-        let counts = counts(text, false, processes);
+        let counts = counts(text, &[], processes);
         assert_eq!(counts.len(), count, "{processes}");
         assert_none(name, counts);
     }
@@ -293,7 +303,9 @@ fn neither_does_a_process_of_several_roles() {
 #[test]
 fn neither_does_a_bridge_to_a_device() {
     let (name, text) = corotate::config::SHIPPED[0];
-    let counts = counts(text, true, "[]");
-    assert!(counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
-    assert_none(name, counts);
+    for roles in [&[RoleId::Plant(1)][..], &[RoleId::Observer, RoleId::Controller]] {
+        let counts = counts(text, roles, "[]");
+        assert!(roles.len() > 1 || counts.iter().any(|(report, _)| report.role == "follower" && report.line.is_some()));
+        assert_none(name, counts);
+    }
 }

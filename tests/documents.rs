@@ -237,10 +237,12 @@ pages! {
     scenario: "docs/scenario.md",
     security: "docs/security.md",
     serial_device: "docs/serial-device.md",
+    serial_protocol: "docs/serial-protocol.md",
     table: "docs/table.md",
     troubleshooting: "docs/troubleshooting.md",
     watch: "docs/watch.md",
     when_things_go_wrong: "docs/when-things-go-wrong.md",
+    your_board: "docs/your-board.md",
     your_own_rig: "docs/your-own-rig.md",
     benchmarks: "docs/benchmarks.md",
 }
