@@ -10,17 +10,21 @@ pub const ACTUATION_DELAY_MAX: u64 = 64;
 /// What a law has sent and what does not act yet at its next tick, for its prediction. `U` is what a command makes act.
 #[derive(Debug)]
 pub struct InFlight<U> {
-    /// With the tick after that of the measurement, 0 if there is none; the first `count` places are in use.
-    sent: [(u64, U); ACTUATION_DELAY_MAX as usize - 1],
-    count: usize,
+    /// With the tick after that of the measurement, 0 if there is none; of a power of two of places, so that none is found by a
+    /// division.
+    sent: [(u64, U); ACTUATION_DELAY_MAX as usize],
+    /// So many of them are in use, and so many commands are on their way at most.
+    places: usize,
+    count: u64,
 }
 
 impl<U: Default> InFlight<U> {
     /// Nothing sent yet, for a law whose commands act so many ticks after their measurement, up to [`ACTUATION_DELAY_MAX`].
     pub fn new(delay_ticks: u64, blank: impl Fn() -> U) -> Self {
-        let count = delay_ticks.clamp(1, ACTUATION_DELAY_MAX) as usize - 1;
-        let place = |index| (0, if index < count { blank() } else { U::default() });
-        Self { sent: core::array::from_fn(place), count }
+        let count = delay_ticks.clamp(1, ACTUATION_DELAY_MAX) - 1;
+        let places = if count > 0 { count.next_power_of_two() as usize } else { 0 };
+        let place = |index| (0, if index < places { blank() } else { U::default() });
+        Self { sent: core::array::from_fn(place), places, count }
     }
 }
 
@@ -34,31 +38,36 @@ impl<U> InFlight<U> {
     /// What acts in each tick after this one until its own command does, in turn. Where a command was not sent the one before
     /// goes on; none as long as that is what acts at this tick.
     pub fn after(&self, tick: u64) -> impl Iterator<Item = Option<&U>> {
-        let count = self.count as u64;
         // The oldest is that of `tick` − count; it acts from `tick` + 1 on.
         let mut last = None;
-        (0..count).map(move |step| {
-            last = (tick + step).checked_sub(count).and_then(|sent| self.at(sent)).or(last);
+        (0..self.count).map(move |step| {
+            last = (tick + step).checked_sub(self.count).and_then(|sent| self.at(sent)).or(last);
             last
         })
     }
 
     fn at(&self, tick: u64) -> Option<&U> {
-        let (filled, input) = &self.sent[(tick % self.count as u64) as usize];
+        let (filled, input) = &self.sent[self.place(tick)];
         (*filled == tick + 1).then_some(input)
     }
 
     /// Room for what was sent at a tick.
     pub fn sent(&mut self, tick: u64) -> Option<&mut U> {
-        let count = self.count as u64;
-        let (filled, input) = self.sent.get_mut(tick.checked_rem(count)? as usize)?;
+        if self.is_empty() {
+            return None;
+        }
+        let (filled, input) = &mut self.sent[self.place(tick)];
         *filled = tick + 1;
         Some(input)
     }
 
+    fn place(&self, tick: u64) -> usize {
+        tick as usize & self.places.wrapping_sub(1) & (ACTUATION_DELAY_MAX as usize - 1)
+    }
+
     /// Passes the state, each input by this.
     pub fn persist_by<W: Words>(&mut self, words: &mut W, mut each: impl FnMut(&mut U, &mut W)) {
-        for (filled, input) in &mut self.sent[..self.count] {
+        for (filled, input) in &mut self.sent[..self.places] {
             filled.persist(words);
             each(input, words);
         }

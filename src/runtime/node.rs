@@ -356,7 +356,11 @@ fn record_bytes(scenario: &Scenario, ports: &Ports) -> usize {
     let all = || ports.writes.iter().chain(&ports.reads);
     let samples: usize = all().map(|port| port.size).sum();
     let commands: usize = all().filter(|port| port.topic.signal == Signal::Command).map(|port| port.size).sum();
-    let in_flight = if scenario.actuation_delay_ticks > 1 { scenario.actuation_delay_ticks as usize } else { 0 };
+    let in_flight = if scenario.actuation_delay_ticks > 1 {
+        scenario.actuation_delay_ticks.next_power_of_two() as usize
+    } else {
+        0
+    };
     2 * (RECORD_BYTES + SAMPLES_KEPT * samples + in_flight * commands)
 }
 
