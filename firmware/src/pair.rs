@@ -37,8 +37,7 @@ pub fn observer() -> Option<HiddenObserver> {
 pub fn law(tick_s: f64) -> Option<RateLaw> {
     let (inertia, gain) = (inertia()?, Vector3::from(GAIN_PER_S));
     let bound = inertia.rate_bound_rad_s(&LEADER_RATE_RAD_S.into());
-    let certificate =
-        Certificate::new(&inertia.coefficients(), HIDDEN + 1, &gain, DECAY_RATE_PER_S, bound, tick_s, 1);
+    let certificate = Certificate::new(&inertia.coefficients(), HIDDEN + 1, &gain, DECAY_RATE_PER_S, bound, tick_s, 1);
     Some(RateLaw::new(&RateLawDesign {
         law: Synchronizer::new(RigidBody::new(&inertia), gain, 0.0),
         adaptation_gain: 0.0,
