@@ -18,7 +18,7 @@ use crate::config::{ClockKind, Scenario};
 use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, results_path, scenario_path,
-    seat_path, shared_memory_bytes, take_short_turns, topic, write_whole,
+    seat_path, shared_memory_bytes, take_short_turns, topic, window_ticks, write_whole,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::system::tell;
@@ -39,8 +39,6 @@ const SCORE_NS: u64 = 10_000_000;
 const EPOCH_LEAD_NS: u64 = 20_000_000;
 /// In lockstep, between two looks at samples when there are none, ns.
 const LULL_NS: u64 = 50_000;
-/// Ticks scored between two credits in lockstep.
-const CREDIT_TICKS: u64 = 16;
 /// Upper bounds on the files that the process which opens most of them, the launcher, has open.
 const DESCRIPTORS: u64 = 32;
 const DESCRIPTORS_PER_ROLE: u64 = 24;
@@ -292,16 +290,21 @@ impl<'a> Supervisor<'a> {
     /// Follows the ticks to the end: scores, gives credit, watches over the roles.
     fn follow(&mut self, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> Result<usize, LaunchError> {
         let lockstep = self.scenario.clock != ClockKind::Realtime;
+        let credit_ticks = (window_ticks(self.scenario) / 4).max(1);
         let mut stall = Stall::new(self.scenario);
         let mut backoff = Backoff::default();
         let (mut next_look_ns, mut somebody_ended) = (0, false);
         while self.members.iter().any(|member| member.state() < RoleState::Done) {
-            let scored = scorer.poll(CREDIT_TICKS)?;
+            let scored = scorer.poll(credit_ticks)?;
             let credit = if lockstep { self.recorder.credit(scorer.next_tick(), self.word.credit_tick)? } else { 0 };
-            if credit > self.word.credit_tick {
+            if scored > 0 {
+                backoff = Backoff::default();
+            }
+            let idle = scored == 0 && !(lockstep && backoff.brief());
+            // A word wakes who is far ahead: for several ticks, unless there is nothing else to do.
+            if credit >= self.word.credit_tick + if idle { 1 } else { credit_ticks } {
                 self.word.credit_tick = credit;
                 self.announce()?;
-                backoff = Backoff::default();
             }
             let now_ns = monotonic_ns();
             if now_ns >= next_look_ns || somebody_ended {
@@ -325,11 +328,9 @@ impl<'a> Supervisor<'a> {
                 let (tick, last_tick) = (scorer.next_tick(), self.scenario.last_tick);
                 (launch.progress)(&Progress::Running { tick, last_tick, metric: scorer.latest() });
             }
-            match (scored, lockstep) {
-                (0, true) if backoff.brief() => {}
-                (0, true) => somebody_ended = self.pause(monotonic_ns() + LULL_NS),
-                (0, false) => somebody_ended = self.pause(next_look_ns),
-                _ => {}
+            if idle {
+                let until_ns = if lockstep { monotonic_ns() + LULL_NS } else { next_look_ns };
+                somebody_ended = self.pause(until_ns);
             }
         }
         Ok(0)

@@ -258,11 +258,13 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
 
     /// Waits for the input that a node lacks, or for credit.
     fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), NodeError> {
-        if backoff.brief() {
+        // Nobody waits for who is so far ahead, and somebody may need its core.
+        let ahead = node.next_tick() > up_to;
+        if !ahead && backoff.brief() {
             return Ok(());
         }
         let until_ns = monotonic_ns() + SLEEP_NS;
-        if node.next_tick() > up_to || !node.sleep(until_ns)? {
+        if ahead || !node.sleep(until_ns)? {
             self.control.schedule.sleep(until_ns)?;
         }
         Ok(())
