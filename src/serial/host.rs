@@ -18,6 +18,8 @@ const SILENT_REQUESTS: u32 = 8;
 /// The shortest time after which a request is repeated where no clock drives the ticks, and the longest, ns.
 const SHORTEST_REPEAT_NS: u64 = 5_000_000;
 const LONGEST_REPEAT_NS: u64 = 1_000_000_000;
+/// Of so many frames it is known when they were sent; a power of two.
+const REMEMBERED: usize = 32;
 /// A request is repeated after so many round trips; the smoothing of that figure, as a shift.
 const PATIENT_ROUND_TRIPS: u64 = 2;
 const SMOOTHING: u32 = 3;
@@ -110,9 +112,6 @@ struct Request {
     /// When it is to be sent (again), ns, and how often it was.
     due_ns: u64,
     sent: u32,
-    /// When and in which frame it was sent first and last, ns.
-    first: (u64, u32),
-    last: (u64, u32),
 }
 
 /// The host of one device in one run.
@@ -135,6 +134,8 @@ pub struct Host {
     /// Requests in a row without an answer, and since when something has been waited for, ns.
     silent: u32,
     silent_since_ns: Option<u64>,
+    /// The latest requests that no answer is known to: frame and when it was sent, ns.
+    sent: [Option<(u32, u64)>; REMEMBERED],
     /// Smoothed, ns.
     round_trip_ns: u64,
     counters: LineCounters,
@@ -157,6 +158,7 @@ impl Host {
             answered: None,
             silent: 0,
             silent_since_ns: None,
+            sent: [None; REMEMBERED],
             round_trip_ns: 0,
             counters: LineCounters::default(),
         }
@@ -172,9 +174,7 @@ impl Host {
         let (mut inputs, length) = ([0; MAX_CONTENT], samples.bytes.len().min(MAX_CONTENT));
         inputs[..length].copy_from_slice(&samples.bytes[..length]);
         let present = samples.present;
-        let sending = (now_ns, 0);
-        let request = Request { tick, present, inputs, length, due_ns: now_ns, sent: 0, first: sending, last: sending };
-        self.request = Some(request);
+        self.request = Some(Request { tick, present, inputs, length, due_ns: now_ns, sent: 0 });
     }
 
     /// Asks no more for the tick at hand.
@@ -195,19 +195,16 @@ impl Host {
             self.silent_since_ns.get_or_insert(now_ns);
             return Some(self.say(Message::Hello(*hello)));
         }
-        let repeat_ns = self.repeat_ns();
-        let sequence = self.sequence;
-        let request = self.request.as_mut().filter(|request| now_ns >= request.due_ns)?;
+        let (repeat_ns, free_ns) = (self.repeat_ns(), self.free_ns());
+        let due = |request: &&mut Request| now_ns >= request.due_ns && (request.sent > 0 || now_ns >= free_ns);
+        let request = self.request.as_mut().filter(due)?;
         // Twice as long after each time: a line that is too slow for what is asked of it must not be asked more.
         request.due_ns = now_ns + (repeat_ns << request.sent.min(8)).min(LONGEST_REPEAT_NS.max(repeat_ns));
-        request.last = (now_ns, sequence);
-        if request.sent == 0 {
-            request.first = request.last;
-        }
         request.sent += 1;
         self.counters.repeats += u64::from(request.sent > 1);
         self.silent += 1;
         self.silent_since_ns.get_or_insert(now_ns);
+        self.sent[self.sequence as usize % REMEMBERED] = Some((self.sequence, now_ns));
         let (tick, present, inputs, length) = (request.tick, request.present, request.inputs, request.length);
         Some(self.say(Message::Tick(Tick { tick, inputs: Samples { present, bytes: &inputs[..length] } })))
     }
@@ -252,6 +249,7 @@ impl Host {
                     counters.handshakes += 1;
                     self.greeted = true;
                     self.silent = 0;
+                    self.sent = [None; REMEMBERED];
                     if let Some(request) = &mut self.request {
                         (request.due_ns, request.sent) = (now_ns, 0);
                     }
@@ -273,14 +271,14 @@ impl Host {
                 }
                 self.silent = 0;
                 self.silent_since_ns = None;
+                // An answer that comes late counts most: a device that has fallen behind and is asked twice stays behind.
+                let sent = self.sent[answer.echo as usize % REMEMBERED].take_if(|(frame, _)| *frame == answer.echo);
+                if let Some((_, sent_ns)) = sent {
+                    smooth(&mut self.round_trip_ns, now_ns.saturating_sub(sent_ns));
+                }
                 match self.request.take_if(|request| request.tick == answer.tick) {
-                    Some(request) => {
+                    Some(_) => {
                         self.answered = Some(answer.tick);
-                        // Of a slow device the answer to the first request comes after the second was sent.
-                        let sent = [request.last, request.first].into_iter().find(|(_, frame)| *frame == answer.echo);
-                        if let Some((sent_ns, _)) = sent {
-                            smooth(&mut self.round_trip_ns, now_ns.saturating_sub(sent_ns));
-                        }
                         return Some(Heard::Answer(answer));
                     }
                     None if self.answered.is_some_and(|tick| answer.tick == tick) => counters.duplicates += 1,
@@ -350,6 +348,14 @@ impl Host {
         self.greeted = false;
         self.silent = 0;
         self.greet_due_ns = now_ns;
+    }
+
+    /// When the device can be asked for another tick of the clock, ns: who is still at an earlier one would be late for this one
+    /// too, and for each after it. After a period it is asked all the same: the earlier request may have been lost.
+    fn free_ns(&self) -> u64 {
+        let Some(period_ns) = self.terms.period_ns else { return 0 };
+        let wait_ns = self.repeat_ns().min(period_ns);
+        self.sent.iter().flatten().map(|(_, sent_ns)| sent_ns + wait_ns).max().unwrap_or(0)
     }
 
     fn repeat_ns(&self) -> u64 {

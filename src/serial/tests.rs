@@ -361,6 +361,44 @@ fn a_slow_device_is_asked_once_per_tick_after_a_while() {
     assert!(asked[0] > 0 && asked[39] == asked[9], "{asked:?}");
 }
 
+/// A device that takes more than half of a period for each frame follows again once it was held up: what it has not answered in
+/// time it is not asked again while it is at it.
+#[test]
+fn a_device_that_was_held_up_catches_up() {
+    // How long it takes for a frame, ns: quick at first, so that a request is repeated early.
+    let slow = |tick: u64| if tick < 50 { 3_000_000 } else { 5_600_000 };
+    const HELD_UP: u64 = 50;
+    const HELD_UP_NS: u64 = 25_000_000;
+    let mut rig = Rig::new(hello(1, true), CLEAN, 1);
+    rig.greet();
+    let (mut line, mut busy_ns, mut missed) = (std::collections::VecDeque::new(), 0, Vec::new());
+    for tick in 0..200 {
+        let end_ns = rig.now_ns + PERIOD_NS;
+        rig.host.request(tick, Samples::default(), rig.now_ns);
+        if tick == HELD_UP {
+            busy_ns = rig.now_ns + HELD_UP_NS;
+        }
+        let mut answered = false;
+        while rig.now_ns < end_ns {
+            rig.now_ns += STEP_NS;
+            while let Some(frame) = rig.host.due(rig.now_ns, &rig.hello) {
+                busy_ns = busy_ns.max(rig.now_ns) + slow(tick);
+                line.push_back((busy_ns, frame.to_vec()));
+            }
+            while let Some((_, up)) = line.pop_front_if(|(done_ns, _)| *done_ns <= rig.now_ns) {
+                let mut down = Vec::new();
+                rig.device.receive(&up, rig.now_ns, |frame| down.extend_from_slice(frame));
+                answered |= rig.hear(&down).iter().any(|event| matches!(event, Event::Answer(..)));
+            }
+        }
+        if !answered {
+            rig.host.give_up();
+            missed.push(tick);
+        }
+    }
+    assert!(missed.contains(&HELD_UP) && missed.len() < 10, "{missed:?}");
+}
+
 #[test]
 fn a_tick_asked_twice_is_executed_once() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
