@@ -26,6 +26,7 @@
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
+//! | `hosts` | a run over several computers: relay, clocks, who may join; with the feature of that name | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
 //! | `campaign` | one scenario run many times, varied; the table of its cases | no |
 //! | `report` | a run as one page that is looked at | no |
@@ -81,6 +82,8 @@ pub mod doctor;
 pub mod files;
 #[cfg(feature = "foxglove")]
 pub mod foxglove;
+#[cfg(feature = "runtime")]
+pub mod hosts;
 #[cfg(feature = "runtime")]
 pub mod launch;
 #[cfg(feature = "runtime")]

@@ -38,6 +38,11 @@ pub trait ReadWords {
     fn next(&mut self) -> Result<Option<&[u64]>, BusError>;
     /// Whether somebody has the writing end open, as [`Read::written`].
     fn written(&self) -> bool;
+    /// Sleeps until there may be a next sample, at most until `until_ns`, as [`Read::sleep`].
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
 }
 
 /// A writing end.
@@ -117,6 +122,10 @@ impl<T: Read<S>, S: Carried + ?Sized> ReadWords for End<T, S> {
 
     fn written(&self) -> bool {
         self.0.written()
+    }
+
+    fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
+        self.0.sleep(until_ns)
     }
 }
 

@@ -1,11 +1,13 @@
 //! The time grid T_k = epoch + k·h and how to wait on it. Never a relative sleep: deadlines are absolute, so nothing drifts.
 
 mod grid;
+mod run_clock;
 
 pub use grid::Grid;
+pub use run_clock::{Correction, RunClock, STEEPEST, adopt};
 
 use rustix::thread::clock_nanosleep_absolute;
-use rustix::time::{ClockId, Timespec, clock_gettime};
+use rustix::time::{ClockId, DynamicClockId, Timespec, clock_gettime, clock_gettime_dynamic};
 
 /// Where time comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,16 +29,44 @@ impl Clock {
     }
 }
 
-/// Nanoseconds on CLOCK_MONOTONIC.
+/// Nanoseconds on the clock of the run: CLOCK_MONOTONIC, and where the run has several hosts, that of the one which launched it,
+/// [as this one knows it](adopt).
 #[inline]
 pub fn monotonic_ns() -> u64 {
-    let now = clock_gettime(ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+    let raw_ns = raw_ns();
+    run_clock::correction().map_or(raw_ns, |correction| correction.apply(raw_ns))
 }
 
-/// Sleeps until `due_ns` on the monotonic clock; returns at once if that is past. A signal may end it early.
+/// Nanoseconds on this host's own CLOCK_MONOTONIC.
+#[inline]
+pub fn raw_ns() -> u64 {
+    nanoseconds(clock_gettime(ClockId::Monotonic))
+}
+
+/// Nanoseconds from CLOCK_MONOTONIC to CLOCK_TAI on this host; 0 on a system without it.
+pub fn tai_offset_ns() -> i64 {
+    let between = || {
+        let before_ns = raw_ns();
+        let tai_ns = nanoseconds(clock_gettime_dynamic(DynamicClockId::Tai).ok()?);
+        let after_ns = raw_ns();
+        Some((after_ns - before_ns, tai_ns as i64 - (before_ns / 2 + after_ns / 2) as i64))
+    };
+    // Of several readings the one that nothing came between.
+    let fastest = (0..5).filter_map(|_| between()).min();
+    fastest.map_or(0, |(_, offset_ns)| offset_ns)
+}
+
+fn nanoseconds(time: Timespec) -> u64 {
+    time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
+}
+
+/// Sleeps until `due_ns` on the clock of the run; returns at once if that is past. A signal may end it early.
 #[inline]
 pub fn sleep_until(due_ns: u64) {
+    let due_ns = match run_clock::correction() {
+        Some(correction) => due_ns.saturating_add_signed(-correction.at(raw_ns())),
+        None => due_ns,
+    };
     let due = Timespec { tv_sec: (due_ns / 1_000_000_000) as i64, tv_nsec: (due_ns % 1_000_000_000) as _ };
     // Interrupted or not, the caller looks at the clock again.
     let _ = clock_nanosleep_absolute(ClockId::Monotonic, &due);

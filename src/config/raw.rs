@@ -3,6 +3,7 @@
 //! Must not judge values; [`super::scenario`] does.
 
 use super::fault::RawFault;
+use super::hosts::{Host, Network};
 use crate::role::Rearm;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -34,6 +35,10 @@ pub(super) struct Raw {
     pub watchdog: Watchdog,
     #[serde(default)]
     pub accept: BTreeMap<String, f64>,
+    #[serde(default, skip_serializing_if = "Network::is_default")]
+    pub network: Network,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub host: Vec<Host>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub fault: Vec<RawFault>,
 }

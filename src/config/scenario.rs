@@ -1,12 +1,14 @@
 //! A scenario as resolved: every value checked, every default filled in, ready to run.
 
 use super::fault::{self, ScriptedFault};
+use super::hosts::{self, Hosts};
 use super::raw::{Launch, Policy, Raw};
 use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
 use serde::Deserialize;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -17,7 +19,7 @@ const MAX_TICK_HZ: f64 = 1e5;
 /// The most ticks of one run: ten years at 1 kHz.
 const MAX_TICKS: f64 = 3.2e11;
 /// The keys that hold one table each, whatever the rig.
-const TABLES: [&str; 6] = ["actuator", "realtime", "launch", "supervision", "watchdog", "accept"];
+const TABLES: [&str; 7] = ["actuator", "realtime", "launch", "supervision", "watchdog", "network", "accept"];
 
 /// The bounds of the watchdog, by their keys, which are the rig's.
 #[derive(Deserialize)]
@@ -59,6 +61,8 @@ pub struct Scenario {
     pub external: Vec<String>,
     /// What the launcher does about roles that fail.
     pub supervision: Supervision,
+    /// The computers, if there are several, and what holds between them.
+    pub hosts: Hosts,
     /// What is to go wrong.
     pub faults: Vec<ScriptedFault>,
     /// What the controller watches.
@@ -69,6 +73,8 @@ pub struct Scenario {
     pub rig: AnyRig,
     /// The scenario as a file that resolves to itself.
     pub resolved: toml::Table,
+    /// Files that it names: key and path.
+    pub files: Vec<(String, PathBuf)>,
     /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
     pub run: Option<RunId>,
 }
@@ -132,14 +138,19 @@ impl Scenario {
         let metrics = rig.as_ref().map(AnyRig::metrics);
         let accept = accept::resolve(&raw.accept, duration_s, metrics.as_deref(), &mut checks);
         check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
+        let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
+        hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
         let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
         if let Some(rig) = &rig {
+            let bodies: Vec<(&str, bool)> = rig.bodies().iter().map(|body| (&*body.name, body.driven)).collect();
+            hosts::check(&hosts, &bodies, &rig.roles(), actuation_delay_ticks, &mut checks);
             check_roles(&raw.supervision.on_failure, rig, &mut checks);
             let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
             let setting = fault::Setting { rig, last_tick, seed: raw.seed, actuation_delay_ticks };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             watch = watchdog::resolve(&raw.watchdog, &maxima.watchdog, rig, tick_s, duration_s, &mut checks);
         }
+        let files = checks.files.take();
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
@@ -162,11 +173,13 @@ impl Scenario {
             processes: raw.launch.processes,
             external: raw.launch.external,
             supervision: raw.supervision,
+            hosts,
             faults,
             watch,
             accept,
             rig,
             resolved,
+            files,
             run: document.run(),
         })
     }
@@ -185,6 +198,11 @@ impl Scenario {
         }
         let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
         if shared { Err(shared_with_external(role)) } else { Ok(()) }
+    }
+
+    /// How many ticks after its tick a role may still wait for what crosses hosts on the way to it.
+    pub fn lag_ticks(&self, role: &str) -> u64 {
+        self.hosts.lag_ticks(role, self.rig.bodies().iter().map(|body| (&*body.name, body.driven)))
     }
 
     /// The period h, s.
@@ -218,11 +236,12 @@ impl Scenario {
 pub struct Checks<'a> {
     document: &'a Document,
     problems: Vec<Problem>,
+    files: RefCell<Vec<(String, PathBuf)>>,
 }
 
 impl<'a> Checks<'a> {
     pub(crate) fn new(document: &'a Document) -> Self {
-        Self { document, problems: Vec::new() }
+        Self { document, problems: Vec::new(), files: RefCell::default() }
     }
 
     /// Notes that the value at `key` makes no sense.
@@ -233,7 +252,10 @@ impl<'a> Checks<'a> {
 
     /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
     pub fn file(&self, key: &str, name: &str) -> PathBuf {
-        if self.document.place(key).starts_with("--set") { name.into() } else { self.document.directory().join(name) }
+        let here = self.document.place(key).starts_with("--set");
+        let path = if here { name.into() } else { self.document.directory().join(name) };
+        self.files.borrow_mut().push((key.to_owned(), path.clone()));
+        path
     }
 
     /// Notes it unless `holds`.

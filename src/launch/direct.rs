@@ -176,6 +176,7 @@ impl<'a, R: Rig> Run<'a, R> {
             problems: Vec::new(),
             score,
             incidents: Vec::new(),
+            hosts: Vec::new(),
             grants: Vec::new(),
             domain: None,
             remains: None,

@@ -88,6 +88,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         problems: Vec::new(),
         score,
         incidents,
+        hosts: Vec::new(),
         grants: Vec::new(),
         domain: None,
         remains: None,

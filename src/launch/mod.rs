@@ -8,10 +8,13 @@ mod external;
 mod foxglove;
 mod in_process;
 mod janitor;
+#[cfg(feature = "hosts")]
+mod join;
 mod junit;
 mod outcome;
 mod processes;
 mod recorder;
+mod relay;
 mod replay;
 mod results;
 mod score;
@@ -22,9 +25,13 @@ mod trace;
 
 pub(crate) use direct::run_rig as run_directly;
 pub use janitor::janitor;
+#[cfg(feature = "hosts")]
+pub use join::{FarOutcome, join};
 pub use junit::junit;
 pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub(crate) use outcome::{Judged, State, state_hash};
+#[cfg(feature = "hosts")]
+pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;
 pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
 pub use results::{LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
@@ -38,6 +45,7 @@ pub use table::{line_words, table};
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
+use crate::hosts::HostSeat;
 use crate::record::RecordError;
 use crate::runtime::NodeError;
 use crate::system::remedy;
@@ -57,6 +65,8 @@ pub struct Launch<'a> {
     pub results: Option<PathBuf>,
     /// Where to show the run on a Foxglove WebSocket; not in one thread, and only by a program that was built with it.
     pub foxglove: Option<SocketAddr>,
+    /// This host's part in a run over several, which others join; without it all roles run here.
+    pub host: Option<HostSeat>,
     /// Refuse to run without every privilege that was asked for.
     pub require_realtime: bool,
     /// Whether the hash is kept of the ticks on the way too, by which two runs are compared; a run in one thread may do without.
@@ -76,6 +86,7 @@ impl<'a> Launch<'a> {
             record: None,
             results: None,
             foxglove: None,
+            host: None,
             require_realtime: false,
             checkpoints: true,
             signal,
@@ -93,6 +104,8 @@ pub enum Progress<'a> {
         roles: Vec<&'a str>,
         /// External roles among them.
         external: Vec<&'a str>,
+        /// Other hosts among whose roles some of them are, once these can be joined with.
+        hosts: Vec<&'a str>,
         /// The domain's directory; it holds a file with the seat of each external role.
         domain: PathBuf,
     },

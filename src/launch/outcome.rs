@@ -8,6 +8,7 @@ use super::{Action, Incident, Score};
 use crate::analysis::{Claim, claims};
 use crate::config::{RunId, Scenario};
 use crate::files;
+use crate::hosts::{HostReport, HostsSummary};
 use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
@@ -38,6 +39,8 @@ pub struct Outcome {
     pub score: Score,
     /// Roles that failed while the ticks ran.
     pub incidents: Vec<Incident>,
+    /// What hosts tell of their part, if there are several.
+    pub hosts: Vec<HostReport>,
     /// The launcher's own privileges.
     pub grants: Vec<Grant>,
     /// What was recorded, if that was asked for.
@@ -102,6 +105,9 @@ pub struct Summary {
     /// The counters of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineCounters>,
+    /// The part of each host, if the run had several.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hosts: Option<HostsSummary>,
     /// What was recorded, if that was asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub recording: Option<RecordingReport>,
@@ -294,6 +300,7 @@ impl Summary {
             books,
             latencies,
             lines: lines(&outcome.reports),
+            hosts: HostsSummary::of(&outcome.hosts),
             recording: outcome.recording.clone(),
             privileges: privileges(outcome),
         }
@@ -315,6 +322,9 @@ impl Accounting {
             if link.published + link.void + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
+        }
+        if !interrupted {
+            problems.extend(HostsSummary::of(&outcome.hosts).iter().flat_map(HostsSummary::problems));
         }
         let mut links = Vec::new();
         for (report, read) in reports.iter().flat_map(|report| report.read.iter().map(move |read| (report, read))) {

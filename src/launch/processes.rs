@@ -2,11 +2,15 @@
 //!
 //! Whatever happens, dropping what this file holds ends every role, removes the domain and ends the janitor, in that order.
 
+#[cfg(feature = "hosts")]
+mod joined;
+
 use super::children::{END_LIMIT, RoleProcess};
 use super::external::{ExternalWatch, Waiting};
 use super::foxglove::{FOXGLOVE, FoxgloveWatch};
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
+use super::relay::RelayWatch;
 use super::score::{self, Scorer};
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
@@ -15,6 +19,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
+use crate::hosts::{HostsSummary, RELAY};
 use crate::record::RECORDER;
 use crate::runtime::{
     Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, results_path, scenario_path,
@@ -35,8 +40,9 @@ use std::time::Duration;
 const LOOK_NS: u64 = 1_000_000;
 /// In real time, between two looks at the samples to be scored, ns.
 const SCORE_NS: u64 = 10_000_000;
-/// From the word to run to the first tick, ns: time for every role to hear it.
+/// From the word to run to the first tick, ns: time for every role to hear it, here and on other hosts.
 const EPOCH_LEAD_NS: u64 = 20_000_000;
+const EPOCH_LEAD_HOSTS_NS: u64 = 300_000_000;
 /// In lockstep, between two looks at samples when there are none, ns.
 const LULL_NS: u64 = 50_000;
 /// Upper bounds on the files that the process which opens most of them, the launcher, has open.
@@ -53,17 +59,9 @@ const HUNG_PERIODS: u64 = 10;
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     // What it starts has them too.
     take_short_turns();
-    require_descriptors(scenario)?;
-    require_files(FILES + FILES_PER_ROLE * RoleId::all(scenario).len() as u64)?;
-    let owned = OwnedDomain::create(shared_memory_bytes(scenario))?;
+    let owned = new_domain(scenario)?;
     let domain = owned.domain();
-    let path = scenario_path(domain);
-    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
-    if let Some(results) = &launch.results {
-        let path = results_path(domain.root());
-        write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
-    }
-    describe_seats(scenario, launch, domain)?;
+    prepare(scenario, launch, domain)?;
     let startup_limit = Duration::from_secs_f64(scenario.startup_timeout_s);
     let mut janitor = Janitor::start(domain, startup_limit)?;
     let (_low_latency, grants) = match scenario.clock {
@@ -76,13 +74,35 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
     let mut shutdown = supervisor.shut_down();
     shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
-    let ShutdownReport { reports, unbooked, problems } = shutdown;
+    let ShutdownReport { reports, unbooked, mut problems } = shutdown;
+    let (hosts, told, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
+    problems.extend(told);
+    elsewhere.iter().for_each(|incident| scorer.incident(incident.tick));
+    supervisor.incidents.extend(elsewhere);
     let score = scorer.finish()?;
     let (incidents, recorder) = supervisor.incidents(&score.recoveries_s);
-    let recording = recorder.finish(domain, &reports);
+    let recording = recorder.finish(domain, &reports, HostsSummary::of(&hosts).as_ref());
     let domain = Some(domain.root().to_owned());
     let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
-    Ok(Outcome { reports, unbooked, problems, score, incidents, grants, recording, domain, signal, remains })
+    Ok(Outcome { reports, unbooked, problems, score, incidents, hosts, grants, recording, domain, signal, remains })
+}
+
+/// A domain with room for a run of a scenario.
+pub fn new_domain(scenario: &Scenario) -> Result<OwnedDomain, LaunchError> {
+    require_descriptors(scenario)?;
+    require_files(FILES + FILES_PER_ROLE * RoleId::all(scenario).len() as u64)?;
+    Ok(OwnedDomain::create(shared_memory_bytes(scenario))?)
+}
+
+/// Leaves in a domain what whoever joins a run there must know.
+pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
+    let path = scenario_path(domain);
+    write_whole(&path, scenario.to_file().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    if let Some(results) = &launch.results {
+        let path = results_path(domain.root());
+        write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
+    }
+    describe_seats(scenario, launch, domain)
 }
 
 /// What is still there of a run whose roles have ended. It is removed when this is dropped, in this order: after the
@@ -103,6 +123,12 @@ fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
     launch.external.iter().chain(&scenario.external).any(|external| external == role)
 }
 
+/// The other host that has a role, if one takes part and has.
+fn elsewhere<'s>(scenario: &'s Scenario, launch: &Launch<'_>, role: &str) -> Option<&'s str> {
+    let seat = launch.host.as_ref()?;
+    scenario.hosts.of(role).filter(|host| *host != seat.host)
+}
+
 /// Leaves the seat of every external role in the domain, for the program that is to take it.
 fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> Result<(), LaunchError> {
     let roles = RoleId::all(scenario).into_iter();
@@ -116,12 +142,12 @@ fn describe_seats(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain) -> 
 
 /// What the roles left when they went.
 #[derive(Default)]
-struct ShutdownReport {
-    reports: Vec<RoleReport>,
+pub(super) struct ShutdownReport {
+    pub reports: Vec<RoleReport>,
     /// External roles that keep no counters.
-    unbooked: Vec<String>,
+    pub unbooked: Vec<String>,
     /// What is wrong with what was left.
-    problems: Vec<String>,
+    pub problems: Vec<String>,
 }
 
 impl ShutdownReport {
@@ -165,7 +191,7 @@ fn require_descriptors(scenario: &Scenario) -> Result<(), LaunchError> {
 }
 
 /// All roles of a run, and the launcher's line to them.
-struct Supervisor<'a> {
+pub(super) struct Supervisor<'a> {
     scenario: &'a Scenario,
     domain: &'a Domain,
     janitor: &'a mut Janitor,
@@ -176,6 +202,7 @@ struct Supervisor<'a> {
     incidents: Vec<Incident>,
     recorder: RecorderWatch,
     foxglove: FoxgloveWatch,
+    relay: RelayWatch,
 }
 
 impl<'a> Supervisor<'a> {
@@ -189,15 +216,21 @@ impl<'a> Supervisor<'a> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let mut recorder = RecorderWatch::start(launch.record.as_deref(), scenario, domain, bus)?;
         let foxglove = FoxgloveWatch::start(launch.foxglove, domain)?;
+        let hub = launch.host.as_ref().map_or("", |seat| &seat.host);
+        let relay = RelayWatch::start(launch.host.as_ref(), hub, scenario, domain)?;
         // All of them first: they come up while their links are opened here.
-        let start = |role: RoleId| match is_external(scenario, launch, role.name(scenario)) {
-            true => Ok((role, None)),
-            false => RoleProcess::start(scenario, role, domain).map(|process| (role, Some(process))),
+        let start = |role: RoleId| {
+            let name = role.name(scenario);
+            match is_external(scenario, launch, name) || elsewhere(scenario, launch, name).is_some() {
+                true => Ok((role, None)),
+                false => RoleProcess::start(scenario, role, domain).map(|process| (role, Some(process))),
+            }
         };
         let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
         let mut started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
         let open = |(role, process): &(RoleId, Option<RoleProcess>)| {
-            Member::new(scenario, *role, process.is_none(), domain, bus)
+            let elsewhere = elsewhere(scenario, launch, role.name(scenario));
+            Ok(Member::new(scenario, *role, process.is_none(), domain, bus)?.on_host(elsewhere))
         };
         let mut members = started.iter().map(open).collect::<Result<Vec<_>, _>>().map_err(|error| {
             let roles = started.iter_mut().map(|(role, process)| (role.name(scenario), process.as_mut()));
@@ -206,13 +239,13 @@ impl<'a> Supervisor<'a> {
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
         let (word, incidents) = (Schedule::default(), Vec::new());
-        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove })
+        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
     }
 
     /// See [`blame`].
     fn blame(&mut self, error: LaunchError) -> LaunchError {
         let members = self.members.iter_mut().map(|member| (&*member.name, member.process.as_mut()));
-        blame(error, members.chain([(RECORDER, self.recorder.process())]))
+        blame(error, members.chain([(RECORDER, self.recorder.process()), (RELAY, self.relay.process())]))
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -235,7 +268,8 @@ impl<'a> Supervisor<'a> {
         }
         self.word.phase = Phase::Run as u64;
         if self.scenario.clock == ClockKind::Realtime {
-            self.word.epoch_ns = monotonic_ns() + EPOCH_LEAD_NS;
+            let lead_ns = if launch.host.is_some() { EPOCH_LEAD_HOSTS_NS } else { EPOCH_LEAD_NS };
+            self.word.epoch_ns = monotonic_ns() + lead_ns;
             scorer.start(Grid { epoch_ns: self.word.epoch_ns, period_ns: self.scenario.period_ns });
         }
         self.announce()?;
@@ -266,7 +300,15 @@ impl<'a> Supervisor<'a> {
             if !self.tell(waiting, scorer, launch) {
                 return Ok(false);
             }
-            let watchers = [(RECORDER, self.recorder.ready()?), (FOXGLOVE, self.foxglove.ready()?)];
+            let watchers =
+                [(RECORDER, self.recorder.ready()?), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
+            if let Some(incident) = self.relay.supervise(self.scenario, 0).into_iter().next() {
+                return Err(LaunchError::Died {
+                    role: incident.role,
+                    cause: incident.cause,
+                    last_words: incident.last_words,
+                });
+            }
             let absent = watchers.into_iter().filter(|(_, ready)| !ready).map(|(name, _)| name);
             let missing: Vec<&Member> = self.members.iter().filter(|member| member.state() < state).collect();
             if missing.is_empty() && absent.clone().count() == 0 {
@@ -275,14 +317,20 @@ impl<'a> Supervisor<'a> {
             if launch.signal.load(Ordering::Relaxed) != 0 {
                 return Ok(false);
             }
-            let names = |external: bool| missing.iter().filter(|m| m.external || !external).map(|m| &*m.name).collect();
-            let (mut roles, external): (Vec<&str>, Vec<&str>) = (names(false), names(true));
+            let mut roles: Vec<&str> = missing.iter().map(|member| &*member.name).collect();
+            let by_hand = missing.iter().filter(|member| member.external && member.host().is_none());
+            let external: Vec<&str> = by_hand.map(|member| &*member.name).collect();
+            let mut hosts: Vec<&str> = missing.iter().filter_map(|member| member.host()).collect();
+            hosts.sort_unstable();
+            hosts.dedup();
             roles.extend(absent);
-            // Whoever starts a role by hand may take all the time in the world.
-            if monotonic_ns() > end_ns && external.is_empty() {
+            // Whoever starts a role by hand, or joins with a host, may take all the time in the world.
+            if monotonic_ns() > end_ns && external.is_empty() && hosts.is_empty() {
                 return Err(LaunchError::StartUp { limit_s, roles: roles.join(", ") });
             }
-            (launch.progress)(&Progress::Waiting { roles, external, domain: self.domain.root().to_owned() });
+            // Where they join is known once somebody listens there.
+            let hosts = if self.relay.ready()? { hosts } else { Vec::new() };
+            (launch.progress)(&Progress::Waiting { roles, external, hosts, domain: self.domain.root().to_owned() });
             self.pause(monotonic_ns() + LOOK_NS);
         }
     }
@@ -312,7 +360,8 @@ impl<'a> Supervisor<'a> {
                 next_look_ns = now_ns + SCORE_NS;
                 self.announce()?;
                 self.listen()?;
-                if !self.supervise(scorer, now_ns)? {
+                let tick = scorer.next_tick();
+                if !self.supervise(&mut |tick| scorer.incident(tick), tick, now_ns)? {
                     return Ok(0);
                 }
                 let waiting = self.externals.in_ticks(self.scenario, &self.members, scorer.next_tick(), now_ns);
@@ -336,9 +385,16 @@ impl<'a> Supervisor<'a> {
         Ok(0)
     }
 
-    /// Notices roles that have failed and brings them back; false if the run is to end for that.
-    fn supervise(&mut self, scorer: &mut dyn Scorer, now_ns: u64) -> Result<bool, LaunchError> {
+    /// Notices roles that have failed and brings them back, and hosts that left; false if the run is to end for that. `note` is told
+    /// the tick of each failure; `tick` is the one at hand.
+    pub fn supervise(&mut self, note: &mut dyn FnMut(u64), tick: u64, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
+        for incident in self.relay.supervise(self.scenario, tick) {
+            tell(format_args!("corotate: {incident}"));
+            note(incident.tick);
+            self.incidents.push(incident);
+            go_on = false;
+        }
         let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
         let over = self.scenario.clock == ClockKind::Realtime && now_ns > self.word.epoch_ns.saturating_add(ticks_ns);
         self.recorder.supervise(self.janitor);
@@ -353,7 +409,7 @@ impl<'a> Supervisor<'a> {
                 };
                 tell(format_args!("corotate: {incident}"));
                 self.janitor.clear_dead();
-                scorer.incident(incident.tick);
+                note(incident.tick);
                 go_on &= incident.action != Action::Stopped;
                 self.incidents.push(incident);
             }
@@ -390,7 +446,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Waits until `until_ns`, or until a role's process ends or the janitor answers: then it is true.
-    fn pause(&self, until_ns: u64) -> bool {
+    pub fn pause(&self, until_ns: u64) -> bool {
         let handles = self.members.iter().filter_map(|member| member.process.as_ref()?.handle()).map(AsFd::as_fd);
         let handles = handles.chain(self.janitor.answers());
         let mut handles: Vec<PollFd<'_>> =
@@ -402,7 +458,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Says the launcher's word again.
-    fn announce(&mut self) -> Result<(), BusError> {
+    pub fn announce(&mut self) -> Result<(), BusError> {
         self.word.stamp =
             Stamp { tick: self.word.stamp.tick + 1, generation: 1, origin_ns: 0, sent_ns: monotonic_ns() };
         let word = self.word;
@@ -410,7 +466,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Hears how the roles are.
-    fn listen(&mut self) -> Result<(), BusError> {
+    pub fn listen(&mut self) -> Result<(), BusError> {
         let now_ns = monotonic_ns();
         self.recorder.listen()?;
         self.members.iter_mut().try_for_each(|member| member.listen(now_ns))
@@ -427,7 +483,7 @@ impl<'a> Supervisor<'a> {
 
     /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its counters, unless it was none of
     /// ours.
-    fn shut_down(&mut self) -> ShutdownReport {
+    pub fn shut_down(&mut self) -> ShutdownReport {
         self.word.phase = Phase::Stop as u64;
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
         // Told first, and then nobody is waited for who is dead: an external role that was killed has left once its remains
@@ -443,7 +499,10 @@ impl<'a> Supervisor<'a> {
         }
         // Whoever takes samples stays until nobody sends any more.
         let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
-        while (self.recorder.lingers() || self.foxglove.lingers()) && monotonic_ns() < limit_ns {
+        let relays = |relay: &mut RelayWatch| relay.lingers() && relay.leads();
+        while (self.recorder.lingers() || self.foxglove.lingers() || relays(&mut self.relay))
+            && monotonic_ns() < limit_ns
+        {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }

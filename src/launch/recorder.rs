@@ -11,6 +11,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::Scenario;
+use crate::hosts::HostsSummary;
 use crate::record::{JOINING, RECORDER, RecordingReport};
 use crate::runtime::{report_path, topic};
 use crate::sample::{Health, RoleState};
@@ -128,7 +129,12 @@ impl RecorderWatch {
     }
 
     /// Tells what is in the file, beside the roles' final counters. A recorder that has not ended by now is ended.
-    pub fn finish(mut self, domain: &Domain, roles: &[RoleReport]) -> Option<RecordingReport> {
+    pub fn finish(
+        mut self,
+        domain: &Domain,
+        roles: &[RoleReport],
+        hosts: Option<&HostsSummary>,
+    ) -> Option<RecordingReport> {
         let file = self.file.take()?;
         self.process = None;
         let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
@@ -138,7 +144,7 @@ impl RecorderWatch {
             let (messages, bytes, signals) = (0, 0, Vec::new());
             RecordingReport { file, complete: false, whole: true, problem: Some(problem), messages, bytes, signals }
         });
-        report.reconcile(roles);
+        report.reconcile(roles, &|service| hosts.map_or(0, |hosts| hosts.lost(service)));
         Some(report)
     }
 

@@ -182,6 +182,7 @@ impl Steps {
             problems: Vec::new(),
             score,
             incidents: Vec::new(),
+            hosts: Vec::new(),
             grants: Vec::new(),
             domain: None,
             remains: None,

@@ -14,7 +14,7 @@ use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::runtime::{RoleId, open_ledger, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
@@ -28,14 +28,14 @@ const DISTRUSTED_NS: u64 = 1_000_000_000;
 const SILENT_PERIODS: f64 = 10.0;
 
 /// A role that failed while the ticks ran, and what was done.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Incident {
     /// The role.
     pub role: String,
     /// Whether it is somebody else's program: then nobody knows whether it died.
     pub external: bool,
     /// Other roles in the same process, which failed with it.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
     /// Which generation of it.
     pub generation: u64,
@@ -46,7 +46,7 @@ pub struct Incident {
     /// The end of its error output.
     pub last_words: String,
     /// Whether its successor begins with its counters alone: the state that it had itself inherited may be what it died of.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub begins_anew: bool,
     /// What was done.
     pub action: Action,
@@ -58,7 +58,7 @@ pub struct Incident {
 }
 
 /// What is done about a role that failed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Action {
     /// It was started anew.
@@ -118,6 +118,8 @@ pub(super) struct Member {
     /// None for a role that somebody else starts, and between a death and the next start.
     pub process: Option<RoleProcess>,
     pub external: bool,
+    /// The other host that has it, if one has.
+    host: Option<String>,
     pub last: Health,
     pub ledger: Ledger,
     /// The other roles in its process, all earlier in a tick, with their counters.
@@ -159,6 +161,7 @@ impl Member {
             role,
             process: None,
             external,
+            host: None,
             last: Health::default(),
             generation: 1,
             silent_ns: 0,
@@ -168,6 +171,22 @@ impl Member {
             restarts: 0,
             restart: None,
         })
+    }
+
+    /// The same on another host, if it is on one.
+    pub fn on_host(self, host: Option<&str>) -> Self {
+        Self { host: host.map(str::to_owned), ..self }
+    }
+
+    /// The same with its process.
+    #[cfg(feature = "hosts")]
+    pub fn with_process(self, process: RoleProcess) -> Self {
+        Self { process: Some(process), ..self }
+    }
+
+    /// The other host that has it, if one has.
+    pub fn host(&self) -> Option<&str> {
+        self.host.as_deref()
     }
 
     /// All roles in its process with their counters, in the order of a tick.
@@ -267,7 +286,10 @@ impl Member {
             let last_words = std::fs::read_to_string(words_path(janitor.root(), &self.name)).unwrap_or_default();
             Some(Failure { cause, last_words })
         };
-        let timeout_s = scenario.supervision.heartbeat_timeout_s;
+        let timeout_s = match &self.host {
+            Some(_) => scenario.hosts.network.silence_timeout_s,
+            None => scenario.supervision.heartbeat_timeout_s,
+        };
         let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
         if matches!(state, RoleState::Absent | RoleState::Done) || self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
@@ -281,7 +303,10 @@ impl Member {
             janitor.clear_dead();
         }
         match (tells, state, scenario.clock) {
-            (true, ..) => fail(janitor, format!("it said nothing for {limit_s} s")),
+            (true, ..) => match &self.host {
+                Some(host) => fail(janitor, format!("nothing was heard of it and the host {host} for {limit_s} s")),
+                None => fail(janitor, format!("it said nothing for {limit_s} s")),
+            },
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
                     self.last.state = RoleState::Done as u64;

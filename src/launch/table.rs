@@ -3,6 +3,7 @@
 use super::outcome::{LinkCounters, State};
 use super::{Incident, Summary};
 use crate::analysis::digits;
+use crate::hosts::{HostsSummary, Silence};
 use crate::serial::LineCounters;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
@@ -41,6 +42,7 @@ pub fn table(summary: &Summary) -> String {
     for (body, counters) in &summary.lines {
         let _ = writeln!(text, "{}", line_words(body, counters));
     }
+    summary.hosts.iter().for_each(|of| hosts(of, &mut text));
     privileges(summary, &mut text);
     text
 }
@@ -194,6 +196,54 @@ fn books(summary: &Summary, text: &mut String) {
             state.hash, state.clean_ticks, state.clean_hash
         ),
     };
+}
+
+fn hosts(summary: &HostsSummary, text: &mut String) {
+    for host in &summary.hosts {
+        let name = &host.host;
+        let _ = match &host.clock {
+            None => writeln!(text, "host {name}: it launched the run; its clock is the run's"),
+            Some(clock) => writeln!(
+                text,
+                "host {name}: clock {} to {:.1} us (at most {:.1} us), drift {:.2} ppm, there and back in {:.0} us, {} corrections of {:.1} us \
+                 at most",
+                clock.source,
+                clock.error_us,
+                clock.error_max_us,
+                clock.drift_ppm,
+                clock.round_trip_us,
+                clock.corrections,
+                clock.largest_correction_us,
+            ),
+        };
+        for silence in &host.silences {
+            let Silence { of, tick, seconds, healed } = silence;
+            let end = if *healed { ", then heard again" } else { "" };
+            let _ = writeln!(text, "  from tick {tick} on nothing was heard of {of} for {seconds:.2} s{end}");
+        }
+        let ill = [
+            (host.repeated_frames, "frames sent again"),
+            (host.refused_frames, "frames without room"),
+            (host.malformed, "messages that are none"),
+        ];
+        let ill: Vec<String> =
+            ill.iter().filter(|(count, _)| *count > 0).map(|(n, what)| format!("{n} {what}")).collect();
+        if !ill.is_empty() {
+            let _ = writeln!(text, "  {}", ill.join(", "));
+        }
+    }
+    let mut rows = plain(&["between hosts", "way", "sent", "received", "lost", "stale", "p50 us", "p99 us", "max us"]);
+    let count = |count: Option<u64>| count.map_or("-".to_owned(), |count| count.to_string());
+    for link in &summary.links {
+        let short = link.service.splitn(3, '/').nth(2).unwrap_or(&link.service).to_owned();
+        let mut row = vec![short, format!("{} to {}", link.from, link.to), count(link.sent), count(link.received)];
+        row.extend([link.lost.to_string(), link.stale.to_string()]);
+        let us = link.one_way.map(|way| [way.p50_us, way.p99_us, way.max_us].map(|us| format!("{us:.0}")));
+        row.extend(us.unwrap_or_else(|| ["-".to_owned(), "-".to_owned(), "-".to_owned()]));
+        rows.add_row(row);
+    }
+    let error_us = summary.clock_error_us();
+    let _ = writeln!(text, "\n{rows}\ntimes between hosts are known to {error_us:.1} us\n");
 }
 
 fn privileges(summary: &Summary, text: &mut String) {

@@ -18,6 +18,7 @@ mod estimate;
 mod export;
 mod foxglove;
 mod help;
+mod hosts;
 mod identify;
 mod init;
 mod latest;
@@ -97,6 +98,8 @@ enum Command {
     Watch(watch::Arguments),
     /// Show a running loop on a Foxglove WebSocket
     Foxglove(foxglove::Arguments),
+    /// Take this host's part in a run that another host launched
+    Join(hosts::JoinArguments),
     /// Find a body's inertia in a log of its angular velocity
     Identify(identify::Arguments),
     /// Find the rate about one axis in a log of the other two
@@ -111,6 +114,9 @@ enum Command {
     Completions(help::CompletionsArguments),
     /// Write the manual pages into a directory
     Man(help::ManArguments),
+    /// Carry what crosses from this host of a run to others, and back
+    #[command(hide = true)]
+    Relay(hosts::RelayArguments),
     /// Take the other end of a hop that is measured
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
@@ -374,6 +380,8 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Report(arguments)) => report::report(&arguments),
         Some(Command::Watch(arguments)) => watch::watch(&arguments),
         Some(Command::Foxglove(arguments)) => foxglove::foxglove(&arguments),
+        Some(Command::Join(arguments)) => hosts::join(&arguments),
+        Some(Command::Relay(arguments)) => hosts::relay(&arguments),
         Some(Command::Identify(arguments)) => identify::identify(&arguments),
         Some(Command::Estimate(arguments)) => estimate::estimate(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),

@@ -2,11 +2,13 @@
 
 use super::campaign;
 use super::color::{Color, paint};
+use super::hosts::{self, KeyArguments};
 use super::scenario::{Change, changed, load, stem};
 use super::{Exit, fail, foxglove, name, print, remark};
 use crate::config::{ClockKind, RunId, Scenario};
 use crate::doctor::Machine;
 use crate::files;
+use crate::hosts::{Address, HostSeat};
 use crate::launch::{
     Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, make_directory, make_latest,
     new_run, table, write_run,
@@ -62,6 +64,14 @@ pub struct Arguments {
     /// Show every signal live on a Foxglove WebSocket, at IP:PORT; without ADDR at 127.0.0.1:8765
     #[arg(long, hide_short_help = true, value_name = "ADDR", num_args = 0..=1, default_missing_value = foxglove::ADDRESS, value_parser = foxglove::address)]
     foxglove: Option<SocketAddr>,
+    /// Be this host of the scenario's, and wait for the others to join
+    #[arg(long, value_name = "NAME", requires = "listen", hide_short_help = true)]
+    host: Option<String>,
+    /// Where the others join: tls/HOST:PORT, or tcp/ or udp/ on loopback
+    #[arg(long, value_name = "ADDR", requires = "host", hide_short_help = true)]
+    listen: Option<Address>,
+    #[command(flatten)]
+    keys: KeyArguments,
     /// Print the summary as JSON, all else on stderr
     #[arg(long)]
     json: bool,
@@ -124,6 +134,7 @@ impl Arguments {
         let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
+            .and_then(|()| self.check_host(&scenario))
             .map_err(|reason| Failure { exit: Exit::Usage, reason })?;
         Ok(scenario)
     }
@@ -132,6 +143,40 @@ impl Arguments {
         let in_thread = "a run in one thread has nothing that another process could show; take --clock lockstep";
         let reason = foxglove::refusal().or((scenario.clock == ClockKind::InProcess).then_some(in_thread));
         reason.filter(|_| self.foxglove.is_some()).map_or(Ok(()), |reason| Err(format!("--foxglove: {reason}")))
+    }
+
+    /// This host's part in a run over several.
+    fn seat(&self) -> Result<Option<HostSeat>, String> {
+        let (Some(host), Some(address)) = (&self.host, &self.listen) else {
+            return if self.keys.any() {
+                Err("--tls-… and --insecure are for --listen".to_owned())
+            } else {
+                Ok(None)
+            };
+        };
+        let endpoint = self.keys.endpoint(address.clone())?;
+        Ok(Some(HostSeat { host: host.clone(), endpoint }))
+    }
+
+    fn check_host(&self, scenario: &Scenario) -> Result<(), String> {
+        let Some(HostSeat { host, .. }) = self.seat()? else { return Ok(()) };
+        hosts::refusal().map_or(Ok(()), |reason| Err(format!("--host {host}: {reason}")))?;
+        let names: Vec<&str> = scenario.hosts.hosts.iter().map(|host| &*host.name).collect();
+        if scenario.clock == ClockKind::InProcess {
+            return Err(format!("--host {host}: one thread has one host; give --clock realtime or lockstep"));
+        }
+        if !self.external.is_empty() {
+            return Err(format!(
+                "--external: somebody else's role has no part in a run over several hosts; leave out --host {host}, or it"
+            ));
+        }
+        match names.contains(&host.as_str()) {
+            true => Ok(()),
+            false if names.is_empty() => {
+                Err(format!("--host {host}: the scenario has no [[host]]; name hosts and their roles there"))
+            }
+            false => Err(format!("--host {host}: the scenario has no such host; it has: {}", names.join(", "))),
+        }
     }
 
     fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
@@ -208,7 +253,8 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
     let (level, events) = (Level::of(arguments), arguments.events);
-    let mut screen = Screen { bar: None, asked: false, fleets, level, told: String::new(), events };
+    let joins = arguments.listen.as_ref().map(|address| arguments.keys.join_words(address));
+    let mut screen = Screen { bar: None, asked: false, fleets, level, told: String::new(), events, joins };
     screen.tell_verbose(format_args!("results go to {}", directory.display()));
     if scenario.clock == ClockKind::Realtime && screen.level > Level::Quiet {
         tell_ungranted(scenario);
@@ -220,6 +266,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
             record: scenario.record.then(|| directory.join("run.mcap")),
             results: std::fs::canonicalize(&directory).ok(),
             foxglove: arguments.foxglove,
+            host: arguments.seat().map_err(|reason| Failure { exit: Exit::Usage, reason })?,
             require_realtime: arguments.require_rt,
             checkpoints: true,
             signal: &signal,
@@ -411,6 +458,8 @@ struct Screen {
     told: String,
     /// Whether programs are told, too.
     events: bool,
+    /// What is typed on another host to join, but for its name; where others can.
+    joins: Option<String>,
 }
 
 impl Screen {
@@ -418,6 +467,13 @@ impl Screen {
         self.tell_phase(progress);
         match progress {
             _ if self.level == Level::Quiet => {}
+            Progress::Waiting { hosts, .. } if !hosts.is_empty() && !self.asked => {
+                self.asked = true;
+                let joins = self.joins.as_deref().unwrap_or_default();
+                for host in hosts {
+                    tell(format_args!("waiting for the host {host}: type there\n  {} {joins} --host {host}", name()));
+                }
+            }
             Progress::Waiting { external, domain, .. } if !external.is_empty() && !self.asked => {
                 self.asked = true;
                 for role in external {
@@ -442,6 +498,9 @@ impl Screen {
     /// Tells each phase of a run once, to whoever wants to know.
     fn tell_phase(&mut self, progress: &Progress<'_>) {
         let phase = match progress {
+            Progress::Waiting { domain, hosts, .. } if !hosts.is_empty() => {
+                format!("the run's domain is {}; it waits for {}", domain.display(), hosts.join(", "))
+            }
             Progress::Waiting { domain, .. } => format!("the run's domain is {}", domain.display()),
             Progress::Running { last_tick, .. } => format!("ticks 0 to {last_tick} run"),
             Progress::External(_) => return,
@@ -452,10 +511,10 @@ impl Screen {
             if self.events {
                 // A reader that has gone is told of at the end, when what it lacks is most.
                 let _ = match progress {
-                    Progress::Waiting { external, domain, .. } => {
+                    Progress::Waiting { external, domain, hosts, .. } => {
                         let seat = |role: &&str| (role.to_string(), seat_path(domain, role));
                         let seats: BTreeMap<String, PathBuf> = external.iter().map(seat).collect();
-                        event("waiting", serde_json::json!({ "domain": domain, "seats": seats }))
+                        event("waiting", serde_json::json!({ "domain": domain, "seats": seats, "hosts": hosts }))
                     }
                     Progress::Running { last_tick, .. } => {
                         event("running", serde_json::json!({ "last_tick": last_tick }))

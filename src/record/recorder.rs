@@ -56,14 +56,21 @@ pub struct SignalReport {
     pub extra: u64,
     /// Samples that its writer published by its own counters; none if it keeps none.
     pub published: Option<u64>,
-    /// Published and not recorded; none if that is not known.
+    /// Published and not recorded, though it came to this host; none if that is not known.
     pub lost: Option<u64>,
+    /// Published on another host, and lost on the way here.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub lost_between_hosts: u64,
     /// The last tick of which there is something.
     pub last_tick: Option<u64>,
     /// Ticks, first and last, of which there is nothing: never published, or lost.
     pub gaps: Vec<[u64; 2]>,
     /// Gaps beyond those told.
     pub more_gaps: u64,
+}
+
+fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 impl SignalReport {
@@ -75,6 +82,7 @@ impl SignalReport {
             extra: counters.extra,
             published: None,
             lost: None,
+            lost_between_hosts: 0,
             last_tick: counters.next.checked_sub(1),
             gaps: counters.gaps,
             more_gaps: counters.more_gaps,
@@ -82,12 +90,14 @@ impl SignalReport {
     }
 
     /// Holds what was recorded against the counters of the roles. Again, if the loop went on after the recording.
-    fn reconcile(&mut self, roles: &[RoleReport]) {
+    fn reconcile(&mut self, roles: &[RoleReport], between_hosts: &dyn Fn(&str) -> u64) {
         let Some(link) = roles.iter().flat_map(|role| &role.written).find(|link| link.service == self.service) else {
             return;
         };
         self.published = Some(link.published);
-        self.lost = Some(link.published.saturating_sub(self.recorded));
+        let missing = link.published.saturating_sub(self.recorded);
+        self.lost_between_hosts = between_hosts(&self.service).min(missing);
+        self.lost = Some(missing - self.lost_between_hosts);
         let from = self.last_tick.map_or(0, |tick| tick + 1);
         if let Some(to) = link.last_tick.filter(|to| *to >= from) {
             self.gaps.retain(|gap| gap[0] != from);
@@ -97,9 +107,10 @@ impl SignalReport {
 }
 
 impl RecordingReport {
-    /// Holds the recording against the roles' final counters.
-    pub fn reconcile(&mut self, roles: &[RoleReport]) {
-        self.signals.iter_mut().for_each(|signal| signal.reconcile(roles));
+    /// Holds the recording against the roles' final counters. `between_hosts` tells how much of a signal was lost on the way to this
+    /// host.
+    pub fn reconcile(&mut self, roles: &[RoleReport], between_hosts: &dyn Fn(&str) -> u64) {
+        self.signals.iter_mut().for_each(|signal| signal.reconcile(roles, between_hosts));
         let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
         // Whoever began in the midst of a run knew that.
         if let (true, None, 1..) = (self.whole, &self.problem, lost) {
@@ -186,7 +197,7 @@ impl Recorder {
             signals: std::mem::take(&mut self.signals),
         };
         report.messages = report.signals.iter().map(|signal| signal.recorded + signal.void + signal.extra).sum();
-        report.reconcile(roles);
+        report.reconcile(roles, &|_| 0);
         match self.end(&report, roles) {
             Ok(bytes) => report.bytes = bytes,
             Err(error) => {

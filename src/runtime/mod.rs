@@ -27,13 +27,17 @@ pub use node::{
     private_ledger, report, shared_ledger, topic,
 };
 pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_bytes};
+#[cfg(feature = "hosts")]
+pub(crate) use privileges::go_before_roles;
 pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
 pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
-pub(crate) use process::{join, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
+pub(crate) use process::{
+    clock_path, join, open_ledger, report_path, results_path, scenario_path, words_path, write_whole,
+};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

@@ -250,7 +250,9 @@ impl<B: Bus> Seat<'_, B> {
     where
         S: Carried + ?Sized,
     {
-        self.input_of(body, signal, guard, Reader::Role)
+        // Where inputs of one tick may come ticks apart, the newest of each is not enough.
+        let lags = self.scenario.lag_ticks(self.role.name(self.scenario)) > 1;
+        self.input_of(body, signal, guard, if lags { Reader::Scorer } else { Reader::Role })
     }
 
     fn input_of<S, G: Guard<S>>(

@@ -145,6 +145,15 @@ pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
     done
 }
 
+/// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
+/// does little, and whoever spins for a sample that it has would hold it up. What is not granted is done without.
+pub fn go_before_roles(scenario: &Scenario) {
+    let _ = set_current_timer_slack(NonZero::new(1));
+    if (1..99).contains(&scenario.realtime.priority) {
+        let _ = set_fifo(scenario.realtime.priority + 1);
+    }
+}
+
 /// Lets everybody pass, and leaves the cores that the scenario names for roles. What is not granted is no harm.
 fn yield_cores(scenario: &Scenario, niceness: i32) {
     let _ = nice(niceness);

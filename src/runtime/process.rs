@@ -12,7 +12,7 @@ use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
-use crate::clock::{Grid, monotonic_ns, sleep_until};
+use crate::clock::{self, Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
 use crate::files;
 use crate::sample::{Phase, RoleState, Schedule};
@@ -117,6 +117,14 @@ pub enum RoleError {
     /// The run is gone, and nobody is left to report to.
     #[error("the run is gone: its launcher was killed, or ended without waiting for this role; start it again")]
     Gone,
+    /// The run was launched on another host, and its time is not to be had.
+    #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
+    Clock {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
     /// The report could not be written.
     #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
     Report {
@@ -207,9 +215,16 @@ pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), R
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
 }
 
-/// The domain of a run with its scenario.
+/// The file with the correction of this host's clock, where the run was launched on another.
+pub(crate) fn clock_path(domain: &Domain) -> PathBuf {
+    domain.shared("clock")
+}
+
+/// The domain of a run with its scenario. The process has the time of that run from here on.
 pub(crate) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let domain = Domain::join(directory)?;
+    let path = clock_path(&domain);
+    clock::adopt(&path).map_err(|source| RoleError::Clock { path, source })?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
     Ok((domain, scenario))
 }
@@ -326,7 +341,7 @@ pub fn serve<B: Bus + 'static>(
     let mut stages = Vec::new();
     let leads = books.iter().any(|(role, _)| *role == RoleId::Plant(0));
     let ended = match begin(scenario, leads, &mut node, &mut control, &mut stages)? {
-        Some(schedule) => drive(scenario, &mut node, &mut control, &schedule, &privileges)?,
+        Some(schedule) => drive(scenario, role, &mut node, &mut control, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
     node.finish()?;
@@ -422,7 +437,9 @@ fn await_phase<B: Bus>(
 }
 
 /// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
-fn waiting<'a>(scenario: &Scenario, privileges: &'a Privileges) -> Waiting<'a> {
+fn waiting<'a>(scenario: &Scenario, role: RoleId, privileges: &'a Privileges) -> Waiting<'a> {
+    // A way between hosts may take its budget: one tick, less what comes after the cutoff, is there in any case.
+    let lag_ticks = scenario.lag_ticks(role.name(scenario)).saturating_sub(1);
     let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
     let [lead_ns, spin_ns] = [wake_lead_us, spin_us].map(|us| ((us * 1e3) as u64).min(scenario.period_ns / 4));
     let (spin_ns, yields_to) = match wake {
@@ -430,11 +447,12 @@ fn waiting<'a>(scenario: &Scenario, privileges: &'a Privileges) -> Waiting<'a> {
         Wake::Spin => (spin_ns, &[][..]),
         Wake::Auto | Wake::Event => (0, &[][..]),
     };
-    Waiting { lead_ns, spin_ns, yields_to, cutoff }
+    Waiting { lead_ns, spin_ns, yields_to, cutoff: cutoff + lag_ticks as f64 }
 }
 
 fn drive<B: Bus>(
     scenario: &Scenario,
+    role: RoleId,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     schedule: &Schedule,
@@ -447,7 +465,7 @@ fn drive<B: Bus>(
     node.start(grid, first_tick.min(scenario.last_tick + 1))?;
     let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
-        ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, privileges)),
+        ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, role, privileges)),
         ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
     };
     Ok(ended?)

@@ -16,7 +16,7 @@ pub struct Latency {
 }
 
 /// The figures that a table shows, µs.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Percentiles {
     /// How many values.
     pub count: u64,

@@ -1,0 +1,165 @@
+//! The time of a run whose hosts have clocks of their own: each host's monotonic clock with a correction, so that all ticks and
+//! stamps of the run are on one time base, that of the host which launched it.
+//!
+//! The correction is a line that one process of the host writes and all others of the run there read from shared memory. It has no
+//! step: a new line begins where the old one is. Must not know how the correction is found.
+
+use crate::shared::SharedWords;
+use std::io;
+use std::path::Path;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, Ordering, fence};
+
+/// Even while the line is whole; odd while it is written.
+const SEQUENCE: usize = 0;
+const REFERENCE: usize = 1;
+const OFFSET: usize = 2;
+const SLOPE: usize = 3;
+const WORDS: usize = 4;
+
+/// The fraction of a slope: 2⁻⁴⁰.
+const FRACTION: u32 = 40;
+/// The steepest line, ns per ns: what a clock is moved by at the most while it catches up.
+pub const STEEPEST: f64 = 500e-6;
+
+/// A line: the correction of the monotonic clock as a function of that clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Correction {
+    reference_ns: u64,
+    offset_ns: i64,
+    /// Ns per ns, as a multiple of 2⁻⁴⁰.
+    slope: i64,
+}
+
+impl Correction {
+    /// `offset_ns` at `reference_ns` on the monotonic clock, and from there on `slope` ns more per ns, at most [`STEEPEST`].
+    pub fn new(reference_ns: u64, offset_ns: i64, slope: f64) -> Self {
+        let slope = (slope.clamp(-STEEPEST, STEEPEST) * (1_u64 << FRACTION) as f64) as i64;
+        Self { reference_ns, offset_ns, slope }
+    }
+
+    /// The correction at a time on the monotonic clock, ns.
+    #[inline]
+    pub fn at(&self, raw_ns: u64) -> i64 {
+        let elapsed_ns = i128::from(raw_ns) - i128::from(self.reference_ns);
+        self.offset_ns + ((elapsed_ns * i128::from(self.slope)) >> FRACTION) as i64
+    }
+
+    /// The time of the run at a time on the monotonic clock, ns.
+    #[inline]
+    pub fn apply(&self, raw_ns: u64) -> u64 {
+        raw_ns.saturating_add_signed(self.at(raw_ns))
+    }
+}
+
+/// The correction in shared memory.
+#[derive(Debug)]
+pub struct RunClock(SharedWords);
+
+impl RunClock {
+    /// The one in a file, made if it is not there: then it corrects nothing.
+    ///
+    /// # Errors
+    /// The system's reason.
+    pub fn open(path: &Path) -> io::Result<Self> {
+        SharedWords::open(path, WORDS).and_then(Self::whole)
+    }
+
+    fn existing(path: &Path) -> io::Result<Self> {
+        SharedWords::existing(path).and_then(Self::whole)
+    }
+
+    fn whole(words: SharedWords) -> io::Result<Self> {
+        if words.words().len() == WORDS { Ok(Self(words)) } else { Err(io::Error::other("it is another version's")) }
+    }
+
+    /// Replaces the correction. There is one writer.
+    pub fn set(&self, correction: Correction) {
+        let words = self.0.words();
+        let sequence = words[SEQUENCE].load(Ordering::Relaxed);
+        words[SEQUENCE].store(sequence + 1, Ordering::Relaxed);
+        fence(Ordering::Release);
+        words[REFERENCE].store(correction.reference_ns, Ordering::Relaxed);
+        words[OFFSET].store(correction.offset_ns as u64, Ordering::Relaxed);
+        words[SLOPE].store(correction.slope as u64, Ordering::Relaxed);
+        words[SEQUENCE].store(sequence + 2, Ordering::Release);
+    }
+
+    /// The correction. A writer that died in the midst of it leaves what others saw last.
+    #[inline]
+    pub fn get(&self) -> Correction {
+        let words: &[AtomicU64] = self.0.words();
+        let mut correction = Correction::default();
+        for _ in 0..TRIES {
+            let before = words[SEQUENCE].load(Ordering::Acquire);
+            correction = Correction {
+                reference_ns: words[REFERENCE].load(Ordering::Relaxed),
+                offset_ns: words[OFFSET].load(Ordering::Relaxed) as i64,
+                slope: words[SLOPE].load(Ordering::Relaxed) as i64,
+            };
+            fence(Ordering::Acquire);
+            if before.is_multiple_of(2) && words[SEQUENCE].load(Ordering::Relaxed) == before {
+                break;
+            }
+        }
+        correction
+    }
+}
+
+/// How often a line is read again that is written meanwhile: three stores take less.
+const TRIES: usize = 1000;
+
+static OF_THIS_PROCESS: OnceLock<RunClock> = OnceLock::new();
+
+/// Takes the time of this process from the correction in a file, from now on and for good, if there is such a file.
+///
+/// # Errors
+/// The system's reason, but for a file that is not there.
+pub fn adopt(path: &Path) -> io::Result<()> {
+    match RunClock::existing(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        clock => clock.map(|clock| {
+            let _ = OF_THIS_PROCESS.set(clock);
+        }),
+    }
+}
+
+/// The correction of this process's clock; none where there is one host, and on the one that launched the run.
+#[inline]
+pub(super) fn correction() -> Option<Correction> {
+    OF_THIS_PROCESS.get().map(RunClock::get)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_is_followed_over_hours_to_the_nanosecond() {
+        let line = Correction::new(1_000, -1_000_000_000_000, 50e-6);
+        assert_eq!(line.at(1_000), -1_000_000_000_000);
+        let ten_hours_ns = 36_000_000_000_000;
+        let drifted_ns = line.at(1_000 + ten_hours_ns) - line.at(1_000);
+        assert!((drifted_ns - 1_800_000_000).abs() <= 100, "{drifted_ns}");
+        assert_eq!(Correction::new(0, 5, -1.0).at(1_000_000) - 5, -500, "no clock stands still");
+        assert_eq!(Correction::new(0, -10, 0.0).apply(3), 0, "there is no time before zero");
+    }
+
+    #[test]
+    fn readers_see_whole_lines() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("clock");
+        let writer = RunClock::open(&path).unwrap();
+        let reader = RunClock::existing(&path).unwrap();
+        assert_eq!(reader.get(), Correction::default());
+        let written = std::thread::spawn(move || {
+            (1..=100_000_i64).for_each(|n| writer.set(Correction { reference_ns: n as u64, offset_ns: n, slope: n }));
+        });
+        while !written.is_finished() {
+            let Correction { reference_ns, offset_ns, slope } = reader.get();
+            assert_eq!((reference_ns as i64, offset_ns), (offset_ns, slope));
+        }
+        written.join().unwrap();
+        assert_eq!(reader.get().offset_ns, 100_000);
+    }
+}

@@ -1,0 +1,224 @@
+//! The computers of a run: which roles each has, and what the ways between them may take.
+//!
+//! Must not know how anything crosses from one to another.
+
+use super::scenario::Checks;
+use serde::{Deserialize, Serialize};
+
+/// The longest budget, ticks: no command is on its way for longer.
+const BUDGET_MAX: u64 = crate::control::ACTUATION_DELAY_MAX;
+
+/// A computer of a run, with the roles that run there.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Host {
+    /// Its name in this scenario.
+    pub name: String,
+    /// The roles that run there.
+    pub roles: Vec<String>,
+}
+
+/// What holds between the computers of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Network {
+    /// How many ticks each way from one host to another may take.
+    pub budget_ticks: u64,
+    /// How hosts agree on the time.
+    pub clock_source: ClockSource,
+    /// A host that says nothing for so long is lost, s.
+    pub silence_timeout_s: f64,
+}
+
+/// How hosts agree on the time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ClockSource {
+    /// Offset and drift of each host's monotonic clock are estimated over the network.
+    Estimated,
+    /// CLOCK_TAI, which the machines keep alike, as by PTP; the network only confirms it.
+    System,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self { budget_ticks: 1, clock_source: ClockSource::Estimated, silence_timeout_s: 5.0 }
+    }
+}
+
+impl Network {
+    pub(super) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// The hosts of a scenario, and the loop that crosses them.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Hosts {
+    /// In the order of the file; none where there is one computer.
+    pub hosts: Vec<Host>,
+    /// What holds between them.
+    pub network: Network,
+}
+
+impl Hosts {
+    /// The name of the host that has a role; none where there is one computer.
+    pub fn of(&self, role: &str) -> Option<&str> {
+        let has = |host: &&Host| host.roles.iter().any(|other| other == role);
+        self.hosts.iter().find(has).map(|host| &*host.name)
+    }
+
+    /// Ticks that a sample may take from one role to another.
+    fn way(&self, from: &str, to: &str) -> u64 {
+        if self.of(from) == self.of(to) { 0 } else { self.network.budget_ticks }
+    }
+
+    /// How many ticks after its tick a role may still wait for inputs: the budgets on the way from the measurements to it, 0 where
+    /// nothing crosses. `bodies` are all bodies, the first of which is observed, and whether each is driven.
+    pub fn lag_ticks<'a>(&self, role: &str, bodies: impl Iterator<Item = (&'a str, bool)> + Clone) -> u64 {
+        let Some((leader, _)) = bodies.clone().next() else { return 0 };
+        let estimated = self.way(leader, "observer");
+        match role {
+            "observer" => estimated,
+            "controller" => {
+                let driven = bodies.filter(|(_, driven)| *driven).map(|(body, _)| self.way(body, "controller"));
+                driven.max().unwrap_or(0).max(estimated + self.way("observer", "controller"))
+            }
+            _ => 0,
+        }
+    }
+}
+
+/// Checks that every role has one host, and that the budgets fit into the delay of the actuators.
+pub(super) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], delay_ticks: u64, checks: &mut Checks<'_>) {
+    let mut taken: Vec<&str> = Vec::new();
+    for (index, host) in hosts.hosts.iter().enumerate() {
+        let key = |part: &str| format!("host[{index}].{part}");
+        for (position, role) in host.roles.iter().enumerate() {
+            let key = format!("{}[{position}]", key("roles"));
+            if !roles.contains(&role.as_str()) {
+                checks.refuse(&key, format!("there is no role `{role}`; this scenario has: {}", roles.join(", ")));
+            } else if taken.contains(&role.as_str()) {
+                checks.refuse(&key, format!("the {role} cannot be on two hosts; name it once"));
+            }
+            taken.push(role);
+        }
+    }
+    let homeless: Vec<&str> = roles.iter().copied().filter(|role| !taken.contains(role)).collect();
+    checks.require(hosts.hosts.is_empty() || homeless.is_empty(), "host", || {
+        format!("no host has the role {}; name every role once", homeless.join(", "))
+    });
+    let lag = hosts.lag_ticks("controller", bodies.iter().copied());
+    for (body, _) in bodies.iter().filter(|(_, driven)| *driven) {
+        let needed = lag + hosts.way("controller", body);
+        checks.require(needed <= delay_ticks, "actuation_delay_ticks", || {
+            format!(
+                "the budgets on the way from the measurements by the controller to {body} come to {needed} ticks, and a command \
+                 acts after {delay_ticks}; give {needed} or more, or lower network.budget_ticks"
+            )
+        });
+    }
+}
+
+/// Checks what can be judged without a rig.
+pub(super) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[String], checks: &mut Checks<'_>) {
+    let mut names: Vec<&str> = Vec::new();
+    for (index, host) in hosts.hosts.iter().enumerate() {
+        let (name, key) = (host.name.as_str(), format!("host[{index}].name"));
+        let letters = name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+        checks.require(letters && (1..=32).contains(&name.len()), &key, || {
+            format!("`{name}` cannot name files; use 1 to 32 of a-z, 0-9 and -")
+        });
+        checks.require(!names.contains(&name), &key, || format!("there are two hosts `{name}`; name each once"));
+        checks.require(!host.roles.is_empty(), &format!("host[{index}].roles"), || {
+            "a host without roles has no part in a run; give it one, or leave it out".to_owned()
+        });
+        names.push(name);
+    }
+    checks.require(hosts.hosts.is_empty() || hosts.hosts.len() <= 16, "host", || {
+        format!("{} hosts are more than a run can have; give 16 at the most", hosts.hosts.len())
+    });
+    for (index, roles) in processes.iter().enumerate() {
+        let apart = roles.iter().any(|role| hosts.of(role) != hosts.of(&roles[0]));
+        checks.require(!apart, &format!("launch.processes[{index}]"), || {
+            format!("{} are on different hosts and cannot share a process; take them apart", roles.join(", "))
+        });
+    }
+    for (index, role) in external.iter().enumerate() {
+        checks.require(hosts.hosts.is_empty(), &format!("launch.external[{index}]"), || {
+            format!("somebody else's {role} has no part in a run over several hosts; leave it out, or the hosts")
+        });
+    }
+    let Network { budget_ticks, silence_timeout_s, .. } = hosts.network;
+    checks.require((1..=BUDGET_MAX).contains(&budget_ticks), "network.budget_ticks", || {
+        format!("no way takes {budget_ticks} ticks; give 1 to {BUDGET_MAX}")
+    });
+    checks.require((0.1..=3600.0).contains(&silence_timeout_s), "network.silence_timeout_s", || {
+        format!("{silence_timeout_s} s is no time to wait for a host that speaks every 0.02 s; give 0.1 to 3600")
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{SHIPPED, Scenario};
+
+    const BODIES: [(&str, bool); 2] = [("leader", false), ("follower", true)];
+
+    fn hosts(of: &[(&str, &[&str])]) -> Hosts {
+        let host = |(name, roles): &(&str, &[&str])| Host {
+            name: (*name).to_owned(),
+            roles: roles.iter().map(|role| (*role).to_owned()).collect(),
+        };
+        Hosts { hosts: of.iter().map(host).collect(), network: Network { budget_ticks: 3, ..Network::default() } }
+    }
+
+    #[test]
+    fn budgets_add_up_on_the_way_to_a_role() {
+        let lag = |hosts: &Hosts, role: &str| hosts.lag_ticks(role, BODIES.into_iter());
+        let bench = hosts(&[("bench", &["leader", "follower"]), ("flight", &["observer", "controller"])]);
+        assert_eq!([lag(&bench, "observer"), lag(&bench, "controller"), lag(&bench, "follower")], [3, 3, 0]);
+        let three = hosts(&[("a", &["leader", "follower"]), ("b", &["observer"]), ("c", &["controller"])]);
+        assert_eq!([lag(&three, "observer"), lag(&three, "controller")], [3, 6]);
+        let formation = hosts(&[("one", &["leader", "observer", "controller"]), ("two", &["follower"])]);
+        assert_eq!([lag(&formation, "observer"), lag(&formation, "controller")], [0, 3]);
+        assert_eq!(lag(&Hosts::default(), "controller"), 0, "one computer");
+    }
+
+    fn refusals(text: &str) -> String {
+        let text = format!("{}\n{text}", SHIPPED[0].1);
+        Scenario::parse(&text, "x.toml", &[]).err().map_or(String::new(), |error| error.to_string())
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_told_with_a_remedy() {
+        let bench = "[[host]]\nname = \"bench\"\nroles = [\"leader\", \"follower\"]\n";
+        let told = refusals(bench);
+        assert!(told.contains("host: no host has the role observer, controller; name every role once"), "{told}");
+        let flight = "[[host]]\nname = \"flight\"\nroles = [\"observer\", \"controller\"]\n";
+        let told = refusals(&format!("{bench}{flight}"));
+        assert!(told.contains("come to 2 ticks, and a command acts after 1; give 2 or more"), "{told}");
+        for (text, expected) in [
+            ("[[host]]\nname = \"A b\"\nroles = []\n", "cannot name files"),
+            ("[[host]]\nname = \"a\"\nroles = []\n", "without roles"),
+            ("[[host]]\nname = \"a\"\nroles = [\"nobody\"]\n", "there is no role `nobody`"),
+            ("[[host]]\nname = \"a\"\nroles = [\"leader\", \"leader\"]\n", "cannot be on two hosts"),
+            ("[network]\nbudget_ticks = 0\n", "no way takes 0 ticks"),
+            ("[network]\nsilence_timeout_s = 0.0\n", "give 0.1 to 3600"),
+            ("[network]\nclock_source = \"sundial\"\n", "sundial"),
+        ] {
+            let told = refusals(text);
+            assert!(told.contains(expected) && told.contains("x.toml:"), "{told}");
+        }
+    }
+
+    #[test]
+    fn the_resolved_file_has_the_hosts() {
+        let text = SHIPPED[0].1.replacen("tick_hz", "actuation_delay_ticks = 2\ntick_hz", 1)
+            + "[[host]]\nname = \"a\"\nroles = [\"leader\", \"follower\"]\n[[host]]\nname = \"b\"\nroles = [\"observer\", \"controller\"]\n";
+        let scenario = Scenario::parse(&text, "x.toml", &[]).unwrap();
+        let again = Scenario::parse(&scenario.to_toml(), "y.toml", &[]).unwrap();
+        assert_eq!(again.hosts, scenario.hosts);
+        assert_eq!((again.hosts.of("observer"), again.hosts.hosts.len()), (Some("b"), 2));
+    }
+}

@@ -1,0 +1,168 @@
+//! Both ends of a stream that loses nothing over a way that may: numbered frames, repeated until they are acknowledged, so many under
+//! way at the most. Pure: bytes in, bytes out, time is an argument. Must not know what a frame holds.
+
+use std::collections::VecDeque;
+
+/// Frames under way at the most.
+const WINDOW: usize = 256;
+/// What is not acknowledged for so long is sent again, ns, and at the most so long when nothing comes through.
+const REPEAT_NS: u64 = 50_000_000;
+const REPEAT_MAX_NS: u64 = 800_000_000;
+
+/// The sending end.
+#[derive(Debug)]
+pub struct Sender {
+    /// The number of the first frame that is kept.
+    first: u64,
+    frames: VecDeque<Vec<u8>>,
+    /// How many of these are under way.
+    under_way: usize,
+    capacity: usize,
+    progress_ns: u64,
+    patience_ns: u64,
+    repeated: u64,
+    refused: u64,
+}
+
+impl Sender {
+    /// An end that keeps so many frames at the most.
+    pub fn new(capacity: usize) -> Self {
+        Self {
+            first: 0,
+            frames: VecDeque::new(),
+            under_way: 0,
+            capacity,
+            progress_ns: 0,
+            patience_ns: REPEAT_NS,
+            repeated: 0,
+            refused: 0,
+        }
+    }
+
+    /// Takes a frame; false, and it is lost, if too many wait already.
+    pub fn push(&mut self, frame: Vec<u8>) -> bool {
+        let fits = self.frames.len() < self.capacity;
+        if fits {
+            self.frames.push_back(frame);
+        } else {
+            self.refused += 1;
+        }
+        fits
+    }
+
+    /// Hands out what is to be sent now, with its number.
+    pub fn poll(&mut self, now_ns: u64, mut send: impl FnMut(u64, &[u8])) {
+        if self.under_way == 0 {
+            self.progress_ns = now_ns;
+        } else if now_ns.saturating_sub(self.progress_ns) >= self.patience_ns {
+            // All of them: whoever waits for the first takes none of the others.
+            self.repeated += self.under_way as u64;
+            self.under_way = 0;
+            self.progress_ns = now_ns;
+            self.patience_ns = (2 * self.patience_ns).min(REPEAT_MAX_NS);
+        }
+        while self.under_way < self.frames.len().min(WINDOW) {
+            send(self.first + self.under_way as u64, &self.frames[self.under_way]);
+            self.under_way += 1;
+        }
+    }
+
+    /// Takes an acknowledgement of all frames before `next`.
+    pub fn acknowledged(&mut self, next: u64, now_ns: u64) {
+        let done = next.saturating_sub(self.first).min(self.frames.len() as u64) as usize;
+        if done > 0 {
+            self.frames.drain(..done);
+            self.first += done as u64;
+            self.under_way = self.under_way.saturating_sub(done);
+            (self.progress_ns, self.patience_ns) = (now_ns, REPEAT_NS);
+        }
+    }
+
+    /// Whether everything has been acknowledged.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Frames that were sent again.
+    pub fn repeated(&self) -> u64 {
+        self.repeated
+    }
+
+    /// Frames that found no room.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+}
+
+/// The receiving end.
+#[derive(Debug, Default)]
+pub struct Receiver {
+    next: u64,
+    owes: bool,
+}
+
+impl Receiver {
+    /// Takes the frame of a number; true if it is the next one, and to be used.
+    pub fn take(&mut self, number: u64) -> bool {
+        self.owes = true;
+        let next = number == self.next;
+        self.next += u64::from(next);
+        next
+    }
+
+    /// The acknowledgement that is owed, if one is.
+    pub fn acknowledgement(&mut self) -> Option<u64> {
+        std::mem::take(&mut self.owes).then_some(self.next)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Whatever the way loses, doubles or turns round, all frames come, in order, each once.
+        #[test]
+        fn nothing_is_lost_and_nothing_comes_twice(fate in prop::collection::vec(0_u8..10, 2000..4000), count in 1_usize..600) {
+            let (mut sender, mut receiver) = (Sender::new(usize::MAX), Receiver::default());
+            (0..count).for_each(|n| assert!(sender.push(n.to_le_bytes().to_vec())));
+            let (mut fate, mut got, mut way) = (fate.into_iter().cycle(), Vec::new(), Vec::new());
+            let mut now_ns = 0;
+            while !sender.is_empty() {
+                now_ns += 10_000_000;
+                prop_assert!(now_ns < 3_600_000_000_000, "it comes to no end");
+                sender.poll(now_ns, |number, frame| way.push((number, frame.to_vec())));
+                for (number, frame) in std::mem::take(&mut way) {
+                    let copies = match fate.next() { Some(0) => 0, Some(1) => 2, Some(2) => { way.push((number, frame)); continue } _ => 1 };
+                    for _ in 0..copies {
+                        if receiver.take(number) {
+                            got.push(usize::from_le_bytes(frame.clone().try_into().unwrap()));
+                        }
+                    }
+                }
+                if let Some(next) = receiver.acknowledgement().filter(|_| fate.next() != Some(0)) {
+                    sender.acknowledged(next, now_ns);
+                }
+            }
+            prop_assert_eq!(got, (0..count).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn what_is_under_way_is_bounded_and_so_is_what_waits() {
+        let mut sender = Sender::new(WINDOW + 5);
+        let taken = (0..WINDOW + 7).filter(|_| sender.push(Vec::new())).count();
+        assert_eq!((taken, sender.refused()), (WINDOW + 5, 2));
+        let mut sent = Vec::new();
+        sender.poll(0, |number, _| sent.push(number));
+        sender.poll(1, |number, _| sent.push(number));
+        assert_eq!(sent.len(), WINDOW);
+        sender.acknowledged(3, 2);
+        sender.acknowledged(2, 2);
+        sender.poll(2, |number, _| sent.push(number));
+        assert_eq!(sent.last(), Some(&(WINDOW as u64 + 2)));
+        sender.poll(2 + REPEAT_NS, |number, _| sent.push(number));
+        assert_eq!((sender.repeated(), sent[WINDOW + 3]), (WINDOW as u64, 3), "again, from the first that is lacked");
+    }
+}

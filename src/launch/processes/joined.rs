@@ -1,0 +1,62 @@
+//! The supervisor of a host that joined: its own roles, led by the word of another host. Must not lead them itself.
+
+use super::*;
+
+impl<'a> Supervisor<'a> {
+    /// The roles of a host in a run that another one leads.
+    pub fn of_host(
+        scenario: &'a Scenario,
+        host: &str,
+        domain: &'a Domain,
+        bus: &'a IoxBus,
+        janitor: &'a mut Janitor,
+        relay: RelayWatch,
+    ) -> Result<Self, LaunchError> {
+        let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
+        let recorder = RecorderWatch::start(None, scenario, domain, bus)?;
+        let foxglove = FoxgloveWatch::start(None, domain)?;
+        let own = |role: &RoleId| role.host(scenario) == *role && scenario.hosts.of(role.name(scenario)) == Some(host);
+        let roles = RoleId::all(scenario).into_iter().filter(own);
+        let started = roles.map(|role| Ok((role, RoleProcess::start(scenario, role, domain)?)));
+        let open = |(role, process)| {
+            let member = Member::new(scenario, role, false, domain, bus)?;
+            Ok(member.with_process(process))
+        };
+        let started = started.collect::<Result<Vec<_>, LaunchError>>()?;
+        let members = started.into_iter().map(open).collect::<Result<Vec<_>, LaunchError>>()?;
+        let externals = ExternalWatch::new(members.len());
+        let (word, incidents) = (Schedule::default(), Vec::new());
+        Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
+    }
+
+    /// Takes over the word of another host's launcher; whether it says anything new.
+    pub fn adopt(&mut self, word: &Schedule) -> bool {
+        let Schedule { phase, epoch_ns, credit_tick, .. } = *word;
+        let new = (phase, epoch_ns, credit_tick) != (self.word.phase, self.word.epoch_ns, self.word.credit_tick);
+        (self.word.phase, self.word.epoch_ns, self.word.credit_tick) = (phase, epoch_ns, credit_tick);
+        new
+    }
+
+    /// Where the run stands.
+    pub fn phase(&self) -> Phase {
+        Phase::from_number(self.word.phase)
+    }
+
+    /// The tick of the role that is furthest behind, once ticks run.
+    pub fn behind(&self) -> Option<u64> {
+        let running = self.phase() >= Phase::Run;
+        self.members.iter().map(|member| member.last.stamp.tick).min().filter(|_| running)
+    }
+
+    /// The roles that have not reached a state.
+    pub fn waiting(&self, state: RoleState) -> Progress<'_> {
+        let late = self.members.iter().filter(|member| member.state() < state);
+        let roles = late.map(|member| &*member.name).collect();
+        Progress::Waiting { roles, external: Vec::new(), hosts: Vec::new(), domain: self.domain.root().to_owned() }
+    }
+
+    /// What happened, and the relay, once all roles have ended.
+    pub fn dismiss(self) -> (Vec<Incident>, RelayWatch) {
+        (self.incidents, self.relay)
+    }
+}

@@ -1,0 +1,213 @@
+//! `corotate join`, the relay that it and `corotate run --listen` start, and the options by which hosts find one another.
+
+use super::role::die_with;
+use super::{Exit, fail};
+use crate::hosts::{Address, Endpoint, Keys};
+use std::path::PathBuf;
+
+/// How hosts show who they are.
+#[derive(clap::Args, Default, Clone)]
+pub struct KeyArguments {
+    /// The certificate of the authority that signed those of all hosts
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
+    tls_ca: Option<PathBuf>,
+    /// This host's certificate
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
+    tls_cert: Option<PathBuf>,
+    /// This host's private key
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
+    tls_key: Option<PathBuf>,
+    /// Let everybody join who reaches the address, without TLS
+    #[arg(long, hide_short_help = true)]
+    insecure: bool,
+}
+
+impl KeyArguments {
+    /// Whether anything is said.
+    pub fn any(&self) -> bool {
+        self.insecure || [&self.tls_ca, &self.tls_cert, &self.tls_key].into_iter().any(Option::is_some)
+    }
+
+    /// An address with these keys, if that is allowed.
+    pub fn endpoint(&self, address: Address) -> Result<Endpoint, String> {
+        let keys = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
+            (Some(ca), Some(cert), Some(key)) => Some(Keys { ca: ca.clone(), cert: cert.clone(), key: key.clone() }),
+            (None, None, None) => None,
+            _ => return Err("--tls-ca, --tls-cert and --tls-key go together; give all three, or none".to_owned()),
+        };
+        let endpoint = Endpoint { address, keys, insecure: self.insecure };
+        endpoint.check().map_err(|error| error.to_string())?;
+        Ok(endpoint)
+    }
+
+    /// What another host types to join at an address.
+    pub fn join_words(&self, address: &Address) -> String {
+        let keys = if self.tls_ca.is_some() { " --tls-ca FILE --tls-cert FILE --tls-key FILE" } else { "" };
+        let insecure = if self.insecure { " --insecure" } else { "" };
+        format!("join {address}{keys}{insecure}")
+    }
+}
+
+/// Options of `corotate join`.
+#[derive(clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub struct JoinArguments {
+    /// Where the run listens: tls/HOST:PORT, or tcp/ or udp/ on loopback
+    #[arg(value_name = "ADDR")]
+    address: Address,
+    /// This host's name in the run's scenario [default: one that is free]
+    #[arg(long, value_name = "NAME")]
+    host: Option<String>,
+    #[command(flatten)]
+    keys: KeyArguments,
+    /// Print nothing but errors
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+const EXAMPLES: &str = "\
+The scenario, with all that it names, comes from the host that launches. Both must
+be the same version with the same rigs. The results are written there.
+
+Examples:
+  corotate run FILE --host bench --listen tcp/127.0.0.1:7447
+                                   on the host that launches; it waits
+  corotate join tcp/127.0.0.1:7447
+                                   on every other: here, the same machine
+  corotate join tls/bench.example:7447 --tls-ca ca.pem --tls-cert flight.pem
+           --tls-key flight.key    over a network";
+
+/// Options of the relay.
+#[derive(clap::Args)]
+pub struct RelayArguments {
+    #[arg(long)]
+    domain: PathBuf,
+    #[arg(long)]
+    host: String,
+    #[arg(long)]
+    hub: String,
+    #[arg(long)]
+    address: Address,
+    #[command(flatten)]
+    keys: KeyArguments,
+    #[arg(long)]
+    parent: Option<i32>,
+}
+
+/// Why this program has no part in runs over several hosts, if it is so.
+pub fn refusal() -> Option<&'static str> {
+    (!cfg!(feature = "hosts")).then_some("this program was built without hosts; build it with `--features hosts`")
+}
+
+/// Takes a host's part in a run, to its end.
+pub fn join(arguments: &JoinArguments) -> Exit {
+    match arguments.keys.endpoint(arguments.address.clone()) {
+        Ok(endpoint) => with_hosts::join(arguments, endpoint),
+        Err(reason) => fail(Exit::Usage, &reason),
+    }
+}
+
+/// Carries for a host of a run, to its end.
+pub fn relay(arguments: &RelayArguments) -> Exit {
+    if let Some(Err(exit)) = arguments.parent.map(die_with) {
+        return exit;
+    }
+    match arguments.keys.endpoint(arguments.address.clone()) {
+        Ok(endpoint) => with_hosts::relay(arguments, endpoint),
+        Err(reason) => fail(Exit::Usage, &reason),
+    }
+}
+
+#[cfg(not(feature = "hosts"))]
+mod with_hosts {
+    use super::*;
+
+    pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> Exit {
+        fail(Exit::Usage, &refusal().unwrap_or_default())
+    }
+
+    pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Exit {
+        fail(Exit::Usage, &refusal().unwrap_or_default())
+    }
+}
+
+#[cfg(feature = "hosts")]
+mod with_hosts {
+    use super::*;
+    use crate::config::Scenario;
+    use crate::hosts::{HostSeat, Inquiry, JoinError, NetError, Part, RelayError, RelaySeat, Request, run_relay};
+    use crate::launch::{FarOutcome, Launch, new_domain};
+    use crate::program::role::terminated_by_signals;
+    use crate::program::run::{catch_signals, exit_of};
+    use crate::system::{random_bits, tell};
+    use std::time::Duration;
+
+    /// How long the host that launches is looked for.
+    const PATIENCE: Duration = Duration::from_secs(10);
+
+    pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Exit {
+        let terminated = match terminated_by_signals() {
+            Ok(terminated) => terminated,
+            Err(exit) => return exit,
+        };
+        let seat = HostSeat { host: arguments.host.clone(), endpoint };
+        let seat = RelaySeat { domain: arguments.domain.clone(), seat, hub: arguments.hub.clone() };
+        match run_relay(&seat, &terminated) {
+            Ok(()) => Exit::Ok,
+            Err(error @ (RelayError::NoHost(..) | RelayError::Clock(_))) => fail(Exit::Usage, &error),
+            Err(error) => fail(Exit::Failure, &error),
+        }
+    }
+
+    pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Exit {
+        attempt(arguments, endpoint).unwrap_or_else(|exit| exit)
+    }
+
+    fn attempt(arguments: &JoinArguments, endpoint: Endpoint) -> Result<Exit, Exit> {
+        let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+        let part = ask(arguments, &endpoint)?;
+        let say = |words: &str| {
+            if !arguments.quiet {
+                tell(words);
+            }
+        };
+        say(&format!("host {} of the run that {} launched", part.host, part.hub));
+        // Read twice: how large a domain must be follows from the scenario, and the files that it names lie in the domain.
+        let failed = |error: &dyn std::fmt::Display| fail(Exit::Failure, &format!("cannot join: {error}"));
+        let aside = tempfile::tempdir().map_err(|error| failed(&error))?;
+        let sized = part.scenario(aside.path()).map_err(|error| refused(&error))?;
+        let owned = new_domain(&sized).map_err(|error| fail(exit_of(&error), &error))?;
+        drop(aside);
+        let scenario: Scenario = part.scenario(owned.domain().root()).map_err(|error| refused(&error))?;
+        let seat = HostSeat { host: part.host.clone(), endpoint };
+        let mut silent = |_: &crate::launch::Progress<'_>| {};
+        let mut launch = Launch::new(&signal, &mut silent);
+        let outcome = crate::launch::join(&scenario, owned, &seat, &part.hub, &mut launch);
+        let FarOutcome { failed, ticks: (executed, missed), .. } =
+            outcome.map_err(|error| fail(exit_of(&error), &error))?;
+        say(&format!("the host {} executed {executed} ticks of its roles, {missed} missed", part.host));
+        let signal = signal.load(std::sync::atomic::Ordering::Relaxed);
+        Ok(match failed {
+            Some(_) if signal != 0 => Exit::Signal(signal),
+            Some(reason) => fail(Exit::ProcessLost, &reason),
+            None => Exit::Ok,
+        })
+    }
+
+    /// Asks for a part in the run.
+    fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Part, Exit> {
+        let token = random_bits().map_err(|error| fail(Exit::Failure, &error))? as u64;
+        let request = Request::new(arguments.host.as_deref(), token).encode();
+        let answer = Inquiry::open(endpoint, PATIENCE).and_then(|inquiry| inquiry.join(&request));
+        let answer = answer.map_err(|error| {
+            let usage = matches!(error, NetError::Key { .. });
+            fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
+        })?;
+        Part::decode(&answer).map_err(|error| refused(&error))
+    }
+
+    fn refused(error: &JoinError) -> Exit {
+        let exit = if matches!(error, JoinError::Write { .. }) { Exit::Failure } else { Exit::Usage };
+        fail(exit, &format!("cannot join: {error}"))
+    }
+}
