@@ -1,7 +1,7 @@
 //! Messages between the hosts of a run; the only file that knows zenoh.
 //!
 //! The host that launches is a router, every other one its client: one port is open, and nothing is looked for by multicast or gossip.
-//! A message that is in a hurry is dropped where the way is blocked; any other waits. Must not know what a message says, but for
+//! Nobody waits for a way: what finds none is lost, in a hurry at once, else after some bytes have piled up. Must not know what a message says, but for
 //! questions for the time, which are answered where they arrive.
 
 use super::seat::{Carrier, Endpoint, Keys};
@@ -9,7 +9,7 @@ use super::wire::{Message, What};
 use crate::clock::{raw_ns, tai_offset_ns};
 use serde_json::json;
 use std::path::Path;
-use std::sync::{Arc, mpsc};
+use std::sync::Arc;
 use std::time::Duration;
 use zenoh::Wait;
 use zenoh::pubsub::{Publisher, Subscriber};
@@ -24,6 +24,8 @@ const TIME: &str = "corotate/time";
 const ANSWER: Duration = Duration::from_secs(5);
 /// After so long without a word the engine gives a connection up and looks for another, ms.
 const LEASE_MS: u64 = 2_000;
+/// Batches, of 64 KiB at the most, that may pile up of what is in no hurry: the most that the engine allows.
+const PILE: usize = 16;
 /// Between two tries to connect again, ms.
 const RETRY_MS: u64 = 200;
 
@@ -87,6 +89,7 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Config,
     set("timestamping/enabled", json!(false));
     set("adminspace/enabled", json!(false));
     set("transport/link/tx/lease", json!(LEASE_MS));
+    set("transport/link/tx/queue/size/data", json!(PILE));
     if let (Carrier::Tls, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {
         [ca, cert, key].into_iter().try_for_each(|path| readable(path))?;
         set("transport/link/tls/root_ca_certificate", json!(ca));
@@ -108,7 +111,8 @@ fn readable(path: &Path) -> Result<(), NetError> {
 fn open(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Session, NetError> {
     zenoh::open(config(endpoint, side, patience)?).wait().map_err(|error| NetError::Open {
         address: endpoint.address.to_string(),
-        reason: error.to_string(),
+        // Where in the engine it was found out is of no use to anybody here.
+        reason: error.to_string().split(" at /").next().unwrap_or_default().to_owned(),
         remedy: match (side, endpoint.address.carrier) {
             (Side::Listens, _) => "name an address of this machine that is free",
             (Side::Connects, Carrier::Tls) => {
@@ -176,23 +180,20 @@ impl Net {
         endpoint: &Endpoint,
         run: &str,
         (own, hosts): (u8, u8),
-        arrived: mpsc::Sender<Arrived>,
+        arrived: impl Fn(Arrived) + Send + Sync + 'static,
         joins: Option<Answers>,
         patience: Duration,
     ) -> Result<Self, NetError> {
         let side = if joins.is_some() { Side::Listens } else { Side::Connects };
         let session = open(endpoint, side, patience)?;
         let key = |host: u8| format!("corotate/{run}/{host}");
-        let way = |host: u8, congestion, priority| {
-            let way = session.declare_publisher(key(host)).congestion_control(congestion).priority(priority);
-            way.express(true).wait().map_err(engine)
+        let way = |host: u8, hurry: bool| {
+            let priority = if hurry { Priority::RealTime } else { Priority::Data };
+            // Even what must not be lost is not waited for: it is sent again.
+            let way = session.declare_publisher(key(host)).congestion_control(CongestionControl::Drop);
+            way.priority(priority).express(hurry).wait().map_err(engine)
         };
-        let ways = |host: u8| {
-            Ok(Ways {
-                hurried: way(host, CongestionControl::Drop, Priority::RealTime)?,
-                patient: way(host, CongestionControl::Block, Priority::Data)?,
-            })
-        };
+        let ways = |host: u8| Ok(Ways { hurried: way(host, true)?, patient: way(host, false)? });
         let post = Arc::new(Post { ways: (0..hosts).map(ways).collect::<Result<_, NetError>>()? });
         let (answers_to, last) = (post.clone(), hosts);
         let heard = move |sample: zenoh::sample::Sample| {
@@ -203,9 +204,7 @@ impl Net {
                     // A question that is not answered is asked again.
                     let _ = answers_to.send(from, true, &Message { from: own, what });
                 }
-                _ => {
-                    let _ = arrived.send(Arrived { at_ns, bytes });
-                }
+                _ => arrived(Arrived { at_ns, bytes }),
             }
         };
         let subscriber = session.declare_subscriber(key(own)).callback(heard).wait().map_err(engine)?;

@@ -118,7 +118,7 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
         begun: AtomicBool::new(false),
         heard_ns: plan.hosts.iter().map(|_| AtomicU64::new(raw_ns())).collect(),
     });
-    let (arrived, inbox) = mpsc::channel();
+    let (arrives, inbox) = mpsc::channel();
     let joins: Option<super::net::Answers> = if plan.own == plan.hub {
         let path = scenario_path(&domain);
         let text = std::fs::read_to_string(&path).map_err(|source| RelayError::Write { path, source })?;
@@ -128,6 +128,14 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
         }))
     } else {
         None
+    };
+    let heard = shared.clone();
+    let arrived = move |arrived: Arrived| {
+        // Noted here: a host is heard even if this one has no time for what it says.
+        if let Some(heard_ns) = arrived.bytes.first().and_then(|from| heard.heard_ns.get(usize::from(*from))) {
+            heard_ns.store(arrived.at_ns, Ordering::Relaxed);
+        }
+        let _ = arrives.send(arrived);
     };
     let numbers = (plan.own, plan.hosts.len() as u8);
     let net = Net::open(&seat.seat.endpoint, &run, numbers, arrived, joins, PATIENCE)?;
@@ -249,6 +257,15 @@ impl<'a> Relay<'a> {
         bus: &IoxBus,
     ) -> Result<Self, BusError> {
         let is_hub = plan.own == plan.hub;
+        // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
+        let (mut health_in, mut health_out) = (Vec::new(), Vec::new());
+        for (number, (role, host)) in plan.roles.iter().enumerate() {
+            let topic = topic(scenario, role.name(scenario), Signal::Health);
+            health_out.push((is_hub && *host != plan.own).then(|| bus.writer(&topic, 1)).transpose()?);
+            if !is_hub && *host == plan.own {
+                health_in.push((number as u16, bus.reader(&topic, Reader::Role)?));
+            }
+        }
         let (mut incoming, mut taps) = (Vec::new(), Vec::new());
         for (number, link) in plan.links.iter().enumerate() {
             let here = link.to.iter().find(|way| way.host == plan.own);
@@ -265,14 +282,6 @@ impl<'a> Relay<'a> {
             if link.from == plan.own && !to.is_empty() {
                 let reader = link.port.reader(bus, Reader::Scorer)?;
                 taps.push(Tap { link: number as u16, reader, to, sent: 0 });
-            }
-        }
-        let (mut health_in, mut health_out) = (Vec::new(), Vec::new());
-        for (number, (role, host)) in plan.roles.iter().enumerate() {
-            let topic = topic(scenario, role.name(scenario), Signal::Health);
-            health_out.push((is_hub && *host != plan.own).then(|| bus.writer(&topic, 1)).transpose()?);
-            if !is_hub && *host == plan.own {
-                health_in.push((number as u16, bus.reader(&topic, Reader::Role)?));
             }
         }
         let longest = plan.links.iter().map(|link| link.port.size).max().unwrap_or(1);
@@ -363,7 +372,6 @@ impl<'a> Relay<'a> {
             self.malformed += 1;
             return Ok(());
         };
-        self.shared.heard_ns[usize::from(from)].store(arrived.at_ns, Ordering::Relaxed);
         self.heard(from, arrived.at_ns);
         let from_hub = from == self.plan.hub;
         match what {

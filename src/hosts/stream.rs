@@ -5,9 +5,13 @@ use std::collections::VecDeque;
 
 /// Frames under way at the most.
 const WINDOW: usize = 256;
-/// What is not acknowledged for so long is sent again, ns, and at the most so long when nothing comes through.
-const REPEAT_NS: u64 = 50_000_000;
+/// What is not acknowledged for so many times the usual is sent again, and never sooner, nor later, than so, ns.
+const PATIENCE: u64 = 4;
+const REPEAT_MIN_NS: u64 = 10_000_000;
+const REPEAT_NS: u64 = 100_000_000;
 const REPEAT_MAX_NS: u64 = 800_000_000;
+/// So many acknowledgements that lack the same frame tell that it is lost.
+const LACKING: u32 = 3;
 
 /// The sending end.
 #[derive(Debug)]
@@ -20,6 +24,10 @@ pub struct Sender {
     capacity: usize,
     progress_ns: u64,
     patience_ns: u64,
+    /// How long an acknowledgement takes as a rule, ns; and a frame by which that is measured, with the time when it was sent.
+    usual_ns: Option<u64>,
+    measured: Option<(u64, u64)>,
+    lacking: u32,
     repeated: u64,
     refused: u64,
 }
@@ -34,6 +42,9 @@ impl Sender {
             capacity,
             progress_ns: 0,
             patience_ns: REPEAT_NS,
+            usual_ns: None,
+            measured: None,
+            lacking: 0,
             repeated: 0,
             refused: 0,
         }
@@ -55,11 +66,11 @@ impl Sender {
         if self.under_way == 0 {
             self.progress_ns = now_ns;
         } else if now_ns.saturating_sub(self.progress_ns) >= self.patience_ns {
-            // All of them: whoever waits for the first takes none of the others.
-            self.repeated += self.under_way as u64;
-            self.under_way = 0;
-            self.progress_ns = now_ns;
+            self.go_back(now_ns);
             self.patience_ns = (2 * self.patience_ns).min(REPEAT_MAX_NS);
+        }
+        if self.measured.is_none() && self.under_way == 0 && !self.frames.is_empty() {
+            self.measured = Some((self.first, now_ns));
         }
         while self.under_way < self.frames.len().min(WINDOW) {
             send(self.first + self.under_way as u64, &self.frames[self.under_way]);
@@ -67,14 +78,41 @@ impl Sender {
         }
     }
 
+    /// Begins again with the first: whoever waits for it takes none of the others.
+    fn go_back(&mut self, now_ns: u64) {
+        self.repeated += self.under_way as u64;
+        (self.under_way, self.progress_ns, self.lacking) = (0, now_ns, 0);
+        // Of a frame that was sent twice nobody knows which one is acknowledged.
+        self.measured = Some((u64::MAX, 0));
+    }
+
     /// Takes an acknowledgement of all frames before `next`.
     pub fn acknowledged(&mut self, next: u64, now_ns: u64) {
+        if next == self.first && self.under_way > 0 {
+            self.lacking += 1;
+            // What was under way when it was sent again is still being acknowledged.
+            let long_enough = now_ns.saturating_sub(self.progress_ns) >= self.usual_ns.unwrap_or(REPEAT_NS);
+            if self.lacking >= LACKING && long_enough {
+                self.go_back(now_ns);
+            }
+        }
         let done = next.saturating_sub(self.first).min(self.frames.len() as u64) as usize;
         if done > 0 {
             self.frames.drain(..done);
             self.first += done as u64;
             self.under_way = self.under_way.saturating_sub(done);
-            (self.progress_ns, self.patience_ns) = (now_ns, REPEAT_NS);
+            match self.measured {
+                Some((number, sent_ns)) if number < next => {
+                    let took_ns = now_ns.saturating_sub(sent_ns);
+                    self.usual_ns = Some(self.usual_ns.map_or(took_ns, |usual_ns| (7 * usual_ns + took_ns) / 8));
+                    self.measured = None;
+                }
+                Some((u64::MAX, _)) => self.measured = None,
+                _ => {}
+            }
+            let usual_ns = self.usual_ns.unwrap_or(REPEAT_NS / PATIENCE);
+            self.patience_ns = (PATIENCE * usual_ns).clamp(REPEAT_MIN_NS, REPEAT_MAX_NS);
+            (self.progress_ns, self.lacking) = (now_ns, 0);
         }
     }
 

@@ -1,0 +1,126 @@
+//! Computers of a test: where this user is root, each with a network and a monotonic clock of its own, joined by veth pairs to the first;
+//! elsewhere all on loopback, with one clock.
+
+use crate::common::{Bench, Running, skipped};
+use std::fs::File;
+use std::process::{Child, Command, Stdio};
+
+/// By how much the clocks of two sites that stand beside each other differ, s.
+pub const APART_S: i64 = 1000;
+
+/// A computer.
+pub struct Site {
+    pub bench: Bench,
+    /// The process that keeps the namespaces, if it has any, and the one in them.
+    holder: Option<(Child, u32)>,
+    /// Its place in the row.
+    number: usize,
+}
+
+impl Site {
+    fn new(number: usize, apart: bool) -> Self {
+        let holder = apart.then(|| {
+            let offset_s = (number as i64 * APART_S).to_string();
+            let mut command = Command::new("unshare");
+            command.args(["--net", "--time", "--monotonic", &offset_s, "--fork", "--kill-child", "sleep", "infinity"]);
+            let child = command.stdin(Stdio::null()).spawn().unwrap();
+            let children = format!("/proc/{0}/task/{0}/children", child.id());
+            let inner = crate::common::await_some(|| {
+                let pid: u32 = std::fs::read_to_string(&children).ok()?.split_whitespace().next()?.parse().ok()?;
+                // Until it has become what it is to be, it may not be there yet.
+                let name = std::fs::read_to_string(format!("/proc/{pid}/comm")).ok()?;
+                (name.trim() == "sleep").then_some(pid)
+            });
+            (child, inner)
+        });
+        let site = Self { bench: Bench::new(), holder, number };
+        if apart {
+            site.system(&["ip", "link", "set", "lo", "up"]);
+        }
+        site
+    }
+
+    /// A command there.
+    pub fn command(&self, program: &std::path::Path) -> Command {
+        let Some((_, pid)) = &self.holder else { return self.bench.command_of(program) };
+        let mut command = self.bench.command_of(std::path::Path::new("nsenter"));
+        command.args(["-t", &pid.to_string(), "--net", "--time", "--"]).arg(program);
+        command
+    }
+
+    /// Starts our program there.
+    pub fn start(&self, arguments: &[&str]) -> Running {
+        Running::new(self.command(std::path::Path::new(env!("CARGO_BIN_EXE_corotate"))).args(arguments))
+    }
+
+    fn system(&self, words: &[&str]) {
+        let done = self.command(std::path::Path::new(words[0])).args(&words[1..]).output().unwrap();
+        assert!(done.status.success(), "{words:?}: {}", String::from_utf8_lossy(&done.stderr));
+    }
+
+    /// Takes the calling thread into its network, if it has one.
+    pub fn enter(&self) {
+        if let Some((_, pid)) = &self.holder {
+            let network = File::open(format!("/proc/{pid}/ns/net")).unwrap();
+            let kind = rustix::thread::LinkNameSpaceType::Network;
+            rustix::thread::move_into_link_name_space(std::os::fd::AsFd::as_fd(&network), Some(kind)).unwrap();
+        }
+    }
+
+    /// Takes its cable out, or puts it in again; only where it has one.
+    pub fn plug(&self, state: &str) {
+        self.system(&["ip", "link", "set", "eth0", state]);
+    }
+
+    /// Where this site reaches the first one.
+    pub fn hub(&self) -> String {
+        if self.holder.is_some() { format!("10.77.{}.1", self.number) } else { "127.0.0.1".to_owned() }
+    }
+
+    /// Kills every process there, as a power cut does.
+    pub fn cut_power(&self) {
+        self.bench.processes().into_iter().for_each(|pid| crate::common::send_signal(pid, libc::SIGKILL));
+    }
+}
+
+impl Drop for Site {
+    fn drop(&mut self) {
+        if let Some((child, _)) = &mut self.holder {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Whether sites have networks and clocks of their own here.
+pub fn apart() -> bool {
+    let tried =
+        Command::new("unshare").args(["--net", "--time", "--monotonic", "1000", "--fork", "ip", "link"]).output();
+    let can = rustix::process::getuid().is_root() && tried.is_ok_and(|done| done.status.success());
+    if !can {
+        skipped("networks and clocks of their own", "this user may not make namespaces: all hosts are on loopback");
+    }
+    can
+}
+
+/// So many sites; every other one is joined to the first.
+pub fn sites(count: usize) -> Vec<Site> {
+    let apart = apart();
+    let sites: Vec<Site> = (0..count).map(|number| Site::new(number, apart)).collect();
+    for site in sites.iter().skip(1).filter(|_| apart) {
+        let (_, pid) = site.holder.as_ref().unwrap();
+        let (near, pid) = (format!("eth{}", site.number), pid.to_string());
+        let [here, there] = [1, 2].map(|end| format!("10.77.{}.{end}/24", site.number));
+        sites[0].system(&["ip", "link", "add", &near, "type", "veth", "peer", "name", "eth0", "netns", &pid]);
+        sites[0].system(&["ip", "addr", "add", &here, "dev", &near]);
+        sites[0].system(&["ip", "link", "set", &near, "up"]);
+        site.system(&["ip", "addr", "add", &there, "dev", "eth0"]);
+        site.plug("up");
+    }
+    sites
+}
+
+/// A port of the first site's that nobody has.
+pub fn free_port() -> u16 {
+    std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
