@@ -21,7 +21,9 @@ use zenoh::{Config, Session};
 const JOIN: &str = "corotate/join";
 const TIME: &str = "corotate/time";
 /// How long an answer may take.
-const ANSWER: Duration = Duration::from_secs(5);
+const ANSWER: Duration = Duration::from_secs(2);
+/// How long the first words of a connection may take, ms: what is lost of them is not sent again by itself.
+const OPENING_MS: u64 = 1_500;
 /// After so long without a word the engine gives a connection up and looks for another, ms.
 const LEASE_MS: u64 = 2_000;
 /// Batches, of 64 KiB at the most, that may pile up of what is in no hurry: the most that the engine allows.
@@ -88,6 +90,8 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Config,
     set("scouting/gossip/enabled", json!(false));
     set("timestamping/enabled", json!(false));
     set("adminspace/enabled", json!(false));
+    set("transport/unicast/open_timeout", json!(OPENING_MS));
+    set("transport/unicast/accept_timeout", json!(OPENING_MS));
     set("transport/link/tx/lease", json!(LEASE_MS));
     set("transport/link/tx/queue/size/data", json!(PILE));
     if let (Carrier::Tls, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {

@@ -34,8 +34,11 @@ use std::time::Duration;
 const WORD_NS: u64 = 20_000_000;
 /// A host that is not heard for so long is silent, ns: it speaks every [`WORD_NS`].
 const SILENT_NS: u64 = 250_000_000;
-/// How long the way to the host that launched may take to be found, and to be known.
+/// How long the way to the host that launched may take to be found; and to be known, each time that it is tried.
 const PATIENCE: Duration = Duration::from_secs(10);
+const TRY_NS: u64 = 3_000_000_000;
+/// So often it is tried: a way that loses may have lost the words by which it is opened.
+const TRIES: u64 = 5;
 /// How long a host that ends tries to tell how it ended, and the one that launched waits for it, ns.
 const LEAVE_NS: u64 = 4_000_000_000;
 /// How long the last acknowledgements are repeated, ns.
@@ -130,17 +133,31 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
         None
     };
     let heard = shared.clone();
-    let arrived = move |arrived: Arrived| {
+    let arrived = Arc::new(move |arrived: Arrived| {
         // Noted here: a host is heard even if this one has no time for what it says.
         if let Some(heard_ns) = arrived.bytes.first().and_then(|from| heard.heard_ns.get(usize::from(*from))) {
             heard_ns.store(arrived.at_ns, Ordering::Relaxed);
         }
         let _ = arrives.send(arrived);
-    };
+    });
     let numbers = (plan.own, plan.hosts.len() as u8);
-    let net = Net::open(&seat.seat.endpoint, &run, numbers, arrived, joins, PATIENCE)?;
-    let timing =
-        if plan.own == plan.hub { None } else { Some(find_time(&domain, &scenario, &plan, &net, &inbox, terminated)?) };
+    let open = |joins| {
+        let arrived = arrived.clone();
+        Net::open(&seat.seat.endpoint, &run, numbers, move |message| arrived(message), joins, PATIENCE)
+    };
+    let (net, timing) = if joins.is_some() {
+        (open(joins)?, None)
+    } else {
+        let found = (0..TRIES).find_map(|_| {
+            let net = match open(None) {
+                Ok(net) => net,
+                Err(error) => return Some(Err(error.into())),
+            };
+            let found = find_time(&domain, &scenario, &plan, &net, &inbox, terminated).transpose()?;
+            Some(found.map(|timing| (net, Some(timing))))
+        });
+        found.unwrap_or(Err(RelayError::NoTime(TRIES * TRY_NS / 1_000_000_000)))?
+    };
     let bus = IoxBus::enter(&domain, RELAY, depths(&scenario))?;
     let mut relay = Relay::open(&domain, &scenario, &plan, &net.post(), shared, timing, &bus)?;
     let carriers = Carriers::start(&domain, &scenario, &plan, &net.post())?;
@@ -157,7 +174,7 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
     written
 }
 
-/// Asks the host that launched for the time until it is known well enough.
+/// Asks the host that launched for the time until it is known well enough; nothing if no answer comes.
 fn find_time(
     domain: &Domain,
     scenario: &Scenario,
@@ -165,14 +182,14 @@ fn find_time(
     net: &Net,
     inbox: &mpsc::Receiver<Arrived>,
     terminated: &AtomicBool,
-) -> Result<Timing, RelayError> {
+) -> Result<Option<Timing>, RelayError> {
     let path = clock_path(domain);
     let clock = RunClock::open(&path).map_err(|source| RelayError::Write { path, source })?;
     let (mut timing, post) = (Timing::new(scenario, clock), net.post());
-    let end_ns = raw_ns() + PATIENCE.as_nanos() as u64;
+    let end_ns = raw_ns() + TRY_NS;
     while !timing.ready(raw_ns())? {
         if raw_ns() > end_ns || terminated.load(Ordering::Relaxed) {
-            return Err(RelayError::NoTime(PATIENCE.as_secs()));
+            return Ok(None);
         }
         ask(&mut timing, plan, &post);
         let Ok(Arrived { at_ns, bytes }) = inbox.recv_timeout(PAUSE) else { continue };
@@ -182,7 +199,7 @@ fn find_time(
             answered(&mut timing, &what, at_ns);
         }
     }
-    Ok(timing)
+    Ok(Some(timing))
 }
 
 /// Asks for the time, if that is due.

@@ -142,6 +142,8 @@ mod with_hosts {
     use crate::system::{random_bits, tell};
     use std::time::Duration;
 
+    /// So often it is asked, if it is there and does not answer.
+    const TRIES: usize = 4;
     /// How long the host that launches is looked for.
     const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -198,7 +200,10 @@ mod with_hosts {
     fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Part, Exit> {
         let token = random_bits().map_err(|error| fail(Exit::Failure, &error))? as u64;
         let request = Request::new(arguments.host.as_deref(), token).encode();
-        let answer = Inquiry::open(endpoint, PATIENCE).and_then(|inquiry| inquiry.join(&request));
+        // A way that loses may lose the question, or the words by which it is opened.
+        let tries = (0..TRIES).map(|_| Inquiry::open(endpoint, PATIENCE).and_then(|inquiry| inquiry.join(&request)));
+        let mut tries = tries.skip_while(|answer| matches!(answer, Err(NetError::Silent { .. })));
+        let answer = tries.next().unwrap_or_else(|| Err(NetError::Silent { address: endpoint.address.to_string() }));
         let answer = answer.map_err(|error| {
             let usage = matches!(error, NetError::Key { .. });
             fail(if usage { Exit::Usage } else { Exit::Failure }, &error)

@@ -88,6 +88,15 @@ impl Run {
     }
 }
 
+/// Waits for both; whoever joined ends first, and must have been let in.
+fn finish(launched: common::Running, joined: common::Running) -> (Done, Value) {
+    let joined = joined.wait();
+    assert_eq!(joined.code, Some(0), "{joined:?}");
+    let done = launched.wait();
+    let over = summary(&done);
+    (done, over)
+}
+
 fn summary(done: &Done) -> Value {
     serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"))
 }
@@ -137,9 +146,8 @@ fn lockstep_loses_nothing_on_a_bad_way() {
     let arguments = [&["--tick-hz", "200", "--duration", "2"][..], &UNJUDGED].concat();
     let launched = run.launch("udp", &[&arguments[..], &["--clock", "lockstep"]].concat());
     let joined = run.join(1, "udp", Some(proxy.port));
-    let done = launched.wait();
-    let over = summary(&done);
-    assert_eq!((done.code, joined.wait().code), (Some(0), Some(0)), "{done:?}");
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
     assert_eq!(run_of(&over), run_of(&run.alone(&arguments)));
     assert!(proxy.ill.iter().all(|count| count.load(std::sync::atomic::Ordering::Relaxed) > 0));
     assert!(over["hosts"]["hosts"][0]["repeated_frames"].as_u64().unwrap() > 0, "{}", over["hosts"]);
@@ -152,9 +160,8 @@ fn real_time_is_the_same_until_a_tick_is_missed() {
     let run = Run::new(&TWO, KEYS, "");
     let launched = run.launch("tcp", &[&SLOW[..], &UNJUDGED, &["--record", "--out", "over"]].concat());
     let joined = run.join(1, "tcp", None);
-    let done = launched.wait();
-    let over = summary(&done);
-    assert_eq!((done.code, joined.wait().code), (Some(0), Some(0)), "{done:?}");
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
     assert_eq!(over["books"]["balanced"], true);
     let clean_ticks = over["state"]["clean_ticks"].as_u64().unwrap();
     if clean_ticks > 0 {
@@ -184,9 +191,8 @@ fn losses_are_counted_and_the_bound_holds() {
     let proxy = run.proxy(1, bad);
     let launched = run.launch("udp", &[&accept[..], &["--record"]].concat());
     let joined = run.join(1, "udp", Some(proxy.port));
-    let done = launched.wait();
-    let over = summary(&done);
-    assert_eq!((done.code, joined.wait().code), (Some(0), Some(0)), "{done:?}");
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
     assert_eq!((&over["accepted"], &over["books"]["balanced"]), (&Value::from(true), &Value::from(true)));
     let links = over["hosts"]["links"].as_array().unwrap();
     let lost: u64 = links.iter().map(|link| link["lost"].as_u64().unwrap()).sum();
@@ -255,7 +261,8 @@ fn cut(run: &Run, length: std::time::Duration, arguments: &[&str]) -> (Done, Don
     proxy.cut(true);
     std::thread::sleep(length);
     proxy.cut(false);
-    (launched.wait(), joined.wait())
+    let joined = joined.wait();
+    (launched.wait(), joined)
 }
 
 /// Whoever vanishes, the other side says so, ends in order and leaves nothing.
@@ -371,9 +378,8 @@ fn a_stranger_neither_joins_nor_injects() {
         assert!(refused.stderr.contains("has one authority signed the keys of both"), "{}", refused.stderr);
     }
     let joined = start(&run.sites[1], &["join", &address], &options("ours", "flight"));
-    let done = launched.wait();
-    let over = summary(&done);
-    assert_eq!((done.code, joined.wait().code), (Some(0), Some(0)), "{done:?}");
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
     assert_eq!(run_of(&over), run_of(&run.alone(&[&SLOW[..], &UNJUDGED].concat())));
     assert_eq!(over["hosts"]["hosts"][0]["malformed"], 0);
     run.assert_clean();
