@@ -12,7 +12,10 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// A command by its first words, and where else it is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 26] = [
+const ELSEWHERE: [(&str, &str); 29] = [
+    ("corotate run pair.toml --host", "it waits for another host; tests/hosts"),
+    ("corotate join", "it needs a run to join; tests/hosts"),
+    ("corotate doctor --link", "it needs a run that waits; tests/hosts"),
     ("cargo run --release", "tests/run builds it so; `run` without arguments is run here"),
     ("tests/run", "it runs this test"),
     ("cargo install --path . --locked", "tests/run"),
@@ -226,6 +229,7 @@ pages! {
     campaigns: "docs/campaigns.md",
     commands_page: "docs/commands.md",
     foreign_role: "docs/foreign-role.md",
+    hosts: "docs/hosts.md",
     formats: "docs/formats.md",
     foxglove: "docs/foxglove.md",
     own_data: "docs/own-data.md",

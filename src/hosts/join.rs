@@ -112,8 +112,15 @@ pub struct Parts {
     hub: String,
     layouts: BTreeMap<String, String>,
     files: Vec<(String, String, Vec<u8>)>,
-    /// By the number of the host: its name, and by which token it is taken since when, ns.
-    parts: Mutex<Vec<(String, Option<(u64, u64)>)>>,
+    /// By the number of the host: its name, and who has it.
+    parts: Mutex<Vec<(String, Option<Taken>)>>,
+}
+
+/// By which token a part is taken, and since when, ns.
+#[derive(Clone, Copy)]
+struct Taken {
+    token: u64,
+    since_ns: u64,
 }
 
 impl Parts {
@@ -173,9 +180,9 @@ impl Parts {
             let host = request.host.as_deref().unwrap_or_default();
             return Err(format!("no host `{host}` joins this run; it waits for: {known}"));
         }
-        let free = |index: usize, taken: &Option<(u64, u64)>| {
+        let free = |index: usize, taken: &Option<Taken>| {
             let heard_ns = heard_ns.get(index).map_or(0, |heard_ns| heard_ns.load(Ordering::Relaxed));
-            taken.is_none_or(|(token, since_ns)| {
+            taken.is_none_or(|Taken { token, since_ns }| {
                 token == request.token || (!begun && now_ns.saturating_sub(since_ns.max(heard_ns)) > GONE_NS)
             })
         };
@@ -185,7 +192,7 @@ impl Parts {
             let which = request.host.as_ref().map_or(known, Clone::clone);
             return Err(format!("{which} has joined already; end that one first, or give --host another name"));
         };
-        *taken = Some((request.token, now_ns));
+        *taken = Some(Taken { token: request.token, since_ns: now_ns });
         Ok(name.clone())
     }
 }

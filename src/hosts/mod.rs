@@ -15,6 +15,8 @@ mod offset;
 #[cfg(feature = "hosts")]
 mod plan;
 #[cfg(feature = "hosts")]
+mod probe;
+#[cfg(feature = "hosts")]
 mod relay;
 mod report;
 mod seat;
@@ -32,8 +34,10 @@ pub use net::{Inquiry, NetError};
 #[cfg(feature = "hosts")]
 pub use offset::{Estimate, Exchange, OffsetEstimator};
 #[cfg(feature = "hosts")]
+pub use probe::{Probe, probe};
+#[cfg(feature = "hosts")]
 pub use relay::{RelayError, RelaySeat, run_relay};
-pub use report::{ClockReport, FarEnd, HostReport, HostsSummary, LinkEnd, Silence};
+pub use report::{ClockReport, HostReport, HostsSummary, LinkEnd, Silence};
 pub(crate) use report::{far_end_path, ready_path, relay_report_path};
 pub use seat::{Address, AddressError, Carrier, Endpoint, HostSeat, Keys, RELAY};
 #[cfg(feature = "hosts")]

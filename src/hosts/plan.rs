@@ -82,7 +82,10 @@ mod tests {
         Scenario::parse(&text, "x.toml", &overrides).unwrap()
     }
 
-    fn ways(plan: &Plan) -> Vec<(String, u8, Vec<(u8, bool)>)> {
+    /// Signal, host where it is written, hosts that it goes to, and whether without loss.
+    type Told = (String, u8, Vec<(u8, bool)>);
+
+    fn ways(plan: &Plan) -> Vec<Told> {
         let of = |link: &Link| {
             let topic = format!("{}/{}", link.port.topic.body, link.port.topic.signal.name());
             (topic, link.from, link.to.iter().map(|way| (way.host, way.lossless)).collect())

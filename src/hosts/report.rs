@@ -84,17 +84,6 @@ pub struct Silence {
     pub healed: bool,
 }
 
-/// What the launcher of a host that joined leaves for the one of the run.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct FarEnd {
-    /// Why the host gave up, if it did.
-    pub failed: Option<String>,
-    /// Roles that failed there, as incidents.
-    pub incidents: Vec<crate::launch::Incident>,
-    /// External roles that keep no counters, and what is wrong with accounts that were left.
-    pub problems: Vec<String>,
-}
-
 /// The file in a domain's directory in which a relay leaves its report.
 pub fn relay_report_path(root: &Path, host: &str) -> PathBuf {
     root.join(format!("{host}.relay.json"))
@@ -111,7 +100,7 @@ pub fn ready_path(root: &Path) -> PathBuf {
 }
 
 /// The part of each host in a run, and both ends of every link between them.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct HostsSummary {
     /// Each host without its links, the one that launched among them.
     pub hosts: Vec<HostReport>,

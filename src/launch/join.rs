@@ -4,7 +4,7 @@
 //! Leads nothing: phases, epoch and credit are the word of the host that launched. Must not score, nor record.
 
 use super::processes::{Supervisor, prepare};
-use super::relay::RelayWatch;
+use super::relay::{FarEnd, RelayWatch};
 use super::supervision::Incident;
 use super::{Launch, LaunchError};
 use crate::bus::domain::{Domain, OwnedDomain};
@@ -12,7 +12,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{self, RunClock, monotonic_ns, raw_ns};
 use crate::config::{ClockKind, Scenario};
-use crate::hosts::{FarEnd, HostSeat, RELAY, far_end_path};
+use crate::hosts::{HostSeat, RELAY, far_end_path};
 use crate::runtime::{clock_path, depths, hold_low_latency_idle, report_path, take_short_turns, topic, write_whole};
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::system::tell;

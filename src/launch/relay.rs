@@ -7,9 +7,21 @@ use super::children::{RoleProcess, program};
 use super::supervision::{Action, Incident};
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
-use crate::hosts::{FarEnd, HostReport, HostSeat, RELAY, far_end_path, ready_path, relay_report_path};
+use crate::hosts::{HostReport, HostSeat, RELAY, far_end_path, ready_path, relay_report_path};
 use crate::runtime::RoleId;
+use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
+
+/// What the launcher of a host that joined leaves for the one of the run.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct FarEnd {
+    /// Why the host gave up, if it did.
+    pub failed: Option<String>,
+    /// Roles that failed there, as incidents.
+    pub incidents: Vec<Incident>,
+    /// External roles that keep no counters, and what is wrong with accounts that were left.
+    pub problems: Vec<String>,
+}
 
 /// A run's relay, if it has several hosts.
 pub(super) struct RelayWatch {

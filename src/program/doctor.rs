@@ -1,10 +1,12 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
+use super::hosts::{self, KeyArguments};
 use super::scenario::load;
 use super::{Exit, fail, say};
 use crate::bus::domain::{DomainError, domains, remove_dead_domains};
 use crate::config::Scenario;
 use crate::doctor::{Demand, Diagnosis, Lateness, Machine, leftovers, measure};
+use crate::hosts::Address;
 use crate::system::remedy;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
@@ -21,6 +23,11 @@ pub struct Arguments {
     /// Remove what dead runs of this user left behind
     #[arg(long)]
     clean: bool,
+    /// Examine the way to where a run waits for hosts to join, for so many seconds, and nothing else
+    #[arg(long, value_name = "ADDR")]
+    link: Option<Address>,
+    #[command(flatten)]
+    keys: KeyArguments,
     /// Print the report as one JSON object on stdout
     #[arg(long)]
     json: bool,
@@ -35,10 +42,16 @@ Examples:
   corotate doctor fast.toml --seconds 60
                                    for that scenario's tick, cores and memory,
                                    measured for a minute
+  corotate doctor --link tcp/127.0.0.1:7447
+                                   the clock of the host that launches, and how
+                                   long messages take to it and back
   corotate doctor --clean --json   remove what dead runs left; for programs";
 
 /// Examines the machine.
 pub fn doctor(arguments: &Arguments) -> Exit {
+    if let Some(address) = &arguments.link {
+        return hosts::probe(address, &arguments.keys, f64::from(arguments.seconds), arguments.json);
+    }
     let scenario = match load(arguments.file.as_deref(), []) {
         Ok(scenario) => scenario,
         Err(error) => return fail(Exit::Usage, &error),

@@ -107,6 +107,14 @@ pub fn join(arguments: &JoinArguments) -> Exit {
     }
 }
 
+/// Examines the way to a host that waits for others.
+pub fn probe(address: &Address, keys: &KeyArguments, seconds: f64, json: bool) -> Exit {
+    match keys.endpoint(address.clone()) {
+        Ok(endpoint) => with_hosts::probe(&endpoint, seconds, json),
+        Err(reason) => fail(Exit::Usage, &reason),
+    }
+}
+
 /// Carries for a host of a run, to its end.
 pub fn relay(arguments: &RelayArguments) -> Exit {
     if let Some(Err(exit)) = arguments.parent.map(die_with) {
@@ -129,6 +137,10 @@ mod with_hosts {
     pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Exit {
         fail(Exit::Usage, &refusal().unwrap_or_default())
     }
+
+    pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> Exit {
+        fail(Exit::Usage, &refusal().unwrap_or_default())
+    }
 }
 
 #[cfg(feature = "hosts")]
@@ -139,6 +151,7 @@ mod with_hosts {
     use crate::launch::{FarOutcome, Launch, new_domain};
     use crate::program::role::terminated_by_signals;
     use crate::program::run::{catch_signals, exit_of};
+    use crate::program::say;
     use crate::system::{random_bits, tell};
     use std::time::Duration;
 
@@ -161,6 +174,15 @@ mod with_hosts {
         }
     }
 
+    pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> Exit {
+        let probe = match crate::hosts::probe(endpoint, seconds) {
+            Ok(probe) => probe,
+            Err(error) => return fail(Exit::Failure, &error),
+        };
+        let object = || serde_json::to_string(&probe).expect("figures are JSON") + "\n";
+        say(&if json { object() } else { probe.to_string() }).err().unwrap_or(Exit::Ok)
+    }
+
     pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Exit {
         attempt(arguments, endpoint).unwrap_or_else(|exit| exit)
     }
@@ -168,12 +190,12 @@ mod with_hosts {
     fn attempt(arguments: &JoinArguments, endpoint: Endpoint) -> Result<Exit, Exit> {
         let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
         let part = ask(arguments, &endpoint)?;
-        let say = |words: &str| {
+        let tells = |words: &str| {
             if !arguments.quiet {
                 tell(words);
             }
         };
-        say(&format!("host {} of the run that {} launched", part.host, part.hub));
+        tells(&format!("host {} of the run that {} launched", part.host, part.hub));
         // Read twice: how large a domain must be follows from the scenario, and the files that it names lie in the domain.
         let failed = |error: &dyn std::fmt::Display| fail(Exit::Failure, &format!("cannot join: {error}"));
         let aside = tempfile::tempdir().map_err(|error| failed(&error))?;
@@ -187,7 +209,7 @@ mod with_hosts {
         let outcome = crate::launch::join(&scenario, owned, &seat, &part.hub, &mut launch);
         let FarOutcome { failed, ticks: (executed, missed), .. } =
             outcome.map_err(|error| fail(exit_of(&error), &error))?;
-        say(&format!("the host {} executed {executed} ticks of its roles, {missed} missed", part.host));
+        tells(&format!("the host {} executed {executed} ticks of its roles, {missed} missed", part.host));
         let signal = signal.load(std::sync::atomic::Ordering::Relaxed);
         Ok(match failed {
             Some(_) if signal != 0 => Exit::Signal(signal),

@@ -1,6 +1,7 @@
 //! `summary.json` as it is read back. What a key does not say is left out; another layout is refused.
 
 use crate::config::RunId;
+use crate::hosts::HostsSummary;
 use crate::telemetry::{Grant, Ticks, WatchReport};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -35,6 +36,7 @@ pub struct Summary {
     pub books: Accounting,
     pub state: State,
     pub latencies: Vec<Stage>,
+    pub hosts: Option<HostsSummary>,
     pub recording: Option<Recorded>,
     pub privileges: Vec<RoleGrant>,
 }

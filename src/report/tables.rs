@@ -4,8 +4,9 @@ use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
 use crate::analysis::{apart, digits};
+use crate::hosts::{HostReport, LinkEnd, Silence};
 use crate::launch::State;
-use crate::telemetry::Ticks;
+use crate::telemetry::{Percentiles, Ticks};
 
 /// A scripted fault as it stands in the scenario.
 #[derive(Debug)]
@@ -227,6 +228,7 @@ pub fn books(source: &Source) -> Section {
         let rows = end.ticks.iter().map(ticks_row).collect();
         blocks.push(Block::table("Ticks", roles.to_vec(), rows));
     }
+    blocks.extend(hosts(source));
     blocks.extend(recorded(source));
     if let Some((summary, state)) = source.summary.as_ref().map(|summary| (summary, &summary.state)) {
         let undisturbed = || {
@@ -241,6 +243,39 @@ pub fn books(source: &Source) -> Section {
 }
 
 /// What was recorded.
+/// The part of each host, and every link between them, if there were several.
+fn hosts(source: &Source) -> Vec<Block> {
+    let Some(hosts) = source.summary.as_ref().and_then(|summary| summary.hosts.as_ref()) else { return Vec::new() };
+    let clock = |host: &HostReport| {
+        let Some(clock) = &host.clock else {
+            return strings(&[&host.host, &"the run's", &"–", &"–", &"–", &"–"]);
+        };
+        let short = |value: f64| format!("{value:.1}");
+        let [error, largest] = [clock.error_max_us, clock.largest_correction_us].map(short);
+        strings(&[&host.host, &clock.source, &error, &short(clock.drift_ppm), &short(clock.round_trip_us), &largest])
+    };
+    let head = vec!["host", "clock", "known to, us", "drift, ppm", "there and back, us", "largest correction, us"];
+    let mut blocks = vec![Block::table("Hosts", head, hosts.hosts.iter().map(clock).collect())];
+    let silences = hosts.hosts.iter().flat_map(|host| host.silences.iter().map(move |silence| (host, silence)));
+    blocks.extend(silences.map(|(host, silence)| {
+        let Silence { of, tick, seconds, healed } = silence;
+        let end = if *healed { ", then heard again" } else { "" };
+        Block::Text(format!("From tick {tick} on {} heard nothing of {of} for {seconds:.2} s{end}.", host.host))
+    }));
+    let row = |link: &LinkEnd| {
+        let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
+        let us = |of: fn(&Percentiles) -> f64| {
+            link.one_way.as_ref().map_or("–".to_owned(), |way| format!("{:.0}", of(way)))
+        };
+        let way = format!("{} to {}", link.from, link.to);
+        let [p50, p99] = [us(|way| way.p50_us), us(|way| way.p99_us)];
+        strings(&[&link.service, &way, &told(link.sent), &told(link.received), &link.lost, &link.stale, &p50, &p99])
+    };
+    let head = vec!["signal", "between hosts", "sent", "received", "lost", "stale", "one way p50, us", "p99, us"];
+    blocks.push(Block::table("Links between hosts", head, hosts.links.iter().map(row).collect()));
+    blocks
+}
+
 fn recorded(source: &Source) -> Vec<Block> {
     let mut blocks = Vec::new();
     if let Some(recorded) = source.summary.as_ref().and_then(|summary| summary.recording.as_ref()) {

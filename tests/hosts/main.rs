@@ -211,7 +211,7 @@ fn losses_are_counted_and_the_bound_holds() {
 /// A way that is cut for a second and joined again: plants hold and go safe by themselves, and the run goes on.
 #[test]
 fn a_cut_of_a_second_is_told_and_outlived() {
-    let run = Run::new(&TWO, KEYS, "[supervision]\nheartbeat_timeout_s = 5.0\n");
+    let run = Run::new(&TWO, KEYS, "");
     let (done, joined) = cut(&run, std::time::Duration::from_secs(1), &[]);
     let over = summary(&done);
     assert_eq!((done.code, joined.code), (Some(0), Some(0)), "{done:?} {joined:?}");
