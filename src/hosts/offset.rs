@@ -11,7 +11,7 @@ const WINDOW_NS: u64 = 500_000_000;
 /// Windows that are kept: long enough for the drift, short enough for a drift that changes with temperature.
 const WINDOWS: usize = 24;
 /// Over less than this a drift is not told from jitter, ns.
-const DRIFT_SPAN_NS: f64 = 2e9;
+const DRIFT_SPAN_NS: f64 = 1e9;
 /// What two clocks of computers drift apart at the most, ns per ns: quartz is within 100 ppm.
 const DRIFT_MAX: f64 = 200e-6;
 /// Exchanges before anything is said.
@@ -75,6 +75,13 @@ struct Fastest {
     round_trip_ns: f64,
 }
 
+impl Fastest {
+    /// What it leaves open of the offset in its middle, ns: half the way, and what clocks drift on it.
+    fn open_ns(&self) -> f64 {
+        self.round_trip_ns * (0.5 + DRIFT_MAX)
+    }
+}
+
 /// Estimates the offset of one clock.
 #[derive(Debug, Default)]
 pub struct OffsetEstimator {
@@ -112,20 +119,30 @@ impl OffsetEstimator {
         let (origin_ns, origin_offset_ns) = self.origin.filter(|_| self.taken >= ENOUGH)?;
         let now = now_ns.wrapping_sub(origin_ns) as i64 as f64;
         let least_ns = self.fastest.iter().map(|point| point.round_trip_ns).fold(f64::INFINITY, f64::min);
-        let (offset, drift, drift_error) = self.line(least_ns);
+        let (offset, drift) = self.line(least_ns);
+        let drift_error = self.drift_error(drift);
         // Any of them bounds the offset of its own time, and with the drift that of now.
         let bound = |point: &Fastest| {
             let missed = (offset + drift * point.at_ns - point.offset_ns).abs();
-            point.round_trip_ns / 2.0 + missed + drift_error * (now - point.at_ns).abs()
+            point.open_ns() + missed + drift_error * (now - point.at_ns).abs()
         };
         let error_ns = self.fastest.iter().map(bound).fold(f64::INFINITY, f64::min);
         let offset_ns = origin_offset_ns.wrapping_add((offset + drift * now).round() as i64);
         Some(Estimate { offset_ns, drift, error_ns, round_trip_ns: least_ns as u64 })
     }
 
-    /// The line of least squares, where a slow exchange weighs less by what it leaves open: offset at the origin, drift, and the error
-    /// of the drift.
-    fn line(&self, least_ns: f64) -> (f64, f64, f64) {
+    /// By how much a drift can be wrong: any two exchanges bound it.
+    fn drift_error(&self, drift: f64) -> f64 {
+        let pairs = self.fastest.iter().enumerate().flat_map(|(n, a)| self.fastest.range(..n).map(move |b| (a, b)));
+        let bound = |(a, b): (&Fastest, &Fastest)| {
+            let apart_ns = a.at_ns - b.at_ns;
+            (drift - (a.offset_ns - b.offset_ns) / apart_ns).abs() + (a.open_ns() + b.open_ns()) / apart_ns
+        };
+        pairs.filter(|(a, b)| a.at_ns > b.at_ns).map(bound).fold(drift.abs() + DRIFT_MAX, f64::min)
+    }
+
+    /// The line of least squares, where a slow exchange weighs less by what it leaves open: offset at the origin, and drift.
+    fn line(&self, least_ns: f64) -> (f64, f64) {
         let weight = |point: &Fastest| {
             let open = (point.round_trip_ns - least_ns) / (SIMILAR * least_ns + 1.0);
             1.0 / (1.0 + open * open)
@@ -141,10 +158,12 @@ impl OffsetEstimator {
             _ => 0.0,
         };
         if span_ns < DRIFT_SPAN_NS {
-            return (offset, 0.0, DRIFT_MAX);
+            // The newest of the fast ones has drifted least.
+            let fast = |point: &&Fastest| point.round_trip_ns <= (1.0 + SIMILAR) * least_ns;
+            return (self.fastest.iter().rev().find(fast).map_or(offset, |point| point.offset_ns), 0.0);
         }
         let drift = (together / spread).clamp(-DRIFT_MAX, DRIFT_MAX);
-        (offset - drift * time, drift, (least_ns / span_ns).min(DRIFT_MAX))
+        (offset - drift * time, drift)
     }
 }
 

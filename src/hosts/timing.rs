@@ -14,7 +14,7 @@ const ASK_NS: u64 = 50_000_000;
 const FIRST_NS: u64 = 600_000_000;
 /// Between two corrections, and how long one takes to act, ns.
 const CORRECT_NS: u64 = 100_000_000;
-const CATCH_UP_NS: f64 = 1e9;
+const CATCH_UP_NS: f64 = 5e8;
 /// A line of the track each, ns, and how many at the most.
 const TRACK_NS: u64 = 1_000_000_000;
 const TRACK_LINES: usize = 3600;
