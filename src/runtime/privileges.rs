@@ -147,6 +147,7 @@ pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
 
 /// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
 /// does little, and whoever spins for a sample that it has would hold it up. What is not granted is done without.
+#[cfg(feature = "hosts")]
 pub fn go_before_roles(scenario: &Scenario) {
     let _ = set_current_timer_slack(NonZero::new(1));
     if (1..99).contains(&scenario.realtime.priority) {
