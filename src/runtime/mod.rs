@@ -34,9 +34,9 @@ pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
-pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
 #[cfg(feature = "hosts")]
 pub(crate) use process::clock_path;
+pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
 pub(crate) use process::{join, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
