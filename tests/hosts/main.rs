@@ -300,6 +300,11 @@ fn who_does_not_belong_is_told_why() {
     assert!(stranger.stderr.contains("no host `moon` joins this run; it waits for: flight"), "{}", stranger.stderr);
     let hub = run.sites[1].start(&["join", &address, "--host", "bench", "--insecure"]).wait();
     assert!(hub.stderr.contains("no host `bench` joins this run"), "{}", hub.stderr);
+    let probe = run.sites[1].start(&["doctor", "--link", &address, "--insecure", "--seconds", "1", "--json"]).wait();
+    let probe = summary(&probe);
+    let truth_ns = if apart() { -APART_S * 1_000_000_000 } else { 0 };
+    let wrong_us = (probe["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
+    assert!(wrong_us <= probe["error_us"].as_f64().unwrap(), "wrong by {wrong_us} us: {probe}");
     let joined = run.join(1, "tcp", None);
     run.sites[1].bench.await_role("controller");
     let second = run.sites[1].start(&["join", &address, "--insecure"]).wait();
