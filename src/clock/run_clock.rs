@@ -10,12 +10,11 @@ use std::path::Path;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
-/// Even while the line is whole; odd while it is written.
+/// Counts the lines; the one that holds is in the place of its parity, and the next is written into the other.
 const SEQUENCE: usize = 0;
-const REFERENCE: usize = 1;
-const OFFSET: usize = 2;
-const SLOPE: usize = 3;
-const WORDS: usize = 4;
+/// Words of a line: reference, offset, slope.
+const LINE: usize = 3;
+const WORDS: usize = 1 + 2 * LINE;
 
 /// The fraction of a slope: 2⁻⁴⁰.
 const FRACTION: u32 = 40;
@@ -73,41 +72,36 @@ impl RunClock {
         if words.words().len() == WORDS { Ok(Self(words)) } else { Err(io::Error::other("it is another version's")) }
     }
 
-    /// Replaces the correction. There is one writer.
-    pub fn set(&self, correction: Correction) {
-        let words = self.0.words();
-        let sequence = words[SEQUENCE].load(Ordering::Relaxed);
-        words[SEQUENCE].store(sequence + 1, Ordering::Relaxed);
-        fence(Ordering::Release);
-        words[REFERENCE].store(correction.reference_ns, Ordering::Relaxed);
-        words[OFFSET].store(correction.offset_ns as u64, Ordering::Relaxed);
-        words[SLOPE].store(correction.slope as u64, Ordering::Relaxed);
-        words[SEQUENCE].store(sequence + 2, Ordering::Release);
+    fn line(&self, sequence: u64) -> &[AtomicU64] {
+        let place = 1 + (sequence % 2) as usize * LINE;
+        &self.0.words()[place..place + LINE]
     }
 
-    /// The correction. A writer that died in the midst of it leaves what others saw last.
+    /// Replaces the correction. There is one writer; where it dies the one before still holds.
+    pub fn set(&self, correction: Correction) {
+        let next = self.0.words()[SEQUENCE].load(Ordering::Relaxed) + 1;
+        // Whoever sees anything of this line sees too that the one which was in its place holds no more.
+        fence(Ordering::Release);
+        let words = [correction.reference_ns, correction.offset_ns as u64, correction.slope as u64];
+        self.line(next).iter().zip(words).for_each(|(place, word)| place.store(word, Ordering::Relaxed));
+        self.0.words()[SEQUENCE].store(next, Ordering::Release);
+    }
+
+    /// The correction. Nobody is waited for: it is read again only if there was a new one meanwhile.
     #[inline]
     pub fn get(&self) -> Correction {
-        let words: &[AtomicU64] = self.0.words();
-        let mut correction = Correction::default();
-        for _ in 0..TRIES {
-            let before = words[SEQUENCE].load(Ordering::Acquire);
-            correction = Correction {
-                reference_ns: words[REFERENCE].load(Ordering::Relaxed),
-                offset_ns: words[OFFSET].load(Ordering::Relaxed) as i64,
-                slope: words[SLOPE].load(Ordering::Relaxed) as i64,
-            };
+        let sequence = &self.0.words()[SEQUENCE];
+        loop {
+            let before = sequence.load(Ordering::Acquire);
+            let [reference, offset, slope] =
+                [0, 1, 2].map(|word: usize| self.line(before)[word].load(Ordering::Relaxed));
             fence(Ordering::Acquire);
-            if before.is_multiple_of(2) && words[SEQUENCE].load(Ordering::Relaxed) == before {
-                break;
+            if sequence.load(Ordering::Relaxed) == before {
+                return Correction { reference_ns: reference, offset_ns: offset as i64, slope: slope as i64 };
             }
         }
-        correction
     }
 }
-
-/// How often a line is read again that is written meanwhile: three stores take less.
-const TRIES: usize = 1000;
 
 static OF_THIS_PROCESS: OnceLock<RunClock> = OnceLock::new();
 
