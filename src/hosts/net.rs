@@ -94,7 +94,7 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Config,
     set("transport/unicast/accept_timeout", json!(OPENING_MS));
     set("transport/link/tx/lease", json!(LEASE_MS));
     set("transport/link/tx/queue/size/data", json!(PILE));
-    if let (Carrier::Tls, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {
+    if let (Carrier::Quic, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {
         [ca, cert, key].into_iter().try_for_each(|path| readable(path))?;
         set("transport/link/tls/root_ca_certificate", json!(ca));
         set("transport/link/tls/enable_mtls", json!(true));
@@ -119,7 +119,7 @@ fn open(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Session, 
         reason: error.to_string().split(" at /").next().unwrap_or_default().to_owned(),
         remedy: match (side, endpoint.address.carrier) {
             (Side::Listens, _) => "name an address of this machine that is free",
-            (Side::Connects, Carrier::Tls) => {
+            (Side::Connects, Carrier::Quic) => {
                 "is `corotate run --listen` waiting there, and has one authority signed the keys of both, with the host's name in its \
                  certificate?"
             }

@@ -15,11 +15,12 @@ pub enum Carrier {
     Tcp,
     /// UDP, in the clear: what is lost is not sent again.
     Udp,
-    /// TCP under TLS; both sides show who they are.
-    Tls,
+    /// QUIC, which is TLS 1.3 over UDP; both sides show who they are. The engine's TLS over TCP reads and writes one connection from two
+    /// threads without a lock (its issue 2557), and dies of it.
+    Quic,
 }
 
-/// Where a host listens: `tcp/HOST:PORT`, `udp/HOST:PORT` or `tls/HOST:PORT`.
+/// Where a host listens: `tcp/HOST:PORT`, `udp/HOST:PORT` or `quic/HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
     /// What carries the messages.
@@ -32,11 +33,11 @@ pub struct Address {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AddressError {
     /// It has not the form.
-    #[error("`{0}` is no address; write tls/HOST:PORT, tcp/HOST:PORT or udp/HOST:PORT")]
+    #[error("`{0}` is no address; write quic/HOST:PORT, tcp/HOST:PORT or udp/HOST:PORT")]
     Form(String),
     /// Anybody could join.
     #[error(
-        "{0} is open to everybody who reaches it; take tls/HOST:PORT with --tls-ca, --tls-cert and --tls-key, or say --insecure if \
+        "{0} is open to everybody who reaches it; take quic/HOST:PORT with --tls-ca, --tls-cert and --tls-key, or say --insecure if \
          only friends do"
     )]
     Open(Address),
@@ -44,7 +45,7 @@ pub enum AddressError {
     #[error("{0} needs --tls-ca, --tls-cert and --tls-key, all three; docs/hosts.md tells how to make them")]
     Keys(Address),
     /// Keys are of no use.
-    #[error("{0} uses no keys; take tls/HOST:PORT, or leave --tls-ca, --tls-cert and --tls-key out")]
+    #[error("{0} uses no keys; take quic/HOST:PORT, or leave --tls-ca, --tls-cert and --tls-key out")]
     NoKeys(Address),
 }
 
@@ -53,7 +54,7 @@ impl fmt::Display for Address {
         let carrier = match self.carrier {
             Carrier::Tcp => "tcp",
             Carrier::Udp => "udp",
-            Carrier::Tls => "tls",
+            Carrier::Quic => "quic",
         };
         write!(f, "{carrier}/{}:{}", self.host, self.port)
     }
@@ -68,7 +69,7 @@ impl FromStr for Address {
             let carrier = match carrier {
                 "tcp" => Carrier::Tcp,
                 "udp" => Carrier::Udp,
-                "tls" => Carrier::Tls,
+                "quic" => Carrier::Quic,
                 _ => return None,
             };
             let (host, port) = place.rsplit_once(':')?;
@@ -105,7 +106,7 @@ pub struct Keys {
 pub struct Endpoint {
     /// Where.
     pub address: Address,
-    /// The keys, with TLS.
+    /// The keys, with QUIC.
     pub keys: Option<Keys>,
     /// Whether it may be open to everybody who reaches it.
     pub insecure: bool,
@@ -119,8 +120,8 @@ impl Endpoint {
     pub fn check(&self) -> Result<(), AddressError> {
         let address = self.address.clone();
         match (self.address.carrier, &self.keys) {
-            (Carrier::Tls, None) => Err(AddressError::Keys(address)),
-            (Carrier::Tls, Some(_)) => Ok(()),
+            (Carrier::Quic, None) => Err(AddressError::Keys(address)),
+            (Carrier::Quic, Some(_)) => Ok(()),
             (_, Some(_)) => Err(AddressError::NoKeys(address)),
             (_, None) if self.insecure || self.address.is_loopback() => Ok(()),
             (_, None) => Err(AddressError::Open(address)),
@@ -160,7 +161,7 @@ mod tests {
 
     #[test]
     fn an_address_is_what_it_says() {
-        for text in ["tcp/127.0.0.1:7447", "tls/bench.example:1", "udp/[::1]:65535"] {
+        for text in ["tcp/127.0.0.1:7447", "quic/bench.example:1", "udp/[::1]:65535"] {
             assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
         }
         for text in [
@@ -187,8 +188,8 @@ mod tests {
         assert!(matches!(open.check(), Err(AddressError::Open(_))));
         assert_eq!(endpoint("tcp/0.0.0.0:1", false, true).check(), Ok(()));
         assert!(matches!(endpoint("tcp/0.0.0.0:1", false, false).check(), Err(AddressError::Open(_))));
-        assert_eq!(endpoint("tls/192.0.2.1:1", true, false).check(), Ok(()));
-        assert!(matches!(endpoint("tls/127.0.0.1:1", false, true).check(), Err(AddressError::Keys(_))));
+        assert_eq!(endpoint("quic/192.0.2.1:1", true, false).check(), Ok(()));
+        assert!(matches!(endpoint("quic/127.0.0.1:1", false, true).check(), Err(AddressError::Keys(_))));
         assert!(matches!(endpoint("tcp/127.0.0.1:1", true, false).check(), Err(AddressError::NoKeys(_))));
     }
 }

@@ -17,7 +17,7 @@ pub struct KeyArguments {
     /// This host's private key
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     tls_key: Option<PathBuf>,
-    /// Let everybody join who reaches the address, without TLS
+    /// Let everybody join who reaches the address, without keys
     #[arg(long, hide_short_help = true)]
     insecure: bool,
 }
@@ -52,7 +52,7 @@ impl KeyArguments {
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct JoinArguments {
-    /// Where the run listens: tls/HOST:PORT, or tcp/ or udp/ on loopback
+    /// Where the run listens: quic/HOST:PORT, or tcp/ or udp/ on loopback
     #[arg(value_name = "ADDR")]
     address: Address,
     /// This host's name in the run's scenario [default: one that is free]
@@ -74,7 +74,7 @@ Examples:
                                    on the host that launches; it waits
   corotate join tcp/127.0.0.1:7447
                                    on every other: here, the same machine
-  corotate join tls/bench.example:7447 --tls-ca ca.pem --tls-cert flight.pem
+  corotate join quic/bench.example:7447 --tls-ca ca.pem --tls-cert flight.pem
            --tls-key flight.key    over a network";
 
 /// Options of the relay.

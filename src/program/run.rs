@@ -67,7 +67,7 @@ pub struct Arguments {
     /// Be this host of the scenario's, and wait for the others to join
     #[arg(long, value_name = "NAME", requires = "listen", hide_short_help = true)]
     host: Option<String>,
-    /// Where the others join: tls/HOST:PORT, or tcp/ or udp/ on loopback
+    /// Where the others join: quic/HOST:PORT, or tcp/ or udp/ on loopback
     #[arg(long, value_name = "ADDR", requires = "host", hide_short_help = true)]
     listen: Option<Address>,
     #[command(flatten)]
