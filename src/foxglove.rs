@@ -14,7 +14,7 @@ use crate::record::{
     Channel, Layout, MESSAGE_ENCODING, MessageSink, RecordError, SCHEMA_ENCODING, Taps, frame, topic_of,
 };
 use crate::runtime::{
-    RoleError, depths, join, join_at_low_priority, run_under_way, topic, with_realtime_priority, write_whole,
+    RoleError, depths, join_at_low_priority, join_whole, run_under_way, topic, with_realtime_priority, write_whole,
 };
 use crate::sample::{Phase, Schedule};
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle};
@@ -93,7 +93,7 @@ pub enum FoxgloveError {
 /// [`FoxgloveError`].
 pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
     let root = run_under_way(seat.domain.as_deref()).map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?;
-    let (domain, scenario) = join(&root)?;
+    let (domain, scenario) = join_whole(&root)?;
     let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;
     let ended = show(seat, &scenario, &domain, &mut links, terminated);

@@ -22,12 +22,27 @@ pub struct Host {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Network {
-    /// How many ticks each way from one host to another may take.
+    /// How many ticks a way from one host to another may take, unless it has a budget of its own.
     pub budget_ticks: u64,
     /// How hosts agree on the time.
     pub clock_source: ClockSource,
     /// A host that says nothing for so long is lost, s.
     pub silence_timeout_s: f64,
+    /// The ways with a budget of their own.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub link: Vec<LinkBudget>,
+}
+
+/// The budget of one way from a host to another.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LinkBudget {
+    /// The host that sends.
+    pub from: String,
+    /// The host that receives.
+    pub to: String,
+    /// How many ticks the way may take.
+    pub budget_ticks: u64,
 }
 
 /// How hosts agree on the time.
@@ -42,7 +57,7 @@ pub enum ClockSource {
 
 impl Default for Network {
     fn default() -> Self {
-        Self { budget_ticks: 1, clock_source: ClockSource::Estimated, silence_timeout_s: 5.0 }
+        Self { budget_ticks: 1, clock_source: ClockSource::Estimated, silence_timeout_s: 5.0, link: Vec::new() }
     }
 }
 
@@ -70,7 +85,23 @@ impl Hosts {
 
     /// Ticks that a sample may take from one role to another.
     fn way(&self, from: &str, to: &str) -> u64 {
-        if self.of(from) == self.of(to) { 0 } else { self.network.budget_ticks }
+        match (self.of(from), self.of(to)) {
+            (Some(from), Some(to)) if from != to => self.budget(from, to),
+            _ => 0,
+        }
+    }
+
+    /// Ticks that a sample may take from one host to another.
+    fn budget(&self, from: &str, to: &str) -> u64 {
+        let link = self.network.link.iter().find(|link| link.from == from && link.to == to);
+        link.map_or(self.network.budget_ticks, |link| link.budget_ticks)
+    }
+
+    /// The smallest budget of a way from a host or to it.
+    pub fn least_budget(&self, host: &str) -> u64 {
+        let others = self.hosts.iter().map(|other| other.name.as_str()).filter(|other| *other != host);
+        let ways = others.flat_map(|other| [self.budget(host, other), self.budget(other, host)]);
+        ways.min().unwrap_or(self.network.budget_ticks)
     }
 
     /// How many ticks after its tick a role may still wait for inputs: the budgets on the way from the measurements to it, 0 where
@@ -114,7 +145,7 @@ pub(super) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
         checks.require(needed <= delay_ticks, "actuation_delay_ticks", || {
             format!(
                 "the budgets on the way from the measurements by the controller to {body} come to {needed} ticks, and a command \
-                 acts after {delay_ticks}; give {needed} or more, or lower network.budget_ticks"
+                 acts after {delay_ticks}; give {needed} or more, or lower those of [network]"
             )
         });
     }
@@ -149,11 +180,28 @@ pub(super) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
             format!("somebody else's {role} has no part in a run over several hosts; leave it out, or the hosts")
         });
     }
-    let Network { budget_ticks, silence_timeout_s, .. } = hosts.network;
-    checks.require((1..=BUDGET_MAX).contains(&budget_ticks), "network.budget_ticks", || {
-        format!("no way takes {budget_ticks} ticks; give 1 to {BUDGET_MAX}")
-    });
-    checks.require((0.1..=3600.0).contains(&silence_timeout_s), "network.silence_timeout_s", || {
+    let Network { budget_ticks, silence_timeout_s, link: links, .. } = &hosts.network;
+    let budgets = links
+        .iter()
+        .enumerate()
+        .map(|(index, link)| (format!("network.link[{index}].budget_ticks"), link.budget_ticks));
+    for (key, ticks) in budgets.chain([("network.budget_ticks".to_owned(), *budget_ticks)]) {
+        checks.require((1..=BUDGET_MAX).contains(&ticks), &key, || {
+            format!("no way takes {ticks} ticks; give 1 to {BUDGET_MAX}")
+        });
+    }
+    for (index, LinkBudget { from, to, .. }) in links.iter().enumerate() {
+        for (part, name) in [("from", from), ("to", to)] {
+            checks.require(names.contains(&name.as_str()), &format!("network.link[{index}].{part}"), || {
+                format!("there is no host `{name}`; this scenario has: {}", names.join(", "))
+            });
+        }
+        let again = links[..index].iter().any(|other| (&other.from, &other.to) == (from, to));
+        checks.require(from != to && !again, &format!("network.link[{index}].to"), || {
+            format!("{from} to {to} is no way, or has its budget already; name each way between two hosts once")
+        });
+    }
+    checks.require((0.1..=3600.0).contains(silence_timeout_s), "network.silence_timeout_s", || {
         format!("{silence_timeout_s} s is no time to wait for a host that speaks every 0.02 s; give 0.1 to 3600")
     });
 }
@@ -183,6 +231,14 @@ mod tests {
         let formation = hosts(&[("one", &["leader", "observer", "controller"]), ("two", &["follower"])]);
         assert_eq!([lag(&formation, "observer"), lag(&formation, "controller")], [0, 3]);
         assert_eq!(lag(&Hosts::default(), "controller"), 0, "one computer");
+        let link = |from: &str, to: &str, budget_ticks| LinkBudget { from: from.into(), to: to.into(), budget_ticks };
+        let network = Network { link: vec![link("a", "b", 1), link("c", "a", 9)], ..three.network.clone() };
+        let three = Hosts { network, ..three };
+        assert_eq!(
+            [lag(&three, "observer"), lag(&three, "controller"), three.way("controller", "follower")],
+            [1, 4, 9]
+        );
+        assert_eq!(["a", "b", "c"].map(|host| three.least_budget(host)), [1, 1, 3]);
     }
 
     fn refusals(text: &str) -> String {
@@ -205,6 +261,9 @@ mod tests {
             ("[[host]]\nname = \"a\"\nroles = [\"leader\", \"leader\"]\n", "cannot be on two hosts"),
             ("[network]\nbudget_ticks = 0\n", "no way takes 0 ticks"),
             ("[network]\nsilence_timeout_s = 0.0\n", "give 0.1 to 3600"),
+            ("[[network.link]]\nfrom = \"a\"\nto = \"b\"\nbudget_ticks = 1\n", "there is no host `a`"),
+            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 65\n", "no way takes 65 ticks"),
+            ("[[network.link]]\nfrom = \"a\"\nto = \"a\"\nbudget_ticks = 1\n", "is no way"),
             ("[network]\nclock_source = \"sundial\"\n", "sundial"),
         ] {
             let told = refusals(text);

@@ -20,7 +20,7 @@ pub use document::{Document, read_text};
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
 pub(crate) use fault::{Fields, fields};
-pub use hosts::{ClockSource, Host, Hosts, Network};
+pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub use run_id::{NoRunId, RunId};
 pub use scenario::{Checks, Scenario};

@@ -20,7 +20,8 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, WordReader, WordWriter, Wr
 use crate::clock::{Grid, RunClock, monotonic_ns, raw_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    RoleError, clock_path, depths, go_before_roles, join, report_path, scenario_path, topic, write_whole,
+    Kept, RoleError, clock_path, depths, go_before_roles, join, kept, open_ledger, report_path, scenario_path, topic,
+    write_whole,
 };
 use crate::sample::{Health, Phase, Schedule, Stamp};
 use crate::system::{remedy, tell};
@@ -185,7 +186,7 @@ fn find_time(
 ) -> Result<Option<Timing>, RelayError> {
     let path = clock_path(domain);
     let clock = RunClock::open(&path).map_err(|source| RelayError::Write { path, source })?;
-    let (mut timing, post) = (Timing::new(scenario, clock), net.post());
+    let (mut timing, post) = (Timing::new(scenario, plan.name(plan.own), clock), net.post());
     let end_ns = raw_ns() + TRY_NS;
     while !timing.ready(raw_ns())? {
         if raw_ns() > end_ns || terminated.load(Ordering::Relaxed) {
@@ -220,6 +221,8 @@ fn answered(timing: &mut Timing, what: &What<'_>, returned_ns: u64) {
 /// A signal of another host, to be written here.
 struct Incoming {
     writer: Option<WordWriter>,
+    /// In lockstep, what stands in for the writer's own: a reader that dies takes what it had not used with it.
+    kept: Option<Kept>,
     lossless: bool,
     /// The number of the sample that is expected next.
     next: u64,
@@ -288,6 +291,8 @@ impl<'a> Relay<'a> {
             let here = link.to.iter().find(|way| way.host == plan.own);
             incoming.push(Incoming {
                 writer: here.map(|_| link.port.writer(bus)).transpose()?,
+                kept: here
+                    .and_then(|_| kept(scenario, &link.port.topic, |role| open_ledger(domain, scenario, role).ok())),
                 lossless: here.is_some_and(|way| way.lossless),
                 next: 0,
                 received: 0,
@@ -444,6 +449,9 @@ impl<'a> Relay<'a> {
         }
         incoming.received += 1;
         let stamp: Stamp = bytemuck::pod_read_unaligned(&sample[..size_of::<Stamp>()]);
+        if let Some(kept) = &incoming.kept {
+            kept.keep(stamp.tick, bytemuck::pod_collect_to_vec(sample).into_iter());
+        }
         writer.send(sample)?;
         if self.scenario.clock == ClockKind::Realtime && stamp.generation > 0 {
             incoming.one_way.record(stamp.sent_ns, monotonic_ns());

@@ -44,7 +44,7 @@ pub struct ClockReport {
     pub corrections: u64,
     /// See `corrections`.
     pub largest_correction_us: f64,
-    /// The estimate each second: seconds on the run's clock since the ticks began, offset since then, µs, and bound, µs.
+    /// The estimate each second: seconds since this host asked for the time first, offset less `offset_ns`, µs, and bound, µs.
     pub track: Vec<[f64; 3]>,
 }
 

@@ -25,7 +25,7 @@ pub enum ClockRefused {
     /// The way takes too long.
     #[error(
         "a message takes {way_us:.0} us to the host that launched, and its time is known to {error_us:.0} us; together that is more than \
-         {part_us:.0} us, the part of network.budget_ticks = {ticks} up to the cutoff; raise the budget, or take a faster network"
+         {part_us:.0} us, the part of a budget of {ticks} ticks up to the cutoff; raise the budget in [network], or take a faster network"
     )]
     Budget {
         /// Half the fastest way there and back, µs.
@@ -70,10 +70,10 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// That of a run of a scenario.
-    pub fn new(scenario: &Scenario, clock: RunClock) -> Self {
-        let network = &scenario.hosts.network;
-        let ticks = scenario.realtime.cutoff + (network.budget_ticks - 1) as f64;
+    /// That of a host in a run of a scenario.
+    pub fn new(scenario: &Scenario, host: &str, clock: RunClock) -> Self {
+        let (network, budget_ticks) = (&scenario.hosts.network, scenario.hosts.least_budget(host));
+        let ticks = scenario.realtime.cutoff + (budget_ticks - 1) as f64;
         let source = match network.clock_source {
             ClockSource::Estimated => "estimated",
             ClockSource::System => "system",
@@ -84,7 +84,7 @@ impl Timing {
             source: network.clock_source,
             tai_there_ns: 0,
             part_ns: ticks * scenario.period_ns as f64,
-            budget_ticks: network.budget_ticks,
+            budget_ticks,
             realtime: scenario.clock == ClockKind::Realtime,
             began_ns: None,
             next_ask_ns: 0,
@@ -200,7 +200,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let scenario = Scenario::parse(SHIPPED[0].1, "x", &[]).unwrap();
         let path = directory.path().join("clock");
-        let mut timing = Timing::new(&scenario, RunClock::open(&path).unwrap());
+        let mut timing = Timing::new(&scenario, "flight", RunClock::open(&path).unwrap());
         let read = RunClock::open(&path).unwrap();
         let there = |here_ns: u64| here_ns + 1_000_000_000_000 + here_ns / 20_000;
         let (mut last_ns, mut worst_ns) = (0, 0);
@@ -238,7 +238,7 @@ mod tests {
     fn a_budget_that_no_way_could_keep_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let scenario = Scenario::parse(SHIPPED[0].1, "x", &["tick_hz=1000".to_owned()]).unwrap();
-        let mut timing = Timing::new(&scenario, RunClock::open(&directory.path().join("clock")).unwrap());
+        let mut timing = Timing::new(&scenario, "flight", RunClock::open(&directory.path().join("clock")).unwrap());
         assert!(!timing.ready(0).unwrap());
         for sent_ns in (0..FIRST_NS).step_by(10_000_000) {
             let exchange =

@@ -12,7 +12,7 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    Backoff, RoleError, RoleId, depths, join, join_at_low_priority, open_ledger, report, report_path, topic,
+    Backoff, RoleError, RoleId, depths, join_at_low_priority, join_whole, open_ledger, report, report_path, topic,
     window_ticks, with_realtime_priority, write_whole,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
@@ -46,7 +46,7 @@ pub struct RecorderSeat {
 /// # Errors
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
-    let (domain, scenario) = join(&seat.domain)?;
+    let (domain, scenario) = join_whole(&seat.domain)?;
     // Not nice to ordinary processes: it must not lose samples because something is being compiled.
     let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;

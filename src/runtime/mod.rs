@@ -21,7 +21,11 @@ pub use compute::{Compute, ComputedTick};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
+#[cfg(feature = "hosts")]
+pub(crate) use link::Kept;
 pub use link::{AcceptedTicks, Input, Output, Seek};
+#[cfg(feature = "hosts")]
+pub(crate) use node::kept;
 pub use node::{
     Node, NodeError, Poll, Port, Ports, ReadyNode, RoleId, RoleImpl, RunCondition, build, build_rig, ports,
     private_ledger, report, shared_ledger, topic,
@@ -34,10 +38,10 @@ pub(crate) use privileges::{
     join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
-#[cfg(feature = "hosts")]
-pub(crate) use process::clock_path;
 pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
-pub(crate) use process::{join, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
+#[cfg(feature = "hosts")]
+pub(crate) use process::{clock_path, join};
+pub(crate) use process::{join_whole, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

@@ -279,15 +279,9 @@ impl<B: Bus> Seat<'_, B> {
         if self.generation == 1 {
             return None;
         }
-        let (scenario, extent) = (self.scenario, extent(self.scenario));
-        RoleId::all(scenario).into_iter().find_map(|writer| {
-            let written = ports(scenario, writer).writes;
-            let index = written.iter().position(|port| port.topic == *topic)?;
-            let path = self.ledger.path()?.with_file_name(ledger_file(scenario, writer));
-            let ledger = Ledger::existing(&path, ledger_words(scenario, writer))?;
-            let length = words(&written[index]);
-            ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_ticks, length));
-            Kept::open(&ledger, extent.kept_ticks, length)
+        kept(self.scenario, topic, |writer| {
+            let path = self.ledger.path()?.with_file_name(ledger_file(self.scenario, writer));
+            Ledger::existing(&path, ledger_words(self.scenario, writer))
         })
     }
 
@@ -313,6 +307,18 @@ impl<B: Bus> Seat<'_, B> {
         let role = self.role.name(self.scenario);
         Interruptions::of(self.scenario, role, self.generation, next_tick(&self.ledger))
     }
+}
+
+/// Where the samples of a signal are kept for the successors of its readers: in its writer's ledger, which `open` opens.
+pub(crate) fn kept(scenario: &Scenario, topic: &Topic, open: impl Fn(RoleId) -> Option<Ledger>) -> Option<Kept> {
+    let extent = extent(scenario);
+    RoleId::all(scenario).into_iter().find_map(|writer| {
+        let written = ports(scenario, writer).writes;
+        let index = written.iter().position(|port| port.topic == *topic)?;
+        let (ledger, length) = (open(writer)?, words(&written[index]));
+        ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_ticks, length));
+        Kept::open(&ledger, extent.kept_ticks, length)
+    })
 }
 
 /// Which ticks samples can have; in real time only once the grid is known.

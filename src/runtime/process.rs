@@ -53,6 +53,9 @@ pub enum RoleError {
     /// The scenario in the domain was refused.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// Only a part of the run is here.
+    #[error("the run in {} was launched on another host, and not all of its signals are here; look at it there", .0.display())]
+    Part(PathBuf),
     /// The scenario has no such role.
     #[error("there is no role `{role}` in this scenario; it has: {known}")]
     NoSuchRole {
@@ -226,6 +229,17 @@ pub(crate) fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let path = clock_path(&domain);
     clock::adopt(&path).map_err(|source| RoleError::Clock { path, source })?;
     let scenario = Scenario::load(&scenario_path(&domain), &[])?;
+    Ok((domain, scenario))
+}
+
+/// The same for whoever wants to see the whole run.
+pub(crate) fn join_whole(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
+    let (domain, scenario) = join(directory)?;
+    // Only hosts that joined a run have a clock to be corrected.
+    if clock_path(&domain).exists() {
+        domain.forget();
+        return Err(RoleError::Part(domain.root().to_owned()));
+    }
     Ok((domain, scenario))
 }
 

@@ -10,7 +10,9 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;
-use crate::runtime::{RoleError, depths, join, join_at_low_priority, run_under_way, topic, with_realtime_priority};
+use crate::runtime::{
+    RoleError, depths, join_at_low_priority, join_whole, run_under_way, topic, with_realtime_priority,
+};
 use crate::sample::{Phase, Schedule};
 use std::path::Path;
 
@@ -52,7 +54,7 @@ impl Session {
     pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
         let root = run_under_way(directory)?.ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
-        let (domain, scenario) = insist(end_ns, || join(&root))?;
+        let (domain, scenario) = insist(end_ns, || join_whole(&root))?;
         let mut model = Model {
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),

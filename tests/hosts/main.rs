@@ -129,8 +129,13 @@ fn lockstep_gives_the_bits_of_one_thread() {
         assert_eq!(run_of(&over), run_of(&alone), "{} hosts", hosts.len());
         assert_eq!(over["books"]["balanced"], true);
         assert_eq!(over["recording"]["complete"], true);
-        let diff = run.sites[0].bench.run(&["diff", "over/run.mcap", "alone/run.mcap"]);
-        assert_eq!(diff.code, Some(0), "{diff:?}");
+        let here = &run.sites[0].bench;
+        for command in [&["diff", "over/run.mcap", "alone/run.mcap"][..], &["replay", "over"], &["report", "over"]] {
+            let done = here.run(command);
+            assert_eq!(done.code, Some(0), "{command:?}: {done:?}");
+        }
+        let page = std::fs::read_to_string(here.path("over/report.html")).unwrap();
+        assert!(hosts.iter().all(|(name, _)| page.contains(name)), "the page names every host");
         for link in over["hosts"]["links"].as_array().unwrap() {
             assert_eq!((&link["sent"], &link["lost"]), (&link["received"], &Value::from(0)), "{link}");
         }
@@ -177,6 +182,14 @@ fn real_time_is_the_same_until_a_tick_is_missed() {
     let error_us = (clock["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
     assert!(error_us <= clock["error_us"].as_f64().unwrap(), "wrong by {error_us} us: {clock}");
     println!("the clock is wrong by {error_us:.1} us: {clock}");
+    // And so it is all the time, but for what a correction has still to make up for.
+    let slack_us = clock["largest_correction_us"].as_f64().unwrap();
+    let track: Vec<[f64; 3]> = serde_json::from_value(clock["track"].clone()).unwrap();
+    let start_us = (clock["offset_ns"].as_i64().unwrap() - truth_ns) as f64 / 1e3;
+    let wrong = track.iter().map(|[_, since_us, bound_us]| ((start_us + since_us).abs(), *bound_us));
+    let largest_us = wrong.clone().map(|(wrong_us, _)| wrong_us).fold(0.0, f64::max);
+    assert!(track.len() >= 4 && wrong.clone().all(|(wrong_us, bound_us)| wrong_us <= bound_us + slack_us), "{clock}");
+    println!("on the way it is wrong by {largest_us:.1} us at the most");
     let crosses = |link: &&Value| link["one_way"].is_object() && link["lossless"] == false;
     assert_eq!(over["hosts"]["links"].as_array().unwrap().iter().filter(crosses).count(), 3);
     assert!(over["recording"]["complete"] == true, "{}", over["recording"]);
@@ -299,6 +312,74 @@ fn a_host_that_vanishes_ends_the_run_of_the_others() {
         assert_eq!(next.code, Some(0), "{next:?}");
         run.assert_clean();
     }
+}
+
+/// A role that dies, wherever it is, is started again there and goes on where it was: in lockstep that costs not a bit.
+#[test]
+fn a_role_that_dies_on_any_host_costs_nothing_in_lockstep() {
+    let run = Run::new(&TWO, KEYS, "");
+    let long = [&["--tick-hz", "200", "--duration", "150"][..], &UNJUDGED].concat();
+    let launched = run.launch("tcp", &[&long[..], &["--clock", "lockstep"]].concat());
+    let joined = run.join(1, "tcp", None);
+    run.sites[1].bench.await_commits("controller", 100);
+    let domain = run.sites[1].bench.domains().remove(0);
+    for command in [&["watch"][..], &["record", "--domain"], &["foxglove"]] {
+        let refused = run.sites[1].start(&[command, &[domain.to_str().unwrap()]].concat()).wait();
+        assert!(refused.code == Some(2) && refused.stderr.contains("look at it there"), "{refused:?}");
+    }
+    let domain = run.sites[0].bench.domains().remove(0);
+    let watched = run.sites[0].start(&["watch", domain.to_str().unwrap(), "--once", "0.5"]).wait();
+    assert!(watched.code == Some(0) && watched.stdout.contains("controller"), "{watched:?}");
+    let dead = [(1, "controller"), (1, "observer"), (0, "follower"), (0, "leader")];
+    for (site, role) in dead {
+        let bench = &run.sites[site].bench;
+        common::send_signal(bench.await_role(role), libc::SIGKILL);
+        // The next one while this is being brought back would be another test.
+        let before = bench.commits(role);
+        bench.await_commits(role, before + 100);
+    }
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert_eq!(run_of(&over), run_of(&run.alone(&long)));
+    let mut told: Vec<&str> =
+        over["incidents"].as_array().unwrap().iter().map(|one| one["role"].as_str().unwrap()).collect();
+    told.sort_unstable();
+    assert_eq!(told, ["controller", "follower", "leader", "observer"]);
+    run.assert_clean();
+}
+
+/// Without a relay a host is alone: on whichever side it dies, both end in order and say so.
+#[test]
+fn a_relay_that_dies_ends_the_run_in_order() {
+    for side in [0, 1] {
+        let run = Run::new(&TWO, KEYS, "[network]\nsilence_timeout_s = 1.5\n");
+        let launched = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "60"][..], &UNJUDGED].concat());
+        let joined = run.join(1, "tcp", None);
+        run.sites[1].bench.await_commits("controller", 100);
+        common::send_signal(run.sites[side].bench.await_role("relay"), libc::SIGKILL);
+        let (launched, joined) = (launched.wait(), joined.wait());
+        assert_eq!((launched.code, joined.code), (Some(4), Some(4)), "{launched:?} {joined:?}");
+        let causes = summary(&launched)["incidents"].to_string();
+        let expected = if side == 0 { "relay" } else { "the host flight" };
+        assert!(causes.contains(expected), "{causes}");
+        run.assert_clean();
+    }
+}
+
+/// Where the machines keep CLOCK_TAI alike, as these do who share it, that is the time.
+#[test]
+fn the_system_s_clock_is_taken_where_it_is_kept() {
+    let run = Run::new(&TWO, KEYS, "[network]\nclock_source = \"system\"\n");
+    let launched = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "2"][..], &UNJUDGED].concat());
+    let joined = run.join(1, "tcp", None);
+    let (done, over) = finish(launched, joined);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let clock = &over["hosts"]["hosts"][1]["clock"];
+    let truth_ns = if apart() { -APART_S * 1_000_000_000 } else { 0 };
+    let wrong_us = (clock["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
+    assert!(clock["source"] == "system" && wrong_us <= clock["error_us"].as_f64().unwrap(), "{wrong_us} us: {clock}");
+    println!("by CLOCK_TAI the clock is wrong by {wrong_us:.2} us");
+    run.assert_clean();
 }
 
 /// What is wrong with a host that wants to join is told by name, to it alone.
