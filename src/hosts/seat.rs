@@ -167,7 +167,7 @@ mod tests {
         for text in [
             "",
             "127.0.0.1:7447",
-            "quic/a:1",
+            "tls/a:1",
             "tcp/a",
             "tcp/:1",
             "tcp/a:70000",
