@@ -8,8 +8,9 @@ use corotate::analysis::claims;
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, Summary, run};
 use corotate::nalgebra::{Matrix3, Vector3};
-use corotate::record::{Recording, Track};
+use corotate::record::{Recording, SignalInfo, Track};
 use serde_json::Value;
+use std::path::Path;
 use std::sync::atomic::AtomicUsize;
 
 const DELAYS: [usize; 3] = [1, 2, 5];
@@ -181,6 +182,59 @@ fn the_rate_is_that_of_the_linearised_loop_with_its_delay() {
         let alike = found.iter().all(|rate| (rate / found[0] - 1.0).abs() < 0.02);
         assert_eq!(alike, predict, "prediction takes a delay out, and nothing else does: {found:?}");
     }
+}
+
+/// What prediction buys: the rate that a run shows is the one that is claimed, and with prediction it is that of one tick's delay,
+/// where without it a longer delay makes the loop slow, and then unstable.
+#[test]
+fn a_run_has_the_rate_that_is_claimed_for_its_delay() {
+    let mut refused = 0;
+    for (delay, gain, predict) in DELAYS
+        .into_iter()
+        .flat_map(|d| [4.0, 40.0, 70.0].into_iter().flat_map(move |gain| [(d, gain, false), (d, gain, true)]))
+    {
+        let sets = [
+            format!("controller.gain_per_s={:?}", [gain; 3]),
+            format!("controller.predict={predict}"),
+            "observer.decay_rate_per_s=150.0".to_owned(),
+            "tick_hz=200.0".to_owned(),
+            "duration_s=10.0".to_owned(),
+            format!("actuation_delay_ticks={delay}"),
+        ];
+        let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap().1;
+        let Ok(scenario) = Scenario::parse(text, "test", &sets) else {
+            println!("d = {delay}, gain {gain}, predict {predict}: refused, unstable");
+            assert!(!predict, "{sets:?}");
+            refused += 1;
+            continue;
+        };
+        let claimed = claims(&scenario).remove(0).loop_rate_per_s.unwrap();
+        let bench = Bench::new();
+        run_program(&bench, "rigid-pair", "in-process", &sets);
+        let observed = falling(&bench.path("in-process/run.mcap"), 200.0);
+        println!("d = {delay}, gain {gain}, predict {predict}: claimed {claimed:.2}, observed {observed:.2} 1/s");
+        assert!((observed / claimed - 1.0).abs() < 0.02, "{sets:?}: claimed {claimed}, observed {observed}");
+    }
+    assert_eq!(refused, 1);
+}
+
+/// The slope of the logarithm of the true distance of both motions from 1e-7 to 1e-12 rad/s, 1/s, falling, by least squares.
+fn falling(recording: &Path, tick_hz: f64) -> f64 {
+    let recording = Recording::open(recording).unwrap();
+    let motion = |body: &str| {
+        let of = |info: &SignalInfo| info.body == body && info.signal == "truth";
+        let track = recording.tracks(of).unwrap().remove(0);
+        [0, 1, 2].map(|axis| track.column("omega_rad_s", axis).unwrap())
+    };
+    let (leader, follower) = (motion("leader"), motion("follower"));
+    let distance =
+        |tick: usize| (0..3).map(|axis| (leader[axis][tick] - follower[axis][tick]).powi(2)).sum::<f64>().sqrt();
+    let below = |limit: f64| (0..leader[0].len()).find(|tick| distance(*tick) < limit).unwrap();
+    let points: Vec<[f64; 2]> =
+        (below(1e-7)..below(1e-12)).map(|tick| [tick as f64 / tick_hz, distance(tick).ln()]).collect();
+    let mean = |of: &dyn Fn(&[f64; 2]) -> f64| points.iter().map(of).sum::<f64>() / points.len() as f64;
+    let [t, y] = [mean(&|point| point[0]), mean(&|point| point[1])];
+    -mean(&|point| (point[0] - t) * (point[1] - y)) / mean(&|point| (point[0] - t).powi(2))
 }
 
 /// The largest exponent of (e, commands on their way, ε) along the free motion of `rigid-pair`'s leader, 1/s, falling: from the
