@@ -271,7 +271,7 @@ impl Host {
                 }
                 self.silent = 0;
                 self.silent_since_ns = None;
-                // An answer that comes late counts most: a device that has fallen behind and is asked twice stays behind.
+                // Late answers tell it too: a device that has fallen behind and is asked twice stays behind.
                 let sent = self.sent[answer.echo as usize % REMEMBERED].take_if(|(frame, _)| *frame == answer.echo);
                 if let Some((_, sent_ns)) = sent {
                     smooth(&mut self.round_trip_ns, now_ns.saturating_sub(sent_ns));

@@ -190,6 +190,16 @@ impl Bench {
     }
 }
 
+/// Whoever cleans up after a test that failed needs the directory until that is done.
+impl Drop for Bench {
+    fn drop(&mut self) {
+        let end = Instant::now() + Duration::from_secs(10);
+        while std::thread::panicking() && !self.processes().is_empty() && Instant::now() < end {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
 /// A test that fails leaves no run behind: the roles die with their launcher, and the janitor cleans up.
 impl Drop for Running {
     fn drop(&mut self) {
