@@ -561,7 +561,9 @@ struct Stall {
 
 impl Stall {
     fn new(scenario: &Scenario) -> Self {
-        let limit_ns = HUNG_NS.max(HUNG_PERIODS * scenario.period_ns);
+        // Who falls silent is blamed first, by name and cause.
+        let heartbeat_ns = (2e9 * scenario.supervision.heartbeat_timeout_s) as u64;
+        let limit_ns = HUNG_NS.max(HUNG_PERIODS * scenario.period_ns).max(heartbeat_ns);
         Self { limit_ns, moved_ns: monotonic_ns(), ticks: Vec::new() }
     }
 

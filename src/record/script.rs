@@ -542,18 +542,26 @@ impl Reading<'_> {
         word.is_none_or(|word| word & status::REJECTED != 0 || word & (status::HOLDING | status::SAFE) == 0)
     }
 
-    /// A file that was cut off ends with each signal at a tick of its own.
-    fn cut_off(&mut self) {
+    /// The tick behind the last of each output, the least and the largest. A recording that ended before its run ends with each
+    /// signal at a tick of its own.
+    fn ends(&self) -> (u64, u64) {
         let after = |track: &Track| track.regular().last().map_or(0, |index| track.stamp(index).tick + 1);
-        let end = self.outputs.iter().map(after).min().unwrap_or(0);
-        self.limit(end, || "the file was cut off there".to_owned());
+        let ends = || self.outputs.iter().map(after);
+        (ends().min().unwrap_or(0), ends().max().unwrap_or(0))
     }
 
     /// What was published and is not in the recording may have been anything.
     fn lost(&mut self) {
         let Some(end) = self.recording.info().end.as_ref().filter(|_| self.recording.damage().is_none()) else {
-            return self.cut_off();
+            return self.limit(self.ends().0, || "the file was cut off there".to_owned());
         };
+        // What the counters say was published may be of a moment before the last sample.
+        match self.ends() {
+            (first, last) if first < last && !end.complete => {
+                self.limit(first, || "the recording ended there".to_owned());
+            }
+            _ => {}
+        }
         let lost = |service: &str| {
             let books = end.signals.iter().find(|books| books.service == service && books.lost.unwrap_or(0) > 0)?;
             Some((books.gaps.first().map_or(0, |gap| gap[0]), books.lost.unwrap_or(0)))

@@ -173,7 +173,8 @@ impl Connections {
         if self.failed.load(Ordering::Relaxed) {
             return Err(Refusal {
                 reason: "not connected to every process that has it open (is /dev/shm full?)".to_owned(),
-                passes: Passes::Never,
+                // Whoever leaves, or dies, meanwhile is put away soon.
+                passes: Passes::WhenVacated,
             });
         }
         Ok(end)
@@ -207,6 +208,18 @@ mod tests {
         assert!(matches!(attempts(&bus, 2, interrupted), (3, Ok(()))));
         let (made, refused) = attempts(&bus, 2, || Refusal::never("a signal called Interrupt"));
         assert!(made == 1 && refused.is_err());
+    }
+
+    #[test]
+    fn who_leaves_while_another_opens_costs_another_attempt() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let bus = bus(&domain);
+        let gone = || {
+            let connections = Connections::default();
+            connections.failed.store(true, Ordering::Relaxed);
+            connections.whole(()).unwrap_err()
+        };
+        assert!(matches!(attempts(&bus, 2, gone), (3, Ok(()))));
     }
 
     #[test]
