@@ -1,9 +1,7 @@
 //! A command that acts d ticks after its measurement: when it acts, under every clock, in every replay, after every kill; and the
 //! rate of the loop, held against an independent computation.
 
-mod common;
-
-use common::{Bench, shipped};
+use crate::common::{Bench, shipped};
 use corotate::analysis::claims;
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, Summary, run};

@@ -1,9 +1,7 @@
 //! The benchmark does what it says: every row, every floor, files that other tools read, and nothing left behind.
 //! No figure is judged here: a smoke run on a loaded machine measures nothing.
 
-mod common;
-
-use common::{Bench, Done, Running, await_some};
+use crate::common::{Bench, Done, Running, await_some};
 use corotate::bench::ROWS;
 use serde_json::Value;
 use std::collections::BTreeSet;

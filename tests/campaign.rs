@@ -1,8 +1,6 @@
 //! `corotate sweep` as it is used: interrupted, killed, spread over shards, and held against an exact solution.
 
-mod common;
-
-use common::{Bench, Done, await_some};
+use crate::common::{self, Bench, Done, await_some};
 use corotate::campaign::{Campaign, End, Entry, Row, Table};
 use corotate::config::ClockKind;
 use std::fs;

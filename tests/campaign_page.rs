@@ -1,8 +1,6 @@
 //! The page of a campaign that was run: whole, well-formed, alone on the network, true to the table; and what it refuses.
 
-mod common;
-
-use common::{Bench, Done};
+use crate::common::{Bench, Done};
 use corotate::campaign::{End, Table};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::fs;

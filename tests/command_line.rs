@@ -1,9 +1,7 @@
 //! The command line: scenarios by name, the last line of a run, the newest run, help that fits a screen, what is for shells and
 //! programs.
 
-mod common;
-
-use common::{Bench, Done, await_some, shipped};
+use crate::common::{self, Bench, Done, await_some, shipped};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 use std::fs::{self, File};

@@ -1,10 +1,8 @@
 //! Roles whose samples a function computes: the same bits as the built-in ones if it computes the same, in one thread step by step
 //! and as a process of a run.
 
-mod common;
-
+use crate::common::{Bench, await_some};
 use bytemuck::{bytes_of, from_bytes};
-use common::{Bench, await_some};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};

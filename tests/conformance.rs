@@ -1,8 +1,6 @@
 //! What every rig and every shipped scenario must fulfil; a new one is picked up from the list by itself.
 
-mod common;
-
-use common::{Bench, shipped};
+use crate::common::{Bench, shipped};
 use corotate::config::{SHIPPED, Scenario};
 use serde_json::Value;
 

@@ -1,13 +1,9 @@
 //! The contest of `benches/contest` measures what it says, and who takes part computes the same.
 //! No figure is judged here: a smoke run on a loaded machine measures nothing.
 
-#[path = "../benches/contest/main.rs"]
-#[allow(dead_code, reason = "its command line is not used")]
-mod contest;
-
-use contest::ROWS;
-use contest::compiled::NATIVE;
-use contest::step::{agreements, library};
+use crate::contestants::ROWS;
+use crate::contestants::compiled::NATIVE;
+use crate::contestants::step::{agreements, library};
 use corotate::bench::{Bench, Results, run};
 use corotate::config::SHIPPED;
 use std::sync::atomic::AtomicUsize;

@@ -1,10 +1,8 @@
 //! Damaged recordings: what is read of one is what was recorded, or it is refused; and what it says commands no terminal.
 //!
-//! The suite takes a part of all damages; `COROTATE_DAMAGE=all cargo test --release --test damage` takes them all.
+//! The suite takes a part of all damages; `COROTATE_DAMAGE=all cargo test --release --test all damage::` takes them all.
 
-mod common;
-
-use common::{Bench, Done, rewrite_metadata};
+use crate::common::{Bench, Done, rewrite_metadata};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, run};
 use corotate::record::Recording;

@@ -1,8 +1,6 @@
 //! `corotate doctor` as a user runs it: on this machine, whatever that is.
 
-mod common;
-
-use common::{Bench, await_some};
+use crate::common::{self, Bench, await_some};
 use serde_json::Value;
 
 const SIGKILL: i32 = 9;

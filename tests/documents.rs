@@ -3,9 +3,7 @@
 //! What is not run here is listed with its reason; a command that is in neither place fails the test. The synopses of
 //! `docs/commands.md` are held against the program's own help.
 
-mod common;
-
-use common::{Bench, Done, Running};
+use crate::common::{Bench, Done, Running};
 use corotate::record::{Recording, SignalInfo};
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -23,7 +21,7 @@ const ELSEWHERE: [(&str, &str); 29] = [
     ("cargo build --release", "for a board, in firmware/; tests/board"),
     ("cargo bench --bench", "tests/run, short"),
     ("corotate bench", "five minutes; tests/bench.rs, some rows"),
-    ("cargo test --release --features hooks --test claims", "tests/claims.rs"),
+    ("cargo test --release --features hooks --test all claims::a_sampled", "tests/claims.rs"),
     ("corotate run config/rigid-pair.toml --external follower", "it waits for a partner; tests/hil.rs"),
     ("corotate run rigid-pair --external follower", "it waits for a partner; tests/hil.rs and tests/serial.rs"),
     ("corotate run rigid-pair --clock lockstep --external", "it waits for a partner; tests/board"),

@@ -1,9 +1,7 @@
 //! A machine that is short of everything: memory, descriptors, disk, time, cores. A run says what it lacks or counts what it
 //! lost; it never hangs, never panics, and leaves nothing behind.
 
-mod common;
-
-use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::Command;

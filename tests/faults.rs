@@ -1,9 +1,7 @@
 //! Scripted faults: no single one moves a follower outside the declared bound, every one is counted somewhere, the books
 //! balance, the loop converges again; and the clocks agree on all of it.
 
-mod common;
-
-use common::{Bench, shipped};
+use crate::common::{Bench, shipped};
 use corotate::config::Scenario;
 use corotate::launch::{Launch, Summary, run};
 use corotate::role::DOUBTS;

@@ -1,9 +1,7 @@
 //! Fleets: many followers in one process. Each gets the bits that it gets alone, under every clock; what happens to a
 //! follower happens to all of a fleet at once.
 
-mod common;
-
-use common::{Bench, await_some, send_signal, shipped};
+use crate::common::{Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
 use corotate::config::Scenario;

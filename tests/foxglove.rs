@@ -1,8 +1,6 @@
 //! A run on a Foxglove WebSocket, seen by a client that shares no code with ours; clients and servers that go wrong.
 
-mod common;
-
-use common::{Bench, Running, await_some, python, send_signal, shipped};
+use crate::common::{Bench, Running, await_some, python, send_signal, shipped};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::net::TcpListener;

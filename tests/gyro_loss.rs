@@ -1,9 +1,7 @@
 //! A gyro axis fails in flight: the estimate does not jump, the follower stays, the axis may come back, and an axis that
 //! fails too early is flagged and bounded.
 
-mod common;
-
-use common::shipped;
+use crate::common::shipped;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;

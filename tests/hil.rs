@@ -1,9 +1,7 @@
 //! Hardware in the loop: a follower that shares no code with ours (tests/hil/follower.py) in a seat of a run, against our
 //! leader, observer and controller. The verdict is read as a CI reads it, from the JUnit file.
 
-mod common;
-
-use common::{Bench, Done, Running, await_some};
+use crate::common::{Bench, Done, Running, await_some};
 use corotate::bus::domain::{Domain, OwnedDomain};
 use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
@@ -53,6 +51,9 @@ fn start_follower(bench: &Bench, seat: &Path, options: &[&str]) -> Running {
     bench.start_program(python(), &[&[program.to_str().unwrap(), seat.to_str().unwrap()], options].concat())
 }
 
+/// Beside other tests nobody is to be taken for dead who is only served late; a test of that sets its own limit after it.
+const PATIENT: [&str; 2] = ["--set", "supervision.heartbeat_timeout_s=30"];
+
 /// Makes the foreign follower leave what it published and received.
 const RECORD: [&str; 2] = ["--record", "record"];
 
@@ -65,7 +66,7 @@ fn await_seat(bench: &Bench, role: &str) -> PathBuf {
 fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
     let scenario = file("pair.toml");
     let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out"];
-    let running = bench.start(&[&common[..], arguments].concat());
+    let running = bench.start(&[&common[..], &PATIENT, arguments].concat());
     let seat = await_seat(bench, "follower");
     (running, seat)
 }
@@ -370,7 +371,7 @@ fn a_follower_that_says_nothing_of_itself_is_seen_by_its_samples() {
 #[test]
 fn a_silent_follower_that_misses_its_last_ticks_is_done() {
     let bench = Bench::new();
-    let brief = ["--duration", "1", "--set", "accept={}"];
+    let brief = ["--duration", "1", "--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=2"];
     let (running, _) = start_waiting(&bench, &[&["--clock", "realtime"], &brief[..]].concat());
     let domains = bench.domains();
     let partner = Partner::new(&domains[0], |tick, _| (tick < 990, tick < 990));

@@ -4,9 +4,7 @@
 //! By default one cell of each system call. `COROTATE_INJECT=N` runs all targets with all errors, at N places in each
 //! system call's sequence; `COROTATE_INJECT=run:openat:EMFILE:120,...` runs these cells and prints what was said.
 
-mod common;
-
-use common::{Bench, Done, Running, WATCHDOG, await_some, send_signal};
+use crate::common::{self, Bench, Done, Running, WATCHDOG, await_some, send_signal};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::Path;

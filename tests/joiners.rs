@@ -5,9 +5,7 @@
 //! kinds below (half an hour), else some of each. Nothing is judged by the machine's speed: a role that stood still is one
 //! that its launcher missed for `STILL_S` of its own attention, and in lockstep no tick may be missed at all.
 
-mod common;
-
-use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,9 +1,7 @@
 //! The verdict as JUnit XML, read by a parser that is not the writer's: it says what the exit code says, with value and
 //! limit, and is never empty nor older than the run.
 
-mod common;
-
-use common::{Bench, Done, Running, send_signal, shipped};
+use crate::common::{Bench, Done, Running, send_signal, shipped};
 use roxmltree::{Document, Node};
 
 const SIGINT: i32 = 2;

@@ -3,9 +3,7 @@
 //!
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
-mod common;
-
-use common::{Bench, Done, Running, send_signal};
+use crate::common::{self, Bench, Done, Running, send_signal};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::runtime::RoleId;
 use rand_pcg::Pcg64;

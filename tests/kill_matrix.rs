@@ -2,9 +2,7 @@
 //!
 //! Needs the feature `hooks`, which compiles those places into the program; `tests/run` turns it on.
 
-mod common;
-
-use common::{Bench, Done, Running, shipped};
+use crate::common::{Bench, Done, Running, shipped};
 use serde_json::Value;
 
 const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];

@@ -1,9 +1,7 @@
 //! Bad company: participants of the same run that do everything wrong, and other users. None of them stalls, corrupts or
 //! starves the loop.
 
-mod common;
-
-use common::{Bench, Running, await_some, shipped, skipped};
+use crate::common::{Bench, Running, await_some, shipped, skipped};
 use iceoryx2::prelude::*;
 use serde_json::Value;
 use std::os::unix::fs::MetadataExt;

@@ -1,18 +1,13 @@
 //! What the filters make of noisy measurements, against the textbook's extended Kalman filter on the same data.
 //!
-//! `cargo test --release --test noise -- --nocapture` prints every figure.
+//! `cargo test --release --test all noise:: -- --nocapture` prints every figure.
 
-#[path = "../benches/contest/ekf.rs"]
-mod ekf;
-#[path = "../benches/contest/recording.rs"]
-mod recording;
-
+use crate::contestants::ekf::Ekf;
+use crate::contestants::recording::{CASES, Case, Recording};
 use corotate::observe::{
     Filter, GuardedKalman, HiddenRate, InvariantFilter, KalmanFilter, Observation, RateNoise, SecondOrderFilter,
 };
-use ekf::Ekf;
 use nalgebra::Vector1;
-use recording::{CASES, Case, Recording};
 use std::f64::consts::FRAC_1_SQRT_2;
 
 /// After this time the filters' transients are over, s; the recordings are twice as long.

@@ -1,9 +1,7 @@
 //! Roles that share a process (`launch.processes`), any of them: the same bits and the same books under every clock, one life
 //! for all of them, and no room for anybody else.
 
-mod common;
-
-use common::{Bench, Done, Running, await_some, send_signal, shipped};
+use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 
 const BOTH: [&str; 2] = ["--set", "launch.processes=[['observer','controller']]"];

@@ -1,9 +1,7 @@
 //! Holds the third paper's system to its word: the motion against an independent reference, the observer's floor, decay and
 //! order, the loop with and without a measured velocity, the clocks against each other, faults, and what is refused.
 
-mod common;
-
-use common::{Bench, reference, shipped};
+use crate::common::{Bench, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;

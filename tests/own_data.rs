@@ -1,8 +1,6 @@
 //! Logs that others wrote: `identify` and `estimate` as a user runs them, on throws of a body that was never measured.
 
-mod common;
-
-use common::{Bench, Done};
+use crate::common::{Bench, Done};
 use corotate::model::{Inertia, Noise, RigidBody};
 use nalgebra::{Rotation3, Vector3};
 use serde_json::Value;

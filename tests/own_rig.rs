@@ -1,8 +1,6 @@
 //! A program of somebody else's, `examples/motor-pair`: with a rig that this crate does not know, everything works.
 
-mod common;
-
-use common::{Bench, await_some};
+use crate::common::{self, Bench, await_some};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,8 +1,6 @@
 //! Recordings as Parquet, read by a library that shares no code with ours, beside the recordings themselves and the CSV.
 
-mod common;
-
-use common::{Bench, Done, python, rewrite, shipped};
+use crate::common::{Bench, Done, python, rewrite, shipped};
 use corotate::record::{Recording, Track};
 use corotate::sample::FieldKind;
 use serde_json::Value;

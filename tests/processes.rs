@@ -1,9 +1,7 @@
 //! A run as processes, from outside: signals, killed roles, a killed launcher, two runs at once, roles started by hand.
 //! After each of them nothing may be left: no process, no file.
 
-mod common;
-
-use common::{Bench, Running, await_some, send_signal, shipped, skipped};
+use crate::common::{Bench, Running, await_some, send_signal, shipped, skipped};
 use serde_json::Value;
 use std::path::PathBuf;
 

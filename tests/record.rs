@@ -1,8 +1,6 @@
 //! Recordings: what is in them beside what was published, read by programs that share no code with ours; replayed; cut off.
 
-mod common;
-
-use common::{Bench, Done, await_some, python, rewrite, send_signal, shipped, skipped};
+use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, send_signal, shipped, skipped};
 use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
@@ -295,6 +293,31 @@ fn on_a_full_disk_the_recording_has_an_end() {
     assert!(mcap::Summary::read(&std::fs::read(bench.path("kept.mcap")).unwrap()).unwrap().is_some());
     let done = replay(&bench, &bench.path("kept.mcap"), &["--accept-incomplete"]);
     assert!(done.code == Some(0) && done.stderr.contains("the disk is full"), "{done:?}");
+}
+
+/// A recorder that ends amid a tick has one of a role's samples and not the other.
+#[test]
+fn what_a_recording_that_ended_early_has_not_is_no_difference() {
+    let bench = Bench::new();
+    let (done, file) = record(&bench, "rigid-pair", "out", &["--clock", "lockstep", "--duration", "1"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    let (cut, ended) = (bench.path("cut.mcap"), bench.path("ended.mcap"));
+    let truth = |name: &str, tick: u32, data: &mut Vec<u8>| {
+        if name == "/corotate/rigid_pair/leader/truth" && tick == 1000 {
+            data.clear();
+        }
+    };
+    rewrite(&file, &cut, |schema| schema, truth);
+    assert_eq!(replay(&bench, &cut, &[]).code, Some(3), "it says that it is complete");
+    rewrite_metadata(&cut, &ended, |name, entries| {
+        if name == "corotate.end" {
+            entries.insert("complete".to_owned(), "false".to_owned());
+            entries.insert("problem".to_owned(), "the disk is full".to_owned());
+        }
+    });
+    let done = replay(&bench, &ended, &["--accept-incomplete"]);
+    assert_eq!(done.code, Some(0), "{done:?}");
+    assert!(done.stdout.contains("from tick 1000 on nothing can be compared: the recording ended there"), "{done:?}");
 }
 
 #[test]

@@ -1,8 +1,6 @@
 //! The closed loop against an implementation that shares no code with it, and the three clocks against each other.
 
-mod common;
-
-use common::{Bench, reference, shipped};
+use crate::common::{Bench, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::config::Scenario;

@@ -1,8 +1,6 @@
 //! Reports of real runs: whole, well-formed, alone on the network, true to the summary; and what they say to bad input.
 
-mod common;
-
-use common::{Bench, Done, shipped};
+use crate::common::{self, Bench, Done, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Signal, Write};
 use corotate::config::Scenario;

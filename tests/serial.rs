@@ -1,11 +1,10 @@
 //! A device behind a serial line in the follower's seat: the real program, a device in a thread, and between them a cable
 //! of two ptys that can be faulty, cut, and joined again.
 
-mod common;
 #[path = "../examples/serial_device.rs"]
 mod serial_device;
 
-use common::{Bench, Done, Running, await_some, shipped};
+use crate::common::{Bench, Done, Running, await_some, shipped};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::Line;
@@ -361,7 +360,9 @@ fn in_lockstep_a_device_may_be_observer_or_controller_or_both_in_any_rig() {
             let with_device = run_roles(&bench, name, roles, &cable.host.path, &arguments);
             assert_eq!(with_device["state"]["hash"], built_in["state"]["hash"], "{name}: {role}");
             assert_eq!(with_device["books"]["roles"], built_in["books"]["roles"], "{name}: {role}");
-            assert_eq!(number(&with_device["lines"][roles[0]]["handshakes"]), 1, "{with_device:#}");
+            // One for all roles of a line; a device that is served late is greeted again.
+            let line = &with_device["lines"][roles[0]];
+            assert!(number(&line["handshakes"]) == 1 || number(&line["repeats"]) > 0, "{line:#}");
         }
     }
 }
@@ -451,12 +452,18 @@ fn a_flight_computer_that_falls_silent_leaves_its_plants_safe_and_another_one_ta
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let flight = |path: &Path| {
-        Powered::of_rig(path, short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]), "observer controller")
+        Powered::of_rig(
+            path,
+            short("rigid-pair", &["duration_s=16", "tick_hz=100", "accept={}"]),
+            "observer controller",
+        )
     };
     let device = flight(&cable.device.path);
     let roles = ["observer", "controller"];
-    let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &roles, &REALTIME);
-    let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &["--patience", "0.5"]);
+    let longer = REALTIME.map(|word| if word == "8" { "16" } else { word });
+    let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &roles, &longer);
+    // A device that is only served late must not be given up before the test takes it away.
+    let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &["--patience", "5"]);
     cable.await_ticks();
     drop(device);
     let first = first.wait();

@@ -1,9 +1,7 @@
 //! Another user of the same machine, who does what he can: with directories and files that he has made beforehand, in a race
 //! with the launcher, and in the places that results are written to. Needs root, who can act as two users.
 
-mod common;
-
-use common::{Bench, Done, await_some, shipped, skipped};
+use crate::common::{Bench, Done, await_some, shipped, skipped};
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, chown, lchown, symlink};
 use std::path::Path;

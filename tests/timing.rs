@@ -1,9 +1,7 @@
 //! Timing as a disturbance: jitter, bursts, weakly-hard losses, missed ticks. The same bits under every clock, in every
 //! replay, and whoever is killed on the way.
 
-mod common;
-
-use common::{Bench, shipped};
+use crate::common::{Bench, shipped};
 use serde_json::{Value, json};
 
 /// A loop of three quarters of a second, with these faults.

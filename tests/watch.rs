@@ -1,8 +1,6 @@
 //! `corotate watch` in a real terminal, tmux, beside a running loop.
 
-mod common;
-
-use common::{Bench, WATCHDOG, await_some};
+use crate::common::{self, Bench, WATCHDOG, await_some};
 use std::process::Command;
 use std::time::Instant;
 

@@ -5,10 +5,10 @@
 //! it runs. Must not be part of the library, nor keep anything that the library needs.
 
 pub mod compiled;
-mod ekf;
+pub mod ekf;
 mod fleet;
 mod product;
-mod recording;
+pub mod recording;
 pub mod step;
 
 use corotate::Program;

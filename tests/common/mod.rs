@@ -323,7 +323,8 @@ fn rewriter(to: &Path) -> mcap::Writer<std::io::BufWriter<std::fs::File>> {
     options.create(std::io::BufWriter::new(std::fs::File::create(to).unwrap())).unwrap()
 }
 
-/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick.
+/// Writes a recording again, as anybody could, with something changed: schemas, and the samples of one topic by tick; what is
+/// made empty is left out.
 pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change: impl Fn(&str, u32, &mut Vec<u8>)) {
     let bytes = std::fs::read(from).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
@@ -339,9 +340,11 @@ pub fn rewrite(from: &Path, to: &Path, schema: impl Fn(String) -> String, change
         channel.schema = Some(of.into());
         let mut data = message.data.to_vec();
         change(&channel.topic, message.sequence, &mut data);
-        message.data = Cow::Owned(data);
         message.channel = channel.into();
-        writer.write(&message).unwrap();
+        if !data.is_empty() {
+            message.data = Cow::Owned(data);
+            writer.write(&message).unwrap();
+        }
     }
     writer.finish().unwrap();
 }

@@ -1,7 +1,7 @@
-//! What several hosts cost: figures to be printed, by `cargo test --release --features hosts --test hosts -- --ignored --nocapture figures`.
+//! What several hosts cost: figures to be printed, by `cargo test --release --features hosts --test all hosts::figures -- --ignored --nocapture`.
 
-use crate::sites::{APART_S, Site, apart, sites};
-use crate::{KEYS, Run, TWO, UNJUDGED, finish};
+use super::sites::{APART_S, Site, apart, sites};
+use super::{KEYS, Run, TWO, UNJUDGED, finish};
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 use zenoh::Wait;

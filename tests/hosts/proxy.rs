@@ -1,6 +1,6 @@
 //! A way that is worse than any cable: datagrams are delayed, lost, doubled, turned round, or cut off altogether.
 
-use crate::sites::Site;
+use super::sites::Site;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::net::{SocketAddr, UdpSocket};

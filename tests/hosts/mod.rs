@@ -1,12 +1,10 @@
 //! Runs over several hosts, with real processes: on networks and clocks of their own where this user is root, else on loopback.
 
-#[path = "../common/mod.rs"]
-mod common;
 mod figures;
 mod proxy;
 mod sites;
 
-use common::{Done, await_some, shipped};
+use crate::common::{self, Done, await_some, shipped};
 use proxy::{Impairment, Proxy};
 use serde_json::Value;
 use sites::{APART_S, Site, apart, free_port, sites};
