@@ -43,6 +43,8 @@ pub(super) struct Pair {
     back: Receiver,
     peer: Peer,
     number: u64,
+    /// Whether both ends leave their core to others between two looks.
+    gives_way: bool,
     /// Samples that the next one overtook before the receiver, which was late, looked.
     lost: u64,
 }
@@ -54,8 +56,10 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     for (wake, mechanisms) in ways {
         for words in bench.size(&SIZES[..], &SIZES[..1]).iter().copied() {
             bench.next(&format!("hop: {}, {} bytes", wake.name(), 8 * words))?;
-            let pairs: Result<Vec<_>, _> =
-                mechanisms.iter().map(|mechanism| Pair::open(domain.domain(), *mechanism, wake, words)).collect();
+            let pairs: Result<Vec<_>, _> = mechanisms
+                .iter()
+                .map(|mechanism| Pair::open(domain.domain(), false, *mechanism, wake, words))
+                .collect();
             let mut pairs = pairs?;
             for pair in &mut pairs {
                 board.granted(pair.grants());
@@ -102,11 +106,18 @@ fn take_turns(bench: &mut Bench<'_>, board: &mut Board, pairs: &mut [Pair], wake
 }
 
 impl Pair {
-    /// Opens both ends.
-    pub fn open(domain: &Domain, mechanism: Mechanism, wake: Wake, words: usize) -> Result<Self, BenchError> {
+    /// Opens both ends; the peer's is in the observer's place, or the controller's.
+    pub fn open(
+        domain: &Domain,
+        observer: bool,
+        mechanism: Mechanism,
+        wake: Wake,
+        words: usize,
+    ) -> Result<Self, BenchError> {
         let title = |mechanism: Mechanism| format!("{}, {}, {} B", mechanism.name(wake), wake.name(), 8 * words);
         let floor = (mechanism == Mechanism::Ours).then(|| title(Mechanism::Iceoryx));
-        let name: String = title(mechanism).chars().filter(|letter| letter.is_ascii_alphanumeric()).collect();
+        let mut name: String = title(mechanism).chars().filter(|letter| letter.is_ascii_alphanumeric()).collect();
+        name += if observer { "observer" } else { "controller" };
         let descriptors = match mechanism.descriptors() {
             true => Some(descriptors(mechanism).map_err(BenchError::system("open descriptors"))?),
             false => None,
@@ -116,14 +127,20 @@ impl Pair {
             |direction| Opening { mechanism, wake, words, name: name.clone(), direction, descriptors: numbers };
         let (ours, theirs) = descriptors.map_or((None, Vec::new()), |pair| (Some(pair.ours), pair.theirs.into()));
         let [read, write] = ours.map_or([None, None], |[read, write]| [Some(read), Some(write)]);
-        let mut peer = Peer::start(domain, false, theirs)?;
+        let mut peer = Peer::start(domain, observer, theirs)?;
         let station = Station { domain, process: "bench" };
         // A blackboard must be there before anybody reads it: the writers' ends come first.
         let mut sender = station.sender(&opening(0), write)?;
         peer.open(opening(0), Some(opening(1)))?;
         let back = station.receiver(&opening(1), read)?;
         sender.refresh()?;
-        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, lost: 0 })
+        Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, gives_way: false, lost: 0 })
+    }
+
+    /// Both ends leave their core to others between two looks.
+    pub fn give_way(&mut self) {
+        self.gives_way = true;
+        self.back.give_way();
     }
 
     /// What the peer asked of the machine.
@@ -141,7 +158,7 @@ impl Pair {
 
     /// So many samples there and back without a pause: half of the mean round trip, µs.
     pub fn back_to_back(&mut self, count: u64) -> Result<f64, BenchError> {
-        self.peer.echo(count)?;
+        self.peer.echo(count, self.gives_way)?;
         self.back.refresh();
         let began_ns = monotonic_ns();
         for _ in 0..count {

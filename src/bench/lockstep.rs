@@ -7,11 +7,13 @@ use super::{Bench, BenchError, Board, resolve};
 use crate::bus::domain::OwnedDomain;
 use crate::config::Scenario;
 use crate::launch::Progress;
-use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig};
+use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig, Truth};
 use crate::role::{Body, Controller, Observer};
-use crate::runtime::RoleId;
+use crate::runtime::{RoleId, take_privileges};
 use crate::sample::Message;
+use crate::telemetry::StateHash;
 use std::hint::black_box;
+use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
@@ -19,6 +21,8 @@ use std::time::{Duration, Instant};
 const SIGTERM: usize = 15;
 /// Hops in a row that a lockstep tick waits for: a follower's measurement to the controller, the command back to it.
 const HOPS: f64 = 2.0;
+/// Words of the bare samples, as in the row `chain`.
+const WORDS: usize = 16;
 
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
@@ -31,8 +35,9 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
     // Without a controller nobody waits for a command.
     let floor = RoleId::all(&measured).contains(&RoleId::Controller).then_some("two raw hops back to back");
     let arithmetic = format!("arithmetic alone, {}", bench.scenarios[0].0);
+    let hashed = format!("arithmetic, truths and hashes, {}", bench.scenarios[0].0);
     let domain = OwnedDomain::create(0)?;
-    let mut hop = Pair::open(domain.domain(), Mechanism::Iceoryx, Wake::Spin, 16)?;
+    let mut hop = Pair::open(domain.domain(), false, Mechanism::Iceoryx, Wake::Spin, WORDS)?;
     board.granted(hop.grants());
     for round in 1..=rounds {
         bench.next(&format!("lockstep: round {round} of {rounds}"))?;
@@ -41,15 +46,21 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         let exchanges = bench.size(20_000, 200);
         let one_way_us = bench.in_the_leaders_place(board, |_| hop.back_to_back(exchanges))?;
         board.add("two raw hops back to back", "ticks/s", None, 1e6 / (HOPS * one_way_us));
+        if let [BodyInfo { driven: false, .. }, BodyInfo { driven: true, .. }] = measured.rig.face().bodies() {
+            let four = bench.in_the_leaders_place(board, |_| four_raw(&measured, exchanges))?;
+            board.add("four raw hops on the same cores", "ticks/s", None, four);
+        }
         for (index, (name, scenario)) in all.iter().enumerate() {
             bench.next(&format!("lockstep: in one thread, {name}"))?;
             let floor = (index == 0).then_some(&*arithmetic);
             let per_second = ticks_per_second(bench, scenario, limit)?;
             board.add(&format!("in one thread, {name}"), "ticks/s", floor, per_second);
         }
-        match measured.rig.face().arithmetic(&measured) {
-            Some(per_second) => board.add(&arithmetic, "ticks/s", None, per_second),
-            None => board.remark(format!("{arithmetic}: not measured: only that of a leader and one follower is")),
+        for (name, with_hashes) in [(&arithmetic, false), (&hashed, true)] {
+            match measured.rig.face().arithmetic(&measured, with_hashes) {
+                Some(per_second) => board.add(name, "ticks/s", None, per_second),
+                None => board.remark(format!("{name}: not measured: only that of a leader and one follower is")),
+            }
         }
     }
     Ok(())
@@ -79,8 +90,37 @@ fn ticks_per_second(bench: &Bench<'_>, scenario: &Scenario, limit: Duration) -> 
     })
 }
 
-/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others.
-pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> Option<f64> {
+/// Ticks per second of bare processes in the places of four roles, which share their cores as those do: two pairs at once, leader and
+/// observer, follower and controller, exchange a sample there and back, and nobody computes anything.
+fn four_raw(scenario: &Scenario, exchanges: u64) -> Result<f64, BenchError> {
+    let domain = OwnedDomain::create(0)?;
+    let domain = domain.domain();
+    let open = |observer| {
+        let mut pair = Pair::open(domain, observer, Mechanism::Iceoryx, Wake::Spin, WORDS)?;
+        pair.give_way();
+        Ok::<_, BenchError>(pair)
+    };
+    let ready = Barrier::new(2);
+    std::thread::scope(|scope| {
+        let follower = scope.spawn(|| {
+            take_privileges(scenario, RoleId::Plant(1));
+            let pair = open(false);
+            ready.wait();
+            pair?.back_to_back(exchanges).map(drop)
+        });
+        let pair = open(true);
+        ready.wait();
+        let began = Instant::now();
+        let led = pair.and_then(|mut pair| pair.back_to_back(exchanges));
+        let followed = follower.join().map_err(|_| BenchError::Peer("a thread panicked".to_owned()))?;
+        led.and(followed)?;
+        Ok(exchanges as f64 / began.elapsed().as_secs_f64())
+    })
+}
+
+/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others. If so
+/// told, with what a run cannot do without besides: the truths, and the hash of every sample.
+pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario, hashed: bool) -> Option<f64> {
     let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
         return None;
     };
@@ -89,19 +129,30 @@ pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario) -> Option<f
     let (mut observer, mut controller) = (Observer::new(rig.estimator(), tick_s), Controller::new(rig.law(1)));
     let mut measured = [Measurement::<R>::default(); 2];
     let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
+    let (mut truth, mut hashes) = (Truth::<R>::default(), [(); 6].map(|()| StateHash::without_checkpoints()));
     let began = Instant::now();
     for tick in 0..=scenario.last_tick {
         if tick > 0 {
             black_box(follower.apply(&command));
         }
-        for (body, measured) in [&mut leader, &mut follower].into_iter().zip(&mut measured) {
+        let bodies = [&mut leader, &mut follower].into_iter().zip(&mut measured).zip(hashes.chunks_exact_mut(2));
+        for ((body, measured), hashes) in bodies {
             body.measure(0, 0, measured);
             measured.stamp_mut().tick = tick;
+            if hashed {
+                body.truth(0, &mut truth);
+                hashes[0].absorb(tick, measured.content());
+                hashes[1].absorb(tick, truth.content());
+            }
             body.flow(tick_s);
         }
         observer.step(&measured[0], &mut estimate);
         controller.step(&estimate, &measured[1], &mut command);
+        if hashed {
+            hashes[4].absorb(tick, estimate.content());
+            hashes[5].absorb(tick, command.content());
+        }
     }
-    black_box(&command);
+    black_box((&command, &hashes));
     Some((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
 }

@@ -36,8 +36,8 @@ enum Order {
     Open { inlet: Opening, outlet: Option<Opening> },
     /// Receive so many samples that are due on a grid, the first of this number; if so told, pass them on.
     Receive { epoch_ns: u64, period_ns: u64, first: u64, count: u64, pass_on: bool },
-    /// Send every one of so many samples back at once.
-    Echo { count: u64 },
+    /// Send every one of so many samples back at once; if so told, leave the core to others between two looks.
+    Echo { count: u64, give_way: bool },
 }
 
 /// What it answers.
@@ -99,7 +99,10 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
             let grid = Grid { epoch_ns: *epoch_ns, period_ns: *period_ns };
             receive(grid, *first, *count, receiver, sender.as_mut().filter(|_| *pass_on))
         }
-        (Order::Echo { count }, Some((receiver, Some(sender)))) => {
+        (Order::Echo { count, give_way }, Some((receiver, Some(sender)))) => {
+            if *give_way {
+                receiver.give_way();
+            }
             for _ in 0..*count {
                 let Some(content) = receiver.receive(monotonic_ns() + SPIN_NS, monotonic_ns() + LOST_NS)? else {
                     return Err(system("relay a sample", "one is lost that nothing could overtake"));
@@ -234,8 +237,8 @@ impl Peer {
     }
 
     /// Lets it echo.
-    pub fn echo(&mut self, count: u64) -> Result<(), BenchError> {
-        self.tell(&Order::Echo { count })
+    pub fn echo(&mut self, count: u64, give_way: bool) -> Result<(), BenchError> {
+        self.tell(&Order::Echo { count, give_way })
     }
 
     /// Waits until everything is echoed.

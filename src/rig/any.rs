@@ -43,7 +43,7 @@ pub(crate) trait Face: Any + Send + Sync {
     fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>;
     fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
     fn judge(&self) -> Box<dyn Judge>;
-    fn arithmetic(&self, scenario: &Scenario) -> Option<f64>;
+    fn arithmetic(&self, scenario: &Scenario, hashed: bool) -> Option<f64>;
 }
 
 impl<R: Rig> Face for R {
@@ -123,8 +123,8 @@ impl<R: Rig> Face for R {
         Box::new(self.clone())
     }
 
-    fn arithmetic(&self, scenario: &Scenario) -> Option<f64> {
-        bench::arithmetic_alone(self, scenario)
+    fn arithmetic(&self, scenario: &Scenario, hashed: bool) -> Option<f64> {
+        bench::arithmetic_alone(self, scenario, hashed)
     }
 }
 
