@@ -589,7 +589,19 @@ impl Stall {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::SHIPPED;
     use std::process::Command;
+
+    /// Or a run would end for want of progress before it says of whom.
+    #[test]
+    fn who_falls_silent_is_blamed_before_the_run_counts_as_hung() {
+        let limit_s = |heartbeat_s: f64| {
+            let patient = [format!("supervision.heartbeat_timeout_s={heartbeat_s:?}")];
+            let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &patient).unwrap();
+            Stall::new(&scenario).limit_ns as f64 / 1e9
+        };
+        assert_eq!([2.0, 30.0, 3600.0].map(limit_s), [30.0, 60.0, 7200.0]);
+    }
 
     /// What a link says that a dead process left half made is no cause.
     #[test]
