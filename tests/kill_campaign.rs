@@ -1,9 +1,9 @@
-//! Roles killed at random: a random role of a random shipped scenario, at a random place of its life, at a random instant,
+//! Roles killed at random: a random role of a random scenario, at a random place of its life, at a random instant,
 //! alone or together with others, or at a random system call. In lockstep nothing may be lost: hash, counters and metrics are those of an undisturbed run.
 //!
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
-use crate::common::{self, Bench, Done, Running, send_signal};
+use crate::common::{Bench, Done, Running, send_signal};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::runtime::RoleId;
 use rand_pcg::Pcg64;
@@ -18,6 +18,70 @@ use std::time::Duration;
 /// Ticks of a run: long enough to be hit in the midst.
 const TICKS: u64 = 4_000;
 const PLACES: [&str; 6] = ["staged", "committing", "in-commit", "committed", "sent", "waiting"];
+/// What happens to samples on their way and to their ticks, all the time: whoever dies, dies amid it. (A generation with a
+/// flipped bit is another one in every life.)
+const DISTURBED: &str = r#"
+[[fault]]
+kind = "delay"
+role = "observer"
+delay_ticks = 3
+jitter_ticks = 3
+from_tick = 5
+ticks = 100000
+probability = 0.3
+
+[[fault]]
+kind = "duplicate"
+role = "observer"
+from_tick = 5
+ticks = 100000
+probability = 0.3
+
+[[fault]]
+kind = "bit-flip"
+role = "observer"
+field = "tick"
+from_tick = 5
+ticks = 100000
+probability = 0.05
+
+[[fault]]
+kind = "drop"
+role = "leader"
+from_tick = 5
+ticks = 100000
+probability = 0.1
+
+[[fault]]
+kind = "duplicate"
+role = "leader"
+from_tick = 5
+ticks = 100000
+probability = 0.3
+
+[[fault]]
+kind = "delay"
+role = "controller"
+delay_ticks = 2
+from_tick = 5
+ticks = 100000
+probability = 0.3
+
+[[fault]]
+kind = "bit-flip"
+role = "follower"
+field = "tick"
+from_tick = 5
+ticks = 100000
+probability = 0.05
+
+[[fault]]
+kind = "duplicate"
+role = "follower"
+from_tick = 5
+ticks = 100000
+probability = 0.3
+"#;
 const CALLS: [&str; 5] = ["futex", "clock_nanosleep", "sched_yield", "mmap", "openat"];
 
 /// How a role is killed.
@@ -45,11 +109,26 @@ fn below(random: &mut Pcg64, limit: u64) -> u64 {
     random.next_u64() % limit
 }
 
+/// The shipped scenarios, and one whose samples are disturbed.
+fn scenarios() -> &'static [(&'static str, String)] {
+    static ALL: LazyLock<Vec<(&str, String)>> = LazyLock::new(|| {
+        let shipped = SHIPPED.iter().map(|(name, text)| (*name, (*text).to_owned()));
+        let (_, pair) = SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap();
+        shipped.chain([("disturbed", format!("{pair}{DISTURBED}"))]).collect()
+    });
+    &ALL
+}
+
+fn parsed(scenario: &str) -> Scenario {
+    let (_, text) = scenarios().iter().find(|(name, _)| *name == scenario).unwrap();
+    Scenario::parse(text, scenario, &[]).unwrap()
+}
+
 impl Case {
     fn draw(number: u64, seed: u64, traced: bool) -> Self {
         let mut random = Pcg64::seed_from_u64(seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15));
-        let (scenario, text) = SHIPPED[below(&mut random, SHIPPED.len() as u64) as usize];
-        let parsed = Scenario::parse(text, scenario, &[]).unwrap();
+        let scenario = scenarios()[below(&mut random, scenarios().len() as u64) as usize].0;
+        let parsed = parsed(scenario);
         let roles = RoleId::all(&parsed);
         let names: Vec<String> = roles.iter().map(|role| role.name(&parsed).to_owned()).collect();
         let role = names[below(&mut random, names.len() as u64) as usize].clone();
@@ -163,8 +242,7 @@ fn libc_kill() -> i32 {
 }
 
 fn lockstep(scenario: &str) -> Vec<String> {
-    let (_, text) = SHIPPED.iter().find(|(name, _)| *name == scenario).unwrap();
-    let parsed = Scenario::parse(text, scenario, &[]).unwrap();
+    let parsed = parsed(scenario);
     // What is scripted is played to its end.
     let ticks = if parsed.faults.is_empty() { TICKS } else { parsed.last_tick };
     vec!["--clock=lockstep".to_owned(), format!("--duration={}", ticks as f64 * parsed.tick_s())]
@@ -172,7 +250,8 @@ fn lockstep(scenario: &str) -> Vec<String> {
 
 fn bench(scenario: &str) -> Bench {
     let bench = Bench::new();
-    std::fs::copy(common::shipped(scenario), bench.path(&format!("{scenario}.toml"))).unwrap();
+    let (_, text) = scenarios().iter().find(|(name, _)| *name == scenario).unwrap();
+    std::fs::write(bench.path(&format!("{scenario}.toml")), text).unwrap();
     bench
 }
 

@@ -13,7 +13,9 @@ pub use output::{Extent, Output};
 mod tests {
     use super::*;
     use crate::bus::memory::MemoryBus;
-    use crate::bus::{Depths, Reader, Signal, Topic};
+    use crate::bus::{Bus, Depths, Read, Reader, Signal, Topic, Write};
+    use crate::config::{SHIPPED, Scenario};
+    use crate::runtime::disturb::Disturbance;
     use crate::sample::RateCommand;
     use crate::state::{Persist, Restore, Words};
     use crate::telemetry::{Ledger, LinkRead, LinkWritten};
@@ -34,7 +36,7 @@ mod tests {
         }
     }
 
-    const EXTENT: Extent = Extent { last_tick: 100, kept_ticks: 4 };
+    const EXTENT: Extent = Extent { last_tick: 100, kept_samples: 24 };
     const WORDS: usize = size_of::<RateCommand>() / size_of::<u64>();
 
     fn topic() -> Topic {
@@ -177,46 +179,133 @@ mod tests {
         assert_eq!((read.received, read.gaps, read.stale, read.last_tick), (4, 2, 2, Some(5)));
     }
 
-    /// Reader and writer die, and what was between them with them: their successors go on as if nothing had happened.
-    #[test]
-    fn what_was_under_way_when_both_ends_died_is_found_in_the_ledger() {
-        let directory = tempfile::tempdir().unwrap();
-        let ledger = Ledger::shared(&directory.path().join("x.books"), EXTENT.words(WORDS)).unwrap();
-        let mut ends = ends_with(ledger, 8);
-        ends.output = ends.output.with_voids(true);
-        ends.send(&[0, 1]);
-        assert_eq!(ends.input.seek(1).unwrap(), Seek::Found);
-        ends.send(&[2]);
-        ends.output.stage_void(3);
-        ends.output.dispatch().unwrap();
-        ends.output.finish().unwrap();
-        ends.output.stage(|sample| (sample.stamp.tick, sample.acceleration_rad_s2[0]) = (4, 0.5)).unwrap();
-        let (mut committed, mut counters, mut state) = (Store(Vec::new()), Store(Vec::new()), Store(Vec::new()));
-        ends.output.persist(&mut committed);
-        ends.output.dispatch().unwrap();
-        ends.input.counters().persist(&mut counters);
-        ends.input.persist(&mut state);
+    /// Twenty ticks on a link that sends samples late, twice and not at all, with deaths at one of them.
+    #[derive(Debug, Default)]
+    struct Course {
+        tick: u64,
+        reader_dies: bool,
+        /// The writer dies when it has sent so many samples of the tick, the last so many of them without a mark.
+        writer_dies: Option<(usize, u64)>,
+        /// So many of the last samples the link brings to the reader's successor.
+        history: usize,
+    }
 
-        ends.bus = MemoryBus::new(Depths { role: 8, scorer: 1, history: 0 });
-        let mut output = ends.successor(&committed).with_voids(true);
-        let shared = ends.ledger.reopened();
-        shared.take(EXTENT.words(WORDS) - Kept::words(EXTENT.kept_ticks, WORDS));
-        let mut input = Input::<_, RateCommand>::watch(&ends.bus, &topic(), Reader::Role)
-            .unwrap()
-            .inheriting(Kept::open(&shared, EXTENT.kept_ticks, WORDS), 1);
-        input.counters().persist(&mut Restore(&counters.0));
-        input.persist(&mut Restore(&state.0));
-        output.dispatch().unwrap();
-        output.finish().unwrap();
-        output.send(|sample| sample.stamp.tick = 5).unwrap();
-        let mut seen = Vec::new();
-        for tick in 2..=5 {
-            let sought = input.seek(tick).unwrap();
-            seen.push((sought, input.sample().map(|sample| (sample.stamp.tick, sample.acceleration_rad_s2[0]))));
+    /// The ticks of deaths, each with the number of samples that go out then: one, two late ones before it, two, a void.
+    const DEATHS: [(u64, usize); 4] = [(11, 1), (12, 3), (13, 2), (14, 1)];
+
+    impl Course {
+        /// The reader's counters at the end, and what it had for every tick.
+        fn run(&self) -> (LinkRead, Vec<Option<f64>>) {
+            let faults = "fault=[{kind='delay', role='controller', delay_ticks=3, from_tick=9}, \
+                {kind='delay', role='controller', delay_ticks=2, from_tick=10}, \
+                {kind='drop', role='controller', from_tick=14}, \
+                {kind='duplicate', role='controller', from_tick=5, ticks=6}, \
+                {kind='duplicate', role='controller', from_tick=13, ticks=4}]";
+            let scenario = Scenario::parse(SHIPPED[0].1, "pair", &[faults.to_owned()]).unwrap();
+            let directory = tempfile::tempdir().unwrap();
+            let ledger = Ledger::shared(&directory.path().join("x.books"), EXTENT.words(WORDS)).unwrap();
+            // What is sent on the one is brought on the other.
+            let depths = Depths { role: 100, scorer: 100, history: 0 };
+            let (sends, mut brings) = (MemoryBus::new(depths), MemoryBus::new(depths));
+            let mut from = sends.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
+            let mut sent: Vec<RateCommand> = Vec::new();
+            let bring = |bus: &MemoryBus, samples: &[RateCommand]| {
+                let mut writer = bus.writer::<RateCommand>(&topic(), 1).unwrap();
+                samples.iter().for_each(|sample| writer.send(|slot| *slot = *sample).unwrap());
+            };
+            let writer = |generation, next_tick| {
+                let faults = Disturbance::of(&scenario, "controller", "follower", 1, next_tick);
+                output(&sends, &ledger, generation).with_voids(true).disturbed(faults)
+            };
+            let reader = |bus: &MemoryBus, generation| {
+                let shared = ledger.reopened();
+                shared.take(EXTENT.words(WORDS) - Kept::words(EXTENT.kept_samples, WORDS));
+                let kept = Kept::open(&shared, EXTENT.kept_samples, WORDS);
+                let input = Input::<_, RateCommand>::watch(bus, &topic(), Reader::Role).unwrap();
+                let mut input = input.recovering(kept, 1, generation > 1);
+                input.expect(AcceptedTicks::Next);
+                input
+            };
+            let (mut output, mut input, mut seen) = (writer(1, 0), reader(&brings, 1), Vec::new());
+            for tick in 0..20 {
+                let fill = |sample: &mut RateCommand| {
+                    (sample.stamp.tick, sample.acceleration_rad_s2[0]) = (tick, 0.5 + tick as f64);
+                };
+                output.stage(fill).unwrap();
+                let mut committed = Store(Vec::new());
+                output.persist(&mut committed);
+                output.persist_late(&mut committed);
+                output.dispatch().unwrap();
+                let before = sent.len();
+                while from.advance().unwrap() {
+                    sent.push(*from.current().unwrap());
+                }
+                if tick == self.tick {
+                    let (of_tick, unmarked) = self.writer_dies.unwrap_or((sent.len() - before, 0));
+                    assert!(of_tick <= sent.len() - before);
+                    sent.truncate(before + of_tick);
+                    if self.reader_dies {
+                        let (mut counters, mut state) = (Store(Vec::new()), Store(Vec::new()));
+                        input.counters().persist(&mut counters);
+                        input.persist(&mut state);
+                        brings = MemoryBus::new(depths);
+                        input = reader(&brings, 2);
+                        input.counters().persist(&mut Restore(&counters.0));
+                        input.persist(&mut Restore(&state.0));
+                        input.expect_repeats();
+                        bring(&brings, &sent[sent.len().saturating_sub(self.history)..]);
+                    } else {
+                        bring(&brings, &sent[before..]);
+                    }
+                    if self.writer_dies.is_some() {
+                        ledger.reopened().take(1).set(0, sent.len() as u64 - unmarked);
+                        output = writer(2, tick + 1);
+                        let mut words = Restore(&committed.0);
+                        output.persist(&mut words);
+                        output.persist_late(&mut words);
+                        output.dispatch().unwrap();
+                        let before = sent.len();
+                        while from.advance().unwrap() {
+                            sent.push(*from.current().unwrap());
+                        }
+                        bring(&brings, &sent[before..]);
+                    }
+                } else {
+                    bring(&brings, &sent[before..]);
+                }
+                output.finish().unwrap();
+                // The reader is three ticks behind, and at last none.
+                let due = (tick + 1).saturating_sub(if tick < 16 { 3 } else { 0 });
+                for due in seen.len() as u64..due {
+                    assert_ne!(input.seek(due).unwrap(), Seek::NotYet, "{due} {self:?}");
+                    seen.push(input.sample().map(|sample| sample.acceleration_rad_s2[0]));
+                }
+            }
+            let written = output.counters().report("");
+            let read = input.counters().report("");
+            assert_eq!(read.received + read.void, 20, "{self:?}");
+            assert_eq!(written.extra, read.stale, "{self:?}");
+            assert_eq!(input.counters().taken(), 20 + written.extra, "{self:?}");
+            (read, seen)
         }
-        let found = |tick, value| (Seek::Found, Some((tick, value)));
-        assert_eq!(seen, [found(2, 0.0), (Seek::Passed, None), found(4, 0.5), found(5, 0.0)]);
-        let read = input.counters().report("");
-        assert_eq!((read.received, read.void, read.gaps, read.stale, read.rejected), (5, 1, 0, 0, 0));
+    }
+
+    /// Whoever dies, and whatever the link lacks or repeats: the successors go on as if nothing had happened.
+    #[test]
+    fn whoever_dies_what_was_sent_is_taken_once() {
+        let undisturbed = Course::default().run();
+        let (read, seen) = &undisturbed;
+        assert_eq!((read.received, read.void, read.gaps, read.stale, read.rejected), (17, 3, 0, 9, 0));
+        assert_eq!(seen.iter().flatten().count(), 17);
+        for (tick, samples) in DEATHS {
+            let last =
+                (0..=samples).flat_map(|sent| (0..=sent.min(1) as u64).map(move |unmarked| Some((sent, unmarked))));
+            for writer_dies in last.chain([None]) {
+                let course = |reader_dies, history| Course { tick, reader_dies, writer_dies, history };
+                for course in (0..=24).map(|history| course(true, history)).chain([course(false, 0)]) {
+                    assert_eq!(course.run(), undisturbed, "{course:?}");
+                }
+            }
+        }
     }
 }

@@ -16,7 +16,7 @@ pub use role_id::{RoleId, RoleImpl};
 
 use super::bridge::DeviceError;
 use super::compute::Computing;
-use super::disturb::{Disturbance, Interruptions, LateSamples};
+use super::disturb::{Disturbance, Interruptions, LateSamples, extra_samples, late_samples};
 use super::hooks::{self, Failpoint};
 use super::link::{self, AcceptedTicks, Extent, Input, Kept, Output};
 use super::share::{Computer, Share};
@@ -267,21 +267,18 @@ impl<B: Bus> Seat<'_, B> {
     {
         let topic = topic(self.scenario, &body.name, signal);
         let mut input = Input::watch_many(self.bus, &topic, body.bodies(), reader)?
-            .inheriting(self.kept(&topic), body.bodies())
+            .recovering(self.kept(&topic), body.bodies(), self.generation > 1)
             .with_late(LateSamples::of(self.scenario, signal, &body.name))
             .guarded(guard);
         input.expect(accepted_ticks(self.scenario, None));
         Ok(input)
     }
 
-    /// What the writer of a signal has kept for the successor of a reader.
+    /// What the writer of a signal keeps.
     fn kept(&self, topic: &Topic) -> Option<Kept> {
-        if self.generation == 1 {
-            return None;
-        }
         kept(self.scenario, topic, |writer| {
             let path = self.ledger.path()?.with_file_name(ledger_file(self.scenario, writer));
-            Ledger::existing(&path, ledger_words(self.scenario, writer))
+            Ledger::shared(&path, ledger_words(self.scenario, writer)).ok()
         })
     }
 
@@ -312,12 +309,13 @@ impl<B: Bus> Seat<'_, B> {
 /// Where the samples of a signal are kept for the successors of its readers: in its writer's ledger, which `open` opens.
 pub(crate) fn kept(scenario: &Scenario, topic: &Topic, open: impl Fn(RoleId) -> Option<Ledger>) -> Option<Kept> {
     let extent = extent(scenario);
-    RoleId::all(scenario).into_iter().find_map(|writer| {
+    let writers = if extent.kept_samples == 0 { Vec::new() } else { RoleId::all(scenario) };
+    writers.into_iter().find_map(|writer| {
         let written = ports(scenario, writer).writes;
         let index = written.iter().position(|port| port.topic == *topic)?;
         let (ledger, length) = (open(writer)?, words(&written[index]));
-        ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_ticks, length));
-        Kept::open(&ledger, extent.kept_ticks, length)
+        ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_samples, length));
+        Kept::open(&ledger, extent.kept_samples, length)
     })
 }
 
@@ -353,8 +351,12 @@ pub(super) fn ledger_file(scenario: &Scenario, role: RoleId) -> String {
 /// role may be ahead of what is scored, and a little longer: a tick is scored before its command is used. As links, twice that.
 fn extent(scenario: &Scenario) -> Extent {
     let lockstep = scenario.clock == ClockKind::Lockstep;
-    let kept_ticks = if lockstep { 2 * super::window_ticks(scenario) } else { 0 };
-    Extent { last_tick: scenario.last_tick, kept_ticks }
+    let kept_samples = if lockstep {
+        2 * super::window_ticks(scenario) * (1 + extra_samples(scenario) as u64) + late_samples(scenario) as u64
+    } else {
+        0
+    };
+    Extent { last_tick: scenario.last_tick, kept_samples }
 }
 
 /// An upper bound on the shared memory that a role's record takes, bytes: two copies of what it writes, and of what bodies,

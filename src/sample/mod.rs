@@ -39,6 +39,12 @@ impl Stamp {
         Self::field("sent_ns", core::mem::offset_of!(Self, sent_ns)),
     ];
 
+    /// Whether it is of a warm-up sample. A sample of a later tick is none, though a fault has broken its generation.
+    #[inline]
+    pub fn is_warm_up(&self) -> bool {
+        (self.tick, self.generation) == (0, 0)
+    }
+
     const fn field(name: &'static str, offset: usize) -> Field {
         Field { name, offset, kind: FieldKind::U64, count: 1 }
     }

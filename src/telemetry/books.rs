@@ -176,6 +176,8 @@ impl WriteCounters {
 /// The counters of a signal's reading end.
 #[derive(Debug, Default)]
 pub struct ReadCounters {
+    /// Samples that were taken off the link, whatever they were worth.
+    taken: u64,
     received: u64,
     gaps: u64,
     stale: u64,
@@ -185,9 +187,21 @@ pub struct ReadCounters {
     rejected: u64,
 }
 
-persist_fields!(ReadCounters, received, gaps, stale, covered, void, rejected);
+persist_fields!(ReadCounters, taken, received, gaps, stale, covered, void, rejected);
 
 impl ReadCounters {
+    /// How many samples were taken off the link, whatever they were worth.
+    #[inline]
+    pub fn taken(&self) -> u64 {
+        self.taken
+    }
+
+    /// Takes one.
+    #[inline]
+    pub fn take(&mut self) {
+        self.taken += 1;
+    }
+
     /// The tick after the last that is counted.
     #[inline]
     pub fn covered(&self) -> u64 {

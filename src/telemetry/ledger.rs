@@ -117,13 +117,6 @@ impl Ledger {
         Ok(Self::over(Storage::shared(path, Self::FIRST + words)?, Some(path.to_owned())))
     }
 
-    /// The ledger of so many words in a file that must be there, to be read.
-    pub fn existing(path: &Path, words: usize) -> Option<Self> {
-        let shared = SharedWords::existing(path).ok()?;
-        let whole = shared.words().len() == Self::FIRST + words;
-        whole.then(|| Self::over(Storage::Shared(shared), Some(path.to_owned())))
-    }
-
     /// The same, to be written: there is one writer at a time.
     ///
     /// # Errors

@@ -61,15 +61,52 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
     doubted: Option<u64>,
     /// Whether what arrives may be what a predecessor of this end has counted already.
     pub(super) repeated: bool,
-    inheritance: Option<Inheritance<S>>,
+    recovery: Option<Recovery<S>>,
     late: Option<Box<LateSamples>>,
     counters: ReadCounters,
 }
 
-/// What was on its way to a predecessor: it may have died together with the writer.
-struct Inheritance<S: Carried + ?Sized> {
+/// Goes on by what the writer keeps after a death at either end of the link, until the link is known to bring just what comes
+/// next: by itself it may lack something, or repeat it.
+struct Recovery<S: Carried + ?Sized> {
     kept: Kept,
+    /// Whether it goes on so at present.
+    active: bool,
+    /// The sample that was found last, if that is the one that was taken last.
+    found: bool,
     sample: S::Owned,
+    /// The stamp of that sample, and whether it is known to differ from that of the sample before.
+    taken: Option<(Stamp, bool)>,
+    /// The stamp of the last sample that the link has brought meanwhile.
+    brought: Option<Stamp>,
+}
+
+impl<S: Carried + ?Sized> Recovery<S> {
+    /// Begins at a sample that the link has brought and that is of another life of the writer: its predecessor may have sent it
+    /// too. A program that keeps nothing is believed.
+    #[cold]
+    fn begin(&mut self, brought: Stamp) {
+        self.active = self.kept.is_used();
+        (self.brought, self.taken) = (Some(brought), None);
+    }
+
+    /// Copies the sample of a number, if it is kept.
+    #[cold]
+    fn find(&mut self, number: u64) -> bool {
+        let found = self.kept.find(number, self.sample.borrow_mut().words_mut());
+        if found {
+            let stamp = *self.sample.borrow().stamp();
+            self.taken = Some((stamp, self.taken.is_some_and(|(last, _)| last != stamp)));
+            self.found = true;
+        }
+        found
+    }
+
+    /// Whether what the link brings next comes next, once everything that is kept is taken. A sample is kept before it is sent,
+    /// so nothing is taken that the link has still to bring, nor brought that is still to be taken.
+    fn is_over(&self) -> bool {
+        self.taken.is_some_and(|(taken, unique)| unique && self.brought == Some(taken))
+    }
 }
 
 impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
@@ -94,7 +131,7 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
             newest: Newest::None,
             doubted: None,
             repeated: false,
-            inheritance: None,
+            recovery: None,
             late: None,
             counters: ReadCounters::default(),
         })
@@ -102,8 +139,8 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
 
     /// The same with a guard.
     pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
-        let Self { port, accepted_ticks, last, newest, doubted, repeated, inheritance, late, counters, .. } = self;
-        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, inheritance, late, counters }
+        let Self { port, accepted_ticks, last, newest, doubted, repeated, recovery, late, counters, .. } = self;
+        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, recovery, late, counters }
     }
 
     /// The same where a scripted fault sends samples late.
@@ -111,9 +148,17 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
         Self { late, ..self }
     }
 
-    /// The same for a successor, with what the writer of a signal of so many bodies has kept.
-    pub fn inheriting(self, kept: Option<Kept>, bodies: usize) -> Self {
-        Self { inheritance: kept.map(|kept| Inheritance { kept, sample: S::blank(bodies) }), ..self }
+    /// The same with what the writer of a signal of so many bodies keeps; a successor begins with that.
+    pub fn recovering(self, kept: Option<Kept>, bodies: usize, successor: bool) -> Self {
+        let recovery = kept.map(|kept| Recovery {
+            active: successor && kept.is_used(),
+            kept,
+            found: false,
+            sample: S::blank(bodies),
+            taken: None,
+            brought: None,
+        });
+        Self { recovery, ..self }
     }
 }
 
@@ -159,29 +204,57 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// Takes one sample off the link, whatever it is worth; false if there is none.
     #[inline]
     fn take(&mut self) -> Result<bool, BusError> {
-        if !self.inherits() && !self.port.advance()? {
+        if self.recovers() {
+            return self.recover();
+        }
+        if !self.port.advance()? {
             return Ok(false);
         }
-        let stamp = self.current().map(|sample| *sample.stamp());
-        self.newest = stamp.map_or(Newest::None, |stamp| self.account(&stamp));
+        let Some(stamp) = self.port.current().map(|sample| *sample.stamp()) else { return Ok(false) };
+        if let Some(recovery) = &mut self.recovery
+            && self.last.is_some_and(|(_, known)| stamp.generation & !VOID != known)
+            && !stamp.is_warm_up()
+        {
+            self.newest = Newest::None;
+            recovery.begin(stamp);
+            if recovery.active {
+                return self.recover();
+            }
+        }
+        self.newest = self.account(&stamp);
         Ok(true)
     }
 
-    /// Moves on to the next sample of what was on its way to a predecessor. Behind the last the link goes on.
-    #[inline]
-    fn inherits(&mut self) -> bool {
-        let Some(Inheritance { kept, sample }) = &mut self.inheritance else { return false };
-        let found = kept.find(self.counters.covered(), sample.borrow_mut().words_mut());
-        if !found {
-            (self.inheritance, self.newest) = (None, Newest::None);
+    /// The same by what the writer keeps.
+    #[cold]
+    fn recover(&mut self) -> Result<bool, BusError> {
+        while let Some(recovery) = &mut self.recovery {
+            if recovery.find(self.counters.taken()) {
+                let stamp = *recovery.sample.borrow().stamp();
+                self.newest = self.account(&stamp);
+                return Ok(true);
+            }
+            if recovery.is_over() {
+                // The link has brought the same, and is as far.
+                (recovery.active, recovery.found) = (false, false);
+                return self.take();
+            }
+            if !self.port.advance()? {
+                return Ok(false);
+            }
+            recovery.brought = self.port.current().map(|sample| *sample.stamp());
+            if !recovery.found {
+                self.newest = Newest::None;
+            }
         }
-        found
+        Ok(false)
     }
 
     /// The sample that was taken last.
     #[inline]
     fn current(&self) -> Option<&S> {
-        self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()))
+        let recovered = self.recovery.as_ref().filter(|recovery| recovery.found);
+        recovered.map_or(self.port.current(), |recovery| Some(recovery.sample.borrow()))
     }
 
     /// Enters a sample into the counters.
@@ -190,6 +263,9 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// tick in which its predecessor died.
     #[inline]
     fn account(&mut self, stamp: &Stamp) -> Newest {
+        if !stamp.is_warm_up() {
+            self.counters.take();
+        }
         let generation = stamp.generation & !VOID;
         let (newest_tick, known) = match self.last {
             Some((tick, known)) => (Some(tick), known),
@@ -201,7 +277,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             // What came before the last sample that a predecessor counted, and that one, are counted. Warm-up tells nothing.
             if self.repeated {
                 self.repeated = stamp.tick < tick || generation == 0;
-            } else if generation == known {
+            } else if generation == known || self.lossless() && !stamp.is_warm_up() {
                 self.counters.stale();
             }
             return Newest::None;
@@ -210,8 +286,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             self.counters.stale();
             return Newest::None;
         }
-        // What is inherited may come once more, by the link.
-        self.repeated = self.inheritance.is_some();
+        self.repeated = false;
         if !self.possible(stamp.tick) {
             self.counters.stray();
             return Newest::None;
@@ -228,13 +303,20 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             return Newest::None;
         }
         // Not by `current`: the guard is another part of this end.
-        let sample = self.inheritance.as_ref().map_or(self.port.current(), |found| Some(found.sample.borrow()));
+        let recovered = self.recovery.as_ref().filter(|recovery| recovery.found);
+        let sample = recovered.map_or(self.port.current(), |recovery| Some(recovery.sample.borrow()));
         if sample.is_some_and(|sample| self.guard.accepts(sample)) {
             self.counters.received(stamp.tick);
             return Newest::AtHand;
         }
         self.counters.rejected(stamp.tick);
         Newest::Rejected
+    }
+
+    /// Whether nothing is lost on this link, so that in every life of the writer a sample comes once.
+    #[inline]
+    fn lossless(&self) -> bool {
+        matches!(self.accepted_ticks, AcceptedTicks::Next)
     }
 
     /// Whether a sample can be of this tick, which is newer than the newest.
@@ -297,6 +379,12 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
 }
 
 impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
+    /// Whether it goes on by what the writer keeps.
+    #[inline]
+    fn recovers(&self) -> bool {
+        self.recovery.as_ref().is_some_and(|recovery| recovery.active)
+    }
+
     /// The counters.
     pub fn counters(&mut self) -> &mut ReadCounters {
         &mut self.counters
@@ -304,7 +392,7 @@ impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
 
     /// Expects what a predecessor, which this end continues, may have had already.
     pub fn expect_repeats(&mut self) {
-        self.repeated = B::REPEATS;
+        self.repeated = B::REPEATS && !self.recovers();
     }
 }
 

@@ -34,14 +34,18 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     shown: bool,
     disturbance: Option<Box<Disturbance<S>>>,
     counters: WriteCounters,
-    /// How much of a tick has been sent, for a successor: the tick + 1, and 16 bits for the number of samples.
+    /// How many samples have been sent, for a successor.
     progress: Option<Slots>,
     kept: Option<Kept>,
+    /// Whether it continues a predecessor and has sent nothing yet.
+    succeeds: bool,
 }
 
 /// What a writing end is about to send for a tick.
 #[derive(Debug, Clone, Copy, Default)]
 struct Staged {
+    /// How many samples were sent before those of the tick.
+    before: u64,
     tick: u64,
     /// One of the constants.
     kind: u64,
@@ -53,7 +57,7 @@ struct Staged {
     copies: u64,
 }
 
-persist_fields!(Staged, tick, kind, stamp, late, copies);
+persist_fields!(Staged, before, tick, kind, stamp, late, copies);
 
 impl Staged {
     /// Nothing, or what was staged is counted.
@@ -65,9 +69,18 @@ impl Staged {
     /// No sample was made.
     const ABSENT: u64 = 3;
 
+    /// How many samples go out.
+    #[inline]
+    fn samples(&self, voids: bool) -> u64 {
+        let void = voids && matches!(self.kind, Self::WITHHELD | Self::ABSENT);
+        self.late + self.copies + u64::from(void)
+    }
+
     /// Counts it, the content of the sample given.
     #[inline]
     fn count(&mut self, counters: &mut WriteCounters, content: &[u8], voids: bool) {
+        self.before += self.samples(voids);
+        (self.late, self.copies) = (0, 0);
         match std::mem::take(&mut self.kind) {
             Self::SAMPLE => counters.enter(self.tick, content),
             Self::WITHHELD | Self::ABSENT => counters.enter_void(self.tick, voids),
@@ -76,19 +89,19 @@ impl Staged {
     }
 }
 
-/// How far a run goes, and of how many ticks samples are [kept](Kept): what decides how much a writing end keeps in a ledger.
+/// How far a run goes, and how many samples are [kept](Kept): what decides how much a writing end keeps in a ledger.
 #[derive(Debug, Clone, Copy)]
 pub struct Extent {
     /// The last tick.
     pub last_tick: u64,
-    /// The ticks whose samples are kept.
-    pub kept_ticks: u64,
+    /// How many samples are kept.
+    pub kept_samples: u64,
 }
 
 impl Extent {
     /// Words of the ledger beside the record, for samples of so many words.
     pub fn words(self, length: usize) -> usize {
-        1 + WriteCounters::words(self.last_tick) + Kept::words(self.kept_ticks, length)
+        1 + WriteCounters::words(self.last_tick) + Kept::words(self.kept_samples, length)
     }
 }
 
@@ -107,7 +120,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     ) -> Result<Self, BusError> {
         let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
         let counters = WriteCounters::open(ledger, extent.last_tick);
-        let kept = Kept::open(ledger, extent.kept_ticks, S::length(bodies));
+        let kept = Kept::open(ledger, extent.kept_samples, S::length(bodies));
         Ok(Self {
             port: S::writer(bus, topic, bodies, generation)?,
             generation,
@@ -121,6 +134,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             counters,
             progress,
             kept,
+            succeeds: generation > 1,
         })
     }
 
@@ -157,8 +171,8 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         })?;
         self.filled = true;
         let stamp = *kept.stamp();
-        self.staged =
-            Staged { tick: stamp.tick, kind: Staged::SAMPLE, stamp: bytemuck::cast(stamp), late: 0, copies: 1 };
+        let (before, stamp_words) = (self.staged.before, bytemuck::cast(stamp));
+        self.staged = Staged { before, tick: stamp.tick, kind: Staged::SAMPLE, stamp: stamp_words, late: 0, copies: 1 };
         hooks::at(Failpoint::Staged);
         Ok(())
     }
@@ -192,7 +206,8 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         };
         self.counters.extra(late + copies - u64::from(delivered));
         let kind = if delivered { Staged::SAMPLE } else { Staged::WITHHELD };
-        self.staged = Staged { tick: stamp.tick, kind, stamp: bytemuck::cast(*sample.stamp()), late, copies };
+        let (before, stamp_words) = (self.staged.before, bytemuck::cast(*sample.stamp()));
+        self.staged = Staged { before, tick: stamp.tick, kind, stamp: stamp_words, late, copies };
         let kept = self.sample.borrow_mut();
         kept.assign(sample);
         *kept.stamp_mut() = stamp;
@@ -202,7 +217,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     /// Says that there is no sample for this tick, where readers wait for one: an input was missing.
     pub fn stage_void(&mut self, tick: u64) {
         let kind = if self.voids { Staged::ABSENT } else { Staged::NOTHING };
-        self.staged = Staged { tick, kind, ..Staged::default() };
+        self.staged = Staged { before: self.staged.before, tick, kind, ..Staged::default() };
     }
 
     /// Sends what was staged, or what is left of it.
@@ -214,7 +229,10 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if !std::mem::take(&mut self.filled) {
             return self.dispatch_rest();
         }
-        self.keep();
+        if let Some(kept) = &self.kept {
+            let sample: &S = self.sample.borrow();
+            kept.keep(self.staged.before, sample.words().iter().copied());
+        }
         if self.shows {
             self.port.show()?;
             self.shown = true;
@@ -226,40 +244,18 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         Ok(())
     }
 
-    /// Keeps what stands for the tick, before anybody sees it.
-    #[inline]
-    fn keep(&self) {
-        let Some(kept) = &self.kept else { return };
-        let sample: &S = self.sample.borrow();
-        if self.staged.kind == Staged::SAMPLE {
-            let content = &sample.words()[STAMP_WORDS..];
-            kept.keep(self.staged.tick, self.staged.stamp.iter().chain(content).copied());
-        } else {
-            let stamp: [u64; STAMP_WORDS] = bytemuck::cast(self.void());
-            kept.keep(self.staged.tick, stamp.into_iter().chain(std::iter::repeat(0)));
-        }
-    }
-
-    /// The stamp of the void that takes the place of what is staged.
-    fn void(&self) -> Stamp {
-        let made = *self.sample.borrow().stamp();
-        let Staged { tick, kind, .. } = self.staged;
-        let stamp = if kind == Staged::WITHHELD { made } else { Stamp { tick, ..Stamp::default() } };
-        Stamp { generation: self.generation | VOID, ..stamp }
-    }
-
     /// Leaves word that so many samples of the tick have been sent.
     #[inline]
     fn sent(&self, samples: u64) {
         if let Some(progress) = &self.progress {
-            progress.set(0, (self.staged.tick + 1) << 16 | samples);
+            progress.set(0, self.staged.before + samples);
         }
     }
 
     /// How many samples of the tick have been sent, by a predecessor.
     fn already_sent(&self) -> u64 {
-        let word = self.progress.as_ref().map_or(0, |progress| progress.get(0));
-        if word >> 16 == self.staged.tick + 1 { word & 0xffff } else { 0 }
+        let sent = self.progress.as_ref().map_or(0, |progress| progress.get(0));
+        sent.saturating_sub(self.staged.before)
     }
 
     /// Sends what a predecessor has not sent of what was staged.
@@ -269,36 +265,48 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     #[cold]
     pub fn dispatch_rest(&mut self) -> Result<(), BusError> {
         self.filled = false;
-        let Staged { kind, late, copies, .. } = self.staged;
-        if kind == Staged::NOTHING {
-            return Ok(());
-        }
-        self.keep();
-        let own = late + copies;
-        let void = self.voids && kind != Staged::SAMPLE;
-        for index in self.already_sent()..own + u64::from(void) {
+        let Staged { before, tick, kind, late, copies, .. } = self.staged;
+        let made = *self.sample.borrow().stamp();
+        // What was made in an earlier life goes out in this one, also where a scripted fault has broken the generation.
+        let lives = if kind == Staged::ABSENT { 0 } else { made.generation ^ self.generation };
+        let own: Stamp = bytemuck::cast(self.staged.stamp);
+        let void = if kind == Staged::ABSENT {
+            Stamp { tick, generation: self.generation | VOID, ..Stamp::default() }
+        } else {
+            Stamp { generation: made.generation | VOID, ..made }
+        };
+        for index in self.already_sent()..self.staged.samples(self.voids) {
             self.port.prepare()?;
             let late =
                 self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
-            match late {
-                Some(late) => self.port.send(|slot| slot.assign(late))?,
-                None if index < own => {
-                    let (stamp, kept): (Stamp, &S) = (bytemuck::cast(self.staged.stamp), self.sample.borrow());
-                    // In this life, also where a scripted fault has broken the generation.
-                    let generation = stamp.generation ^ kept.stamp().generation ^ self.generation;
-                    self.port.send(|slot| {
-                        slot.assign(kept);
-                        *slot.stamp_mut() = Stamp { generation, ..stamp };
-                    })?;
-                }
-                None => {
-                    let void = self.void();
-                    self.port.send(|slot| {
+            let (sample, kept): (&S, _) = (self.sample.borrow(), self.kept.as_ref());
+            // What a successor sends first, its predecessor may have sent: whoever reads it has to look at what is kept.
+            let (first, generation) = (std::mem::take(&mut self.succeeds), self.generation);
+            self.port.fill(|slot| {
+                match late {
+                    Some(late) => slot.assign(late),
+                    None if index < self.staged.late + copies => {
+                        slot.assign(sample);
+                        *slot.stamp_mut() = own;
+                    }
+                    None => {
                         slot.words_mut().fill(0);
                         *slot.stamp_mut() = void;
-                    })?;
+                    }
                 }
-            }
+                // Before anybody sees it.
+                if let Some(kept) = kept {
+                    kept.keep(before + index, slot.words().iter().copied());
+                }
+                let stamp = slot.stamp_mut();
+                if late.is_none() {
+                    stamp.generation ^= lives;
+                }
+                if first && kept.is_some() {
+                    stamp.generation = generation | stamp.generation & VOID;
+                }
+            })?;
+            self.port.deliver()?;
             hooks::at(Failpoint::Sent);
             self.sent(index + 1);
         }
@@ -319,7 +327,6 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if let Some(disturbance) = &mut self.disturbance {
             disturbance.forget(self.staged.late);
         }
-        self.staged.late = 0;
         self.staged.count(&mut self.counters, self.sample.borrow().content(), self.voids);
         self.port.prepare()
     }
@@ -391,7 +398,7 @@ pub fn written(
 ) -> LinkWritten {
     ledger.take(1);
     let (mut counters, mut staged) = (WriteCounters::open(ledger, extent.last_tick), Staged::default());
-    ledger.take(Kept::words(extent.kept_ticks, length));
+    ledger.take(Kept::words(extent.kept_samples, length));
     let mut sample = vec![0_u64; length];
     counters.persist(words);
     staged.persist(words);

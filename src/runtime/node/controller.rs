@@ -231,9 +231,18 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             return Ok(false);
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
-            self.pass_over()?;
+            // Where nothing is lost, counters must not tell who was faster.
+            if self.clock == Clock::Monotonic || self.gather_measurements(self.counters.next())? {
+                self.pass_over()?;
+            }
             return Ok(false);
         };
+        Ok(self.gather_measurements(tick)? || overdue)
+    }
+
+    /// Looks for the measurements of a tick; whether it is known of all what has become of them.
+    #[inline]
+    fn gather_measurements(&mut self, tick: u64) -> Result<bool, NodeError> {
         let mut complete = true;
         for channel in &mut self.channels {
             complete &= channel.gather(tick)?;
@@ -241,7 +250,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         for fleet in &mut self.fleets {
             complete &= fleet.gather(tick)?;
         }
-        Ok(complete || overdue)
+        Ok(complete)
     }
 
     /// Gives a device that makes the estimate too the measurements of a tick, once it is known of all of them what has become of
