@@ -726,6 +726,22 @@ fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
     run.wait();
 }
 
+#[test]
+fn a_run_whose_commands_act_later_than_at_the_next_tick_is_no_run_for_a_device_that_is_a_body() {
+    let bench = Bench::new();
+    let port = Port::new();
+    let (run, domain) =
+        start(&bench, &shipped("rigid-pair"), &[&REALTIME[..], &["--set=actuation_delay_ticks=2"]].concat());
+    let done = bridge(&bench, &port.path, &domain, &[]).wait();
+    assert_eq!(done.code, Some(2), "{done:?}");
+    for word in ["actuation_delay_ticks = 2", "give 1", "simulated plant"] {
+        assert!(done.stderr.contains(word), "{word}: {done:?}");
+    }
+    run.signal(2);
+    run.wait();
+    bench.assert_clean(&[domain]);
+}
+
 /// A bridge that dies takes nothing with it: the next one finds the books where they were, and a device that knows the run.
 #[test]
 fn a_bridge_that_was_killed_can_be_started_again() {
