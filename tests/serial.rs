@@ -235,7 +235,9 @@ fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
 
 /// The same for any roles.
 fn start_without(bench: &Bench, file: &Path, roles: &[&str], arguments: &[&str]) -> (Running, PathBuf) {
-    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
+    // On a loaded machine the kernel keeps who reads a pseudo-terminal for seconds.
+    let patient = "--set=supervision.heartbeat_timeout_s=30";
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", patient];
     let external: Vec<&str> = roles.iter().flat_map(|role| ["--external", *role]).collect();
     let running = bench.start(&[&common[..], &external, arguments].concat());
     bench.await_role("leader");
@@ -417,7 +419,7 @@ fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
     let bench = Bench::new();
     let cable = Cable::new(CLEAN);
     let (path, scenario) =
-        (cable.device.path.clone(), short("rigid-pair", &["duration_s=8", "tick_hz=100", "accept={}"]));
+        (cable.device.path.clone(), short("rigid-pair", &["duration_s=30", "tick_hz=100", "accept={}"]));
     let _device = Powered::new(move |on| {
         with_shipped_rig!(scenario.rig, rig => {
             let seat = |hello: &Hello<'_>| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello));
@@ -427,7 +429,7 @@ fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
                 let count = line.read(&mut bytes);
                 device.receive(&bytes[..count], 0, |frame| {
                     answers += 1;
-                    if answers == 200 {
+                    if answers == 50 {
                         std::thread::sleep(PAUSE);
                     }
                     line.write(frame);
@@ -436,14 +438,15 @@ fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
             }
         })
     });
-    let summary = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &REALTIME);
+    let longer = REALTIME.map(|word| if word == "8" { "30" } else { word });
+    let summary = run_roles(&bench, "rigid-pair", &["observer", "controller"], &cable.host.path, &longer);
     let books = &summary["books"]["roles"];
     println!("{books}; line {}", summary["lines"]["observer"]);
     assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
     for role in ["observer", "controller"] {
         assert!(number(&books[role]["missed"]) >= 28, "{books}");
-        // A machine that withholds the processor misses more; whoever does not go on misses nearly all of 801.
-        assert!(number(&books[role]["executed"]) > 300, "{books}");
+        // A machine that withholds the processor misses more; whoever does not go on has executed 50 at the most.
+        assert!(number(&books[role]["executed"]) > 100, "{books}");
     }
 }
 
@@ -779,10 +782,12 @@ fn a_device_that_was_restarted_is_told_as_that() {
     assert_eq!(bridge.code, Some(0), "{bridge:?} {run:?}");
     let told = "1 times the device lost the run, its body at the initial state again";
     for text in [&bridge.stderr, &run.stderr] {
-        assert!(text.contains(told) && text.contains("2 handshakes") && !text.contains("no fault"), "{text}");
+        assert!(text.contains(told) && !text.contains("no fault"), "{text}");
     }
     let summary = summary(&run);
-    assert_eq!(number(&summary["lines"]["follower"]["restarts"]), 1);
+    let line = &summary["lines"]["follower"];
+    // Who has not heard from its device for long greets it once more.
+    assert_eq!((number(&line["restarts"]), number(&line["handshakes"]) >= 2), (1, true), "{line}");
     assert!(number(&summary["state"]["first_disturbed_tick"]) > 0, "{}", summary["state"]);
     assert_ne!(summary["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
     bench.assert_clean(&[domain]);

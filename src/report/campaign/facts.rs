@@ -69,7 +69,7 @@ impl<'a> Facts<'a> {
     /// The command that runs a case.
     pub fn command(&self, case: u64) -> String {
         let file = self.file.as_deref().unwrap_or("CAMPAIGN.toml");
-        format!("corotate run {file} --case {case}")
+        format!("corotate run {file} --case {case} --clock in-process")
     }
 
     /// The rows whose values are numbers, or were lost, the least first.

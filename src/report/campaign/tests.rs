@@ -157,7 +157,10 @@ fn the_worst_case_is_first_and_every_command_names_its_case() {
     let facts = Facts::of(&table, directory.path());
     // The peak is beyond its limit in every case.
     assert_eq!((facts.metric, facts.limit), (Some(2), Some(0.5)));
-    assert!(facts.command(3).starts_with("corotate run '/") && facts.command(3).ends_with("/campaign.toml' --case 3"));
+    assert!(
+        facts.command(3).starts_with("corotate run '/")
+            && facts.command(3).ends_with("/campaign.toml' --case 3 --clock in-process")
+    );
     let worst = tables::worst(&facts).unwrap();
     let Some(Block::Table { rows, .. }) = worst.blocks.last() else { panic!("{worst:?}") };
     let cases: Vec<&str> = rows.iter().map(|row| row[0].as_str()).collect();
