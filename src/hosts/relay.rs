@@ -223,7 +223,9 @@ struct Incoming {
     writer: Option<WordWriter>,
     /// In lockstep, what stands in for the writer's own: a reader that dies takes what it had not used with it.
     kept: Option<Kept>,
+    /// How many were kept.
     kept_samples: u64,
+    /// The stamp of the last sample of the loop, where nothing is lost.
     last: Option<Stamp>,
     lossless: bool,
     /// The number of the sample that is expected next.

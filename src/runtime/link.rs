@@ -209,6 +209,11 @@ mod tests {
             let (sends, mut brings) = (MemoryBus::new(depths), MemoryBus::new(depths));
             let mut from = sends.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
             let mut sent: Vec<RateCommand> = Vec::new();
+            let mut collect = |sent: &mut Vec<RateCommand>| {
+                while from.advance().unwrap() {
+                    sent.push(*from.current().unwrap());
+                }
+            };
             let bring = |bus: &MemoryBus, samples: &[RateCommand]| {
                 let mut writer = bus.writer::<RateCommand>(&topic(), 1).unwrap();
                 samples.iter().for_each(|sample| writer.send(|slot| *slot = *sample).unwrap());
@@ -237,9 +242,7 @@ mod tests {
                 output.persist_late(&mut committed);
                 output.dispatch().unwrap();
                 let before = sent.len();
-                while from.advance().unwrap() {
-                    sent.push(*from.current().unwrap());
-                }
+                collect(&mut sent);
                 if tick == self.tick {
                     let (of_tick, unmarked) = self.writer_dies.unwrap_or((sent.len() - before, 0));
                     assert!(of_tick <= sent.len() - before);
@@ -265,9 +268,7 @@ mod tests {
                         output.persist_late(&mut words);
                         output.dispatch().unwrap();
                         let before = sent.len();
-                        while from.advance().unwrap() {
-                            sent.push(*from.current().unwrap());
-                        }
+                        collect(&mut sent);
                         bring(&brings, &sent[before..]);
                     }
                 } else {
