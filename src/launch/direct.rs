@@ -48,9 +48,9 @@ pub(crate) fn run_rig<R: Rig>(rig: &R, scenario: &Scenario, launch: &mut Launch<
     is_plain(scenario, launch).then(|| Run::new(rig, scenario, launch.checkpoints).run(launch)).flatten()
 }
 
-/// Where the command of a tick lies, and where that lay which is applied then.
+/// Where the command of a tick lies, and where that lay which is applied then. As a rule without a division.
 fn place(tick: u64, delay_ticks: u64) -> usize {
-    (tick % delay_ticks) as usize
+    if delay_ticks == 1 { 0 } else { (tick % delay_ticks) as usize }
 }
 
 struct Run<'a, R: Rig> {

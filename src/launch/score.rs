@@ -417,7 +417,7 @@ impl DrivenBody {
                 && before >= delay_ticks
                 && undisturbed
             {
-                let holds = v <= (v_before + tick_s * bound).max(lyapunov_floor(tick_s));
+                let holds = v <= v_before + tick_s * bound || v <= lyapunov_floor(tick_s);
                 *(if holds { &mut score.held } else { &mut score.broken }) += 1;
             }
         }

@@ -55,8 +55,9 @@ pub struct Plausible<const N: usize> {
     repeated: [u64; N],
     /// Whether that one was believed.
     trusted: bool,
-    /// Whether every component of that sample was believed; follows from the above.
-    whole: bool,
+    /// Bit i set: component i of that sample was believed. Its `believed_tick` is `before_tick` then, which is not kept up: see
+    /// [`spell_out`](Self::spell_out).
+    current: u64,
 }
 
 impl<const N: usize> Plausible<N> {
@@ -73,7 +74,7 @@ impl<const N: usize> Plausible<N> {
             before_tick: 0,
             repeated: [0; N],
             trusted: true,
-            whole: false,
+            current: 0,
         }
     }
 
@@ -82,32 +83,47 @@ impl<const N: usize> Plausible<N> {
     /// A sender that has been started anew speaks of the same body: its samples are compared with those before.
     #[inline]
     pub fn accepts(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) -> bool {
-        let slew = self.bounds.slew_per_tick;
-        self.accepts_within(stamp, values, valid, |i, _, ticks| slew[i] * ticks)
+        self.accepts_within(stamp, values, valid, |bounds, i, _, ticks| bounds.slew_per_tick[i] * ticks)
     }
 
     /// The same where the change that is possible depends on where the body was: `change` tells that of a component, from
-    /// all of them and the number of ticks.
+    /// the bounds, all components and the number of ticks.
     #[inline]
     pub fn accepts_within(
         &mut self,
         stamp: &Stamp,
         values: &[f64; N],
         valid: u64,
-        change: impl Fn(usize, &[f64; N], f64) -> f64,
+        change: impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
     ) -> bool {
-        let counts = self.bounds.repeats != u64::MAX;
-        // As a rule every component was believed a tick ago, and is now: what follows says the same at greater length.
-        let next = self.whole && self.trusted && !counts && self.before_tick.checked_add(1) == Some(stamp.tick);
+        // As a rule the same components were believed a tick ago, and are now: what follows says the same at greater length.
+        let valid = valid & Self::ALL;
+        let next = self.trusted && valid == self.current && self.before_tick.checked_add(1) == Some(stamp.tick);
         let near = |i: usize| {
-            let bound = self.bounds.allowance[i] + change(i, &self.believed, 1.0);
-            self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
+            let bound = self.bounds.allowance[i] + change(&self.bounds, i, &self.believed, 1.0);
+            valid >> i & 1 == 0 || self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
         };
-        if next && valid & Self::ALL == Self::ALL && (0..N).all(near) {
-            (self.believed, self.before) = (*values, *values);
-            (self.believed_tick, self.before_tick) = ([Some(stamp.tick); N], stamp.tick);
+        if next && self.bounds.repeats == u64::MAX && (0..N).all(near) {
+            for i in (0..N).filter(|i| valid >> i & 1 == 1) {
+                self.believed[i] = values[i];
+            }
+            (self.before, self.before_tick) = (*values, stamp.tick);
             return true;
         }
+        self.accepts_any(stamp, values, valid, change)
+    }
+
+    /// Apart, so that the short way has nothing to keep for it.
+    #[inline(never)]
+    fn accepts_any(
+        &mut self,
+        stamp: &Stamp,
+        values: &[f64; N],
+        valid: u64,
+        change: impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
+    ) -> bool {
+        self.spell_out();
+        let counts = self.bounds.repeats != u64::MAX;
         let mut believed = true;
         for (i, &value) in values.iter().enumerate() {
             if counts {
@@ -122,22 +138,31 @@ impl<const N: usize> Plausible<N> {
             self.believe(stamp, values, valid);
         }
         (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
-        self.set_whole();
+        self.set_current();
         believed
     }
 
     /// Remembers a sample that was found to be right in another way.
     #[inline]
     pub fn believe(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) {
+        self.spell_out();
         for i in (0..N).filter(|i| valid >> i & 1 == 1) {
             (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
         }
         self.trusted = true;
-        self.set_whole();
+        self.set_current();
     }
 
-    fn set_whole(&mut self) {
-        self.whole = self.believed_tick == [Some(self.before_tick); N];
+    /// Brings up to date what is implied as long as the same components are believed, one sample after the other.
+    fn spell_out(&mut self) {
+        for i in (0..N).filter(|i| self.current >> i & 1 == 1) {
+            self.believed_tick[i] = Some(self.before_tick);
+        }
+    }
+
+    fn set_current(&mut self) {
+        let current = |i: &usize| self.believed_tick[*i] == Some(self.before_tick);
+        self.current = (0..N).filter(current).fold(0, |current, i| current | 1 << i);
     }
 
     /// The bounds that it judges by.
@@ -160,10 +185,16 @@ impl<const N: usize> Plausible<N> {
     /// Whether a component can have come to a value from where it was last believed to be. As the time grows so does what can
     /// be reached, and noise comes to be possible; so after doubts it must have come smoothly, too.
     #[inline]
-    fn reached(&self, i: usize, value: f64, tick: u64, change: &impl Fn(usize, &[f64; N], f64) -> f64) -> bool {
+    fn reached(
+        &self,
+        i: usize,
+        value: f64,
+        tick: u64,
+        change: &impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
+    ) -> bool {
         let within = |from: &[f64; N], since: u64| {
             let ticks = tick.saturating_sub(since).max(1) as f64;
-            (value - from[i]).abs() <= self.bounds.allowance[i] + change(i, from, ticks)
+            (value - from[i]).abs() <= self.bounds.allowance[i] + change(&self.bounds, i, from, ticks)
         };
         self.believed_tick[i].is_none_or(|since| {
             let smooth = self.trusted || tick.saturating_sub(since) <= SHORT_GAP_TICKS;
@@ -174,13 +205,14 @@ impl<const N: usize> Plausible<N> {
 
 impl<const N: usize> Persist for Plausible<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
+        self.spell_out();
         self.believed.persist(words);
         self.believed_tick.persist(words);
         self.before.persist(words);
         self.before_tick.persist(words);
         self.repeated.persist(words);
         self.trusted.persist(words);
-        self.set_whole();
+        self.set_current();
     }
 }
 
@@ -303,6 +335,7 @@ mod tests {
             assert_eq!(told, accepts(&mut long, tick, shown, valid), "tick {tick}, {shown:?}");
             believed += u64::from(told);
             long.repeated = [0; 3];
+            short.spell_out();
             // As text: what is not a number is unequal to itself.
             assert_eq!(format!("{:?}", Plausible { bounds: long.bounds, ..short }), format!("{long:?}"));
         }

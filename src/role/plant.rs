@@ -202,7 +202,11 @@ impl<B: Body> Plant<B> {
         self.advance(ticks - held);
     }
 
+    #[inline]
     fn status(&self) -> u64 {
+        if self.silent_ticks == 0 && !self.safe && !self.rejected {
+            return 0;
+        }
         let rejected = if self.rejected { status::REJECTED } else { 0 };
         rejected
             | match (self.safe, self.silent_ticks > 0) {

@@ -314,11 +314,13 @@ fn spin(node: &dyn Node, yields_to: &[RoleId]) {
     }
 }
 
-/// Looks that are worth a spin, and those worth a system call that lets others run.
+/// Looks that are worth a spin.
 const SPIN_ROUNDS: u32 = 50;
-const YIELD_ROUNDS: u32 = 60;
 
-/// Waits longer the longer there is nothing to do: spins, then yields, then sleeps.
+/// Waits longer the longer there is nothing to do: spins, then sleeps.
+///
+/// It does not yield: Linux takes a whole time slice off who does (6.18), and thousands of yields per second drive the queue's
+/// clock so far ahead that whoever wakes up beside other busy processes waits for seconds, the kernel's own threads too.
 #[derive(Default)]
 pub struct Backoff {
     rounds: u32,
@@ -327,13 +329,12 @@ pub struct Backoff {
 impl Backoff {
     /// One round of waiting that is no sleep; false if it is time for one.
     pub fn brief(&mut self) -> bool {
-        self.rounds = self.rounds.saturating_add(1);
-        match self.rounds {
-            0..SPIN_ROUNDS => std::hint::spin_loop(),
-            SPIN_ROUNDS..YIELD_ROUNDS => std::thread::yield_now(),
-            _ => return false,
+        let brief = self.rounds < SPIN_ROUNDS;
+        if brief {
+            self.rounds += 1;
+            std::hint::spin_loop();
         }
-        true
+        brief
     }
 }
 

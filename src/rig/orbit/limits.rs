@@ -160,7 +160,7 @@ impl Guard<OrbitMeasurement> for MeasurementGuard {
             && placed
             && self
                 .state
-                .accepts_within(&sample.stamp, &state, sample.valid, |i, from, ticks| limits.change(i, from, ticks))
+                .accepts_within(&sample.stamp, &state, sample.valid, |_, i, from, ticks| limits.change(i, from, ticks))
     }
 }
 

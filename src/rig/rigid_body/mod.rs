@@ -399,15 +399,14 @@ impl Rig for RigidBodyRig {
             (Some(_), Some(leader)) => fleet(index).map_or(f64::NAN, |truth| farthest(truth.vector(0), &leader)),
             (Some(_), None) => f64::NAN,
         };
-        let followers = (1..self.bodies.len()).map(follower);
-        let worst =
-            followers.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst });
-        let estimate_error = distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader);
-        let coefficients = estimate.map(|estimate| Vector3::from(estimate.coefficients));
-        let coefficient_error = distance(coefficients, Some(self.inertia.coefficients()));
-        let values = [worst, estimate_error, coefficient_error];
-        let (first, _) = self.scored();
-        out.iter_mut().zip(&values[first..]).for_each(|(out, value)| *out = *value);
+        let worst = |worst: f64, error: f64| if error > worst || error.is_nan() { error } else { worst };
+        let value = |metric| match metric {
+            0 => (1..self.bodies.len()).map(follower).fold(0.0, worst),
+            1 => distance(estimate.map(|estimate| estimate.omega_rad_s.into()), leader),
+            _ => distance(estimate.map(|estimate| estimate.coefficients.into()), Some(self.inertia.coefficients())),
+        };
+        let (first, end) = self.scored();
+        out.iter_mut().zip(first..end).for_each(|(out, metric)| *out = value(metric));
     }
 
     fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
