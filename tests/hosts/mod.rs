@@ -68,6 +68,21 @@ impl Run {
         self.sites[number].start(&["join", &address, "--host", self.hosts[number], "--insecure"])
     }
 
+    /// A run in lockstep of these hosts that is ended by a signal only, and whose ticks run.
+    fn endless(&self) -> [common::Running; 2] {
+        let long = [&["--clock", "lockstep", "--tick-hz", "200", "--duration", "86400"][..], &UNJUDGED].concat();
+        let both = [self.launch("tcp", &long), self.join(1, "tcp", None)];
+        self.sites[1].bench.await_commits("controller", 1);
+        both
+    }
+
+    /// Ends such a run.
+    fn end(&self, [launched, joined]: [common::Running; 2]) {
+        launched.signal(libc::SIGTERM);
+        assert_eq!((launched.wait().code, joined.wait().code), (Some(128 + libc::SIGTERM), Some(0)));
+        self.assert_clean();
+    }
+
     /// Waits until others can join.
     fn await_listening(&self) {
         await_some(|| {
@@ -103,6 +118,8 @@ fn summary(done: &Done) -> Value {
 /// One tick is 5 ms, and a command has two of them.
 const KEYS: &str = "actuation_delay_ticks = 2";
 const SLOW: [&str; 4] = ["--tick-hz", "200", "--duration", "5"];
+/// In real time where the rate does not matter: a loaded machine takes longer than most of a tick of 5 ms, and is refused.
+const CALM: [&str; 2] = ["--tick-hz", "50"];
 const UNJUDGED: [&str; 2] = ["--set", "accept={}"];
 
 fn run_of(summary: &Value) -> (&str, u64) {
@@ -259,7 +276,7 @@ fn a_cut_within_the_limit_heals() {
     let over = summary(&done);
     assert!(over["hosts"]["hosts"][0]["silences"][0]["seconds"].as_f64().unwrap() >= 9.0);
     let hold = over["books"]["roles"]["follower"]["safe"].as_u64().unwrap();
-    assert!(hold > 1500, "{hold}");
+    assert!(hold > 375, "{hold}");
     run.assert_clean();
 }
 
@@ -267,7 +284,7 @@ fn a_cut_within_the_limit_heals() {
 fn cut(run: &Run, length: std::time::Duration, arguments: &[&str]) -> (Done, Done) {
     let proxy = run.proxy(1, Impairment { delay_us: 100, ..Impairment::default() });
     let duration = if arguments.is_empty() { &["--duration", "8"][..] } else { arguments };
-    let launched = run.launch("udp", &[&["--tick-hz", "200"][..], &UNJUDGED, duration].concat());
+    let launched = run.launch("udp", &[&CALM[..], &UNJUDGED, duration].concat());
     let joined = run.join(1, "udp", Some(proxy.port));
     run.sites[1].bench.await_commits("controller", 100);
     proxy.cut(true);
@@ -282,7 +299,7 @@ fn cut(run: &Run, length: std::time::Duration, arguments: &[&str]) -> (Done, Don
 fn a_host_that_vanishes_ends_the_run_of_the_others() {
     for vanishing in [0, 1] {
         let run = Run::new(&TWO, KEYS, "[network]\nsilence_timeout_s = 1.5\n");
-        let launched = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "60"][..], &UNJUDGED].concat());
+        let launched = run.launch("tcp", &[&CALM[..], &["--duration", "60"], &UNJUDGED].concat());
         let joined = run.join(1, "tcp", None);
         run.sites[1].bench.await_commits("controller", 100);
         run.sites[vanishing].cut_power();
@@ -320,14 +337,6 @@ fn a_role_that_dies_on_any_host_costs_nothing_in_lockstep() {
     let launched = run.launch("tcp", &[&long[..], &["--clock", "lockstep"]].concat());
     let joined = run.join(1, "tcp", None);
     run.sites[1].bench.await_commits("controller", 100);
-    let domain = run.sites[1].bench.domains().remove(0);
-    for command in [&["watch"][..], &["record", "--domain"], &["foxglove"]] {
-        let refused = run.sites[1].start(&[command, &[domain.to_str().unwrap()]].concat()).wait();
-        assert!(refused.code == Some(2) && refused.stderr.contains("look at it there"), "{refused:?}");
-    }
-    let domain = run.sites[0].bench.domains().remove(0);
-    let watched = run.sites[0].start(&["watch", domain.to_str().unwrap(), "--once", "0.5"]).wait();
-    assert!(watched.code == Some(0) && watched.stdout.contains("controller"), "{watched:?}");
     let dead = [(1, "controller"), (1, "observer"), (0, "follower"), (0, "leader")];
     for (site, role) in dead {
         let bench = &run.sites[site].bench;
@@ -351,7 +360,7 @@ fn a_role_that_dies_on_any_host_costs_nothing_in_lockstep() {
 fn a_relay_that_dies_ends_the_run_in_order() {
     for side in [0, 1] {
         let run = Run::new(&TWO, KEYS, "[network]\nsilence_timeout_s = 1.5\n");
-        let launched = run.launch("tcp", &[&["--tick-hz", "200", "--duration", "60"][..], &UNJUDGED].concat());
+        let launched = run.launch("tcp", &[&CALM[..], &["--duration", "60"], &UNJUDGED].concat());
         let joined = run.join(1, "tcp", None);
         run.sites[1].bench.await_commits("controller", 100);
         common::send_signal(run.sites[side].bench.await_role("relay"), libc::SIGKILL);
@@ -384,8 +393,7 @@ fn the_system_s_clock_is_taken_where_it_is_kept() {
 #[test]
 fn who_does_not_belong_is_told_why() {
     let run = Run::new(&TWO, KEYS, "");
-    let launched = run.launch("tcp", &[&SLOW[..], &UNJUDGED, &["--clock", "lockstep"]].concat());
-    run.await_listening();
+    let both = run.endless();
     let address = format!("tcp/{}:{}", run.sites[1].hub(), run.port);
     let stranger = run.sites[1].start(&["join", &address, "--host", "moon", "--insecure"]).wait();
     assert_eq!(stranger.code, Some(2), "{stranger:?}");
@@ -397,12 +405,25 @@ fn who_does_not_belong_is_told_why() {
     let truth_ns = if apart() { -APART_S * 1_000_000_000 } else { 0 };
     let wrong_us = (probe["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
     assert!(wrong_us <= probe["error_us"].as_f64().unwrap(), "wrong by {wrong_us} us: {probe}");
-    let joined = run.join(1, "tcp", None);
-    run.sites[1].bench.await_role("controller");
     let second = run.sites[1].start(&["join", &address, "--insecure"]).wait();
     assert!(second.stderr.contains("has joined already"), "{}", second.stderr);
-    assert_eq!((launched.wait().code, joined.wait().code), (Some(0), Some(0)));
-    run.assert_clean();
+    run.end(both);
+}
+
+/// What shows or records a run is refused where a host has joined, and sees all of it where it was launched.
+#[test]
+fn a_run_is_looked_at_where_it_was_launched() {
+    let run = Run::new(&TWO, KEYS, "");
+    let both = run.endless();
+    let domain = run.sites[1].bench.domains().remove(0);
+    for command in [&["watch"][..], &["record", "--domain"], &["foxglove"]] {
+        let refused = run.sites[1].start(&[command, &[domain.to_str().unwrap()]].concat()).wait();
+        assert!(refused.code == Some(2) && refused.stderr.contains("look at it there"), "{refused:?}");
+    }
+    let domain = run.sites[0].bench.domains().remove(0);
+    let watched = run.sites[0].start(&["watch", domain.to_str().unwrap(), "--once", "0.5"]).wait();
+    assert!(watched.code == Some(0) && watched.stdout.contains("controller"), "{watched:?}");
+    run.end(both);
 }
 
 /// What is open to everybody is so only if it was said, and only with a scenario that has hosts.
