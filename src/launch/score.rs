@@ -8,7 +8,7 @@ use crate::config::{Accept, Scenario};
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
-use crate::sample::{Message, Sample, Stamp, status};
+use crate::sample::{Message, Sample, Stamp, status, status_of};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -129,25 +129,18 @@ struct DrivenBody {
 /// How often the status of a signal's samples said what.
 struct Statuses {
     signal: String,
-    /// Where the status is in a sample, words.
-    at: Option<usize>,
     counts: [u64; status::NAMES.len()],
 }
 
 impl Statuses {
-    fn new<S: Sample>(body: &str, signal: Signal) -> Self {
-        let at = S::FIELDS.iter().find(|field| field.name == "status").map(|field| field.offset / size_of::<u64>());
-        Self { signal: format!("{body}/{}", signal.name()), at, counts: [0; status::NAMES.len()] }
-    }
-
-    fn of(&self, words: &[u64]) -> u64 {
-        self.at.map_or(0, |at| words[at])
+    fn new(body: &str, signal: Signal) -> Self {
+        Self { signal: format!("{body}/{}", signal.name()), counts: [0; status::NAMES.len()] }
     }
 
     /// Counts what a sample says. Most say nothing.
     #[inline]
-    fn take(&mut self, words: &[u64]) {
-        let told = self.of(words);
+    fn take<S: Sample>(&mut self, sample: &S) {
+        let told = status_of(sample);
         if told != 0 {
             let counts = self.counts.iter_mut().zip(status::NAMES);
             counts.for_each(|(count, (_, bit))| *count += u64::from(told & bit != 0));
@@ -244,8 +237,8 @@ impl<R: Rig> Scoring<R> {
         let bodies = rig.bodies().iter();
         // The certificate is about single bodies.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
-        let estimates = Statuses::new::<Estimate<R>>(&rig.bodies()[0].name, Signal::Estimate);
-        let truths = bodies.clone().map(|body| Statuses::new::<Truth<R>>(&body.name, Signal::Truth));
+        let estimates = Statuses::new(&rig.bodies()[0].name, Signal::Estimate);
+        let truths = bodies.clone().map(|body| Statuses::new(&body.name, Signal::Truth));
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
@@ -309,11 +302,11 @@ impl<R: Rig> Scoring<R> {
             *last = tick;
         }
         let (estimates, truths) = self.statuses.split_at_mut(1);
-        estimate.iter().for_each(|estimate| estimates[0].take(estimate.words()));
+        estimate.iter().for_each(|estimate| estimates[0].take(*estimate));
         let told = truths.iter_mut().enumerate();
-        told.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(truth.words())));
+        told.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
         // What the observer was not told of cannot be judged.
-        let seen = estimate.filter(|estimate| estimates[0].of(estimate.words()) & BLIND == 0);
+        let seen = estimate.filter(|estimate| status_of(*estimate) & BLIND == 0);
         for driven in &mut self.driven {
             let (observed, own) = (truth(0), truth(driven.body));
             let now = match (observed, own, seen) {

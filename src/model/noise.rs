@@ -53,6 +53,7 @@ impl<const N: usize> Noise<N> {
     }
 
     /// Every component draws, also one without deviation: setting one sensor's noise leaves the others' as they are.
+    #[inline(never)]
     fn draw(&mut self) -> SVector<f64, N> {
         self.drawn = self.drawn.wrapping_add(1);
         let mut sample = self.bias;

@@ -204,7 +204,7 @@ impl<B: Body> Plant<B> {
 
     #[inline]
     fn status(&self) -> u64 {
-        if self.silent_ticks == 0 && !self.safe && !self.rejected {
+        if self.silent_ticks | u64::from(self.safe) | u64::from(self.rejected) == 0 {
             return 0;
         }
         let rejected = if self.rejected { status::REJECTED } else { 0 };

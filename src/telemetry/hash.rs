@@ -18,7 +18,7 @@ pub struct StateHash {
     checkpoints: Slots,
     stride: u64,
     capacity: u64,
-    /// After how many ticks the next checkpoint is: seldom, so that a comparison must do.
+    /// After how many ticks the next checkpoint is, were there one more.
     due: u64,
 }
 
@@ -65,26 +65,32 @@ impl StateHash {
     #[inline(always)]
     pub fn absorb(&mut self, tick: u64, content: &[u8]) {
         if tick >= self.due {
-            self.checkpoint(tick);
+            self.pass(tick);
         }
         self.value = xxh3_64_with_seed(content, self.value ^ tick.rotate_left(32));
         if tick.saturating_add(1) >= self.due {
-            self.checkpoint(tick.saturating_add(1));
+            self.checkpoint();
         }
     }
 
     /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
-    #[inline(never)]
-    fn checkpoint(&mut self, ticks: u64) {
-        while self.count < self.capacity && self.due <= ticks {
-            self.checkpoints.set(self.count as usize, self.value);
-            self.count += 1;
-            self.set_due();
+    #[cold]
+    fn pass(&mut self, ticks: u64) {
+        while self.due <= ticks && self.count < self.capacity {
+            self.checkpoint();
         }
     }
 
-    fn set_due(&mut self) {
-        self.due = if self.count < self.capacity { (self.count + 1) * self.stride } else { u64::MAX };
+    /// Notes the hash for the checkpoint that is due.
+    #[inline(never)]
+    fn checkpoint(&mut self) {
+        if self.count < self.capacity {
+            self.checkpoints.set(self.count as usize, self.value);
+            self.count += 1;
+            self.due += self.stride;
+        } else {
+            self.due = u64::MAX;
+        }
     }
 
     /// What has been gathered.
@@ -102,7 +108,7 @@ impl Persist for StateHash {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.value.persist(words);
         self.count.persist(words);
-        self.set_due();
+        self.due = self.count.saturating_add(1).saturating_mul(self.stride);
     }
 }
 

@@ -75,6 +75,7 @@ impl Body for RatePlant {
         out.status = status;
     }
 
+    #[inline]
     fn measure(&mut self, tick: u64, status: u64, out: &mut RateMeasurement) {
         let (valid, seen) = (self.valid(tick), self.rate + self.noise.sample());
         out.omega_rad_s = seen.into();
