@@ -5,7 +5,7 @@
 //! kinds below (half an hour), else some of each. Nothing is judged by the machine's speed: a role that stood still is one
 //! that its launcher missed for `STILL_S` of its own attention, and in lockstep no tick may be missed at all.
 
-use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
+use crate::common::{Bench, Done, Running, await_some, catches, send_signal, shipped, status_of};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -87,11 +87,9 @@ fn deaths(trace: &Path, domain: &Path) -> Vec<(&'static str, usize)> {
 }
 
 /// Whether a process sleeps, and would hear that it is to leave; none if it has ended.
-fn rests(pid: &str) -> Option<bool> {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
-    let field = |name: &str| status.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default().trim();
-    let caught = u64::from_str_radix(field("SigCgt:"), 16).unwrap_or(0);
-    (!field("State:").starts_with('Z')).then(|| field("State:").starts_with('S') && caught >> (SIGTERM - 1) & 1 == 1)
+fn rests(pid: u32) -> Option<bool> {
+    let state = status_of(pid, "State");
+    (!state.is_empty() && !state.starts_with('Z')).then(|| state.starts_with('S') && catches(pid, SIGTERM))
 }
 
 /// Waits for a joiner under strace, telling it to leave if it stays: once it has had nothing to do for half a second, however
@@ -100,24 +98,22 @@ fn await_left(joiner: &Joiner, mut running: Running) -> Done {
     if joiner.stays {
         let children = format!("/proc/{0}/task/{0}/children", running.pid());
         // Before the joiner, strace has children of its own, by which it learns what this machine can trace.
-        let is_joiner = |pid: &&str| {
-            std::fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name.trim_end() != "strace")
-        };
+        let is_joiner = |pid: &u32| status_of(*pid, "Name") != "strace";
         let child = await_some(|| {
             let text = std::fs::read_to_string(&children).unwrap_or_default();
-            let found = text.split_whitespace().find(is_joiner).map(|pid| Some(pid.to_owned()));
+            let found = text.split_whitespace().flat_map(str::parse).find(is_joiner).map(Some);
             found.or_else(|| running.has_ended().then_some(None))
         });
         let (mut rested, end) = (0_u32, Instant::now() + Duration::from_secs(60));
         while rested < 50 && Instant::now() < end {
-            match child.as_ref().and_then(|pid| rests(pid)) {
+            match child.and_then(rests) {
                 Some(true) => rested += 1,
                 Some(false) => rested = rested.saturating_sub(10),
                 None => break,
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        child.iter().for_each(|pid| send_signal(pid.parse().unwrap(), SIGTERM));
+        child.iter().for_each(|pid| send_signal(*pid, SIGTERM));
     }
     running.wait()
 }

@@ -398,7 +398,7 @@ fn a_recorder_beside_a_running_loop_takes_everything_from_then_on_within_four_me
         // everybody, and what is started from its thread would too.
         let watch = || {
             await_some(|| {
-                let mut session = Session::open(Some(&domain)).ok()?;
+                let mut session = Session::open(Some(&domain), || false).ok()?;
                 session.follow(200_000_000, || false).ok()?;
                 (session.model.tick > 0).then_some(())
             })

@@ -226,6 +226,26 @@ fn a_killed_watcher_leaves_nothing() {
     bench.assert_clean(&[domain]);
 }
 
+/// The run waits for its observer, and the watcher for the run.
+#[test]
+fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
+    let bench = Bench::new();
+    let run = bench.start(&["run", "--clock", "lockstep", "--external", "observer"]);
+    let domain = await_some(|| bench.domains().pop());
+    bench.await_role("controller");
+    let watcher = bench.start(&["watch", domain.to_str().unwrap(), "--once", "1"]);
+    await_some(|| common::catches(watcher.pid(), 15).then_some(()));
+    let told = Instant::now();
+    watcher.signal(15);
+    let done = watcher.wait();
+    assert_eq!(done.code, Some(143), "{done:?}");
+    assert!(done.stdout.is_empty() && done.stderr.is_empty(), "{done:?}");
+    println!("ended after {:.1} s", told.elapsed().as_secs_f64());
+    run.signal(15);
+    run.wait();
+    bench.assert_clean(&[domain]);
+}
+
 #[test]
 fn one_screen_can_be_had_without_a_terminal() {
     let bench = Bench::new();

@@ -5,10 +5,10 @@
 use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
 use crate::config::{Accept, Scenario};
-use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth};
+use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
-use crate::sample::{Message, Sample, Stamp, status, status_of};
+use crate::sample::{Message, Sample, Stamp, status};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -124,6 +124,15 @@ struct DrivenBody {
     body: usize,
     /// Tick, V, and the bound on V̇, of the tick before.
     before: Option<(u64, f64, f64)>,
+}
+
+/// The status bits of a sample; none where its type has no field `status`.
+#[inline]
+fn status_of<S: Sample>(sample: &S) -> u64 {
+    match const { field_named(S::FIELDS, "status") } {
+        Some(index) => sample.words()[S::FIELDS[index].offset / size_of::<u64>()],
+        None => 0,
+    }
 }
 
 /// How often the status of a signal's samples said what.

@@ -65,17 +65,21 @@ pub fn watch(arguments: &Arguments) -> Exit {
 }
 
 fn attempt(arguments: &Arguments, signal: &AtomicUsize) -> Result<Exit, WatchError> {
-    let mut session = Session::open(arguments.domain.as_deref())?;
+    let told = || signal.load(Ordering::Relaxed);
+    let mut session = match Session::open(arguments.domain.as_deref(), || told() != 0) {
+        Err(_) if told() != 0 => return Ok(Exit::Signal(told())),
+        opened => opened?,
+    };
     match arguments.once {
         None => show(&mut session, signal)?,
         Some(seconds) => {
-            session.follow((seconds * 1e9) as u64, || signal.load(Ordering::Relaxed) != 0)?;
+            session.follow((seconds * 1e9) as u64, || told() != 0)?;
             if let Err(exit) = say(&if arguments.json { json(&session.model) } else { text(&session.model, 80, 24) }) {
                 return Ok(exit);
             }
         }
     }
-    Ok(match signal.load(Ordering::Relaxed) {
+    Ok(match told() {
         0 => Exit::Ok,
         number => Exit::Signal(number),
     })

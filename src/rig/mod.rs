@@ -20,6 +20,7 @@ pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
 pub use registry::{RigKind, register, shipped};
 pub(crate) use registry::{resolve, sections, shapes, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
+pub(crate) use simple::field_named;
 pub use simple::{Bounded, Difference, SimpleRig};
 
 use crate::config::{Checks, ConfigError, Document};

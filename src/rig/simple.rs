@@ -5,7 +5,7 @@
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
 use crate::config::{Checks, ConfigError, Document};
 use crate::role::{Body, Estimator, Guard, Law, SingleBody};
-use crate::sample::{Field, FieldKind, Message, Sample, field_named};
+use crate::sample::{Field, FieldKind, Message, Sample};
 use crate::state::{Persist, Words};
 use serde::de::{DeserializeOwned, Deserializer, Visitor, value::Error};
 use serde::{Serialize, forward_to_deserialize_any};
@@ -100,6 +100,26 @@ const fn has(fields: &[Field], name: &str) -> bool {
         Some(index) => matches!(fields[index].kind, FieldKind::F64),
         None => false,
     }
+}
+
+/// Which of the fields has a name, known when a program is built.
+pub(crate) const fn field_named(fields: &[Field], name: &str) -> Option<usize> {
+    let mut index = 0;
+    while index < fields.len() {
+        if same(fields[index].name.as_bytes(), name.as_bytes()) {
+            return Some(index);
+        }
+        index += 1;
+    }
+    None
+}
+
+const fn same(one: &[u8], other: &[u8]) -> bool {
+    let mut index = 0;
+    while index < one.len() && index < other.len() && one[index] == other[index] {
+        index += 1;
+    }
+    index == one.len() && index == other.len()
 }
 
 /// The numbers of a sample's field.

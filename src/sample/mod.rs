@@ -148,35 +148,6 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     }
 }
 
-/// Which of the fields has a name, known when a program is built.
-pub(crate) const fn field_named(fields: &[Field], name: &str) -> Option<usize> {
-    let mut index = 0;
-    while index < fields.len() {
-        if same(fields[index].name.as_bytes(), name.as_bytes()) {
-            return Some(index);
-        }
-        index += 1;
-    }
-    None
-}
-
-const fn same(one: &[u8], other: &[u8]) -> bool {
-    let mut index = 0;
-    while index < one.len() && index < other.len() && one[index] == other[index] {
-        index += 1;
-    }
-    index == one.len() && index == other.len()
-}
-
-/// The status bits of a sample; none where its type has no field `status`.
-#[inline]
-pub(crate) fn status_of<S: Sample>(sample: &S) -> u64 {
-    match const { field_named(S::FIELDS, "status") } {
-        Some(index) => sample.words()[S::FIELDS[index].offset / size_of::<u64>()],
-        None => 0,
-    }
-}
-
 /// Bytes of a sample's content.
 pub const fn content_length<S: Sample>() -> usize {
     size_of::<S>() - size_of::<Stamp>()

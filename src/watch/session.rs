@@ -38,23 +38,30 @@ struct Joined {
 }
 
 impl Joined {
-    fn open(domain: &Domain, scenario: &Scenario, end_ns: u64, model: &mut Model) -> Result<Self, BusError> {
-        let bus = insist(end_ns, || IoxBus::join(domain, "watch", depths(scenario)))?;
-        let feed = insist(end_ns, || Feed::open(scenario, &bus, model))?;
+    fn open(
+        domain: &Domain,
+        scenario: &Scenario,
+        patient: impl Fn() -> bool,
+        model: &mut Model,
+    ) -> Result<Self, BusError> {
+        let bus = insist(&patient, || IoxBus::join(domain, "watch", depths(scenario)))?;
+        let feed = insist(&patient, || Feed::open(scenario, &bus, model))?;
         let schedule = bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?;
         Ok(Self { feed, schedule, _bus: bus })
     }
 }
 
 impl Session {
-    /// Joins the run in that domain, or with its results in that directory, or the newest of this user.
+    /// Joins the run in that domain, or with its results in that directory, or the newest of this user. Waits for one that is
+    /// only just being started, until `stop` says so.
     ///
     /// # Errors
     /// [`WatchError`].
-    pub fn open(directory: Option<&Path>) -> Result<Self, WatchError> {
+    pub fn open(directory: Option<&Path>, stop: impl Fn() -> bool) -> Result<Self, WatchError> {
         let root = run_under_way(directory)?.ok_or(WatchError::NoRun)?;
         let end_ns = monotonic_ns() + JOIN_NS;
-        let (domain, scenario) = insist(end_ns, || join_whole(&root))?;
+        let patient = || monotonic_ns() < end_ns && !stop();
+        let (domain, scenario) = insist(patient, || join_whole(&root))?;
         let mut model = Model {
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),
@@ -63,7 +70,8 @@ impl Session {
             tick_s: scenario.tick_s(),
             ..Model::default()
         };
-        let joined = join_at_low_priority(&scenario, NICENESS, || Joined::open(&domain, &scenario, end_ns, &mut model));
+        let joined =
+            join_at_low_priority(&scenario, NICENESS, || Joined::open(&domain, &scenario, patient, &mut model));
         Ok(Self { joined: Some(joined.map_err(|source| WatchError::Join { source })?), domain, scenario, model })
     }
 
@@ -121,14 +129,14 @@ impl Drop for Session {
     }
 }
 
-/// Tries again and again until `end_ns`: a run that was just started makes one thing after another.
-fn insist<T, E>(end_ns: u64, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, E>
+/// Tries again and again: a run that was just started makes one thing after another.
+fn insist<T, E>(patient: impl Fn() -> bool, mut attempt: impl FnMut() -> Result<T, E>) -> Result<T, E>
 where
     E: Retry,
 {
     loop {
         match attempt() {
-            Err(error) if error.may_pass() && monotonic_ns() < end_ns => sleep_until(monotonic_ns() + LOOK_NS),
+            Err(error) if error.may_pass() && patient() => sleep_until(monotonic_ns() + LOOK_NS),
             other => return other,
         }
     }

@@ -282,6 +282,18 @@ pub fn processes_marked(mark: &str) -> Vec<u32> {
     .collect()
 }
 
+/// What a process's status says of it, the like of `State` and `SigCgt`; empty if it has ended.
+pub fn status_of(pid: u32, field: &str) -> String {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let told = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    told.unwrap_or_default().trim().to_owned()
+}
+
+/// Whether a process has a handler for a signal.
+pub fn catches(pid: u32, signal: i32) -> bool {
+    u64::from_str_radix(&status_of(pid, "SigCgt"), 16).is_ok_and(|caught| caught >> (signal - 1) & 1 == 1)
+}
+
 pub fn send_signal(pid: u32, signal: i32) {
     let pid = rustix::process::Pid::from_raw(pid as i32).unwrap();
     let signal = rustix::process::Signal::from_named_raw(signal).unwrap();
