@@ -40,8 +40,10 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const TRY_NS: u64 = 3_000_000_000;
 /// So often it is tried: a way that loses may have lost the words by which it is opened.
 const TRIES: u64 = 5;
-/// How long a host that ends tries to tell how it ended, and the one that launched waits for it, ns.
+/// How long a host that ends tries to tell how it ended, and the one that launched waits for it, ns: while nothing is heard of
+/// the other one, and in all.
 const LEAVE_NS: u64 = 4_000_000_000;
+const LEAVE_HEARD_NS: u64 = 20_000_000_000;
 /// How long the last acknowledgements are repeated, ns.
 const LINGER_NS: u64 = 200_000_000;
 /// Bytes that wait for one host at the most, where that is enough to go on, and so many frames in any case.
@@ -626,8 +628,8 @@ impl<'a> Relay<'a> {
                 return Ok(false);
             }
             let since_ns = *since_ns.get_or_insert(now_ns);
-            let all = self.ended.iter().all(|ended| *ended);
-            return Ok(now_ns - since_ns > if all { LINGER_NS } else { LEAVE_NS });
+            let waits = |host: u8| !self.ended[usize::from(host)] && !self.gives_up(host, since_ns, now_ns);
+            return Ok(now_ns - since_ns > LINGER_NS && !self.plan.others().any(waits));
         }
         let end = far_end_path(root, self.plan.name(own));
         match *since_ns {
@@ -649,9 +651,15 @@ impl<'a> Relay<'a> {
             None => Ok(false),
             Some(since_ns) => {
                 let told = self.streams[usize::from(self.plan.hub)].0.is_empty();
-                Ok(told || now_ns - since_ns > LEAVE_NS)
+                Ok(told || self.gives_up(self.plan.hub, since_ns, now_ns))
             }
         }
+    }
+
+    /// Whether a host is not waited for any longer by one that leaves since `since_ns`.
+    fn gives_up(&self, host: u8, since_ns: u64, now_ns: u64) -> bool {
+        let heard_ns = self.shared.heard_ns[usize::from(host)].load(Ordering::Relaxed).max(since_ns);
+        now_ns.saturating_sub(heard_ns) > LEAVE_NS || now_ns - since_ns > LEAVE_HEARD_NS
     }
 
     /// This host's account; `sent` is what went in a hurry, by link and host.

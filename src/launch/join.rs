@@ -24,8 +24,8 @@ const LOOK_NS: u64 = 10_000_000;
 /// Between two looks at the word when there is none, ns: in real time, and in lockstep.
 const LULL_NS: u64 = 1_000_000;
 const LOCKSTEP_LULL_NS: u64 = 50_000;
-/// How long the relay may take to tell how the host ended, ns.
-const TELL_NS: u64 = 6_000_000_000;
+/// How long the relay may take to tell how the host ended, ns: longer than it tries.
+const TELL_NS: u64 = 25_000_000_000;
 
 /// How a host's part in a run ended.
 #[derive(Debug)]
