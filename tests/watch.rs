@@ -233,6 +233,9 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
     let run = bench.start(&["run", "--clock", "lockstep", "--external", "observer"]);
     let domain = await_some(|| bench.domains().pop());
     bench.await_role("controller");
+    // A run without its scenario has only just begun, so there is something to wait for.
+    let (there, aside) = (domain.join("scenario.toml"), domain.join("aside"));
+    std::fs::rename(&there, &aside).unwrap();
     let watcher = bench.start(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| common::catches(watcher.pid(), 15).then_some(()));
     let told = Instant::now();
@@ -241,6 +244,7 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
     assert_eq!(done.code, Some(143), "{done:?}");
     assert!(done.stdout.is_empty() && done.stderr.is_empty(), "{done:?}");
     println!("ended after {:.1} s", told.elapsed().as_secs_f64());
+    std::fs::rename(&aside, &there).unwrap();
     run.signal(15);
     run.wait();
     bench.assert_clean(&[domain]);
