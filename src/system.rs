@@ -1,4 +1,4 @@
-//! The system: its errors in words, with what a user can do about them, its stderr, and its randomness. Must not decide what
+//! The system: its errors in words, with what a user can do about them, its stderr, its time of day, and its randomness. Must not decide what
 //! becomes of the program.
 
 use rustix::io::retry_on_intr;
@@ -9,6 +9,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::Command;
 use std::sync::OnceLock;
+use std::time::SystemTime;
 
 /// The file that this program is started from, and what it is given before all else.
 static PROGRAM: OnceLock<(PathBuf, Vec<OsString>)> = OnceLock::new();
@@ -31,6 +32,11 @@ pub fn this_program() -> io::Result<Command> {
     let mut command = Command::new(file);
     command.args(arguments);
     Ok(command)
+}
+
+/// A time in UTC as text (RFC 3339), from 1970 on.
+pub fn utc(time: SystemTime) -> String {
+    humantime::format_rfc3339(time.max(SystemTime::UNIX_EPOCH)).to_string()
 }
 
 /// What to do about an error of the system.

@@ -10,6 +10,7 @@ use corotate::record::{Recording, SignalInfo, Track};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;
+use std::time::SystemTime;
 
 const DELAYS: [usize; 3] = [1, 2, 5];
 
@@ -31,7 +32,7 @@ fn direct(name: &str, overrides: &[String]) -> Value {
     let overrides = [&["clock=in-process".to_owned(), "accept={}".to_owned()], overrides].concat();
     let scenario = Scenario::parse(text, "test", &overrides).unwrap();
     let outcome = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).unwrap();
-    serde_json::to_value(Summary::new(&scenario, &outcome, jiff::Timestamp::UNIX_EPOCH)).unwrap()
+    serde_json::to_value(Summary::new(&scenario, &outcome, SystemTime::UNIX_EPOCH)).unwrap()
 }
 
 fn owned(overrides: &[&str]) -> Vec<String> {

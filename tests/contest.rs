@@ -7,6 +7,7 @@ use crate::contestants::step::{agreements, library};
 use corotate::bench::{Bench, Results, run};
 use corotate::config::SHIPPED;
 use std::sync::atomic::AtomicUsize;
+use std::time::SystemTime;
 
 #[test]
 fn the_step_and_the_fleet_stand_beside_all_their_floors() {
@@ -18,7 +19,7 @@ fn the_step_and_the_fleet_stand_beside_all_their_floors() {
         progress: &mut |_| {},
     };
     let (board, privileges) = run(&mut bench).unwrap();
-    let results = Results::new(&bench, board, privileges, jiff::Timestamp::now());
+    let results = Results::new(&bench, board, privileges, SystemTime::now());
     let has = |row: &str, name: &str| results.figures.iter().any(|figure| figure.row == row && figure.name == name);
     for name in ["first order", "second order", "identifier", "orbit"] {
         for suffix in ["", " in C", " in C, for any machine"] {

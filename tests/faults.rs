@@ -9,6 +9,7 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::SystemTime;
 
 /// The declared bound: that of `faults.toml`, rad/s.
 const BOUND_RAD_S: f64 = 0.1;
@@ -45,7 +46,7 @@ impl Disturbed {
     /// Runs a scenario in this thread.
     fn run(scenario: &Scenario) -> Self {
         let outcome = run(scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).unwrap();
-        let summary = serde_json::to_value(Summary::new(scenario, &outcome, jiff::Timestamp::UNIX_EPOCH)).unwrap();
+        let summary = serde_json::to_value(Summary::new(scenario, &outcome, SystemTime::UNIX_EPOCH)).unwrap();
         let metric = &summary["score"]["metrics"][0];
         let number = |key: &str| metric[key].as_f64().unwrap_or(f64::INFINITY);
         Self { peak: number("peak"), last: number("last"), summary }

@@ -12,6 +12,7 @@ use pyo3::prelude::*;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::SystemTime;
 
 create_exception!(
     _corotate,
@@ -95,7 +96,7 @@ pub fn run(
     external
         .iter()
         .try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
-    let started = jiff::Timestamp::now();
+    let started = SystemTime::now();
     let directory = make_directory(out.as_deref(), &scenario.name, started).map_err(failed)?;
     if out.is_some() {
         claim(&directory).map_err(failed)?;

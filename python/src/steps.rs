@@ -8,6 +8,7 @@ use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use std::path::PathBuf;
+use std::time::SystemTime;
 
 /// Words of a stamp.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
@@ -26,7 +27,7 @@ pub struct Steps {
     actions: Vec<usize>,
     observation: Vec<f64>,
     over: bool,
-    started: jiff::Timestamp,
+    started: SystemTime,
 }
 
 impl Steps {
@@ -75,7 +76,7 @@ impl Steps {
             actions: ports.writes.iter().map(|port| port.fields.first().map_or(0, |field| field.count)).collect(),
             observation: vec![0.0; length],
             over: false,
-            started: jiff::Timestamp::now(),
+            started: SystemTime::now(),
         };
         this.observe()?;
         Ok(this)

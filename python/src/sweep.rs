@@ -8,6 +8,7 @@ use pyo3::prelude::*;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::SystemTime;
 
 /// The number of the signal by which Ctrl-C ends a sweep in order.
 const SIGINT: usize = 2;
@@ -65,7 +66,7 @@ impl Cases {
     fn directory(&self, out: Option<PathBuf>) -> PyResult<PathBuf> {
         match out {
             Some(out) => Ok(out),
-            None => make_directory(None, self.campaign.name(), jiff::Timestamp::now()).map_err(failed),
+            None => make_directory(None, self.campaign.name(), SystemTime::now()).map_err(failed),
         }
     }
 

@@ -5,12 +5,14 @@
 use super::{Bench, Board, Figure, Row, Target, Verdict};
 use crate::files;
 use crate::launch::plain;
+use crate::system::utc;
 use crate::telemetry::Host;
 use crate::telemetry::{Grant, write_hgrm};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
+use std::time::SystemTime;
 
 /// Layout version of `bench.json`.
 const SCHEMA: &str = "corotate/bench/v1";
@@ -43,7 +45,7 @@ pub struct Results {
 
 impl Results {
     /// Draws up the results of a run that began at `started`.
-    pub fn new(bench: &Bench<'_>, mut board: Board, privileges: Vec<Grant>, started: jiff::Timestamp) -> Self {
+    pub fn new(bench: &Bench<'_>, mut board: Board, privileges: Vec<Grant>, started: SystemTime) -> Self {
         board.compare();
         let not_judged = bench.unjudged();
         let verdict = |(row, target): (&'static str, &Target)| {
@@ -56,7 +58,7 @@ impl Results {
             schema: SCHEMA,
             version: env!("CARGO_PKG_VERSION"),
             revision: env!("COROTATE_REVISION"),
-            started_utc: started.to_string(),
+            started_utc: utc(started),
             quick: bench.quick,
             host: Host::this(),
             privileges,

@@ -206,8 +206,8 @@ impl Document {
     }
 
     fn read_once<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
-        serde_path_to_error::deserialize(Value::Table(self.table.clone())).map_err(|error| {
-            let (path, message) = (error.path().to_string(), error.inner().message().trim().to_owned());
+        read(Value::Table(self.table.clone())).map_err(|(path, message)| {
+            let path = path.to_string();
             self.explain(if path == "." { String::new() } else { path }, &message)
         })
     }
@@ -419,6 +419,12 @@ fn locate_value(value: &DeValue<'_>, path: &str, found: &mut impl FnMut(String, 
         }
         _ => {}
     }
+}
+
+/// Reads a value into a type; otherwise where that refuses it, and why.
+pub(super) fn read<T: DeserializeOwned>(value: Value) -> Result<T, (serde_path_to_error::Path, String)> {
+    serde_path_to_error::deserialize(value)
+        .map_err(|error| (error.path().clone(), error.inner().message().trim().to_owned()))
 }
 
 fn is_below(path: &str, key: &str) -> bool {

@@ -2,6 +2,7 @@
 //!
 //! Must not know what any key means, nor need a word from the type beyond that it can be deserialized.
 
+use super::document::read;
 use serde::de::value::{Error, StrDeserializer};
 use serde::de::{
     DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, SeqAccess, Visitor,
@@ -85,8 +86,10 @@ impl Shape {
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Key(&'static str),
-    /// Into a list, or a table of any keys.
+    /// Into a list.
     Element,
+    /// Into a table of any keys.
+    Entry,
 }
 
 /// What the type asks for where the way ends.
@@ -110,12 +113,12 @@ fn at<T: DeserializeOwned>(way: &mut Vec<Step>) -> Shape {
         return Shape::Any(None);
     }
     let asked = RefCell::new(None);
-    let _ = T::deserialize(Probe { way, end: End::Ask(&asked) });
-    let element = |way: &mut Vec<Step>| {
-        way.push(Step::Element);
-        let element = at::<T>(way);
+    let _ = T::deserialize(Probe { way, asked: &asked });
+    let further = |way: &mut Vec<Step>, step| {
+        way.push(step);
+        let shape = at::<T>(way);
         way.pop();
-        Box::new(element)
+        shape
     };
     match asked.into_inner() {
         None => Shape::Any(None),
@@ -126,9 +129,9 @@ fn at<T: DeserializeOwned>(way: &mut Vec<Step>) -> Shape {
         Some(Asked::Number) => Shape::Number,
         Some(Asked::Text) => Shape::Text,
         Some(Asked::Choice(choices)) => Shape::Choice(choices),
-        Some(Asked::List) => Shape::List(element(way)),
-        Some(Asked::Array(length)) => Shape::Array(element(way), length),
-        Some(Asked::Map) => Shape::Map(element(way)),
+        Some(Asked::List) => Shape::List(Box::new(further(way, Step::Element))),
+        Some(Asked::Array(length)) => Shape::Array(Box::new(further(way, Step::Element)), length),
+        Some(Asked::Map) => Shape::Map(Box::new(further(way, Step::Entry))),
         Some(Asked::Table(names)) => table::<T>(way, names),
     }
 }
@@ -143,22 +146,27 @@ fn table<T: DeserializeOwned>(way: &mut Vec<Step>, names: &'static [&'static str
     let mut keys: Vec<Key> = names.iter().map(|name| key(*name)).collect();
     let mut given = toml::Table::new();
     // One after the other: only the first that is missing is complained of.
-    while let Some(name) = refusal::<T>(way, &given).as_deref().and_then(missing) {
+    while let Some(name) = refusal::<T>(way, Value::Table(given.clone())).as_deref().and_then(missing) {
         let Some(key) = keys.iter_mut().find(|key| key.name == name && !key.required) else { break };
         key.required = true;
         let Some(example) = key.shape.example() else { break };
         given.insert(name.to_owned(), example);
     }
     let stranger = toml::Table::from_iter([("?".to_owned(), Value::Integer(0))]);
-    let closed = refusal::<T>(way, &stranger).is_some_and(|reason| reason.contains("unknown field"));
+    let closed = refusal::<T>(way, Value::Table(stranger)).is_some_and(|reason| reason.contains("unknown field"));
     Shape::Table { keys, closed }
 }
 
-/// Why a table is refused at the end of a way, if it is.
-fn refusal<T: DeserializeOwned>(way: &[Step], table: &toml::Table) -> Option<String> {
-    let (value, told) = (Value::Table(table.clone()), RefCell::new(None));
-    let _ = T::deserialize(Probe { way, end: End::Give(&value, &told) });
-    told.into_inner()
+/// Why a value is refused at the end of a way, if it is.
+fn refusal<T: DeserializeOwned>(way: &[Step], value: Value) -> Option<String> {
+    let whole = way.iter().rev().fold(value, |value, step| match step {
+        Step::Key(name) => Value::Table(toml::Table::from_iter([((*name).to_owned(), value)])),
+        Step::Element => Value::Array(vec![value]),
+        Step::Entry => Value::Table(toml::Table::from_iter([("element".to_owned(), value)])),
+    });
+    // What is missing around it is no refusal of it.
+    let (path, reason) = read::<T>(whole).err()?;
+    (path.iter().count() >= way.len()).then_some(reason)
 }
 
 /// The key in a message as "missing field `a`".
@@ -168,26 +176,17 @@ fn missing(reason: &str) -> Option<&str> {
 
 /// What a type that takes several kinds of values says to one that it does not take.
 fn choices<T: DeserializeOwned>(way: &[Step]) -> Option<String> {
-    let (value, told) = (Value::Boolean(true), RefCell::new(None));
-    // It is the type around the value that judges it, once it has it.
-    let error = T::deserialize(Probe { way, end: End::Give(&value, &told) }).err()?.to_string();
-    error.split_once("; ").map(|(_, remedy)| remedy.to_owned()).filter(|remedy| remedy.starts_with("give "))
+    refusal::<T>(way, Value::Boolean(true))?
+        .split_once("; ")
+        .map(|(_, remedy)| remedy.to_owned())
+        .filter(|remedy| remedy.starts_with("give "))
 }
 
-/// What happens where the way ends.
-#[derive(Clone, Copy)]
-enum End<'a> {
-    /// What the type asks for is noted.
-    Ask(&'a RefCell<Option<Asked>>),
-    /// It gets a value, and why it refuses that is noted.
-    Give(&'a Value, &'a RefCell<Option<String>>),
-}
-
-/// A deserializer that has one value, and tables and lists with one entry each on the way to it.
+/// A deserializer that has tables and lists with one entry each, and notes what the type asks for where the way ends.
 #[derive(Clone, Copy)]
 struct Probe<'a> {
     way: &'a [Step],
-    end: End<'a>,
+    asked: &'a RefCell<Option<Asked>>,
 }
 
 impl<'a> Probe<'a> {
@@ -196,36 +195,24 @@ impl<'a> Probe<'a> {
         let (step, way) = self.way.split_first()?;
         let name = match step {
             Step::Key(name) => name,
-            Step::Element => "element",
+            Step::Element | Step::Entry => "element",
         };
         Some((name, Self { way, ..self }))
     }
 
-    fn arrive<'de, V: Visitor<'de>>(self, asked: Asked, visitor: V) -> Result<V::Value, Error> {
-        match self.end {
-            _ if !self.way.is_empty() => Err(Error::custom("there is no such way")),
-            End::Ask(note) => {
-                note.replace(Some(asked));
-                Err(Error::custom("this is all that was to be known"))
-            }
-            End::Give(value, told) => {
-                let given = match asked {
-                    Asked::Choice(names) => value.clone().deserialize_enum("", names, visitor),
-                    _ => value.clone().deserialize_any(visitor),
-                };
-                given.map_err(|error| {
-                    told.replace(Some(error.message().to_owned()));
-                    Error::custom(error.message())
-                })
-            }
+    /// There is never more than is asked: always an error.
+    fn arrive<T>(self, asked: Asked) -> Result<T, Error> {
+        if self.way.is_empty() {
+            self.asked.replace(Some(asked));
         }
+        Err(Error::custom("there is only what is asked"))
     }
 }
 
 macro_rules! plain {
     ($($method:ident: $asked:ident)*) => {$(
-        fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
-            self.arrive(Asked::$asked, visitor)
+        fn $method<V: Visitor<'de>>(self, _visitor: V) -> Result<V::Value, Error> {
+            self.arrive(Asked::$asked)
         }
     )*};
 }
@@ -246,8 +233,8 @@ impl<'de> Deserializer<'de> for Probe<'_> {
         visitor.visit_some(self)
     }
 
-    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
-        self.arrive(Asked::Any, visitor)
+    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, _visitor: V) -> Result<V::Value, Error> {
+        self.arrive(Asked::Any)
     }
 
     fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
@@ -257,14 +244,14 @@ impl<'de> Deserializer<'de> for Probe<'_> {
     fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
         match self.step() {
             Some((_, probe)) => visitor.visit_seq(One(Some((None, probe)))),
-            None => self.arrive(Asked::List, visitor),
+            None => self.arrive(Asked::List),
         }
     }
 
     fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, Error> {
         match self.step() {
             Some((_, probe)) => visitor.visit_seq(One(Some((None, probe)))),
-            None => self.arrive(Asked::Array(length), visitor),
+            None => self.arrive(Asked::Array(length)),
         }
     }
 
@@ -280,7 +267,7 @@ impl<'de> Deserializer<'de> for Probe<'_> {
     fn deserialize_map<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
         match self.step() {
             Some((name, probe)) => visitor.visit_map(One(Some((Some(name), probe)))),
-            None => self.arrive(Asked::Map, visitor),
+            None => self.arrive(Asked::Map),
         }
     }
 
@@ -292,7 +279,7 @@ impl<'de> Deserializer<'de> for Probe<'_> {
     ) -> Result<V::Value, Error> {
         match self.step() {
             Some((name, probe)) => visitor.visit_map(One(Some((Some(name), probe)))),
-            None => self.arrive(Asked::Table(names), visitor),
+            None => self.arrive(Asked::Table(names)),
         }
     }
 
@@ -300,9 +287,9 @@ impl<'de> Deserializer<'de> for Probe<'_> {
         self,
         _name: &'static str,
         names: &'static [&'static str],
-        visitor: V,
+        _visitor: V,
     ) -> Result<V::Value, Error> {
-        self.arrive(Asked::Choice(names), visitor)
+        self.arrive(Asked::Choice(names))
     }
 }
 

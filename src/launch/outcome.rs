@@ -13,6 +13,7 @@ use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::RoleId;
 use crate::serial::LineCounters;
+use crate::system::utc;
 use crate::telemetry::{
     Checkpoints, Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine,
     write_hgrm, write_hlog,
@@ -22,6 +23,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 /// Layout version of `summary.json`.
 const SCHEMA: &str = "corotate/summary/v1";
@@ -271,7 +273,7 @@ fn hashes(reports: &[RoleReport]) -> Vec<(&String, &Checkpoints)> {
 
 impl Summary {
     /// Draws up the summary of a run that began at `started`.
-    pub fn new(scenario: &Scenario, outcome: &Outcome, started: jiff::Timestamp) -> Self {
+    pub fn new(scenario: &Scenario, outcome: &Outcome, started: SystemTime) -> Self {
         let Judged { latencies, books, criteria, accepted, verdict } = Judged::new(scenario, outcome);
         Self {
             schema: SCHEMA,
@@ -282,7 +284,7 @@ impl Summary {
             clock: scenario.clock.name(),
             tick_hz: 1e9 / scenario.period_ns as f64,
             last_tick: scenario.last_tick,
-            started_utc: started.to_string(),
+            started_utc: utc(started),
             host: Host::this(),
             hosted: hosted(scenario),
             domain: outcome.domain.clone(),

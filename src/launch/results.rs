@@ -5,11 +5,12 @@
 
 use crate::config::RunId;
 use crate::files;
-use crate::system::random_bits;
+use crate::system::{random_bits, utc};
 use serde::Deserialize;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 /// The files of a run.
 pub(crate) const SUMMARY: &str = "summary.json";
@@ -63,14 +64,16 @@ const DIRECTORIES: u32 = 10_000;
 ///
 /// # Errors
 /// Those of the system, with the path.
-pub fn make_directory(given: Option<&Path>, name: &str, started: jiff::Timestamp) -> io::Result<PathBuf> {
+pub fn make_directory(given: Option<&Path>, name: &str, started: SystemTime) -> io::Result<PathBuf> {
     let named = |path: &Path, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     if let Some(path) = given {
         return files::create_directories(path).map(|()| path.to_owned()).map_err(|error| named(path, error));
     }
     let runs = Path::new(RUNS);
     files::create_directories(runs).map_err(|error| named(runs, error))?;
-    let stem = format!("{}-{name}", started.strftime("%Y%m%dT%H%M%SZ"));
+    // To the second, without what separates the parts.
+    let began = utc(started)[.."1970-01-01T00:00:00".len()].replace(['-', ':'], "");
+    let stem = format!("{began}Z-{name}");
     for attempt in 1..=DIRECTORIES {
         let path = runs.join(if attempt == 1 { stem.clone() } else { format!("{stem}-{attempt}") });
         match files::create_directory(&path) {

@@ -7,7 +7,7 @@
 //! Components are decoupled: the filter of each is scalar. Must not store φ itself, of which only increments are known:
 //! the state is the residual r = φ − φ̂.
 
-use super::{Increment, StepAgain};
+use super::{Increment, StepAgain, series};
 use crate::state::{Persist, Weights, Words, persist_fields};
 use nalgebra::SVector;
 
@@ -111,8 +111,8 @@ fn place(x: f64, damping: f64) -> (f64, f64) {
     let root = x * libm::sqrt((damping * damping - 1.0).abs());
     let potential = -libm::expm1(-2.0 * damping * x);
     let unknown = if damping < 1.0 {
-        let (fall, half) = (libm::expm1(-damping * x), libm::sin(0.5 * root));
-        fall * fall + 4.0 * (1.0 + fall) * half * half
+        let fall = libm::expm1(-damping * x);
+        fall * fall + 4.0 * (1.0 + fall) * series::sine_squared(0.5 * root)
     } else {
         libm::expm1(-damping * x + root) * libm::expm1(-damping * x - root)
     };

@@ -9,7 +9,7 @@ use crate::launch::make_directory;
 use indicatif::ProgressBar;
 use std::cell::RefCell;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 /// Options of `corotate bench`.
 #[derive(clap::Args)]
@@ -68,7 +68,7 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, String
         return Err((Exit::Usage, format!("there is no row `{name}`; there are {}", known.join(", "))));
     }
     let asked = |row: &&Row| arguments.rows.is_empty() || arguments.rows.iter().any(|name| name == row.name);
-    let started = jiff::Timestamp::now();
+    let started = SystemTime::now();
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner();

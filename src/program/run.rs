@@ -23,6 +23,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
+use std::time::SystemTime;
 
 /// Options of `corotate run`.
 #[derive(clap::Args, Default)]
@@ -240,7 +241,7 @@ fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str
 /// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
 fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failure> {
     let broken = |reason: String| Failure { exit: Exit::Failure, reason };
-    let started = jiff::Timestamp::now();
+    let started = SystemTime::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
     if arguments.out.is_some() {

@@ -13,7 +13,7 @@ use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicUsize;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// Options of `corotate sweep`.
 #[derive(clap::Args)]
@@ -171,7 +171,7 @@ fn directory(arguments: &Arguments, campaign: &Campaign) -> Result<PathBuf, Exit
             fail(Exit::Usage, &format!("--resume: {RUNS}/ has no results of this campaign `{name}`; begin without it"))
         });
     }
-    let made = make_directory(None, campaign.name(), jiff::Timestamp::now());
+    let made = make_directory(None, campaign.name(), SystemTime::now());
     made.map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory with --out")))
 }
 
@@ -316,7 +316,7 @@ fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -
     let run = new_run().map_err(|error| format!("no random numbers: {error}"))?;
     let scenario = Scenario { run: Some(run), record: true, ..scenario };
     claim(path).map_err(|error| error.to_string())?;
-    let (started, mut silent) = (jiff::Timestamp::now(), |_: &Progress<'_>| {});
+    let (started, mut silent) = (SystemTime::now(), |_: &Progress<'_>| {});
     let mut launch = Launch { record: Some(path.join("run.mcap")), ..Launch::new(signal, &mut silent) };
     let outcome = crate::launch::run(&scenario, &mut launch).map_err(|error| error.to_string())?;
     write_run(path, &scenario, &Summary::new(&scenario, &outcome, started)).map_err(|error| error.to_string())

@@ -8,10 +8,12 @@ use crate::bus::AnyBus;
 use crate::clock::monotonic_ns;
 use crate::config::Scenario;
 use crate::runtime::{RoleId, ports};
+use crate::system::utc;
 use crate::telemetry::{Host, RoleReport};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::time::SystemTime;
 use xxhash_rust::xxh3::xxh3_64;
 
 /// The recorder's name where a role would have its own.
@@ -244,7 +246,7 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
         ("clock", scenario.clock.name().to_owned()),
         ("period_ns", scenario.period_ns.to_string()),
         ("last_tick", scenario.last_tick.to_string()),
-        ("started_utc", jiff::Timestamp::now().to_string()),
+        ("started_utc", utc(SystemTime::now())),
         ("host", json(&host)),
     ];
     let run = scenario.run.map(|run| ("run", run.to_string()));
