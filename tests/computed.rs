@@ -122,7 +122,9 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
             assert_eq!(own["state"]["hash"], built_in["state"]["hash"], "{clock}");
         }
         assert!(clock == "realtime" || own["state"]["first_disturbed_tick"].is_null());
-        assert!(own["books"]["roles"]["controller"]["executed"].as_u64().unwrap() > 2000, "{own:#}");
+        // How many in real time is up to the machine.
+        let least = if clock == "realtime" { 0 } else { 2000 };
+        assert!(own["books"]["roles"]["controller"]["executed"].as_u64().unwrap() > least, "{own:#}");
         bench.assert_clean(&[domain]);
     }
 }

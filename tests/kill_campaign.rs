@@ -166,6 +166,8 @@ impl Case {
         };
         let fixed =
             ["run", &format!("{}.toml", self.scenario), "--json", "--out=out", "--set=accept={}"].map(str::to_owned);
+        // However long a loaded machine takes to start everybody.
+        let fixed = fixed.into_iter().chain(["--set=launch.startup_timeout_s=120".to_owned()]);
         fixed.into_iter().chain(clock).collect()
     }
 

@@ -324,7 +324,7 @@ fn what_a_recording_that_ended_early_has_not_is_no_difference() {
 fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
     let bench = Bench::new();
     for (clock, signal, ticks) in
-        [("realtime", SIGKILL, 2000), ("lockstep", SIGKILL, 60_000), ("lockstep", SIGSTOP, 60_000)]
+        [("realtime", SIGKILL, 8000), ("lockstep", SIGKILL, 60_000), ("lockstep", SIGSTOP, 60_000)]
     {
         let out = format!("{clock}-{signal}");
         let (duration, scenario) = ((ticks / 1000).to_string(), shipped("rigid-pair"));

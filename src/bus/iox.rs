@@ -414,6 +414,26 @@ mod tests {
     }
 
     #[test]
+    fn who_is_connected_gets_what_a_writer_sent_that_is_gone() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let (ours, theirs) = (bus(&domain), bus(&domain));
+        let [mut connected, mut other] = [0, 1].map(|_| theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap());
+        let mut writer = ours.writer::<RateTruth>(&topic(), 1).unwrap();
+        connected.refresh();
+        for tick in 0..5 {
+            writer.send(|sample| sample.stamp.tick = tick).unwrap();
+        }
+        drop((writer, ours));
+        let mut received = 0;
+        while connected.advance().unwrap() {
+            received += 1;
+        }
+        assert_eq!(received, 5);
+        // Why a recorder connects before the ticks run.
+        assert!(!other.advance().unwrap());
+    }
+
+    #[test]
     fn refuses_a_second_writer_and_another_type() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);

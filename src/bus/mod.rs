@@ -202,6 +202,7 @@ pub trait Read<S: ?Sized> {
     /// # Errors
     /// [`BusError::Receive`].
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
-    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    /// Connects to the writer that there is now, by the shortest way. Off the critical path. Who is connected gets what was sent
+    /// also when the writer is gone by then.
     fn refresh(&mut self);
 }

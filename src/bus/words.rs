@@ -43,6 +43,8 @@ pub trait ReadWords {
     /// # Errors
     /// [`BusError::Receive`].
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
+    /// Connects to the writer that there is now, as [`Read::refresh`].
+    fn refresh(&mut self);
 }
 
 /// A writing end.
@@ -126,6 +128,10 @@ impl<T: Read<S>, S: Carried + ?Sized> ReadWords for End<T, S> {
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
         self.0.sleep(until_ns)
+    }
+
+    fn refresh(&mut self) {
+        self.0.refresh();
     }
 }
 

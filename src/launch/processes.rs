@@ -300,8 +300,9 @@ impl<'a> Supervisor<'a> {
             if !self.tell(waiting, scorer, launch) {
                 return Ok(false);
             }
+            let recorder = self.recorder.has_reached(state)?;
             let watchers =
-                [(RECORDER, self.recorder.ready()?), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
+                [(RECORDER, recorder), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
             if let Some(incident) = self.relay.supervise(self.scenario, 0).into_iter().next() {
                 return Err(LaunchError::Died {
                     role: incident.role,

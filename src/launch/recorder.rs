@@ -76,11 +76,11 @@ impl RecorderWatch {
         Ok(())
     }
 
-    /// Whether the ticks may run; how it failed if they never will.
-    pub fn ready(&mut self) -> Result<bool, LaunchError> {
+    /// Whether it has come to a state before the ticks; how it failed if it never will.
+    pub fn has_reached(&mut self, state: RoleState) -> Result<bool, LaunchError> {
         let Some(process) = &mut self.process else { return Ok(true) };
         process.require_alive(RECORDER)?;
-        Ok(self.state() >= RoleState::Ready)
+        Ok(self.state() >= state)
     }
 
     /// The last tick that has been seen by whoever must see every one, if it is `scored` without the recorder and the last

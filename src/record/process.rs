@@ -28,6 +28,8 @@ const LULL_NS: u64 = 50_000;
 const WORD_NS: u64 = 20_000_000;
 /// In lockstep: a word after so many ticks.
 const CREDIT_TICKS: u64 = 8;
+/// Before ordinary processes, where that is granted: it must not lose samples because something is being compiled.
+const NICENESS: i32 = -10;
 /// The run is over when nothing has come for so long after its stop, ns; and for so long it may still come.
 const QUIET_NS: u64 = 100_000_000;
 const LEAVE_NS: u64 = 3_000_000_000;
@@ -47,8 +49,8 @@ pub struct RecorderSeat {
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join_whole(&seat.domain)?;
-    // Not nice to ordinary processes: it must not lose samples because something is being compiled.
-    let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
+    let (bus, mut line, mut recorder) =
+        join_at_low_priority(&scenario, NICENESS, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended =
@@ -84,23 +86,27 @@ fn follow(
     let (mut backoff, mut whole) = (Backoff::default(), false);
     loop {
         let schedule = line.hear()?;
-        let phase = Phase::from_number(schedule.phase);
-        whole |= schedule.stamp.generation > 0 && phase < Phase::Run;
         // Before the first word nothing is known.
+        let phase = Some(Phase::from_number(schedule.phase)).filter(|_| schedule.stamp.generation > 0);
+        if phase == Some(Phase::WarmUp) && !whole {
+            // Every writer is open. In lockstep a short run may be over before the first look at its samples.
+            recorder.connect();
+            whole = true;
+        }
         line.say(if whole { RoleState::Ready } else { RoleState::Open }, 0)?;
         match phase {
-            Phase::Run if whole => {
+            Some(Phase::Run) if whole => {
                 recorder.start(schedule.epoch_ns, None)?;
                 break;
             }
-            Phase::Run => {
+            Some(Phase::Run) => {
                 line.say(RoleState::Running, JOINING)?;
                 // Heard after that is said: what is sent beyond it is little enough to be kept.
                 let from_tick = line.hear()?.credit_tick;
                 recorder.start(schedule.epoch_ns, Some(from_tick))?;
                 break;
             }
-            Phase::Stop => return Ok(()),
+            Some(Phase::Stop) => return Ok(()),
             _ if end() => return Ok(()),
             _ => sleep_until(monotonic_ns() + LOOK_NS / 5),
         }

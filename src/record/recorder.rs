@@ -151,6 +151,11 @@ impl Recorder {
         })
     }
 
+    /// Connects to every writer that there is now: what these send is taken even if they are gone by then.
+    pub fn connect(&mut self) {
+        self.taps.connect();
+    }
+
     /// Begins the file, once the epoch of the ticks is known: 0 where there is no time. If ticks have run, `joined` is
     /// the first that is taken.
     ///

@@ -183,6 +183,11 @@ impl Taps {
         (self.grid.epoch_ns, self.joined) = (epoch_ns, joined);
     }
 
+    /// Connects to every writer that there is now: what these send is taken even if they are gone by then.
+    pub fn connect(&mut self) {
+        self.taps.iter_mut().for_each(|tap| tap.reader.refresh());
+    }
+
     /// Announces every signal.
     ///
     /// # Errors

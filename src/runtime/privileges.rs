@@ -126,7 +126,8 @@ fn set_fifo(priority: i32) -> io::Result<()> {
     set_scheduler(libc::SCHED_FIFO, priority)
 }
 
-/// Opens links to a loop that may be running, for a process that no role waits for, and gives way to everybody from then on.
+/// Opens links to a loop that may be running, for a process that no role waits for, and yields to all roles from then on: at this
+/// niceness, off their cores.
 pub fn join_at_low_priority<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() -> T) -> T {
     let opened = with_realtime_priority(open);
     yield_cores(scenario, niceness);
@@ -155,7 +156,7 @@ pub fn go_before_roles(scenario: &Scenario) {
     }
 }
 
-/// Lets everybody pass, and leaves the cores that the scenario names for roles. What is not granted is no harm.
+/// Takes a niceness, and leaves the cores that the scenario names for roles. What is not granted is no harm.
 fn yield_cores(scenario: &Scenario, niceness: i32) {
     let _ = nice(niceness);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {

@@ -35,8 +35,16 @@ struct Run {
 }
 
 impl Run {
+    /// A host is silent for longer than usual on a loaded machine: where no time is given, that is no silence.
     fn new(hosts: &[(&'static str, &'static [&'static str])], keys: &str, tables: &str) -> Self {
         let sites = sites(hosts.len());
+        let patient = "[network]\nsilence_timeout_s = 60.0";
+        let tables = match tables {
+            "" => patient.to_owned(),
+            given if given.contains("silence_timeout_s") => given.to_owned(),
+            given => given.replacen("[network]", patient, 1),
+        };
+        let tables = &tables;
         let file = scenario(&sites[0].bench.path(""), hosts, keys, tables);
         Self { file, port: free_port(), hosts: hosts.iter().map(|(name, _)| *name).collect(), sites }
     }
@@ -245,9 +253,9 @@ fn a_cut_of_a_second_is_told_and_outlived() {
     let over = summary(&done);
     assert_eq!((done.code, joined.code), (Some(0), Some(0)), "{done:?} {joined:?}");
     let silences = over["hosts"]["hosts"][0]["silences"].as_array().unwrap();
-    assert_eq!(silences[0]["of"], "flight");
-    assert_eq!(silences[0]["healed"], true);
-    assert!(silences[0]["seconds"].as_f64().unwrap() >= 0.7, "{silences:?}");
+    assert!(silences.iter().all(|silence| silence["of"] == "flight" && silence["healed"] == true), "{silences:?}");
+    // On a loaded machine there are shorter ones beside that of the cut.
+    assert!(silences.iter().any(|silence| silence["seconds"].as_f64().unwrap() >= 0.7), "{silences:?}");
     assert!(over["books"]["roles"]["follower"]["safe"].as_u64().unwrap() > 0, "the follower goes safe by itself");
     let last = over["books"]["roles"]["follower"]["elapsed"].as_u64().unwrap();
     assert_eq!(last, over["last_tick"].as_u64().unwrap() + 1);

@@ -168,5 +168,8 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
         self.notifier.sleep(until_ns, news)
     }
 
-    fn refresh(&mut self) {}
+    fn refresh(&mut self) {
+        // What is wrong with the writer is told by the next look.
+        let _ = self.subscriber.update_connections();
+    }
 }

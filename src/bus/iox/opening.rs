@@ -116,6 +116,10 @@ impl From<PublishSubscribeOpenOrCreateError> for Refusal {
         use PublishSubscribeCreateError as Create;
         use PublishSubscribeOpenOrCreateError as Error;
         match error {
+            // What is not there is made: it has not been for so long that somebody else was making it.
+            Error::PublishSubscribeOpenError(PublishSubscribeOpenError::DoesNotExist) => {
+                Self::new(error, Passes::WhenFinished)
+            }
             Error::PublishSubscribeOpenError(error) => error.into(),
             Error::PublishSubscribeCreateError(
                 Create::Interrupt
