@@ -301,8 +301,7 @@ impl<'a> Supervisor<'a> {
                 return Ok(false);
             }
             let recorder = self.recorder.has_reached(state)?;
-            let watchers =
-                [(RECORDER, recorder), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
+            let watchers = [(RECORDER, recorder), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
             if let Some(incident) = self.relay.supervise(self.scenario, 0).into_iter().next() {
                 return Err(LaunchError::Died {
                     role: incident.role,

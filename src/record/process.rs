@@ -49,8 +49,7 @@ pub struct RecorderSeat {
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join_whole(&seat.domain)?;
-    let (bus, mut line, mut recorder) =
-        join_at_low_priority(&scenario, NICENESS, || open(seat, &domain, &scenario))?;
+    let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, NICENESS, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended =

@@ -291,10 +291,10 @@ fn a_cut_within_the_limit_heals() {
 /// Runs in real time over a way that is cut for so long once ticks run.
 fn cut(run: &Run, length: std::time::Duration, arguments: &[&str]) -> (Done, Done) {
     let proxy = run.proxy(1, Impairment { delay_us: 100, ..Impairment::default() });
-    let duration = if arguments.is_empty() { &["--duration", "8"][..] } else { arguments };
+    let duration = if arguments.is_empty() { &["--duration", "16"][..] } else { arguments };
     let launched = run.launch("udp", &[&CALM[..], &UNJUDGED, duration].concat());
     let joined = run.join(1, "udp", Some(proxy.port));
-    run.sites[1].bench.await_commits("controller", 100);
+    run.sites[1].bench.await_commits("controller", 20);
     proxy.cut(true);
     std::thread::sleep(length);
     proxy.cut(false);
