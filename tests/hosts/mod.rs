@@ -282,7 +282,8 @@ fn a_cut_within_the_limit_heals() {
     let (done, joined) = cut(&run, std::time::Duration::from_secs(10), &["--duration", "20"]);
     assert_eq!((done.code, joined.code), (Some(0), Some(0)), "{done:?} {joined:?}");
     let over = summary(&done);
-    assert!(over["hosts"]["hosts"][0]["silences"][0]["seconds"].as_f64().unwrap() >= 9.0);
+    let silences = over["hosts"]["hosts"][0]["silences"].as_array().unwrap();
+    assert!(silences.iter().any(|silence| silence["seconds"].as_f64().unwrap() >= 9.0), "{silences:?}");
     let hold = over["books"]["roles"]["follower"]["safe"].as_u64().unwrap();
     assert!(hold > 375, "{hold}");
     run.assert_clean();
