@@ -1,5 +1,5 @@
-//! The recorder as a process beside a loop: of no real-time priority once it has joined, and on no core that the scenario
-//! names for roles.
+//! The recorder as a process beside a loop: in real time of the least real-time priority, where granted, else of none; and on no
+//! core that the scenario names for roles.
 //!
 //! Must not keep a role waiting: what it cannot take in time is lost and told. In lockstep the launcher gives no credit
 //! beyond what it has taken.
@@ -12,8 +12,8 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
-    Backoff, RoleError, RoleId, depths, join_at_low_priority, join_whole, open_ledger, report, report_path, topic,
-    window_ticks, with_realtime_priority, write_whole,
+    Backoff, RoleError, RoleId, depths, go_before_ordinary, join_at_low_priority, join_whole, open_ledger, report,
+    report_path, topic, window_ticks, with_realtime_priority, write_whole,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::telemetry::RoleReport;
@@ -28,8 +28,6 @@ const LULL_NS: u64 = 50_000;
 const WORD_NS: u64 = 20_000_000;
 /// In lockstep: a word after so many ticks.
 const CREDIT_TICKS: u64 = 8;
-/// Before ordinary processes, where that is granted: it must not lose samples because something is being compiled.
-const NICENESS: i32 = -10;
 /// The run is over when nothing has come for so long after its stop, ns; and for so long it may still come.
 const QUIET_NS: u64 = 100_000_000;
 const LEAVE_NS: u64 = 3_000_000_000;
@@ -49,8 +47,12 @@ pub struct RecorderSeat {
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
     let (domain, scenario) = join_whole(&seat.domain)?;
-    let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, NICENESS, || open(seat, &domain, &scenario))?;
+    let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
+    if !lockstep {
+        // It must not lose samples because something is being compiled, and takes some 2 % of a core.
+        go_before_ordinary();
+    }
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended =
         follow(&mut recorder, &mut line, credit_ticks, &|| terminated.load(Ordering::Relaxed) || !domain.exists());

@@ -35,7 +35,7 @@ pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_byt
 pub(crate) use privileges::go_before_roles;
 pub use privileges::{Privileges, hold_low_latency_idle};
 pub(crate) use privileges::{
-    join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
+    go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
 pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};

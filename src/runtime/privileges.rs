@@ -139,11 +139,15 @@ pub fn join_at_low_priority<T>(scenario: &Scenario, niceness: i32, open: impl Fn
 /// A role that finds a link half made waits until it is whole, and must not wait for a process that others keep from going
 /// on.
 pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
-    // Not granted, it takes its chance; a role's priority is above this in any case.
-    let _ = set_fifo(1);
+    go_before_ordinary();
     let done = act();
     release();
     done
+}
+
+/// Goes before all ordinary processes, and behind all roles, from now on. Not granted, it takes its chance.
+pub fn go_before_ordinary() {
+    let _ = set_fifo(1);
 }
 
 /// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
