@@ -1,5 +1,5 @@
-//! The system: its errors in words, with what a user can do about them, its stderr, its time of day, and its randomness. Must not decide what
-//! becomes of the program.
+//! The system: its errors in words, with what a user can do about them, its stderr, its time of day, and its randomness. Must not
+//! decide what becomes of the program.
 
 use rustix::io::retry_on_intr;
 use rustix::rand::{GetRandomFlags, getrandom};

@@ -1,5 +1,5 @@
-//! The recorder as a process beside a loop: in real time of the least real-time priority, where granted, else of none; and on no
-//! core that the scenario names for roles.
+//! The recorder as a process beside a loop: in real time of the least real-time priority, where granted and below that of the
+//! roles, else of none; and on no core that the scenario names for roles.
 //!
 //! Must not keep a role waiting: what it cannot take in time is lost and told. In lockstep the launcher gives no credit
 //! beyond what it has taken.
@@ -49,8 +49,8 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     let (domain, scenario) = join_whole(&seat.domain)?;
     let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
-    if !lockstep {
-        // It must not lose samples because something is being compiled, and takes some 2 % of a core.
+    // It must not lose samples because something is being compiled, and must stay behind the roles.
+    if !lockstep && scenario.realtime.priority > 1 {
         go_before_ordinary();
     }
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));

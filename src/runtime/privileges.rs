@@ -145,7 +145,7 @@ pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
     done
 }
 
-/// Goes before all ordinary processes, and behind all roles, from now on. Not granted, it takes its chance.
+/// Goes before all ordinary processes from now on, behind roles of a higher priority. Not granted, it takes its chance.
 pub fn go_before_ordinary() {
     let _ = set_fifo(1);
 }
