@@ -279,7 +279,10 @@ fn sync_error(summary: &Value) -> f64 {
 }
 
 const LOCKSTEP: [&str; 6] = ["--clock", "lockstep", "--tick-hz", "100", "--duration", "10"];
-const REALTIME: [&str; 8] = ["--clock", "realtime", "--tick-hz", "100", "--duration", "8", "--set", "accept={}"];
+/// A loaded machine may keep a bridge from saying anything for seconds.
+const PATIENT: &str = "--set=supervision.heartbeat_timeout_s=60";
+const REALTIME: [&str; 9] =
+    ["--clock", "realtime", "--tick-hz", "100", "--duration", "8", "--set", "accept={}", PATIENT];
 
 /// The device computes with the same pure plant: nothing of the run tells that it sits behind a line.
 #[test]

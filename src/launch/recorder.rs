@@ -136,11 +136,12 @@ impl RecorderWatch {
         hosts: Option<&HostsSummary>,
     ) -> Option<RecordingReport> {
         let file = self.file.take()?;
-        self.process = None;
+        let late = self.process.take().is_some_and(|mut process| process.ended().is_none());
         let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
         let report = left.and_then(|bytes| serde_json::from_slice(&bytes).ok());
         let mut report: RecordingReport = report.unwrap_or_else(|| {
-            let problem = self.problem.unwrap_or_else(|| "it left no report".to_owned());
+            let how = if late { "it had not ended its file when it was ended" } else { "it left no report" };
+            let problem = self.problem.unwrap_or_else(|| how.to_owned());
             let (messages, bytes, signals) = (0, 0, Vec::new());
             RecordingReport { file, complete: false, whole: true, problem: Some(problem), messages, bytes, signals }
         });
