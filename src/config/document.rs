@@ -2,6 +2,7 @@
 //!
 //! Must not know what any key means.
 
+use super::reader::read;
 use super::{ConfigError, RunId, Shape};
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
@@ -206,10 +207,7 @@ impl Document {
     }
 
     fn read_once<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
-        read(Value::Table(self.table.clone())).map_err(|(path, message)| {
-            let path = path.to_string();
-            self.explain(if path == "." { String::new() } else { path }, &message)
-        })
+        read(&self.table).map_err(|(path, message)| self.explain(path, &message))
     }
 
     /// A mistake with those that are found once it is mended, and so on.
@@ -279,9 +277,7 @@ impl Document {
             if parent.is_empty() { field.to_owned() } else { format!("{parent}.{field}") }
         };
         if let Some((field, mut known)) = alternatives(message, "unknown field") {
-            // The path ends at the unknown field itself or at its table, by the kind of map.
-            let itself = path == field || path.ends_with(&format!(".{field}"));
-            let key = if itself { path } else { join(&path, field) };
+            let key = join(&path, field);
             if key == field {
                 known.extend(self.elsewhere.iter().map(String::as_str));
             }
@@ -365,7 +361,7 @@ fn plain(message: &str) -> String {
         "i32" | "i64" => "a whole number",
         "u64" | "usize" => "a whole number, not below 0",
         "a boolean" => "true or false",
-        "a string" | "string only" => "a text in quotes",
+        text if text == "a string" || text.starts_with("enum ") => "a text in quotes",
         "a sequence" if given == "a table" => "a list of tables, each under its name in double brackets",
         "a sequence" => "a list",
         "fewer elements in array" => "fewer values",
@@ -419,12 +415,6 @@ fn locate_value(value: &DeValue<'_>, path: &str, found: &mut impl FnMut(String, 
         }
         _ => {}
     }
-}
-
-/// Reads a value into a type; otherwise where that refuses it, and why.
-pub(super) fn read<T: DeserializeOwned>(value: Value) -> Result<T, (serde_path_to_error::Path, String)> {
-    serde_path_to_error::deserialize(value)
-        .map_err(|error| (error.path().clone(), error.inner().message().trim().to_owned()))
 }
 
 fn is_below(path: &str, key: &str) -> bool {

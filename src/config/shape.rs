@@ -2,12 +2,8 @@
 //!
 //! Must not know what any key means, nor need a word from the type beyond that it can be deserialized.
 
-use super::document::read;
-use serde::de::value::{Error, StrDeserializer};
-use serde::de::{
-    DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, SeqAccess, Visitor,
-};
-use std::cell::RefCell;
+use super::reader::{Asked, Step, asked, refusal};
+use serde::de::DeserializeOwned;
 use toml::Value;
 
 /// The most steps to a value: what lies deeper is of a type that holds itself.
@@ -82,45 +78,18 @@ impl Shape {
     }
 }
 
-/// A step on the way to a value.
-#[derive(Debug, Clone, Copy)]
-enum Step {
-    Key(&'static str),
-    /// Into a list.
-    Element,
-    /// Into a table of any keys.
-    Entry,
-}
-
-/// What the type asks for where the way ends.
-enum Asked {
-    Any,
-    Boolean,
-    Integer,
-    Count,
-    Number,
-    Text,
-    Choice(&'static [&'static str]),
-    List,
-    Array(usize),
-    Map,
-    Table(&'static [&'static str]),
-}
-
 /// The shape of what the type reads at the end of a way.
 fn at<T: DeserializeOwned>(way: &mut Vec<Step>) -> Shape {
     if way.len() > MAX_STEPS {
         return Shape::Any(None);
     }
-    let asked = RefCell::new(None);
-    let _ = T::deserialize(Probe { way, asked: &asked });
     let further = |way: &mut Vec<Step>, step| {
         way.push(step);
         let shape = at::<T>(way);
         way.pop();
         shape
     };
-    match asked.into_inner() {
+    match asked::<T>(way) {
         None => Shape::Any(None),
         Some(Asked::Any) => Shape::Any(choices::<T>(way)),
         Some(Asked::Boolean) => Shape::Boolean,
@@ -146,27 +115,15 @@ fn table<T: DeserializeOwned>(way: &mut Vec<Step>, names: &'static [&'static str
     let mut keys: Vec<Key> = names.iter().map(|name| key(*name)).collect();
     let mut given = toml::Table::new();
     // One after the other: only the first that is missing is complained of.
-    while let Some(name) = refusal::<T>(way, Value::Table(given.clone())).as_deref().and_then(missing) {
+    while let Some(name) = refusal::<T>(way, &Value::Table(given.clone())).as_deref().and_then(missing) {
         let Some(key) = keys.iter_mut().find(|key| key.name == name && !key.required) else { break };
         key.required = true;
         let Some(example) = key.shape.example() else { break };
         given.insert(name.to_owned(), example);
     }
     let stranger = toml::Table::from_iter([("?".to_owned(), Value::Integer(0))]);
-    let closed = refusal::<T>(way, Value::Table(stranger)).is_some_and(|reason| reason.contains("unknown field"));
+    let closed = refusal::<T>(way, &Value::Table(stranger)).is_some_and(|reason| reason.contains("unknown field"));
     Shape::Table { keys, closed }
-}
-
-/// Why a value is refused at the end of a way, if it is.
-fn refusal<T: DeserializeOwned>(way: &[Step], value: Value) -> Option<String> {
-    let whole = way.iter().rev().fold(value, |value, step| match step {
-        Step::Key(name) => Value::Table(toml::Table::from_iter([((*name).to_owned(), value)])),
-        Step::Element => Value::Array(vec![value]),
-        Step::Entry => Value::Table(toml::Table::from_iter([("element".to_owned(), value)])),
-    });
-    // What is missing around it is no refusal of it.
-    let (path, reason) = read::<T>(whole).err()?;
-    (path.iter().count() >= way.len()).then_some(reason)
 }
 
 /// The key in a message as "missing field `a`".
@@ -176,147 +133,10 @@ fn missing(reason: &str) -> Option<&str> {
 
 /// What a type that takes several kinds of values says to one that it does not take.
 fn choices<T: DeserializeOwned>(way: &[Step]) -> Option<String> {
-    refusal::<T>(way, Value::Boolean(true))?
+    refusal::<T>(way, &Value::Boolean(true))?
         .split_once("; ")
         .map(|(_, remedy)| remedy.to_owned())
         .filter(|remedy| remedy.starts_with("give "))
-}
-
-/// A deserializer that has tables and lists with one entry each, and notes what the type asks for where the way ends.
-#[derive(Clone, Copy)]
-struct Probe<'a> {
-    way: &'a [Step],
-    asked: &'a RefCell<Option<Asked>>,
-}
-
-impl<'a> Probe<'a> {
-    /// One step on, if there is one; a table of named keys has one only by its name.
-    fn step(self) -> Option<(&'static str, Self)> {
-        let (step, way) = self.way.split_first()?;
-        let name = match step {
-            Step::Key(name) => name,
-            Step::Element | Step::Entry => "element",
-        };
-        Some((name, Self { way, ..self }))
-    }
-
-    /// There is never more than is asked: always an error.
-    fn arrive<T>(self, asked: Asked) -> Result<T, Error> {
-        if self.way.is_empty() {
-            self.asked.replace(Some(asked));
-        }
-        Err(Error::custom("there is only what is asked"))
-    }
-}
-
-macro_rules! plain {
-    ($($method:ident: $asked:ident)*) => {$(
-        fn $method<V: Visitor<'de>>(self, _visitor: V) -> Result<V::Value, Error> {
-            self.arrive(Asked::$asked)
-        }
-    )*};
-}
-
-impl<'de> Deserializer<'de> for Probe<'_> {
-    type Error = Error;
-
-    plain! {
-        deserialize_any: Any deserialize_ignored_any: Any deserialize_unit: Any deserialize_bytes: Any
-        deserialize_byte_buf: Any deserialize_bool: Boolean
-        deserialize_i8: Integer deserialize_i16: Integer deserialize_i32: Integer deserialize_i64: Integer
-        deserialize_i128: Integer deserialize_u8: Count deserialize_u16: Count deserialize_u32: Count deserialize_u64: Count
-        deserialize_u128: Count deserialize_f32: Number deserialize_f64: Number
-        deserialize_char: Text deserialize_str: Text deserialize_string: Text deserialize_identifier: Text
-    }
-
-    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
-        visitor.visit_some(self)
-    }
-
-    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, _visitor: V) -> Result<V::Value, Error> {
-        self.arrive(Asked::Any)
-    }
-
-    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
-        visitor.visit_newtype_struct(self)
-    }
-
-    fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
-        match self.step() {
-            Some((_, probe)) => visitor.visit_seq(One(Some((None, probe)))),
-            None => self.arrive(Asked::List),
-        }
-    }
-
-    fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, Error> {
-        match self.step() {
-            Some((_, probe)) => visitor.visit_seq(One(Some((None, probe)))),
-            None => self.arrive(Asked::Array(length)),
-        }
-    }
-
-    fn deserialize_tuple_struct<V: Visitor<'de>>(
-        self,
-        _name: &'static str,
-        length: usize,
-        visitor: V,
-    ) -> Result<V::Value, Error> {
-        self.deserialize_tuple(length, visitor)
-    }
-
-    fn deserialize_map<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
-        match self.step() {
-            Some((name, probe)) => visitor.visit_map(One(Some((Some(name), probe)))),
-            None => self.arrive(Asked::Map),
-        }
-    }
-
-    fn deserialize_struct<V: Visitor<'de>>(
-        self,
-        _name: &'static str,
-        names: &'static [&'static str],
-        visitor: V,
-    ) -> Result<V::Value, Error> {
-        match self.step() {
-            Some((name, probe)) => visitor.visit_map(One(Some((Some(name), probe)))),
-            None => self.arrive(Asked::Table(names)),
-        }
-    }
-
-    fn deserialize_enum<V: Visitor<'de>>(
-        self,
-        _name: &'static str,
-        names: &'static [&'static str],
-        _visitor: V,
-    ) -> Result<V::Value, Error> {
-        self.arrive(Asked::Choice(names))
-    }
-}
-
-/// The one entry of a table or a list; its key is taken first.
-struct One<'a>(Option<(Option<&'static str>, Probe<'a>)>);
-
-impl<'de> MapAccess<'de> for One<'_> {
-    type Error = Error;
-
-    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Error> {
-        let name = self.0.as_mut().and_then(|(name, _)| name.take());
-        let key = |name: &'static str| -> StrDeserializer<'static, Error> { name.into_deserializer() };
-        name.map(|name| seed.deserialize(key(name))).transpose()
-    }
-
-    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Error> {
-        let (_, probe) = self.0.take().ok_or_else(|| Error::custom("there is one entry"))?;
-        seed.deserialize(probe)
-    }
-}
-
-impl<'de> SeqAccess<'de> for One<'_> {
-    type Error = Error;
-
-    fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Error> {
-        self.0.take().map(|(_, probe)| seed.deserialize(probe)).transpose()
-    }
 }
 
 #[cfg(test)]

@@ -3,12 +3,12 @@
 //! Must not do anything that a [`Rig`] of its own could not.
 
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
-use crate::config::{Checks, ConfigError, Document};
+use crate::config::{Checks, ConfigError, Document, keys_of};
 use crate::role::{Body, Estimator, Guard, Law, SingleBody};
 use crate::sample::{Field, FieldKind, Message, Sample};
 use crate::state::{Persist, Words};
-use serde::de::{DeserializeOwned, Deserializer, Visitor, value::Error};
-use serde::{Serialize, forward_to_deserialize_any};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use std::borrow::Cow;
 
 /// A leader and a follower, or whatever [`bodies`](Self::bodies) says, of one kind.
@@ -190,7 +190,7 @@ impl<R: SimpleRig> Rig for R {
     const LISTS: &'static [&'static str] = R::LISTS;
 
     fn tables() -> Vec<&'static str> {
-        fields_of::<R>().iter().copied().filter(|field| !R::LISTS.contains(field)).collect()
+        keys_of::<R>().iter().copied().filter(|field| !R::LISTS.contains(field)).collect()
     }
 
     fn resolve(
@@ -276,39 +276,5 @@ impl<R: SimpleRig> Rig for R {
 
     fn pictures() -> Vec<Picture> {
         <R as SimpleRig>::pictures()
-    }
-}
-
-/// The names of a struct's fields, as serde has them; none of what is no struct.
-fn fields_of<T: DeserializeOwned>() -> &'static [&'static str] {
-    let mut fields: &'static [&'static str] = &[];
-    // It gives nothing but the names, so there is always an error.
-    let _ = T::deserialize(Names(&mut fields));
-    fields
-}
-
-/// Asks a type for the names of its fields.
-struct Names<'a>(&'a mut &'static [&'static str]);
-
-impl<'de> Deserializer<'de> for Names<'_> {
-    type Error = Error;
-
-    fn deserialize_any<V: Visitor<'de>>(self, _visitor: V) -> Result<V::Value, Error> {
-        Err(serde::de::Error::custom("only names are asked for"))
-    }
-
-    fn deserialize_struct<V: Visitor<'de>>(
-        self,
-        _name: &'static str,
-        fields: &'static [&'static str],
-        visitor: V,
-    ) -> Result<V::Value, Error> {
-        *self.0 = fields;
-        self.deserialize_any(visitor)
-    }
-
-    forward_to_deserialize_any! {
-        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf option unit unit_struct
-        newtype_struct seq tuple tuple_struct map enum identifier ignored_any
     }
 }

@@ -1,0 +1,408 @@
+//! The one deserializer that types of scenarios are read by: from a value, noting the way to what they refuse; or from
+//! nothing, noting what they ask for. Each type is compiled for it alone.
+//!
+//! Must not know what any key means.
+
+use serde::de::value::Error;
+use serde::de::{
+    DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, SeqAccess, Visitor,
+};
+use std::cell::RefCell;
+use std::iter::Enumerate;
+use std::slice;
+use toml::{Table, Value, map};
+
+/// A step on the way to a value in a type.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Step {
+    Key(&'static str),
+    /// Into a list.
+    Element,
+    /// Into a table of any keys.
+    Entry,
+}
+
+/// What a type asks for.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Asked {
+    Any,
+    Boolean,
+    Integer,
+    Count,
+    Number,
+    Text,
+    Choice(&'static [&'static str]),
+    List,
+    Array(usize),
+    Map,
+    Table(&'static [&'static str]),
+}
+
+/// Reads a table into a type; otherwise the key of what the type refuses, as `a.b[0]`, and why.
+pub(super) fn read<T: DeserializeOwned>(table: &Table) -> Result<T, (String, String)> {
+    let notes = Notes::default();
+    let reader = Reader { source: Source::Table(table), notes: &notes, depth: 0 };
+    T::deserialize(reader).map_err(|error| (notes.path(), error.to_string()))
+}
+
+/// What a type asks for at the end of a way.
+pub(super) fn asked<T: DeserializeOwned>(way: &[Step]) -> Option<Asked> {
+    let notes = Notes::default();
+    // There is never more than is asked: always an error.
+    let _ = T::deserialize(Reader { source: Source::at_end(way, None), notes: &notes, depth: 0 });
+    notes.asked.into_inner()
+}
+
+/// The names of a struct's fields, as serde has them; none of what is no struct.
+pub(crate) fn keys_of<T: DeserializeOwned>() -> &'static [&'static str] {
+    match asked::<T>(&[]) {
+        Some(Asked::Table(names)) => names,
+        _ => &[],
+    }
+}
+
+/// Why a type refuses a value at the end of a way, if it does. What it misses around the value is no refusal of it.
+pub(super) fn refusal<T: DeserializeOwned>(way: &[Step], value: &Value) -> Option<String> {
+    let notes = Notes::default();
+    let error = T::deserialize(Reader { source: Source::at_end(way, Some(value)), notes: &notes, depth: 0 }).err()?;
+    (notes.steps.borrow().len() >= way.len()).then(|| error.to_string())
+}
+
+/// What is noted while a type reads.
+#[derive(Default)]
+struct Notes {
+    /// The steps to what is being read; to what was refused, once something was.
+    steps: RefCell<Vec<String>>,
+    asked: RefCell<Option<Asked>>,
+}
+
+impl Notes {
+    /// The key that they lead to.
+    fn path(&self) -> String {
+        self.steps.borrow().concat().trim_start_matches('.').to_owned()
+    }
+}
+
+/// What there is to be read.
+#[derive(Clone, Copy)]
+enum Source<'a> {
+    Table(&'a Table),
+    List(&'a [Value]),
+    Plain(&'a Value),
+    /// A table or a list of one entry: a step on a way, what follows it, and what is at the end.
+    Step(&'a Step, &'a [Step], Option<&'a Value>),
+    /// The type is only asked.
+    Nothing,
+}
+
+impl<'a> Source<'a> {
+    fn of(value: &'a Value) -> Self {
+        match value {
+            Value::Table(table) => Self::Table(table),
+            Value::Array(list) => Self::List(list),
+            plain => Self::Plain(plain),
+        }
+    }
+
+    fn at_end(way: &'a [Step], end: Option<&'a Value>) -> Self {
+        match (way, end) {
+            ([step, way @ ..], end) => Self::Step(step, way, end),
+            ([], Some(value)) => Self::of(value),
+            ([], None) => Self::Nothing,
+        }
+    }
+}
+
+/// The deserializer.
+#[derive(Clone, Copy)]
+struct Reader<'a> {
+    source: Source<'a>,
+    notes: &'a Notes,
+    /// How many steps lead to it.
+    depth: usize,
+}
+
+impl Reader<'_> {
+    /// Reads what there is; notes what is asked for if that is nothing.
+    fn give<'de, V: Visitor<'de>>(self, asked: Asked, visitor: V) -> Result<V::Value, Error> {
+        let (rest, length) = match self.source {
+            Source::Table(table) => (Rest::Table(table.iter()), None),
+            Source::List(list) => (Rest::List(list.iter().enumerate()), Some(list.len())),
+            Source::Step(step, way, end) => {
+                let one = |name| Rest::One(Some((name, Source::at_end(way, end))));
+                match (step, asked) {
+                    (Step::Key(name), Asked::Table(_)) => (one(name), None),
+                    (Step::Entry, Asked::Map) => (one("element"), None),
+                    (Step::Element, Asked::List | Asked::Array(_)) => (one("element"), Some(1)),
+                    _ => return Err(Error::custom("the way does not lead on")),
+                }
+            }
+            Source::Plain(Value::String(text)) => return visitor.visit_str(text),
+            Source::Plain(Value::Integer(number)) => return visitor.visit_i64(*number),
+            Source::Plain(Value::Float(number)) => return visitor.visit_f64(*number),
+            Source::Plain(Value::Boolean(flag)) => return visitor.visit_bool(*flag),
+            // A name may look like a date; tables and lists are never plain.
+            Source::Plain(date) => return visitor.visit_str(&date.to_string()),
+            Source::Nothing => {
+                self.notes.asked.replace(Some(asked));
+                return Err(Error::custom("there is only what is asked"));
+            }
+        };
+        let mut entries = Entries { rest, value: None, notes: self.notes, depth: self.depth };
+        let Some(length) = length else { return visitor.visit_map(entries) };
+        let read = visitor.visit_seq(&mut entries)?;
+        match entries.rest.next() {
+            Some(_) => Err(Error::invalid_length(length, &"fewer elements in array")),
+            None => Ok(read),
+        }
+    }
+}
+
+macro_rules! plain {
+    ($($method:ident: $asked:ident)*) => {$(
+        fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+            self.give(Asked::$asked, visitor)
+        }
+    )*};
+}
+
+impl<'de> Deserializer<'de> for Reader<'_> {
+    type Error = Error;
+
+    plain! {
+        deserialize_any: Any deserialize_ignored_any: Any deserialize_unit: Any deserialize_bytes: Any
+        deserialize_byte_buf: Any deserialize_bool: Boolean
+        deserialize_i8: Integer deserialize_i16: Integer deserialize_i32: Integer deserialize_i64: Integer
+        deserialize_i128: Integer deserialize_u8: Count deserialize_u16: Count deserialize_u32: Count deserialize_u64: Count
+        deserialize_u128: Count deserialize_f32: Number deserialize_f64: Number
+        deserialize_char: Text deserialize_str: Text deserialize_string: Text deserialize_identifier: Text
+    }
+
+    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+        visitor.visit_some(self)
+    }
+
+    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
+        self.give(Asked::Any, visitor)
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
+        visitor.visit_newtype_struct(self)
+    }
+
+    fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+        self.give(Asked::List, visitor)
+    }
+
+    fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, Error> {
+        self.give(Asked::Array(length), visitor)
+    }
+
+    fn deserialize_tuple_struct<V: Visitor<'de>>(
+        self,
+        _name: &'static str,
+        length: usize,
+        visitor: V,
+    ) -> Result<V::Value, Error> {
+        self.deserialize_tuple(length, visitor)
+    }
+
+    fn deserialize_map<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+        self.give(Asked::Map, visitor)
+    }
+
+    fn deserialize_struct<V: Visitor<'de>>(
+        self,
+        _name: &'static str,
+        names: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, Error> {
+        self.give(Asked::Table(names), visitor)
+    }
+
+    /// A choice is a word, without anything below.
+    fn deserialize_enum<V: Visitor<'de>>(
+        self,
+        _name: &'static str,
+        names: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, Error> {
+        match self.source {
+            Source::Plain(Value::String(word)) => visitor.visit_enum(word.as_str().into_deserializer()),
+            _ => self.give(Asked::Choice(names), visitor),
+        }
+    }
+}
+
+/// The entries of a table or a list.
+struct Entries<'a> {
+    rest: Rest<'a>,
+    /// Of the entry whose key has been read.
+    value: Option<(String, Source<'a>)>,
+    notes: &'a Notes,
+    depth: usize,
+}
+
+/// What of them has not been read.
+enum Rest<'a> {
+    Table(map::Iter<'a, String, Value>),
+    List(Enumerate<slice::Iter<'a, Value>>),
+    One(Option<(&'static str, Source<'a>)>),
+}
+
+impl<'a> Iterator for Rest<'a> {
+    /// Key, step to be noted, and what is there.
+    type Item = (&'a str, String, Source<'a>);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        match self {
+            Self::Table(rest) => rest.next().map(|(key, value)| (key.as_str(), format!(".{key}"), Source::of(value))),
+            Self::List(rest) => rest.next().map(|(index, value)| ("", format!("[{index}]"), Source::of(value))),
+            Self::One(rest) => rest.take().map(|(key, source)| (key, format!(".{key}"), source)),
+        }
+    }
+}
+
+impl<'a> Entries<'a> {
+    fn next(&mut self) -> Option<(&'a str, String, Source<'a>)> {
+        self.notes.steps.borrow_mut().truncate(self.depth);
+        self.rest.next()
+    }
+
+    /// Reads what is a step further in; the note of the step stays if that is refused.
+    fn enter<'de, S: DeserializeSeed<'de>>(
+        &self,
+        step: String,
+        source: Source<'_>,
+        seed: S,
+    ) -> Result<S::Value, Error> {
+        self.notes.steps.borrow_mut().push(step);
+        let read = seed.deserialize(Reader { source, notes: self.notes, depth: self.depth + 1 })?;
+        self.notes.steps.borrow_mut().truncate(self.depth);
+        Ok(read)
+    }
+}
+
+impl<'de> MapAccess<'de> for Entries<'_> {
+    type Error = Error;
+
+    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Error> {
+        let Some((key, step, source)) = self.next() else { return Ok(None) };
+        self.value = Some((step, source));
+        let key: serde::de::value::StrDeserializer<'_, Error> = key.into_deserializer();
+        seed.deserialize(key).map(Some)
+    }
+
+    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Error> {
+        let (step, source) = self.value.take().ok_or_else(|| Error::custom("a key comes before its value"))?;
+        self.enter(step, source, seed)
+    }
+}
+
+impl<'de> SeqAccess<'de> for &mut Entries<'_> {
+    type Error = Error;
+
+    fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Error> {
+        let Some((_, step, source)) = self.next() else { return Ok(None) };
+        self.enter(step, source, seed).map(Some)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde::Deserialize;
+    use std::collections::BTreeMap;
+
+    #[derive(Debug, Deserialize)]
+    #[serde(rename_all = "kebab-case")]
+    enum Kind {
+        OneWay,
+    }
+
+    #[derive(Debug, Deserialize)]
+    #[serde(untagged)]
+    enum Either {
+        Matrix([[f64; 2]; 2]),
+        Word(String),
+    }
+
+    #[derive(Debug, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Inner {
+        kind: Kind,
+        either: Either,
+        pair: Option<[f64; 2]>,
+    }
+
+    #[derive(Debug, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Outer {
+        name: String,
+        count: u64,
+        inner: Vec<Inner>,
+        #[serde(default)]
+        limits: BTreeMap<String, f64>,
+    }
+
+    const TEXT: &str = "name = 'a'\ncount = 3\nlimits = { x = 1 }\n\
+        inner = [{ kind = 'one-way', either = [[1, 2.5], [3, 4]] }, { kind = 'one-way', either = 'w', pair = [1, 2] }]";
+
+    fn read_text(text: &str) -> Result<Outer, (String, String)> {
+        read(&toml::from_str(text).unwrap())
+    }
+
+    #[test]
+    fn reads_what_there_is() {
+        let Outer { name, count, inner, limits } = read_text(TEXT).unwrap();
+        assert_eq!((&*name, count, limits["x"]), ("a", 3, 1.0));
+        let [first, second] = &inner[..] else { panic!("there are two") };
+        assert!(matches!((&first.kind, &first.either), (Kind::OneWay, Either::Matrix([[1.0, 2.5], [3.0, 4.0]]))));
+        assert!(matches!((&second.either, second.pair), (Either::Word(word), Some([1.0, 2.0])) if word == "w"));
+        assert!(matches!((first.pair, &second.kind), (None, Kind::OneWay)));
+    }
+
+    #[test]
+    fn tells_where_and_why_it_refuses() {
+        for (from, to, path, reason) in [
+            ("count = 3", "count = -3", "count", "invalid value: integer `-3`, expected u64"),
+            ("count = 3", "count = 1979-05-27", "count", "invalid type: string \"1979-05-27\", expected u64"),
+            (
+                "count = 3",
+                "counts = 3",
+                "",
+                "unknown field `counts`, expected one of `name`, `count`, `inner`, `limits`",
+            ),
+            ("count = 3\n", "", "", "missing field `count`"),
+            ("x = 1", "x = 'a'", "limits.x", "invalid type: string \"a\", expected f64"),
+            ("'w'", "1", "inner[1].either", "data did not match any variant of untagged enum Either"),
+            // What one variant refused is not where the next field is.
+            ("pair = [1, 2]", "pair = [1, true]", "inner[1].pair[1]", "invalid type: boolean `true`, expected f64"),
+            (
+                "pair = [1, 2]",
+                "pair = [1, 2, 3]",
+                "inner[1].pair",
+                "invalid length 3, expected fewer elements in array",
+            ),
+            ("pair = [1, 2]", "pair = [1]", "inner[1].pair", "invalid length 1, expected an array of length 2"),
+            ("pair = [1, 2]", "pear = 1", "inner[1]", "unknown field `pear`, expected one of `kind`, `either`, `pair`"),
+            (
+                "'one-way', either = 'w'",
+                "'way', either = 'w'",
+                "inner[1].kind",
+                "unknown variant `way`, expected `one-way`",
+            ),
+            (
+                "'one-way', either = 'w'",
+                "2, either = 'w'",
+                "inner[1].kind",
+                "invalid type: integer `2`, expected enum Kind",
+            ),
+            ("inner = [", "inner = [2, ", "inner[0]", "invalid type: integer `2`, expected struct Inner"),
+        ] {
+            assert!(TEXT.contains(from), "{from}");
+            let refused = read_text(&TEXT.replace(from, to)).unwrap_err();
+            assert_eq!(refused, (path.to_owned(), reason.to_owned()), "{to}");
+        }
+    }
+}
