@@ -497,8 +497,8 @@ impl<'a> Supervisor<'a> {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);
         }
-        // Whoever takes samples stays until nobody sends any more, and the recorder until its file is written, however slow the
-        // disk is; the relay, as long as it waits for other hosts.
+        // Whoever takes samples stays until nobody sends any more; the recorder until its file is written, which a busy disk may
+        // hold up; the relay, as long as it waits for other hosts.
         let begun_ns = monotonic_ns();
         let within = |limit_ns: u64| monotonic_ns() - begun_ns < limit_ns;
         while self.foxglove.lingers() && within(END_LIMIT.as_nanos() as u64)
