@@ -352,6 +352,28 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
     }
 }
 
+/// As a busy disk keeps it: more than 5 s, in which it would be given up were it a role.
+#[test]
+fn a_recorder_that_is_long_about_its_end_is_waited_for() {
+    let bench = Bench::new();
+    let words = ["run", "rigid-pair", "--record", "--clock", "realtime", "--duration", "2", "--out", "out"];
+    let patient = ["--set", "accept={}", "--set", "supervision.heartbeat_timeout_s=60"];
+    let running = bench.start(&[&words[..], &patient].concat());
+    let domain = await_some(|| bench.domains().pop());
+    let (leader, recorder) = (bench.await_role("leader"), bench.await_role("record"));
+    bench.await_ticks("controller");
+    send_signal(recorder, SIGSTOP);
+    await_some(|| (!std::path::Path::new(&format!("/proc/{leader}")).exists()).then_some(()));
+    std::thread::sleep(std::time::Duration::from_secs(7));
+    send_signal(recorder, SIGCONT);
+    let done = running.wait();
+    // What it could not take while it stood still is lost and told; what it had is in the file, with its end.
+    let recording = &summary(&bench, "out")["recording"];
+    assert!(recording["messages"].as_u64().unwrap() > 0, "{recording}: {done:?}");
+    assert!(recording["bytes"].as_u64().unwrap() > 0, "{recording}: {done:?}");
+    bench.assert_clean(&[domain]);
+}
+
 /// Nothing is sent to whoever joins then, and the loop must not wait for it to take something.
 #[test]
 fn a_recorder_that_joins_a_loop_that_waits_for_credit_does_not_stop_it() {
