@@ -69,7 +69,7 @@ pub fn serve_peer(domain: &Path, scenario: &Scenario, observer: bool) -> Result<
     let mut ends = None;
     for line in std::io::stdin().lock().lines() {
         let line = line.map_err(|error| error.to_string())?;
-        let order: Order = serde_json::from_slice(line.as_bytes()).map_err(|error| error.to_string())?;
+        let order: Order = serde_json::from_str(&line).map_err(|error| error.to_string())?;
         ends.iter_mut().for_each(|(receiver, _): &mut (Receiver, _)| receiver.refresh());
         let answer = obey(&order, &domain, &mut ends).map_err(|error| error.to_string())?;
         if let (Some((receiver, _)), true) = (&mut ends, co_located.contains(&waits_for)) {
@@ -257,7 +257,7 @@ impl Peer {
 
     fn answer(&mut self) -> Result<Answer, BenchError> {
         let line = self.answers.recv_timeout(WATCHDOG).map_err(|_| BenchError::Peer("no answer".to_owned()))?;
-        serde_json::from_slice(line.as_bytes()).map_err(|error| BenchError::Peer(error.to_string()))
+        serde_json::from_str(&line).map_err(|error| BenchError::Peer(error.to_string()))
     }
 }
 

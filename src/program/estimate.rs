@@ -227,8 +227,7 @@ fn read_body(text: &str) -> Result<Body, String> {
         schema: String,
         body: Option<Found>,
     }
-    let printed: Printed =
-        serde_json::from_slice(text.as_bytes()).map_err(|error| format!("it has no body ({error})"))?;
+    let printed: Printed = serde_json::from_str(text).map_err(|error| format!("it has no body ({error})"))?;
     if printed.schema != "corotate/identify/v1" {
         return Err(format!("its schema is `{}`", printed.schema));
     }

@@ -443,9 +443,9 @@ impl EndInfo {
         Self {
             complete: text("complete") == "true",
             problem: text("problem").to_owned(),
-            signals: serde_json::from_slice(text("signals").as_bytes()).unwrap_or_default(),
-            ticks: serde_json::from_slice(text("ticks").as_bytes()).unwrap_or_default(),
-            privileges: serde_json::from_slice(text("privileges").as_bytes()).unwrap_or_default(),
+            signals: serde_json::from_str(text("signals")).unwrap_or_default(),
+            ticks: serde_json::from_str(text("ticks")).unwrap_or_default(),
+            privileges: serde_json::from_str(text("privileges")).unwrap_or_default(),
         }
     }
 }

@@ -192,10 +192,10 @@ impl Summary {
         struct Head {
             schema: String,
         }
-        let head: Head = serde_json::from_slice(text.as_bytes()).map_err(|error| error.to_string())?;
+        let head: Head = serde_json::from_str(text).map_err(|error| error.to_string())?;
         if head.schema != SCHEMA {
             return Err(format!("it is laid out as {}, and this version reads {SCHEMA}", head.schema));
         }
-        serde_json::from_slice(text.as_bytes()).map_err(|error| error.to_string())
+        serde_json::from_str(text).map_err(|error| error.to_string())
     }
 }

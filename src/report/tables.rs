@@ -363,7 +363,7 @@ fn told_of_loop(certificate: &super::summary::Certificate) -> String {
 pub fn machine(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let info = source.recording.as_ref().map(|recording| recording.info());
-    let told = |text: &String| serde_json::from_slice::<super::summary::Host>(text.as_bytes()).ok();
+    let told = |text: &String| serde_json::from_str::<super::summary::Host>(text).ok();
     let recorded = info.and_then(|info| told(&info.host));
     if let Some(host) = source.summary.as_ref().map(|summary| &summary.host).or(recorded.as_ref()) {
         blocks.push(Block::Text(format!("{}: {}, {} cores, {}.", host.name, host.cpu, host.cores, host.kernel)));
