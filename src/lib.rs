@@ -4,6 +4,7 @@
 //!
 //! | module | duty | builds without `runtime` |
 //! |---|---|---|
+//! | `vector` | reductions of vectors of a few components | yes, `no_std` |
 //! | [`model`] | bodies and their motion | yes, `no_std` |
 //! | [`observe`] | invariant relations and the filter that serves them all | yes, `no_std` |
 //! | [`identify`] | the inertia of a body from a log of its angular velocity | yes, `no_std` |
@@ -58,6 +59,7 @@ pub mod rate;
 pub mod role;
 pub mod sample;
 pub mod state;
+mod vector;
 
 #[cfg(feature = "serial")]
 pub mod serial;

@@ -21,6 +21,8 @@ pub(super) struct Chain<R: Rig> {
     commands: Vec<Command<R>>,
     truths: [Truth<R>; 2],
     estimate: Estimate<R>,
+    /// What the loop is to control of the truth, and of the estimate.
+    controlled: [Vec<&'static Field>; 2],
     tick: u64,
 }
 
@@ -45,6 +47,7 @@ impl<R: Rig> Chain<R> {
             commands: vec![Default::default(); delay_ticks as usize],
             truths: Default::default(),
             estimate: Default::default(),
+            controlled: [controlled::<R, Truth<R>>(), controlled::<R, Estimate<R>>()],
             tick: 0,
         }
     }
@@ -98,16 +101,14 @@ impl<R: Rig> Chain<R> {
     /// Every number of the driven body's motion and of the estimate at the last tick that the loop is to control.
     pub fn output(&self, out: &mut Vec<f64>) {
         out.clear();
-        let controlled = |field: &&Field| R::CONTROLLED.contains(&field.name);
-        numbers::<Truth<R>>().filter(controlled).for_each(|field| out.extend(values(self.truth(), field)));
-        numbers::<Estimate<R>>().filter(controlled).for_each(|field| out.extend(values(&self.estimate, field)));
+        self.controlled[0].iter().for_each(|field| out.extend(values(self.truth(), field)));
+        self.controlled[1].iter().for_each(|field| out.extend(values(&self.estimate, field)));
     }
 
     /// Every number of the observed body's motion that the loop is to control.
     pub fn observed(&self, out: &mut Vec<f64>) {
         out.clear();
-        let controlled = |field: &&Field| R::CONTROLLED.contains(&field.name);
-        numbers::<Truth<R>>().filter(controlled).for_each(|field| out.extend(values(&self.truths[0], field)));
+        self.controlled[0].iter().for_each(|field| out.extend(values(&self.truths[0], field)));
     }
 
     /// The driven body's coordinate that the loop does not control.
@@ -206,6 +207,10 @@ impl<R: Rig> Guards<R> {
 /// The fields of a sample that are numbers.
 fn numbers<S: Sample>() -> impl Iterator<Item = &'static Field> {
     S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64)
+}
+
+fn controlled<R: Rig, S: Sample>() -> Vec<&'static Field> {
+    numbers::<S>().filter(|field| R::CONTROLLED.contains(&field.name)).collect()
 }
 
 fn values<'a, S: Sample>(sample: &'a S, field: &Field) -> impl Iterator<Item = f64> + use<'a, S> {

@@ -2,6 +2,7 @@
 //!
 //! Must only report; whether a condition that fails is an error is for its reader to decide.
 
+use crate::vector::sum;
 use nalgebra::Vector3;
 
 /// A sampled axis with |k|·h above this answers visibly slower or rings; warned about well before it is unstable.
@@ -89,7 +90,7 @@ impl Certificate {
     pub fn lyapunov(&self, error: &Vector3<f64>, hidden_error: f64) -> (f64, f64) {
         let square = error.component_mul(error);
         let hidden = hidden_error * hidden_error;
-        (0.5 * (square.sum() + hidden), -self.slopes.dot(&square) - self.hidden_slope * hidden)
+        (0.5 * (sum(&square) + hidden), -self.slopes.dot(&square) - self.hidden_slope * hidden)
     }
 
     /// The condition of the sampled loop alone, which needs no observer: see the field of this name.

@@ -14,6 +14,7 @@
 
 use super::Condition;
 use crate::model::{CentralField, OrbitState};
+use crate::vector::zeros;
 use nalgebra::Vector2;
 
 /// Gains of the law, all positive.
@@ -66,7 +67,7 @@ impl OrbitHold {
     /// The thrust, du/s², that makes `body` move as the free `leader` does: same r, Vr and Vθ, at whatever angle.
     #[inline]
     pub fn to_leader(&self, leader: &OrbitState, body: &OrbitState, applied: &Vector2<f64>) -> Vector2<f64> {
-        self.limited(self.law(&self.ahead(leader, &Vector2::zeros()), &self.ahead(body, applied)))
+        self.limited(self.law(&self.ahead(leader, &zeros()), &self.ahead(body, applied)))
     }
 
     /// The thrust limit against what the law asks of `body`, without thrust so far, for the free reference `to`, du/s²: the
@@ -86,7 +87,7 @@ impl OrbitHold {
     /// The law without the limit, du/s².
     #[inline]
     fn law(&self, to: &OrbitState, body: &OrbitState) -> Vector2<f64> {
-        let free = |x: &OrbitState| self.field.derivative(&(*x).into(), &Vector2::zeros());
+        let free = |x: &OrbitState| self.field.derivative(&(*x).into(), &zeros());
         let (wanted, own, gains) = (free(to), free(body), &self.gains);
         Vector2::new(
             wanted.y - own.y - gains.radius_per_s2 * (body.r - to.r) - gains.radial_per_s * (body.vr - to.vr),
@@ -109,8 +110,8 @@ impl OrbitHold {
     #[inline]
     fn limited(&self, thrust: Vector2<f64>) -> Vector2<f64> {
         // A radius of zero or an overflow gives no direction to push in.
-        let finite = thrust.iter().all(|value| value.is_finite());
-        if finite { thrust.map(|value| value.clamp(-self.thrust_max, self.thrust_max)) } else { Vector2::zeros() }
+        let finite = thrust.x.is_finite() && thrust.y.is_finite();
+        if finite { thrust.map(|value| value.clamp(-self.thrust_max, self.thrust_max)) } else { zeros() }
     }
 }
 

@@ -3,6 +3,7 @@
 //! The printed law has the gain's sign reversed (with k < 0 it gives ė = −k e); this is the one that yields ė = k e.
 
 use crate::model::RigidBody;
+use crate::vector::zeros;
 use nalgebra::Vector3;
 
 /// Synchronising law for one follower: u_i = a_i(ω_j ω_k − p_j p_k) − gain_i (p_i − ω_i), gain = −k > 0.
@@ -74,7 +75,7 @@ impl Synchronizer {
     /// The reference alone, rad/s.
     #[inline]
     pub fn reference_ahead(&self, reference: Vector3<f64>) -> Vector3<f64> {
-        if self.lead_s > 0.0 { self.body.flow(&reference, &Vector3::zeros(), self.lead_s) } else { reference }
+        if self.lead_s > 0.0 { self.body.flow(&reference, &zeros(), self.lead_s) } else { reference }
     }
 
     /// The body that reference and follower are like.

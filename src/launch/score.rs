@@ -300,7 +300,8 @@ impl<R: Rig> Scoring<R> {
         self.rig.score(truth, fleet, estimate, &mut self.values);
         self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
         let time_s = tick as f64 * self.tick_s;
-        for (metric, &value) in self.score.metrics.iter_mut().zip(&self.values) {
+        for (index, metric) in self.score.metrics.iter_mut().enumerate() {
+            let value = self.values[index];
             metric.take(tick, value, &self.accept, time_s);
             metric.ise += if value.is_nan() { 0.0 } else { value * value * self.tick_s };
         }
@@ -402,6 +403,7 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
 
 impl DrivenBody {
     /// Judges one step by what is known of V now.
+    #[inline]
     fn judge(
         &mut self,
         tick: u64,

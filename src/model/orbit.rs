@@ -4,6 +4,7 @@
 //! where the model ends (at the central body's surface, far away, or where numbers do): the last good state comes back.
 
 use super::integrate;
+use crate::vector::amax;
 use nalgebra::{Vector2, Vector4};
 
 /// How far anything may change in one integration step, rad or part of the radius. One step then errs by less than a
@@ -217,7 +218,7 @@ impl CentralField {
     #[inline]
     fn longest_step_s(&self, x: &OrbitState, thrust: &Vector2<f64>) -> f64 {
         let speed = x.vr.abs().max(x.vtheta.abs()) / x.r;
-        let pull = (self.mu / (x.r * x.r)).max(thrust.amax()) / x.r;
+        let pull = (self.mu / (x.r * x.r)).max(amax(thrust)) / x.r;
         MAX_STEP_RAD / speed.max(libm::sqrt(pull))
     }
 }

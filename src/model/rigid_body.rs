@@ -1,6 +1,7 @@
 //! A rigid body turning about its centre of mass, in its principal axes: Euler's equations, \[D\](1)-(3), \[SZ\](1).
 
 use super::integrate;
+use crate::vector::amax;
 use nalgebra::Vector3;
 
 /// How far the body may turn in one integration step, rad. One step then errs by less than a rounding.
@@ -137,7 +138,7 @@ impl RigidBody {
 /// How fast a body may turn within `dt_s` under a held torque, rad/s, more or less.
 #[inline]
 pub(super) fn fastest_rad_s(rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> f64 {
-    rate.amax() + torque.amax() * dt_s
+    amax(rate) + amax(torque) * dt_s
 }
 
 /// Whether one integration step does for `dt_s`: most ticks, and told without a division.

@@ -6,6 +6,7 @@
 //! not use a step that is long enough for θ to have turned by π.
 
 use super::{Identification, Increment, RateSample};
+use crate::vector::zeros;
 use nalgebra::{Vector1, Vector3};
 
 /// The longest turn of the transverse component in one step that is safely told from its complement, rad (π is ambiguous).
@@ -112,7 +113,7 @@ impl Axisymmetric {
     fn increment(&self, to: &Spin, potential: f64, weight: f64) -> Increment<1> {
         let [vi, vj, _] = self.axes.map(|index| self.variance_rad2_s2[index]);
         let square = to.i * to.i + to.j * to.j;
-        let nothing = Vector1::zeros();
+        let nothing = zeros();
         Increment {
             variance: Vector1::new((to.j * to.j * vi + to.i * to.i * vj) / (square * square)),
             ..Increment::exact(Vector1::new(potential), weight, nothing, nothing)

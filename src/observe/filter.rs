@@ -6,6 +6,7 @@
 
 use super::Hurwitz;
 use crate::state::{Persist, Words};
+use crate::vector::zeros;
 use nalgebra::SVector;
 
 /// What an invariant relation learned about its unknown w over one step from 0 to h.
@@ -38,7 +39,7 @@ impl<const N: usize> Increment<N> {
         drift: SVector<f64, N>,
         moment: SVector<f64, N>,
     ) -> Self {
-        let [variance, drift_variance, drift_covariance] = [SVector::zeros(); 3];
+        let [variance, drift_variance, drift_covariance] = [zeros(); 3];
         let Span { length: weight, inverse: inverse_weight } = weight.into();
         Self {
             potential,

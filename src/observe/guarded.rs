@@ -99,7 +99,7 @@ impl GuardedKalman {
         for index in [(self.hidden + 1) % 3, (self.hidden + 2) % 3] {
             self.correct(index, to.rate_rad_s[index]);
         }
-        let [from, to] = [from, to].map(|sample| self.relation.regressor(sample));
+        let (from, to) = (self.relation.regressor(from), self.relation.regressor(to));
         let seen = self.relation.observe(&from, &to, dt_s, self.guard.estimate().x);
         match &seen {
             Observation::Seen(increment) => self.guard.step(increment),

@@ -383,7 +383,7 @@ impl HiddenRate {
     }
 
     fn unobservable(&self, from: &Regressor, to: &Regressor, interval: &Interval, estimate: f64) -> Observation {
-        let push = [from, to].map(|end| self.push(end, &from.torque));
+        let push = [self.push(from, &from.torque), self.push(to, &from.torque)];
         Observation::Unobservable { drift: Vector1::new(drift(from, to, push, interval, estimate).0) }
     }
 
@@ -490,7 +490,7 @@ impl HiddenRate {
         let turned = velocity(from, hidden[0]) - velocity(to, hidden[1]);
         let middle = 0.5 * Vector2::new(from.i + to.i, from.j + to.j) + dt_s / 8.0 * turned;
         let middle = self.gradient(&self.at(middle.into(), torque), share);
-        let ends_mean = torque_share([from, to].map(|end| self.gradient(end, share)), &torque);
+        let ends_mean = torque_share([self.gradient(from, share), self.gradient(to, share)], &torque);
         dt_s * (ends_mean + 2.0 * torque_share([middle; 2], &torque)) * (1.0 / 3.0)
     }
 

@@ -4,6 +4,7 @@
 //! nalgebra has it with `std` only: scaling, a Taylor polynomial, squaring. It needs no eigenvectors, so a defective matrix
 //! is no special case.
 
+use crate::vector::times;
 use core::fmt;
 use nalgebra::allocator::Allocator;
 use nalgebra::{Complex, Const, DefaultAllocator, DimDiff, DimSub, SMatrix, SVector, Schur, U1};
@@ -155,7 +156,7 @@ impl<const N: usize> Hurwitz<N> {
         if self.norm * weight > SHORT_NORM {
             return self.exp(weight) * error;
         }
-        SHORT_INVERSES.iter().fold(*error, |sum, inverse| error + self.matrix * sum * (weight * inverse))
+        SHORT_INVERSES.iter().fold(*error, |sum, inverse| error + times(&self.matrix, &sum) * (weight * inverse))
     }
 
     /// e^{𝒜W} for a finite `weight` W ≥ 0; the identity for 0.

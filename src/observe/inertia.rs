@@ -9,6 +9,7 @@
 //! Only the ratios of the moments of inertia can be known from a torque-free motion, or from torque over inertia.
 
 use super::{Increment, RateSample};
+use crate::vector::{product, sum, zeros};
 use nalgebra::Vector3;
 
 /// Below this mean of |ω1 ω2 ω3| over a step, (rad/s)³, a potential over a weight is rounding only.
@@ -114,7 +115,7 @@ impl InertiaRelation {
 
     #[inline]
     fn increment(&self, piece: &Piece, to: &RateSample) -> Increment<3> {
-        let nothing = Vector3::zeros();
+        let nothing = zeros();
         Increment {
             variance: to.rate_rad_s.map(|rate| rate * rate).component_mul(&self.variance_rad2_s2),
             ..Increment::exact(piece.potential, piece.weight, nothing, nothing)
@@ -191,7 +192,7 @@ impl Path {
         let sixth = self.dt_s * part * (1.0 / 6.0);
         // Simpson's rule, exact for the cubics themselves.
         let turned = (from + middle * 4.0 + to) * sixth;
-        let [first, central, last] = [from, middle, to].map(|rate| rate.product());
+        let (first, central, last) = (product(&from), product(&middle), product(&to));
         let weight = (first.abs() + 4.0 * central.abs() + last.abs()) * sixth;
         let sign = 1.0_f64.copysign(central);
         // From the difference, not as a difference of squares: the small change is what carries the information.
@@ -302,7 +303,7 @@ impl InertiaRatios {
     /// [`InertiaRatioError`] if the moments are not all positive and finite.
     pub fn new(a: &Vector3<f64>) -> Result<Self, InertiaRatioError> {
         // The definitions of a are three linear equations for I; these are the cross products of any two of them.
-        let forms = [
+        let [first, second, third] = [
             Vector3::new(1.0 - a.y, 1.0 + a.x, 1.0 + a.x * a.y),
             Vector3::new(1.0 + a.y * a.z, 1.0 - a.z, 1.0 + a.y),
             Vector3::new(1.0 + a.z, 1.0 + a.z * a.x, 1.0 - a.x),
@@ -310,10 +311,10 @@ impl InertiaRatios {
         let longer = |left: Vector3<f64>, right: Vector3<f64>| {
             if right.norm_squared() > left.norm_squared() { right } else { left }
         };
-        let moments = forms.into_iter().fold(Vector3::zeros(), longer);
+        let moments = longer(longer(first, second), third);
         let (second, third) = (moments.y / moments.x, moments.z / moments.x);
-        let closure = a.sum() + a.product();
-        let positive = moments.iter().all(|moment| *moment > 0.0);
+        let closure = sum(a) + product(a);
+        let positive = moments.x > 0.0 && moments.y > 0.0 && moments.z > 0.0;
         if positive && second.is_finite() && third.is_finite() && closure.is_finite() {
             Ok(Self { second, third, closure })
         } else {

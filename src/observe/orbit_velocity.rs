@@ -73,7 +73,7 @@ impl OrbitVelocity {
     pub fn observe(&self, from: &OrbitSample, to: &OrbitSample, dt_s: f64) -> Increment<2> {
         let thrust = &from.thrust;
         let ends = [self.end(from, thrust), self.end(to, thrust)];
-        let [g0, g1] = ends.map(|end| end.acceleration);
+        let (g0, g1) = (ends[0].acceleration, ends[1].acceleration);
         let potential = ends[1].radial * ends[1].r - ends[0].radial * ends[0].r;
         // The velocity at the ends if the acceleration were linear: wrong by the third order, in the slopes only.
         let mean = potential / dt_s;

@@ -9,6 +9,7 @@
 
 use super::{Increment, StepAgain, series};
 use crate::state::{Persist, Weights, Words, persist_fields};
+use crate::vector::zeros;
 use nalgebra::SVector;
 
 /// Second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
@@ -67,7 +68,7 @@ impl<const N: usize> SecondOrderFilter<N> {
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
-        self.residual = SVector::zeros();
+        self.residual = zeros();
     }
 
     #[inline(always)]
@@ -184,7 +185,7 @@ impl<const N: usize> KalmanFilter<N> {
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>, weight: f64) {
         self.estimate += drift;
-        self.residual = SVector::zeros();
+        self.residual = zeros();
         for (covariance, density) in self.covariance.iter_mut().zip(self.density.iter()) {
             *covariance = Covariance { potential: 0.0, slope: 0.0, rest: covariance.unknown() + density * weight };
         }

@@ -3,7 +3,8 @@
 use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
 use crate::state::{Persist, Words};
-use nalgebra::{SVector, Vector1, Vector3};
+use crate::vector::zeros;
+use nalgebra::{Vector1, Vector3};
 
 /// An identifier with its estimate.
 #[derive(Debug, Clone)]
@@ -100,6 +101,6 @@ fn take<const N: usize>(seen: Identification<N>, filter: &mut Filter<N>, excitat
         Identification::Ambiguous => status::UNOBSERVABLE,
     };
     // Nothing drifts; but a filter of second order must not take up the potential where it left it.
-    filter.predict(&SVector::zeros(), 0.0);
+    filter.predict(&zeros(), 0.0);
     blind
 }

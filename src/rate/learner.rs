@@ -10,6 +10,7 @@ use crate::observe::{HiddenRate, RateSample};
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
+use crate::vector::{amax, product, sum};
 use nalgebra::Vector3;
 
 /// The identifier's error counts as gone after so many decay times: e^−25 is 1e-11.
@@ -85,7 +86,7 @@ impl Learner {
     fn learn(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let to = seen(measurement);
         self.status = status::LEARNING;
-        self.fastest_rad_s = self.fastest_rad_s.max(to.rate_rad_s.amax());
+        self.fastest_rad_s = self.fastest_rad_s.max(amax(&to.rate_rad_s));
         // Over the step in which an axis comes back there is no increment: only one end of it is complete.
         if self.supplier.take().is_none() {
             self.status |= self.identifier.learn(&self.last, &to, dt_s);
@@ -134,7 +135,7 @@ impl Learner {
     /// Whether the coefficients can be relied on.
     fn settled(&self) -> bool {
         let a = self.identifier.coefficients();
-        self.identifier.decay_times() >= SETTLED_DECAYS && (a.sum() + a.product()).abs() < SETTLED_CLOSURE
+        self.identifier.decay_times() >= SETTLED_DECAYS && (sum(&a) + product(&a)).abs() < SETTLED_CLOSURE
     }
 
     fn rate(&self) -> Vector3<f64> {

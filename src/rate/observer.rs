@@ -9,6 +9,7 @@ use crate::observe::{
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
+use crate::vector::{product, sum};
 use nalgebra::{Vector1, Vector3};
 
 /// All components of a vector.
@@ -261,7 +262,7 @@ pub(crate) struct Knowledge {
 impl Knowledge {
     /// What these coefficients say.
     pub fn new(coefficients: Vector3<f64>) -> Self {
-        let closure = coefficients.sum() + coefficients.product();
+        let closure = sum(&coefficients) + product(&coefficients);
         let ratios = InertiaRatios::new(&coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
         Self { coefficients, closure, inertia_ratios: ratios }
     }

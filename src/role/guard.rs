@@ -103,9 +103,15 @@ impl<const N: usize> Plausible<N> {
             let bound = self.bounds.allowance[i] + change(&self.bounds, i, &self.believed, 1.0);
             valid >> i & 1 == 0 || self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
         };
-        if next && self.bounds.repeats == u64::MAX && (0..N).all(near) {
-            for i in (0..N).filter(|i| valid >> i & 1 == 1) {
-                self.believed[i] = values[i];
+        let mut all_near = next && self.bounds.repeats == u64::MAX;
+        for i in 0..N {
+            all_near = all_near && near(i);
+        }
+        if all_near {
+            for (i, &value) in values.iter().enumerate() {
+                if valid >> i & 1 == 1 {
+                    self.believed[i] = value;
+                }
             }
             (self.before, self.before_tick) = (*values, stamp.tick);
             return true;

@@ -9,6 +9,7 @@ use crate::rig::FilterDesign;
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use crate::state::persist_fields;
+use crate::vector::zeros;
 use nalgebra::Vector2;
 
 /// The bits of r and θ in a sample's `valid`.
@@ -45,6 +46,7 @@ impl Body for OrbitPlant {
     type Measurement = OrbitMeasurement;
     type Command = OrbitCommand;
 
+    #[inline]
     fn apply(&mut self, command: &OrbitCommand) -> bool {
         let usable = command.thrust_du_s2.iter().all(|value| value.is_finite());
         if usable {
@@ -57,6 +59,7 @@ impl Body for OrbitPlant {
         self.applied = Vector2::zeros();
     }
 
+    #[inline]
     fn truth(&self, status: u64, out: &mut OrbitTruth) {
         out.radius_du = self.state.r;
         out.angle_rad = self.state.theta;
@@ -65,6 +68,7 @@ impl Body for OrbitPlant {
         out.status = status | self.fault;
     }
 
+    #[inline]
     fn measure(&mut self, _tick: u64, status: u64, out: &mut OrbitMeasurement) {
         let noise = self.noise.sample();
         out.radius_du = self.state.r + noise[0];
@@ -77,6 +81,7 @@ impl Body for OrbitPlant {
     }
 
     /// Freezes for good at the last good state where the model ends.
+    #[inline]
     fn flow(&mut self, dt_s: f64) {
         if self.fault != 0 {
             return;
@@ -116,14 +121,16 @@ impl OrbitObserver {
     }
 
     /// The motion as estimated; at rest in the centre before anything was measured.
+    #[inline]
     fn estimate(&self) -> OrbitState {
         self.coasted.unwrap_or_else(|| {
-            let at = self.last.unwrap_or(OrbitSample { r: 0.0, theta: 0.0, thrust: Vector2::zeros() });
+            let at = self.last.unwrap_or(OrbitSample { r: 0.0, theta: 0.0, thrust: zeros() });
             let velocity = to_polar(at.theta, self.filter.estimate());
             OrbitState { r: at.r, vr: velocity.x, theta: at.theta, vtheta: velocity.y }
         })
     }
 
+    #[inline]
     fn seen(measurement: &OrbitMeasurement) -> OrbitSample {
         OrbitSample { r: measurement.radius_du, theta: measurement.angle_rad, thrust: measurement.applied_du_s2.into() }
     }
@@ -136,6 +143,7 @@ impl Estimator for OrbitObserver {
     type Estimate = OrbitEstimate;
 
     /// What a frozen body reports is no motion to learn from.
+    #[inline]
     fn usable(&self, measurement: &OrbitMeasurement) -> bool {
         let OrbitSample { r, theta, thrust } = Self::seen(measurement);
         measurement.valid & POSITION == POSITION
@@ -152,6 +160,7 @@ impl Estimator for OrbitObserver {
         self.status = status::INITIAL;
     }
 
+    #[inline]
     fn update(&mut self, measurement: &OrbitMeasurement, dt_s: f64) {
         let seen = Self::seen(measurement);
         if let Some(last) = &self.last {
@@ -170,6 +179,7 @@ impl Estimator for OrbitObserver {
         }
     }
 
+    #[inline]
     fn write(&self, status: u64, out: &mut OrbitEstimate) {
         // Without any measurement there is nothing that could be said, and no bit says that there was.
         let OrbitState { r, vr, theta, vtheta } = self.estimate();
@@ -211,6 +221,7 @@ impl OrbitLaw {
     }
 
     /// The thrust, or none to be asked for: a lost body, or nothing known of the leader yet.
+    #[inline]
     fn thrust(&self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement) -> Option<Vector2<f64>> {
         let sound = measurement.status & status::FAULT == 0 && estimate.valid & POSITION == POSITION;
         let body = state(measurement.radius_du, measurement.angle_rad, &measurement.velocity_du_s);
@@ -237,14 +248,18 @@ impl OrbitLaw {
     }
 
     /// A body one tick before a new command begins to act, and what acts in that tick: the law itself predicts the last.
+    #[inline]
     fn ahead(&self, tick: u64, body: OrbitState, applied: [f64; 2]) -> (OrbitState, Vector2<f64>) {
-        let on = |(body, acts): (OrbitState, Vector2<f64>), input: Option<&[f64; 2]>| {
-            (self.law.ahead(&body, &acts), input.map_or(acts, |input| (*input).into()))
-        };
-        self.in_flight.after(tick).fold((body, applied.into()), on)
+        let (mut body, mut acts) = (body, Vector2::from(applied));
+        for input in self.in_flight.after(tick) {
+            body = self.law.ahead(&body, &acts);
+            acts = input.map_or(acts, |input| (*input).into());
+        }
+        (body, acts)
     }
 }
 
+#[inline]
 fn state(r: f64, theta: f64, velocity: &[f64; 2]) -> OrbitState {
     OrbitState { r, vr: velocity[0], theta, vtheta: velocity[1] }
 }
@@ -256,6 +271,7 @@ impl Law for OrbitLaw {
     type Measurement = OrbitMeasurement;
     type Command = OrbitCommand;
 
+    #[inline]
     fn command(&mut self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement, out: &mut OrbitCommand) {
         out.thrust_du_s2 = self.thrust(estimate, measurement).unwrap_or_default().into();
         if let Some(sent) = self.in_flight.sent(measurement.stamp.tick) {

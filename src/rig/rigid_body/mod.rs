@@ -85,6 +85,7 @@ struct ControllerDesign {
 
 impl RigidBodyRig {
     /// The component that the observer supplies, 0 to 2; where there is none, any serves.
+    #[inline]
     fn supplied(&self) -> usize {
         self.supplied_axis.unwrap_or(3) - 1
     }
@@ -381,6 +382,7 @@ impl Rig for RigidBodyRig {
     }
 
     /// |p − ω| of the worst follower, of all bodies of fleets too, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
+    #[inline]
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a RateTruth>,
@@ -497,14 +499,15 @@ impl Rig for RigidBodyRig {
         self.notes.clone()
     }
 
+    #[inline]
     fn undisturbed(truth: &RateTruth) -> bool {
         truth.status & (status::HOLDING | status::SAFE) == 0
     }
 
+    #[inline]
     fn true_lyapunov(&self, leader: &RateTruth, follower: &RateTruth, estimate: &RateEstimate) -> Option<(f64, f64)> {
-        let [rate, own, estimated] =
-            [leader.omega_rad_s, follower.omega_rad_s, estimate.omega_rad_s].map(Vector3::from);
-        let hidden_error = rate[self.supplied()] - estimated[self.supplied()];
+        let (rate, own) = (Vector3::from(leader.omega_rad_s), Vector3::from(follower.omega_rad_s));
+        let hidden_error = rate[self.supplied()] - estimate.omega_rad_s[self.supplied()];
         Some(self.certificate?.lyapunov(&(own - rate), hidden_error))
     }
 

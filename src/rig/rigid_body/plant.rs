@@ -38,11 +38,13 @@ pub struct RatePlant {
 }
 
 impl RatePlant {
+    #[inline]
     fn acceleration(&self) -> Vector3<f64> {
         self.asked.component_div(&self.inertia_factor)
     }
 
     /// Bit i set: component i is measured at this tick.
+    #[inline]
     fn valid(&self, tick: u64) -> u64 {
         let dead = |outage: &&Outage| (outage.from_tick..outage.until_tick).contains(&tick);
         self.outages.iter().filter(dead).fold(self.measured, |valid, outage| valid & !(1 << outage.component))
@@ -56,9 +58,10 @@ impl Body for RatePlant {
     type Measurement = RateMeasurement;
     type Command = RateCommand;
 
+    #[inline]
     fn apply(&mut self, command: &RateCommand) -> bool {
         let asked = Vector3::from(command.acceleration_rad_s2);
-        let usable = asked.iter().all(|value| value.is_finite());
+        let usable = asked.x.is_finite() && asked.y.is_finite() && asked.z.is_finite();
         if usable {
             self.asked = asked;
         }
@@ -69,6 +72,7 @@ impl Body for RatePlant {
         self.asked = Vector3::zeros();
     }
 
+    #[inline]
     fn truth(&self, status: u64, out: &mut RateTruth) {
         out.omega_rad_s = self.rate.into();
         out.applied_rad_s2 = self.acceleration().into();
@@ -87,6 +91,7 @@ impl Body for RatePlant {
         out.status = status;
     }
 
+    #[inline]
     fn flow(&mut self, dt_s: f64) {
         self.rate = match &self.playback {
             Some(playback) => {
