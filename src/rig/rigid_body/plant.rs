@@ -83,8 +83,10 @@ impl Body for RatePlant {
     fn measure(&mut self, tick: u64, status: u64, out: &mut RateMeasurement) {
         let (valid, seen) = (self.valid(tick), self.rate + self.noise.sample());
         out.omega_rad_s = seen.into();
-        for component in (0..3).filter(|component| valid >> component & 1 == 0) {
-            out.omega_rad_s[component] = 0.0;
+        for (component, rate) in out.omega_rad_s.iter_mut().enumerate() {
+            if valid >> component & 1 == 0 {
+                *rate = 0.0;
+            }
         }
         out.applied_rad_s2 = self.asked.into();
         out.valid = valid;
