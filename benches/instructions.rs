@@ -2,8 +2,8 @@
 //! however noisy the machine is.
 //!
 //! `cargo bench --features hooks,foxglove,parquet,pdf,hosts --bench instructions` (the features of the tests: others inline
-//! differently) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs valgrind. The
-//! figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
+//! differently) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs
+//! valgrind. The figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 
 #[path = "contest/product.rs"]
 #[allow(dead_code, reason = "the contest uses all of it")]

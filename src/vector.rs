@@ -1,11 +1,11 @@
 //! Reductions of vectors of a few components, and a product with a matrix, as plain loops.
 //!
 //! nalgebra has them all, but over iterators and functions that are not marked inline: from another unit of code they are calls, and
-//! a step of the identifier took three times as long. Must give the same bits as nalgebra's.
+//! a step of the identifier took three times the instructions. Must give the same bits as nalgebra's.
 
 use nalgebra::{SMatrix, SVector};
 
-/// No component.
+/// Every component zero.
 #[inline]
 pub(crate) fn zeros<const N: usize>() -> SVector<f64, N> {
     SVector::from([0.0; N])

@@ -33,7 +33,7 @@ pub struct AxesFit {
 impl AxesFit {
     /// a1 + a2 + a3 + a1·a2·a3: zero for every body.
     pub fn closure(&self) -> f64 {
-        self.coefficients.sum() + self.coefficients.product()
+        crate::model::closure(&self.coefficients)
     }
 }
 

@@ -10,4 +10,4 @@ pub use fleet::flow_all;
 pub use integrate::{flow, rk4_step};
 pub use noise::{Noise, uniform};
 pub use orbit::{CentralField, CentralFieldError, OrbitFault, OrbitState};
-pub use rigid_body::{Inertia, InertiaError, RigidBody, euler};
+pub use rigid_body::{Inertia, InertiaError, RigidBody, closure, euler};

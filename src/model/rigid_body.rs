@@ -1,7 +1,7 @@
 //! A rigid body turning about its centre of mass, in its principal axes: Euler's equations, \[D\](1)-(3), \[SZ\](1).
 
 use super::integrate;
-use crate::vector::amax;
+use crate::vector::{amax, product, sum};
 use nalgebra::Vector3;
 
 /// How far the body may turn in one integration step, rad. One step then errs by less than a rounding.
@@ -91,6 +91,12 @@ impl Inertia {
     }
 }
 
+/// a1 + a2 + a3 + a1·a2·a3, zero for the coefficients a of every body: what it is for others says how little they are a body's.
+#[inline]
+pub fn closure(a: &Vector3<f64>) -> f64 {
+    sum(a) + product(a)
+}
+
 /// Right-hand side of Euler's equations, rad/s²: ω̇1 = a1 ω2 ω3 + u1 and cyclic, \[D\](2), (3).
 ///
 /// `a` are [`Inertia::coefficients`], `rate` in rad/s, `torque` is torque over inertia, rad/s².
@@ -171,7 +177,7 @@ mod tests {
     fn the_coefficients_satisfy_their_identity() {
         let a = Inertia::new([1.0, 2.0, 2.5]).unwrap().coefficients();
         assert_eq!(a, Vector3::new(-0.5, 0.75, -0.4));
-        assert!((a.sum() + a.product()).abs() < 1e-16);
+        assert!(closure(&a).abs() < 1e-16);
     }
 
     #[test]

@@ -9,7 +9,8 @@
 //! Only the ratios of the moments of inertia can be known from a torque-free motion, or from torque over inertia.
 
 use super::{Increment, RateSample};
-use crate::vector::{product, sum, zeros};
+use crate::model::closure;
+use crate::vector::{product, zeros};
 use nalgebra::Vector3;
 
 /// Below this mean of |ω1 ω2 ω3| over a step, (rad/s)³, a potential over a weight is rounding only.
@@ -313,7 +314,7 @@ impl InertiaRatios {
         };
         let moments = longer(longer(first, second), third);
         let (second, third) = (moments.y / moments.x, moments.z / moments.x);
-        let closure = sum(a) + product(a);
+        let closure = closure(a);
         let positive = moments.x > 0.0 && moments.y > 0.0 && moments.z > 0.0;
         if positive && second.is_finite() && third.is_finite() && closure.is_finite() {
             Ok(Self { second, third, closure })

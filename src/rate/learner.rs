@@ -6,11 +6,12 @@
 
 use super::identifier::Identifier;
 use super::observer::{ALL, HiddenObserver, Knowledge, filter, seen};
+use crate::model::closure;
 use crate::observe::{HiddenRate, RateSample};
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
-use crate::vector::{amax, product, sum};
+use crate::vector::amax;
 use nalgebra::Vector3;
 
 /// The identifier's error counts as gone after so many decay times: e^−25 is 1e-11.
@@ -135,7 +136,7 @@ impl Learner {
     /// Whether the coefficients can be relied on.
     fn settled(&self) -> bool {
         let a = self.identifier.coefficients();
-        self.identifier.decay_times() >= SETTLED_DECAYS && (sum(&a) + product(&a)).abs() < SETTLED_CLOSURE
+        self.identifier.decay_times() >= SETTLED_DECAYS && closure(&a).abs() < SETTLED_CLOSURE
     }
 
     fn rate(&self) -> Vector3<f64> {

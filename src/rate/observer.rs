@@ -1,7 +1,7 @@
 //! The observers: which components are measured, which one is supplied, and from what.
 
 use super::learner::Learner;
-use crate::model::RigidBody;
+use crate::model::{RigidBody, closure};
 use crate::observe::{
     Filter, GuardedKalman, HiddenRate, InertiaRatios, Interval, InvariantFilter, Observation, RateNoise, RateSample,
     Regressor,
@@ -9,7 +9,6 @@ use crate::observe::{
 use crate::role::Estimator;
 use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
-use crate::vector::{product, sum};
 use nalgebra::{Vector1, Vector3};
 
 /// All components of a vector.
@@ -262,7 +261,7 @@ pub(crate) struct Knowledge {
 impl Knowledge {
     /// What these coefficients say.
     pub fn new(coefficients: Vector3<f64>) -> Self {
-        let closure = sum(&coefficients) + product(&coefficients);
+        let closure = closure(&coefficients);
         let ratios = InertiaRatios::new(&coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
         Self { coefficients, closure, inertia_ratios: ratios }
     }

@@ -103,6 +103,7 @@ impl<const N: usize> Plausible<N> {
             let bound = self.bounds.allowance[i] + change(&self.bounds, i, &self.believed, 1.0);
             valid >> i & 1 == 0 || self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
         };
+        // Not `(0..N).all(near)`, which is a call per component: see `vector`.
         let mut all_near = next && self.bounds.repeats == u64::MAX;
         for i in 0..N {
             all_near = all_near && near(i);
