@@ -132,7 +132,7 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     // A signal is selected, and stands still while the loop goes on.
     terminal.press("Up");
     terminal.await_text(">follower/command");
-    terminal.await_text("acceleration_ra");
+    terminal.await_text("acceleration_rad_s2");
     terminal.press("Space");
     let paused = terminal.await_text("paused");
     std::thread::sleep(std::time::Duration::from_millis(500));
@@ -140,6 +140,10 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     assert_eq!(tick(&paused, "leader"), tick(&still, "leader"));
     terminal.press("Space");
     terminal.await_screen("ticks going on", |screen| tick(screen, "leader") > tick(&still, "leader"));
+
+    // Below the names are the fields of the marked signal; no line has a signal's name and a value.
+    let marked = terminal.screen();
+    assert!(line(&marked, "acceleration_rad_s2").len() == 4 && line(&marked, "omega_rad_s").is_empty(), "{marked}");
 
     // It follows the window's size.
     terminal.tmux(&["resize-window", "-x", "100", "-y", "40"]);

@@ -12,13 +12,16 @@ use ratatui::{Frame, Terminal};
 /// Below this nothing can be read.
 const MIN_WIDTH: u16 = 60;
 const MIN_HEIGHT: u16 = 12;
-/// Lines for roles and for events, at the most.
-const ROLES_MAX: usize = 8;
-const EVENTS_MAX: usize = 3;
-/// Columns of names and values beside a sparkline, of its scale, and of the list of signals.
+/// The height for which everything is laid out; higher screens show more roles and events.
+const USUAL_HEIGHT: u16 = 24;
+/// Lines for roles on a screen of the usual height, and the least number of lines for events and fields.
+const ROLES: u16 = 8;
+const EVENTS_MIN: u16 = 3;
+const FIELDS_MIN: u16 = 5;
+/// Columns of names and values beside a sparkline, of its scale, and of a field's name.
 const NAME_WIDTH: u16 = 24;
 const SCALE_WIDTH: u16 = 6;
-const SIGNALS_WIDTH: u16 = 26;
+const FIELD_WIDTH: usize = 26;
 /// Steps of a sparkline, more than any screen resolves.
 const STEPS: f64 = 1000.0;
 
@@ -34,26 +37,30 @@ pub fn draw(model: &Model, frame: &mut Frame<'_>) {
         frame.render_widget(Paragraph::new(text), area);
         return;
     }
-    let roles = model.roles.len().min(ROLES_MAX) as u16;
+    let roles = (model.roles.len() as u16).min(ROLES + area.height.saturating_sub(USUAL_HEIGHT) / 2);
     // Two lines per sparkline where there is room.
-    let fixed = 1 + (1 + roles) + 1 + (1 + EVENTS_MAX as u16) + 6 + 1;
+    let fixed = 1 + (1 + roles) + 1 + (1 + EVENTS_MIN) + (1 + FIELDS_MIN) + 1;
     let series = model.series.len() as u16;
     let lines = if area.height >= fixed + 2 * series { 2 } else { 1 };
+    // All fields of the selected signal where there is room; events have the rest.
+    let others = 1 + (1 + roles) + (1 + lines * series) + 1;
+    let fields = model.signals.get(model.selected).map_or(0, |signal| signal.fields.len() as u16).max(FIELDS_MIN);
+    let events = area.height.saturating_sub(others + 1 + fields).max(1 + EVENTS_MIN);
     let [head, role_area, series_area, event_area, signal_area, foot] = Layout::vertical([
         Constraint::Length(1),
         Constraint::Length(1 + roles),
         Constraint::Length(1 + lines * series),
-        Constraint::Length(1 + EVENTS_MAX as u16),
+        Constraint::Length(events),
         Constraint::Min(2),
         Constraint::Length(1),
     ])
     .areas(area);
     frame.render_widget(header(model), head);
-    frame.render_widget(Paragraph::new(role_lines(model)), role_area);
+    frame.render_widget(Paragraph::new(role_lines(model, usize::from(roles))), role_area);
     let series_area = section("errors, log scale; the largest of each stretch", series_area, frame);
     draw_series(model, lines, frame, series_area);
     draw_events(model, frame, event_area);
-    let signal_area = section("signals", signal_area, frame);
+    let signal_area = section(&signal_title(model, usize::from(area.width)), signal_area, frame);
     draw_signals(model, frame, signal_area);
     frame.render_widget(Line::styled("q quit  space pause  up/down/tab signal  left/right fields", DIM), foot);
 }
@@ -97,12 +104,12 @@ fn header(model: &Model) -> Line<'static> {
     ])
 }
 
-fn role_lines(model: &Model) -> Vec<Line<'static>> {
+fn role_lines(model: &Model, room: usize) -> Vec<Line<'static>> {
     let titles = format!(
         "{:<14} {:<7} {:>4} {:>9} {:>7} {:>6} {:>13} {:>13}",
         "role", "state", "life", "tick", "Hz", "missed", "due-sent us", "in-sent us"
     );
-    let hidden = model.roles.len().saturating_sub(ROLES_MAX);
+    let hidden = model.roles.len().saturating_sub(room);
     let shown = model.roles.len() - if hidden > 0 { hidden + 1 } else { 0 };
     let more = (hidden > 0).then(|| Line::styled(format!("... and {} more", hidden + 1), DIM));
     std::iter::once(Line::styled(titles, DIM)).chain(model.roles[..shown].iter().map(role_line)).chain(more).collect()
@@ -184,29 +191,42 @@ fn draw_events(model: &Model, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
+/// The names of the signals, the selected one marked, as many as fit beside each other.
+fn signal_title(model: &Model, width: usize) -> String {
+    let room = width.saturating_sub(" signals (999): ... ... ".len());
+    let names: Vec<String> = model.signals.iter().map(|signal| cut(&signal.name, room)).collect();
+    let length = |from: usize, to: usize| names[from..to].iter().map(|name| name.chars().count() + 2).sum::<usize>();
+    let selected = model.selected.min(names.len().saturating_sub(1));
+    let first = (0..=selected).find(|first| length(*first, names.len().min(selected + 1)) <= room).unwrap_or(selected);
+    let end = (selected + 1..=names.len()).rev().find(|end| length(first, *end) <= room).unwrap_or(names.len());
+    let marked = |(index, name): (usize, &String)| format!("{}{name} ", if index == selected { ">" } else { " " });
+    let shown: String = names.iter().enumerate().take(end).skip(first).map(marked).collect();
+    let more = |hidden: bool| if hidden { "..." } else { "" };
+    let title = format!("signals ({}): {}{shown}{}", names.len(), more(first > 0), more(end < names.len()));
+    title.trim_end().to_owned()
+}
+
+/// The fields of the selected signal, which the title names.
 fn draw_signals(model: &Model, frame: &mut Frame<'_>, area: Rect) {
-    let [list, fields] = Layout::horizontal([Constraint::Length(SIGNALS_WIDTH), Constraint::Min(10)]).areas(area);
-    let height = usize::from(list.height);
-    let first = (model.selected + 1).saturating_sub(height);
-    let name = |(index, signal): (usize, &super::SignalLine)| {
-        let (mark, style) = if index == model.selected { (">", BOLD) } else { (" ", Style::new()) };
-        Line::styled(format!("{mark}{}", cut(&signal.name, usize::from(SIGNALS_WIDTH) - 2)), style)
-    };
-    let names = model.signals.iter().enumerate().skip(first).take(height).map(name);
-    frame.render_widget(Paragraph::new(names.collect::<Vec<_>>()), list);
     let Some(selected) = model.signals.get(model.selected) else { return };
-    let field = |(name, value): &(String, String)| Line::raw(format!("{:<17} {value}", cut(name, 17)));
+    let field =
+        |(name, value): &(String, String)| Line::raw(format!(" {:<FIELD_WIDTH$} {value}", cut(name, FIELD_WIDTH)));
     let lines: Vec<Line<'_>> = match selected.fields.as_slice() {
-        [] => vec![Line::styled("no sample yet", DIM)],
+        [] => vec![Line::styled(" no sample yet", DIM)],
         fields => fields.iter().skip(model.scroll).map(field).collect(),
     };
-    frame.render_widget(Paragraph::new(lines), fields);
+    frame.render_widget(Paragraph::new(lines), area);
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::{Event, SignalLine};
     use super::*;
+
+    fn signal(name: &str, omega_rad_s: &str) -> SignalLine {
+        let fields = [("tick", "1234"), ("omega_rad_s", omega_rad_s)];
+        SignalLine { name: name.to_owned(), fields: fields.map(|(name, value)| (name.into(), value.into())).to_vec() }
+    }
 
     fn model() -> Model {
         let mut leader = RoleLine::new("leader");
@@ -223,13 +243,7 @@ mod tests {
             roles: vec![leader, RoleLine::new("a-follower-with-a-long-name")],
             series: vec![error, Series::new("estimate_error_rad_s")],
             events: [Event { tick: 1200, text: "leader is back, in its life 2".to_owned() }].into(),
-            signals: vec![SignalLine {
-                name: "leader/truth".to_owned(),
-                fields: vec![
-                    ("tick".to_owned(), "1234".to_owned()),
-                    ("omega_rad_s".to_owned(), "+1.0000e0".to_owned()),
-                ],
-            }],
+            signals: vec![signal("leader/measurement", "+1.0000e0"), signal("leader/truth", "+2.0000e0")],
             ..Model::default()
         }
     }
@@ -246,14 +260,44 @@ mod tests {
             "1e0",
             "1e-10",
             "     1200  leader is back, in its life 2",
-            ">leader/truth             tick              1234",
-            "omega_rad_s       +1.0000e0",
+            " signals (2): >leader/measurement  leader/truth ─",
+            " tick                       1234",
+            " omega_rad_s                +1.0000e0",
             "q quit",
         ] {
             assert!(text.contains(word), "{word}\n{text}");
         }
         assert_eq!(text.lines().count(), 24);
         assert!(text.lines().all(|line| line.chars().count() <= 80));
+    }
+
+    /// The values below the names of the signals are those of the marked one, and beside a value stands no signal's name.
+    #[test]
+    fn fields_are_those_of_the_marked_signal() {
+        let mut model = model();
+        for (selected, value, other) in [(0, "+1.0000e0", "+2.0000e0"), (1, "+2.0000e0", "+1.0000e0")] {
+            model.selected = selected;
+            let text = text(&model, 80, 24);
+            assert!(text.contains(&format!(">{}", model.signals[selected].name)), "{text}");
+            assert_eq!(
+                text.lines().find(|line| line.contains("omega")),
+                Some(&*format!(" omega_rad_s                {value}"))
+            );
+            assert!(!text.contains(other), "{text}");
+        }
+    }
+
+    /// What a high screen has more of are events, and no line between the sections is empty while there are more.
+    #[test]
+    fn events_have_the_height_that_there_is() {
+        let mut model = model();
+        model.events = (0..24).map(|tick| Event { tick, text: format!("event of {tick}") }).collect();
+        for (height, shown) in [(24, 7), (30, 13), (40, 23), (41, 24), (50, 24)] {
+            let text = text(&model, 120, height);
+            assert_eq!(text.matches("event of").count(), shown, "{text}");
+            assert!(text.contains("event of 23") && text.contains("+1.0000e0") && text.contains("q quit"), "{text}");
+            assert!(shown == 24 || text.lines().filter(|line| line.is_empty()).count() == 3, "{text}");
+        }
     }
 
     /// A falling error falls on the screen: the bars get no higher from left to right.
@@ -277,7 +321,9 @@ mod tests {
             let text = text(&model, width, height);
             assert_eq!(text.lines().count(), usize::from(height));
             assert!(
-                width < 80 || height < 24 || text.contains(">f77/truth") && text.contains("... and 33 more"),
+                width < 80
+                    || height < 24
+                    || text.contains(">f77/truth") && text.contains("... and 33 more") == (height == 24),
                 "{text}"
             );
         }
