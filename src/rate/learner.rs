@@ -4,8 +4,8 @@
 //! Its modes are explicit and told in the status word. Must not jump when an axis goes or comes back, and must stay bounded
 //! when it goes too early.
 
+use super::hidden::{ALL, HiddenObserver, Knowledge, filter, seen};
 use super::identifier::Identifier;
-use super::observer::{ALL, HiddenObserver, Knowledge, filter, seen};
 use crate::model::closure;
 use crate::observe::{HiddenRate, RateSample};
 use crate::role::Estimator;

@@ -3,14 +3,16 @@
 //! Which components are measured, which one is supplied and from what is decided here; the mathematics is in `model`, `observe`
 //! and `control`. Must not know a scenario.
 
+mod hidden;
 mod identifier;
 mod law;
 mod learner;
 mod observer;
 
+#[cfg(feature = "runtime")]
+pub(crate) use hidden::ALL;
+pub use hidden::HiddenObserver;
 pub use identifier::Identifier;
 pub use law::{RateLaw, RateLawDesign};
 pub use learner::{Learner, Parts};
-#[cfg(feature = "runtime")]
-pub(crate) use observer::ALL;
-pub use observer::{HiddenObserver, KalmanObserver, RateObserver};
+pub use observer::{KalmanObserver, RateObserver};
