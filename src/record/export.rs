@@ -6,15 +6,16 @@
 mod csv;
 #[cfg(feature = "parquet")]
 mod parquet;
+mod table;
 #[cfg(feature = "parquet")]
 pub(crate) use parquet::RowGroups;
 
+use self::table::Table;
 use super::RecordError;
-use super::layout::Layout;
 use super::reader::{Recording, SignalInfo};
 use crate::files;
-use crate::sample::{FieldKind, Stamp};
-use std::fs::{File, Permissions};
+use crate::sample::Stamp;
+use std::fs::Permissions;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -46,21 +47,6 @@ pub enum ExportError {
     },
 }
 
-/// A table in the making.
-trait Table: Sized {
-    /// How its file's name ends.
-    const EXTENSION: &'static str;
-
-    /// Begins the table of a signal.
-    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
-
-    /// Adds a row: the bits of every column.
-    fn row(&mut self, bits: &[u64]) -> io::Result<()>;
-
-    /// Writes what is left.
-    fn end(self) -> io::Result<()>;
-}
-
 /// Writes every signal as CSV, `<body>.<signal>.csv`, into a directory, which is made: the time in the run, s; when the
 /// sample was received, ns; then every element of every field, the stamp's first. All samples are in it, voids too, as they
 /// came. Returns the files.
@@ -78,6 +64,7 @@ pub fn export_csv(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf
 #[cfg(feature = "parquet")]
 pub fn export_parquet(recording: &Recording, directory: &Path) -> Result<Vec<PathBuf>, ExportError> {
     use self::parquet::{COLUMNS_MAX, Parquet};
+    use self::table::OWN;
     let width = |signal: &SignalInfo| OWN.len() + signal.layout.size() / 8;
     match recording.signals().iter().find(|signal| width(signal) > COLUMNS_MAX) {
         Some(signal) => {
@@ -153,16 +140,6 @@ impl<T: Table> Part<T> {
 /// A name from a file is not to lead anywhere else.
 fn file_name(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() || letter == '-' { letter } else { '_' }).collect()
-}
-
-/// The columns that every table has beside the recorded ones, before them.
-const OWN: [(&str, FieldKind); 2] = [("time_s", FieldKind::F64), ("received_ns", FieldKind::U64)];
-
-/// The name and type of every column.
-fn columns(layout: &Layout) -> Vec<(String, FieldKind)> {
-    let own = OWN.iter().map(|(name, kind)| ((*name).to_owned(), *kind));
-    let recorded = layout.columns.iter().flat_map(|column| column.elements().map(|name| (name, column.kind)));
-    own.chain(recorded).collect()
 }
 
 /// Makes a sample a row.

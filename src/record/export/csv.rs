@@ -1,6 +1,6 @@
 //! A table as CSV. Numbers are written so that the very bits are read back from them; of what is no number only that is kept.
 
-use super::{Table, columns};
+use super::table::{Table, columns};
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
 use std::fs::File;

@@ -2,7 +2,7 @@
 //!
 //! Every bit is kept, of what is no number too. Must not hold more than the rows of one group.
 
-use super::{Table, columns};
+use super::table::{Table, columns};
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
@@ -118,7 +118,7 @@ impl RowGroups {
 
 /// The same for all tables, for they have as many rows as there are ticks.
 fn rows_per_group(recording: &Recording) -> usize {
-    let row_bytes = recording.signals().iter().map(|signal| 8 * super::OWN.len() + signal.layout.size());
+    let row_bytes = recording.signals().iter().map(|signal| 8 * super::table::OWN.len() + signal.layout.size());
     (WAITING_BYTES / row_bytes.sum::<usize>()).max(1)
 }
 

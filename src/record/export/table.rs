@@ -1,0 +1,31 @@
+//! What a table of a recording is, whatever its format.
+
+use crate::record::reader::{Recording, SignalInfo};
+use crate::sample::{FieldKind, Layout};
+use std::fs::File;
+use std::io;
+
+/// A table in the making.
+pub trait Table: Sized {
+    /// How its file's name ends.
+    const EXTENSION: &'static str;
+
+    /// Begins the table of a signal.
+    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
+
+    /// Adds a row: the bits of every column.
+    fn row(&mut self, bits: &[u64]) -> io::Result<()>;
+
+    /// Writes what is left.
+    fn end(self) -> io::Result<()>;
+}
+
+/// The columns that every table has beside the recorded ones, before them.
+pub const OWN: [(&str, FieldKind); 2] = [("time_s", FieldKind::F64), ("received_ns", FieldKind::U64)];
+
+/// The name and type of every column.
+pub fn columns(layout: &Layout) -> Vec<(String, FieldKind)> {
+    let own = OWN.iter().map(|(name, kind)| ((*name).to_owned(), *kind));
+    let recorded = layout.columns.iter().flat_map(|column| column.elements().map(|name| (name, column.kind)));
+    own.chain(recorded).collect()
+}
