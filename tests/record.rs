@@ -5,10 +5,11 @@ use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
 use corotate::config::Scenario;
-use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process, topic_of};
+use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process};
 use corotate::runtime::{
     Poll, ReadyNode, RoleId, RunCondition, build, depths, in_turn, ports, private_ledger, report, shared_ledger,
 };
+use corotate::sample::topic_of;
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
 use serde_json::Value;

@@ -4,7 +4,7 @@
 
 use super::columns::{RateUnit, TimeUnit};
 use super::{DataError, Meaning, Options, Row, Rows, Stamp};
-use crate::record::Layout;
+use crate::sample::Layout;
 use crate::sample::{FieldKind, VOID};
 use mcap::McapError;
 use mcap::records::Record;

@@ -17,7 +17,6 @@
 
 mod diff;
 mod export;
-mod layout;
 mod process;
 mod reader;
 mod recorder;
@@ -32,9 +31,6 @@ pub(crate) use export::RowGroups;
 #[cfg(feature = "parquet")]
 pub use export::export_parquet;
 pub use export::{ExportError, export_csv};
-pub use layout::{Column, Layout, topic_of};
-#[cfg(feature = "foxglove")]
-pub(crate) use layout::{MESSAGE_ENCODING, SCHEMA_ENCODING, frame};
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};
 pub(crate) use recorder::{JOINING, RECORDER};

@@ -6,11 +6,10 @@
 //! file is too short for, nor use a sample whose checksum is wrong.
 
 use super::RecordError;
-use super::layout::{CDR_HEADER, Layout};
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, Scenario, ScriptedFault};
-use crate::sample::{FieldKind, Stamp, VOID};
+use crate::sample::{CDR_HEADER, FieldKind, Layout, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};

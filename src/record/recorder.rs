@@ -1,13 +1,13 @@
 //! Writes what the taps take to a file, and holds what came against the counters of the roles. Must not judge a sample.
 
 use super::RecordError;
-use super::layout::Layout;
 use super::taps::{SignalCounters, Taps};
 use super::writer::Writer;
 use crate::bus::AnyBus;
 use crate::clock::monotonic_ns;
 use crate::config::Scenario;
 use crate::runtime::{RoleId, ports};
+use crate::sample::Layout;
 use crate::system::utc;
 use crate::telemetry::{Host, RoleReport};
 use serde::{Deserialize, Serialize};

@@ -4,12 +4,11 @@
 //! know what becomes of a message.
 
 use super::RecordError;
-use super::layout::Layout;
 use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{Port, RoleId, ports};
-use crate::sample::{Stamp, VOID};
+use crate::sample::{Layout, Stamp, VOID};
 use std::collections::BTreeMap;
 
 /// The most gaps that are told one by one.

@@ -6,10 +6,10 @@
 //! chunk, and a file that was cut off has none of the whole. Must not know samples.
 
 use super::RecordError;
-use super::layout::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 use super::taps::{Channel, MessageSink};
 use crate::clock::monotonic_ns;
 use crate::files;
+use crate::sample::{Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions};
 use rustix::fs::{FallocateFlags, fallocate};

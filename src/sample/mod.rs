@@ -4,11 +4,15 @@
 //! type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of layout changes the
 //! version in the name. Must not know how samples travel.
 
+#[cfg(feature = "runtime")]
+mod definition;
 mod fleet;
 mod orbit;
 mod rigid;
 mod run;
 
+#[cfg(feature = "runtime")]
+pub use definition::{CDR_HEADER, Column, Layout, MESSAGE_ENCODING, SCHEMA_ENCODING, frame, topic_of};
 pub use fleet::{
     CommandLayout, FleetCommand, FleetLayout, FleetMeasurement, FleetSample, FleetTruth, MeasurementLayout, TruthLayout,
 };

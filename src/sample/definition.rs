@@ -1,13 +1,14 @@
-//! The layout of a sample as a recording tells it: a ROS 2 message definition, made of the table that seats are made of.
+//! The layout of a sample as a ROS 2 message definition, which recordings carry.
 //!
 //! A sample's bytes are the body of that message in little-endian CDR: every field is naturally aligned, so nothing is
 //! transformed. Must not know files.
 
-use crate::sample::{Field, FieldKind, Stamp};
+use super::{Field, FieldKind, Stamp};
 use std::fmt::Write;
 
-/// How definitions and messages are encoded, by the names that MCAP has for it.
+/// The encoding of definitions, by its name in MCAP.
 pub const SCHEMA_ENCODING: &str = "ros2msg";
+/// The encoding of messages, by its name in MCAP.
 pub const MESSAGE_ENCODING: &str = "cdr";
 /// What comes before the body of a message: little-endian CDR, no options.
 pub const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
