@@ -41,7 +41,6 @@ mod tables;
 mod traces;
 
 pub use hidden::{HiddenFacts, HiddenPage};
-pub(crate) use traces::{Traces, trace_rig};
 
 use crate::campaign::{JournalError, Table};
 use crate::config::{ConfigError, RunId};

@@ -4,12 +4,12 @@
 //! does not believe) is left out here too. Must not know pictures.
 
 use super::columns::{Columns, Corners, Count, Extremes};
+use crate::bus::Signal;
 use crate::config::Scenario;
 use crate::launch::lyapunov_floor;
-use crate::record::{Column, RecordError, Recording, SignalInfo};
-use crate::rig::{Command, Estimate, FleetTruth, Measurement, Picture, Plane, Rig, Truth};
-use crate::role::Guard;
-use crate::sample::{FieldKind, Message, Sample, Stamp, VOID, status};
+use crate::record::{RecordError, Recording, SignalInfo};
+use crate::rig::{AnyRig, Picture, Plane, WordGuard};
+use crate::sample::{Column, FieldKind, Stamp, VOID, status};
 use std::collections::BTreeMap;
 
 /// So many ticks behind the newest, a tick is scored with the samples that it has.
@@ -72,31 +72,21 @@ pub struct MetricTrace {
 /// [`RecordError`], if its samples have another layout, too.
 pub fn trace(recording: &Recording, scenario: &Scenario) -> Result<Traces, RecordError> {
     recording.check_layouts(scenario)?;
-    scenario.rig.face().traces(scenario, recording)
+    Tracer::new(scenario, recording).run(recording)
 }
 
-/// The same for a rig whose type is known.
-pub(crate) fn trace_rig<R: Rig>(rig: &R, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError> {
-    Tracer::new(rig, scenario, recording).run(recording)
-}
-
-/// What is known of a signal while its samples pass.
-struct Signal<R: Rig> {
-    kind: Kind<R>,
+/// A recorded signal while its samples pass.
+struct SignalTrace {
+    /// The signal; none if the scenario has none of this name and length.
+    kind: Option<Signal>,
+    guard: Option<Box<dyn WordGuard>>,
     body: usize,
     role: Option<usize>,
     last: Option<u64>,
+    /// The word of the status, if there is one.
+    status: Option<usize>,
     /// The fields that are shown, with a trace for each element.
     fields: Vec<Field>,
-}
-
-enum Kind<R: Rig> {
-    Truth,
-    FleetTruth,
-    Measurement(R::MeasurementGuard),
-    Estimate(R::EstimateGuard),
-    Command(R::CommandGuard),
-    Other,
 }
 
 struct Field {
@@ -109,26 +99,21 @@ struct Field {
     traces: Vec<(Key, Columns<Extremes>)>,
 }
 
-enum TruthSample<R: Rig> {
-    One(Truth<R>),
-    Fleet(Vec<u64>),
+/// A tick of which not everything has come: the truths of all bodies and the estimate.
+struct Pending {
+    truths: Vec<Option<Vec<u64>>>,
+    estimate: Option<Vec<u64>>,
 }
 
-/// A tick of which not everything has come.
-struct Pending<R: Rig> {
-    truths: Vec<Option<TruthSample<R>>>,
-    estimate: Option<Estimate<R>>,
-}
-
-struct Tracer<R: Rig> {
-    rig: R,
+struct Tracer {
+    rig: AnyRig,
     tick_s: f64,
     settled_by_s: f64,
     epoch_ns: u64,
     period_ns: u64,
     last_tick: u64,
-    signals: Vec<Signal<R>>,
-    pending: BTreeMap<u64, Pending<R>>,
+    signals: Vec<SignalTrace>,
+    pending: BTreeMap<u64, Pending>,
     newest: u64,
     /// V and the bound on its rate by body, at its last command.
     before: BTreeMap<usize, (u64, f64, f64)>,
@@ -141,9 +126,9 @@ fn plane(picture: Picture) -> Option<Plane> {
     if let Picture::Plane(plane) = picture { Some(plane) } else { None }
 }
 
-impl<R: Rig> Tracer<R> {
-    fn new(rig: &R, scenario: &Scenario, recording: &Recording) -> Self {
-        let info = recording.info();
+impl Tracer {
+    fn new(scenario: &Scenario, recording: &Recording) -> Self {
+        let (rig, info) = (&scenario.rig, recording.info());
         let metric = |name: &&'static str| MetricTrace {
             name,
             values: Columns::default(),
@@ -153,7 +138,7 @@ impl<R: Rig> Tracer<R> {
         };
         let bodies = rig.bodies().iter().map(|body| body.name.to_string()).collect();
         let mut traces = Traces { bodies, metrics: rig.metrics().iter().map(metric).collect(), ..Traces::default() };
-        let signals = recording.signals().iter().map(|signal| Signal::new(rig, signal, &mut traces)).collect();
+        let signals = recording.signals().iter().map(|signal| SignalTrace::new(rig, signal, &mut traces)).collect();
         Self {
             rig: rig.clone(),
             tick_s: info.period_ns as f64 / 1e9,
@@ -166,7 +151,7 @@ impl<R: Rig> Tracer<R> {
             newest: 0,
             before: BTreeMap::new(),
             metrics: vec![f64::NAN; rig.metrics().len()],
-            planes: R::pictures().into_iter().filter_map(plane).collect(),
+            planes: rig.pictures().into_iter().filter_map(plane).collect(),
             traces,
         }
     }
@@ -205,7 +190,7 @@ impl<R: Rig> Tracer<R> {
                 role.lateness_us.at(tick).take((stamp.sent_ns as f64 - due_ns).max(0.0) / 1e3);
             }
         }
-        if self.believed(index, tick, sample) {
+        if self.accepted(index, tick, sample) {
             self.signals[index].fields.iter_mut().for_each(|field| field.take(tick, sample));
         }
     }
@@ -217,57 +202,43 @@ impl<R: Rig> Tracer<R> {
         tick <= self.last_tick && if self.epoch_ns > 0 { tick <= due.saturating_add(1) } else { next }
     }
 
-    /// Keeps what the metrics need; tells whether the sample would be used.
-    fn believed(&mut self, index: usize, tick: u64, sample: &[u8]) -> bool {
-        let (body, newest) = (self.signals[index].body, &mut self.newest);
-        *newest = tick.max(*newest);
-        match &mut self.signals[index].kind {
-            Kind::Other => {}
-            Kind::Truth => {
-                let truth: Truth<R> = bytemuck::pod_read_unaligned(sample);
-                self.path(body, tick, sample, index);
-                self.keep(tick, |pending| pending.truths[body] = Some(TruthSample::One(truth)));
-            }
-            Kind::FleetTruth => {
-                let words = sample.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect();
-                self.keep(tick, |pending| pending.truths[body] = Some(TruthSample::Fleet(words)));
-            }
-            Kind::Measurement(guard) => {
-                let measurement: Measurement<R> = bytemuck::pod_read_unaligned(sample);
-                return guard.accepts(&measurement);
-            }
-            Kind::Estimate(guard) => {
-                let estimate: Estimate<R> = bytemuck::pod_read_unaligned(sample);
-                if !guard.accepts(&estimate) {
-                    return false;
+    /// Keeps what the metrics need; returns true if the sample would be used.
+    fn accepted(&mut self, index: usize, tick: u64, sample: &[u8]) -> bool {
+        let signal = &mut self.signals[index];
+        let (body, kind) = (signal.body, signal.kind);
+        self.newest = tick.max(self.newest);
+        let words: Vec<u64> = sample.chunks_exact(8).map(bytemuck::pod_read_unaligned).collect();
+        if signal.guard.as_mut().is_some_and(|guard| !guard.accepts(&words)) {
+            return false;
+        }
+        match kind {
+            Some(Signal::Truth) => {
+                if self.rig.bodies()[body].fleet.is_none() {
+                    self.path(body, tick, sample, index);
                 }
+                self.keep(tick, |pending| pending.truths[body] = Some(words));
+            }
+            Some(Signal::Estimate) => {
                 self.path(body, tick, sample, index);
-                self.unseen(tick, &estimate);
-                self.keep(tick, |pending| pending.estimate = Some(estimate));
+                self.unseen(tick, self.signals[index].status.map_or(0, |word| words[word]));
+                self.keep(tick, |pending| pending.estimate = Some(words));
             }
-            Kind::Command(guard) => {
-                let command: Command<R> = bytemuck::pod_read_unaligned(sample);
-                if !guard.accepts(&command) {
-                    return false;
-                }
-                self.fall(body, tick, &command);
-            }
+            Some(Signal::Command) => self.fall(body, tick, &words),
+            _ => {}
         }
         true
     }
 
-    /// Counts what an estimate says that it lacks.
-    fn unseen(&mut self, tick: u64, estimate: &Estimate<R>) {
-        let field = Estimate::<R>::FIELDS.iter().find(|field| field.name == "status");
-        let told = field.map_or(0, |field| estimate.words()[field.offset / 8]) & UNSEEN;
-        for (name, _) in status::NAMES.into_iter().filter(|(_, bit)| told & bit != 0) {
+    /// Counts the ticks at which the status of an estimate tells that it lacks something.
+    fn unseen(&mut self, tick: u64, status: u64) {
+        for (name, _) in status::NAMES.into_iter().filter(|(_, bit)| status & UNSEEN & bit != 0) {
             self.traces.unseen.entry(name).or_default().at(tick).0 += 1;
         }
     }
 
-    fn keep(&mut self, tick: u64, put: impl FnOnce(&mut Pending<R>)) {
+    fn keep(&mut self, tick: u64, put: impl FnOnce(&mut Pending)) {
         let bodies = self.rig.bodies().len();
-        let blank = || Pending { truths: (0..bodies).map(|_| None).collect(), estimate: None };
+        let blank = || Pending { truths: vec![None; bodies], estimate: None };
         let pending = self.pending.entry(tick).or_insert_with(blank);
         put(pending);
         if pending.estimate.is_some() && pending.truths.iter().all(Option::is_some) {
@@ -283,16 +254,13 @@ impl<R: Rig> Tracer<R> {
         }
     }
 
-    fn score(&mut self, tick: u64, pending: &Pending<R>) {
-        let one = |body: usize| match &pending.truths[body] {
-            Some(TruthSample::One(truth)) => Some(truth),
+    fn score(&mut self, tick: u64, pending: &Pending) {
+        let words = |body: usize, signal| match signal {
+            Signal::Truth => pending.truths[body].as_deref(),
+            Signal::Estimate => pending.estimate.as_deref(),
             _ => None,
         };
-        let fleet = |body: usize| match &pending.truths[body] {
-            Some(TruthSample::Fleet(words)) => Some(FleetTruth::<R>::over(words)),
-            _ => None,
-        };
-        self.rig.score(one, fleet, pending.estimate.as_ref(), &mut self.metrics);
+        self.rig.face().score_words(&words, &mut self.metrics);
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
             metric.values.at(tick).take(value);
@@ -307,8 +275,8 @@ impl<R: Rig> Tracer<R> {
     }
 
     /// How fast V fell from the last command to this one, and how fast it had to.
-    fn fall(&mut self, body: usize, tick: u64, command: &Command<R>) {
-        let Some((v, bound)) = R::lyapunov(command) else { return };
+    fn fall(&mut self, body: usize, tick: u64, command: &[u64]) {
+        let Some((v, bound)) = self.rig.face().lyapunov_words(command) else { return };
         let name = &self.traces.bodies[body];
         if let Some((before, v_before, bound)) = self.before.insert(body, (tick, v, bound))
             && before + 1 == tick
@@ -323,7 +291,7 @@ impl<R: Rig> Tracer<R> {
     /// The paths of a body, or of an estimate, in the planes that are shown.
     fn path(&mut self, body: usize, tick: u64, sample: &[u8], index: usize) {
         let owner = match self.signals[index].kind {
-            Kind::Estimate(_) => "observer".to_owned(),
+            Some(Signal::Estimate) => "observer".to_owned(),
             _ => self.traces.bodies[body].clone(),
         };
         let fields = &self.signals[index].fields;
@@ -339,40 +307,33 @@ impl<R: Rig> Tracer<R> {
     }
 }
 
-impl<R: Rig> Signal<R> {
-    fn new(rig: &R, info: &SignalInfo, traces: &mut Traces) -> Self {
+impl SignalTrace {
+    fn new(rig: &AnyRig, info: &SignalInfo, traces: &mut Traces) -> Self {
         let body = rig.bodies().iter().position(|body| body.name == info.body);
         let fleet = body.and_then(|body| rig.bodies()[body].fleet);
-        // What the scenario does not have, or has otherwise, is nothing to show; a file may hold anything.
-        let size = info.layout.size();
-        let (kind, name) = match (info.signal.as_str(), body, fleet) {
-            ("truth", Some(_), None) if size == size_of::<Truth<R>>() => (Kind::Truth, "truth"),
-            ("truth", Some(_), Some(bodies)) if size == 8 * FleetTruth::<R>::length(bodies) => {
-                (Kind::FleetTruth, "truth")
-            }
-            ("measurement", Some(body), None) if size == size_of::<Measurement<R>>() => {
-                (Kind::Measurement(rig.measurement_guard(body, false)), "measurement")
-            }
-            ("estimate", Some(0), _) if size == size_of::<Estimate<R>>() => {
-                (Kind::Estimate(rig.estimate_guard()), "estimate")
-            }
-            ("command", Some(body), None) if size == size_of::<Command<R>>() => {
-                (Kind::Command(rig.command_guard(body)), "command")
-            }
-            _ => (Kind::Other, ""),
+        let signals = [Signal::Truth, Signal::Measurement, Signal::Estimate, Signal::Command];
+        // A file may hold anything: a signal that the scenario does not have, or has otherwise, is not shown.
+        let fits = |signal: &Signal| {
+            let length = body.and_then(|body| rig.face().length(body, *signal));
+            info.signal == signal.name() && length.is_some_and(|words| 8 * words == info.layout.size())
         };
+        let kind = signals.into_iter().find(fits);
+        let guard = kind.zip(body).and_then(|(signal, body)| rig.face().guard(body, signal));
         let body = body.unwrap_or(0);
-        let shown = !matches!(kind, Kind::Other) && body <= BODIES_SHOWN;
+        let shown = kind.is_some() && body <= BODIES_SHOWN;
         let columns = info.layout.columns.iter().skip(Stamp::FIELDS.len());
         let columns = columns.filter(|column| shown && column.kind == FieldKind::F64);
         // The first field has the components that sensors may lack.
-        let valid = info.layout.columns.iter().find(|column| column.name == "valid" && name == "measurement");
+        let named = |name: &str| info.layout.columns.iter().find(|column| column.name == name);
+        let valid = named("valid").filter(|_| kind == Some(Signal::Measurement));
+        let name = kind.map_or("", Signal::name);
         let field = |(place, column): (usize, &Column)| {
-            let valid = valid.filter(|_| place == 0 && column.count == R::AXES).map(|valid| valid.offset);
+            let valid = valid.filter(|_| place == 0 && column.count == rig.face().axes()).map(|valid| valid.offset);
             Field { valid, ..Field::new(column, info, name, fleet.unwrap_or(1)) }
         };
         let fields = columns.enumerate().map(field).collect();
-        Self { kind, body, role: role(info, traces), last: None, fields }
+        let status = named("status").map(|status| status.offset / size_of::<u64>());
+        Self { kind, guard, body, role: role(info, traces), last: None, status, fields }
     }
 }
 

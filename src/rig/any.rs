@@ -2,25 +2,24 @@
 //!
 //! Must not compute anything: each answer is the generic code of the module that asks.
 
-use super::{BodyInfo, CertificateReport, Figure, Picture, Rig};
+use super::{BodyInfo, CertificateReport, Figure, Picture, Rig, WordView};
 use crate::analysis::{self, Claim};
 use crate::bench;
 use crate::bus::{AnyBus, BusError};
 use crate::config::{Fields, Scenario, fields};
 use crate::launch::{Launch, Outcome, Scorer, run_directly, score_rig};
-use crate::record::{RecordError, Recording};
-use crate::report::{Traces, trace_rig};
 use crate::runtime::{Port, ReadyNode, RoleId, RoleImpl, build_rig, ports_of_rig};
 use crate::telemetry::Ledger;
-use crate::watch::Judge;
 use std::any::Any;
 use std::fmt;
+use std::sync::Arc;
 
 /// Any rig.
-pub struct AnyRig(Box<dyn Face>);
+#[derive(Clone)]
+pub struct AnyRig(Arc<dyn Face>);
 
 /// What is asked of a rig, whichever it is.
-pub(crate) trait Face: Any + Send + Sync {
+pub(crate) trait Face: WordView + Any + Send + Sync {
     fn bodies(&self) -> &[BodyInfo];
     fn metrics(&self) -> Vec<&'static str>;
     fn certificates(&self) -> Vec<CertificateReport>;
@@ -41,8 +40,6 @@ pub(crate) trait Face: Any + Send + Sync {
     ) -> Result<ReadyNode, BusError>;
     fn scorer(&self, scenario: &Scenario, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
     fn direct(&self, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome>;
-    fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError>;
-    fn judge(&self) -> Box<dyn Judge>;
     fn arithmetic(&self, scenario: &Scenario, hashed: bool) -> Option<f64>;
 }
 
@@ -115,14 +112,6 @@ impl<R: Rig> Face for R {
         run_directly(self, scenario, launch)
     }
 
-    fn traces(&self, scenario: &Scenario, recording: &Recording) -> Result<Traces, RecordError> {
-        trace_rig(self, scenario, recording)
-    }
-
-    fn judge(&self) -> Box<dyn Judge> {
-        Box::new(self.clone())
-    }
-
     fn arithmetic(&self, scenario: &Scenario, hashed: bool) -> Option<f64> {
         bench::arithmetic_alone(self, scenario, hashed)
     }
@@ -131,7 +120,7 @@ impl<R: Rig> Face for R {
 impl AnyRig {
     /// A rig as any.
     pub fn new(rig: impl Rig) -> Self {
-        Self(Box::new(rig))
+        Self(Arc::new(rig))
     }
 
     /// The rig, if it is of this type.

@@ -10,6 +10,7 @@ mod pictures;
 mod registry;
 mod rigid_body;
 mod simple;
+mod words;
 
 pub use any::AnyRig;
 pub use delay::{DelayLine, Due};
@@ -22,6 +23,7 @@ pub(crate) use registry::{resolve, sections, shapes, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
 pub(crate) use simple::field_named;
 pub use simple::{Bounded, Difference, SimpleRig};
+pub(crate) use words::{WordGuard, WordView};
 
 use crate::config::{Checks, ConfigError, Document};
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};

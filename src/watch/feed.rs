@@ -9,9 +9,9 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Topic, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::{ClockKind, Scenario};
 use crate::fault::{Action, Fault, Interruption, Transport};
-use crate::rig::{Command, Estimate, Rig, Truth};
+use crate::rig::AnyRig;
 use crate::runtime::{Port, RoleId, ports, topic, window_ticks};
-use crate::sample::{Field, FieldKind, FleetSample, Health, RoleState, Sample, Stamp, VOID, status};
+use crate::sample::{Field, FieldKind, Health, RoleState, Stamp, VOID, status};
 use std::collections::VecDeque;
 
 /// Between two looks, ns: seldom enough that their traces are not in the 99 % of a loop at 1 kHz, and less than what waits.
@@ -146,36 +146,6 @@ fn bit_names(bits: u64) -> Vec<&'static str> {
     status::NAMES.into_iter().filter(|(_, bit)| bits & bit != 0).map(|(name, _)| name).collect()
 }
 
-/// What the samples of one tick come to, for a rig whose samples have types.
-pub(crate) trait Judge {
-    /// Writes every metric; `words` gives the sample of a body's signal.
-    fn score<'a>(&self, words: &dyn Fn(&str, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
-    /// The largest V of all driven bodies; NaN if none is told.
-    fn lyapunov<'a>(&self, words: &dyn Fn(&str, Signal) -> Option<&'a [u64]>) -> f64;
-}
-
-impl<R: Rig> Judge for R {
-    fn score<'a>(&self, words: &dyn Fn(&str, Signal) -> Option<&'a [u64]>, out: &mut [f64]) {
-        let bodies = self.bodies();
-        let truth = |index: usize| words(&bodies[index].name, Signal::Truth);
-        let one = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
-        let many = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
-        let estimate = words(&bodies[0].name, Signal::Estimate).and_then(cast::<Estimate<R>>);
-        Rig::score(self, one, many, estimate, out);
-    }
-
-    fn lyapunov<'a>(&self, words: &dyn Fn(&str, Signal) -> Option<&'a [u64]>) -> f64 {
-        let driven = self.bodies().iter().filter(|body| body.driven && body.fleet.is_none());
-        let commands = driven.filter_map(|body| words(&body.name, Signal::Command).and_then(cast::<Command<R>>));
-        commands.filter_map(R::lyapunov).map(|(v, _)| v).fold(f64::NAN, f64::max)
-    }
-}
-
-/// Words as the sample that they are.
-fn cast<S: Sample>(words: &[u64]) -> Option<&S> {
-    bytemuck::try_from_bytes(bytemuck::cast_slice(words)).ok()
-}
-
 /// What is known of a role besides what its line shows.
 struct RoleFeed {
     health: <IoxBus as Bus>::Reader<Health>,
@@ -190,7 +160,7 @@ struct RoleFeed {
 pub(super) struct Feed {
     taps: Vec<Tap>,
     roles: Vec<RoleFeed>,
-    judge: Box<dyn Judge>,
+    rig: AnyRig,
     faults: Vec<(u64, String)>,
     realtime: bool,
     stride: u64,
@@ -237,7 +207,7 @@ impl Feed {
             told: vec![(0, f64::NEG_INFINITY); taps.len()],
             taps,
             roles,
-            judge: scenario.rig.face().judge(),
+            rig: scenario.rig.clone(),
             faults,
             realtime,
             stride: if realtime { (LOOK_NS / 2 / scenario.period_ns).max(1) } else { 1 },
@@ -356,12 +326,15 @@ impl Feed {
         let Some(tick) = ticks.filter(|tick| self.scored.is_none_or(|scored| *tick > scored)).find(whole) else {
             return;
         };
-        let words = |body: &str, signal: Signal| of(signal).find(|tap| tap.topic.body == body)?.at(tick);
+        let bodies = self.rig.bodies();
+        let words = |body: usize, signal| of(signal).find(|tap| tap.topic.body == bodies[body].name)?.at(tick);
         let mut values = vec![f64::NAN; model.series.len()];
         let metrics = values.len() - usize::from(model.series.last().is_some_and(|series| series.name == LYAPUNOV));
-        self.judge.score(&words, &mut values[..metrics]);
+        self.rig.face().score_words(&words, &mut values[..metrics]);
         model.series.iter_mut().zip(values).for_each(|(series, value)| series.push(value));
-        let v = self.judge.lyapunov(&words);
+        let commands = (0..bodies.len()).filter_map(|body| words(body, Signal::Command));
+        let functions = commands.filter_map(|command| self.rig.face().lyapunov_words(command));
+        let v = functions.map(|(v, _)| v).fold(f64::NAN, f64::max);
         if !v.is_nan() {
             if metrics == model.series.len() {
                 model.series.push(Series::new(LYAPUNOV));
@@ -391,7 +364,7 @@ fn word(fault: &Fault) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sample::{RateEstimate, RateTruth};
+    use crate::sample::{FleetSample, RateEstimate, Sample};
 
     #[test]
     fn fields_are_told_as_people_read_them() {
@@ -413,24 +386,5 @@ mod tests {
         let many: Vec<Field> = FleetSample::<crate::sample::TruthLayout>::fields(100).collect();
         assert!(told(&many[2], &vec![0; 1000]).1.ends_with("... of 300"));
         assert_eq!(told(&many[2], &[]).1, "", "a sample that is too short");
-    }
-
-    #[test]
-    fn the_judge_reads_words_as_the_rig_s_samples() {
-        let scenario = Scenario::parse(crate::config::SHIPPED[0].1, "test", &[]).unwrap();
-        let judge = scenario.rig.face().judge();
-        let truth = |rate: f64| RateTruth { omega_rad_s: [rate, 0.0, 0.0], ..RateTruth::default() };
-        let (leader, follower) = (truth(1.0), truth(3.0));
-        let estimate = RateEstimate { omega_rad_s: [1.0, 0.0, 0.5], ..RateEstimate::default() };
-        let of = |body: &str, signal: Signal| match (body, signal) {
-            ("leader", Signal::Truth) => Some(crate::sample::Message::words(&leader)),
-            ("follower", Signal::Truth) => Some(crate::sample::Message::words(&follower)),
-            ("leader", Signal::Estimate) => Some(crate::sample::Message::words(&estimate)),
-            _ => None,
-        };
-        let mut values = [f64::NAN; 2];
-        judge.score(&of, &mut values);
-        assert_eq!(values, [2.0, 0.5]);
-        assert!(judge.lyapunov(&of).is_nan(), "no command was told");
     }
 }

@@ -18,7 +18,6 @@ mod screen;
 mod session;
 mod terminal;
 
-pub(crate) use feed::Judge;
 pub use input::{Action, action};
 pub use model::{Event, History, Model, RoleLine, Series, SignalLine, Window};
 pub use screen::{draw, text};

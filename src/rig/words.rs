@@ -1,0 +1,112 @@
+//! Samples as words: what a reader asks of a rig whose sample types it does not know.
+//!
+//! Must not interpret a sample that is shorter or longer than the rig's own.
+
+use super::{Command, Estimate, FleetTruth, Measurement, Rig, Truth};
+use crate::bus::Signal;
+use crate::role::Guard;
+use crate::sample::{FleetSample, Sample};
+
+/// A guard of one reading end that is given a sample's words.
+pub(crate) trait WordGuard {
+    /// Returns true if the sample is accepted.
+    fn accepts(&mut self, words: &[u64]) -> bool;
+}
+
+/// A view of a rig's samples as words. Bodies are given by their index.
+pub(crate) trait WordView {
+    /// Returns the number of words of a body's sample; none if the body has no such signal, or not of this type.
+    fn length(&self, body: usize, signal: Signal) -> Option<usize>;
+    /// Returns the guard of a reader that observes a body's signal; none for a signal without one.
+    fn guard(&self, body: usize, signal: Signal) -> Option<Box<dyn WordGuard>>;
+    /// Returns the number of components of which the `valid` word of measurements and estimates tells.
+    fn axes(&self) -> usize;
+    /// Writes one tick's value of every metric, as [`Rig::score`]; `words` gives the samples.
+    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
+    /// Returns V and the bound on V̇ that a command carries, as [`Rig::lyapunov`].
+    fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)>;
+}
+
+impl<R: Rig> WordView for R {
+    fn length(&self, body: usize, signal: Signal) -> Option<usize> {
+        let info = self.bodies().get(body)?;
+        let bytes = match (signal, info.fleet) {
+            (Signal::Truth, None) => size_of::<Truth<R>>(),
+            (Signal::Truth, Some(bodies)) => return Some(FleetTruth::<R>::length(bodies)),
+            (Signal::Measurement, None) => size_of::<Measurement<R>>(),
+            (Signal::Estimate, _) if body == 0 => size_of::<Estimate<R>>(),
+            (Signal::Command, None) if info.driven => size_of::<Command<R>>(),
+            _ => return None,
+        };
+        Some(bytes / size_of::<u64>())
+    }
+
+    fn guard(&self, body: usize, signal: Signal) -> Option<Box<dyn WordGuard>> {
+        Some(match signal {
+            Signal::Measurement => boxed(self.measurement_guard(body, false)),
+            Signal::Estimate => boxed(self.estimate_guard()),
+            Signal::Command => boxed(self.command_guard(body)),
+            _ => return None,
+        })
+    }
+
+    fn axes(&self) -> usize {
+        R::AXES
+    }
+
+    fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]) {
+        let bodies = self.bodies();
+        let truth = |index: usize| words(index, Signal::Truth);
+        let one = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
+        let many = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
+        self.score(one, many, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), out);
+    }
+
+    fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {
+        R::lyapunov(cast(command)?)
+    }
+}
+
+/// Reads words as the sample that they are; none if they are not as many.
+fn cast<S: Sample>(words: &[u64]) -> Option<&S> {
+    bytemuck::try_from_bytes(bytemuck::cast_slice(words)).ok()
+}
+
+struct Typed<G, S>(G, core::marker::PhantomData<S>);
+
+fn boxed<S: Sample, G: Guard<S> + 'static>(guard: G) -> Box<dyn WordGuard> {
+    Box::new(Typed(guard, core::marker::PhantomData::<S>))
+}
+
+impl<S: Sample, G: Guard<S>> WordGuard for Typed<G, S> {
+    fn accepts(&mut self, words: &[u64]) -> bool {
+        cast(words).is_some_and(|sample| self.0.accepts(sample))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::bus::Signal;
+    use crate::config::{SHIPPED, Scenario};
+    use crate::sample::{Message, RateEstimate, RateTruth};
+
+    #[test]
+    fn words_are_scored_as_the_samples_that_they_are() {
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &[]).unwrap();
+        let truth = |rate: f64| RateTruth { omega_rad_s: [rate, 0.0, 0.0], ..RateTruth::default() };
+        let (leader, follower) = (truth(1.0), truth(3.0));
+        let estimate = RateEstimate { omega_rad_s: [1.0, 0.0, 0.5], ..RateEstimate::default() };
+        let words = |body: usize, signal: Signal| match (body, signal) {
+            (0, Signal::Truth) => Some(leader.words()),
+            (1, Signal::Truth) => Some(follower.words()),
+            (0, Signal::Estimate) => Some(estimate.words()),
+            _ => None,
+        };
+        let (view, mut values) = (scenario.rig.face(), [f64::NAN; 2]);
+        view.score_words(&words, &mut values);
+        assert_eq!(values, [2.0, 0.5]);
+        assert_eq!(view.lyapunov_words(&[0; 3]), None, "too short for a command");
+        assert_eq!(view.length(0, Signal::Command), None, "the leader is not driven");
+        assert!(!view.guard(0, Signal::Measurement).unwrap().accepts(&[0; 3]), "too short for a measurement");
+    }
+}
