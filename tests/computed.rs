@@ -1,13 +1,13 @@
 //! Roles whose samples a function computes: the same bits as the built-in ones if it computes the same, in one thread step by step
 //! and as a process of a run.
 
-use crate::common::{Bench, await_some};
+use crate::common::{Bench, Running, await_some};
 use bytemuck::{bytes_of, from_bytes};
 use corotate::config::{SHIPPED, Scenario};
 use corotate::launch::{Launch, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
 use corotate::role::Law;
-use corotate::runtime::{Compute, ComputedTick, RoleSeat, run_computed};
+use corotate::runtime::{Compute, ComputedTick, RoleError, RoleSeat, run_computed};
 use corotate::sample::Message;
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::time::SystemTime;
@@ -129,25 +129,73 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
     }
 }
 
-/// A function that fails ends its role with what it says, and the run in order.
-#[test]
-fn a_function_that_fails_ends_the_run_in_order() {
-    struct Fails;
-    impl Compute for Fails {
-        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
-            if tick.tick < 100 { Ok(()) } else { Err("it cannot divide by zero".to_owned()) }
-        }
-    }
-    let bench = Bench::new();
-    let options = ["--set", "accept={}", "--set", "launch.external_timeout_s=3", "--duration", "1000"];
-    let running = bench
-        .start(&[&["run", "rigid-pair", "--clock", "lockstep", "--external", "controller"], &options[..]].concat());
+/// A run that waits for a controller of this process.
+fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleSeat) {
+    let waits = ["run", "rigid-pair", "--external", "controller", "--set", "accept={}", "--json"];
+    let running = bench.start(&[&waits[..], options].concat());
     let domain = await_some(|| bench.domains().pop());
     await_some(|| domain.join("controller.seat.json").exists().then_some(()));
-    let seat = RoleSeat { domain: domain.clone(), role: "controller".to_owned() };
-    let error = run_computed(&seat, Box::new(Fails), &AtomicBool::new(false)).unwrap_err();
-    assert_eq!(error.to_string(), "it cannot divide by zero");
-    let done = running.wait();
-    assert!(done.code == Some(4) && done.stdout.contains("it said: it cannot divide by zero"), "{done:?}");
-    bench.assert_clean(&[domain]);
+    (running, RoleSeat { domain, role: "controller".to_owned() })
+}
+
+/// A function that fails ends its role with what it says, and the run in order, whatever the tick and the clock: by what it
+/// says and not by its silence, which is never long enough here.
+#[test]
+fn a_function_that_fails_ends_the_run_in_order() {
+    struct Fails(u64);
+    impl Compute for Fails {
+        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+            if tick.tick < self.0 { Ok(()) } else { Err("it cannot divide by zero".to_owned()) }
+        }
+    }
+    for (clock, tick) in [("lockstep", 0), ("lockstep", 100), ("realtime", 0), ("realtime", 5)] {
+        let bench = Bench::new();
+        let patient = ["--clock", clock, "--duration", "1000", "--set", "supervision.heartbeat_timeout_s=3600"];
+        let (running, seat) = start_waiting(&bench, &patient);
+        let error = run_computed(&seat, Box::new(Fails(tick)), &AtomicBool::new(false)).unwrap_err();
+        assert_eq!(error.to_string(), "it cannot divide by zero");
+        let done = running.wait();
+        assert_eq!(done.code, Some(4), "{done:?}");
+        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        let incident = &summary["incidents"][0];
+        assert_eq!(incident["last_words"], "it cannot divide by zero", "{incident}");
+        // In real time the ticks before may have been missed, and are counted with the next that is executed.
+        assert!(clock == "realtime" || incident["tick"] == tick, "{incident}");
+        assert_eq!(summary["accepted"], false, "a run that lost a role is not accepted");
+        bench.assert_clean(&[seat.domain]);
+    }
+}
+
+/// In lockstep a function that is slow once is waited for, however short the heartbeat's timeout; with a limit the run ends, at the
+/// tick that the function is at, and the function is told that it was late.
+#[test]
+fn a_function_that_is_slow_is_waited_for_in_lockstep() {
+    struct Slow;
+    impl Compute for Slow {
+        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+            if tick.tick == 50 {
+                std::thread::sleep(std::time::Duration::from_secs(3));
+            }
+            Ok(())
+        }
+    }
+    let brief = ["--clock", "lockstep", "--duration", "0.2", "--set", "supervision.heartbeat_timeout_s=0.2"];
+    for (limit, exit) in [("600.0", 0), ("0.5", 4)] {
+        let bench = Bench::new();
+        let limit = format!("launch.external_timeout_s={limit}");
+        let (running, seat) = start_waiting(&bench, &[&brief[..], &["--set", &limit]].concat());
+        let served = run_computed(&seat, Box::new(Slow), &AtomicBool::new(false));
+        let done = running.wait();
+        assert_eq!(done.code, Some(exit), "{done:?}");
+        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        if exit == 0 {
+            served.unwrap();
+            assert_eq!(summary["incidents"], serde_json::json!([]));
+        } else {
+            // It may be back before the run is gone; nobody killed its launcher.
+            assert!(matches!(served, Ok(()) | Err(RoleError::Late)), "{served:?}");
+            assert_eq!(summary["incidents"][0]["tick"], 50, "{summary:#}");
+        }
+        bench.assert_clean(&[seat.domain]);
+    }
 }

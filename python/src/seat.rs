@@ -83,15 +83,21 @@ fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
     outputs.iter().map(|words| words.iter().flat_map(|word| word.to_ne_bytes()).collect()).collect()
 }
 
-/// Serves a seat with a function of tick, inputs and blank outputs, all as bytes, that gives the outputs. To the end of the run.
+/// Serves a seat to the end of the run with a function of tick, inputs and blank outputs, all as bytes, that returns the outputs.
+/// What the function raises is raised.
 #[pyfunction]
 pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
-    let served =
-        py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(Function(function)), &AtomicBool::new(false)));
-    served.map_err(failed)
+    let raised = Arc::new(Mutex::new(None));
+    let function = Function { function, raised: Arc::clone(&raised) };
+    let served = py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(function), &AtomicBool::new(false)));
+    let raised: Option<PyErr> = raised.lock().map_err(failed)?.take();
+    served.map_err(|error| raised.unwrap_or_else(|| failed(error)))
 }
 
-struct Function(Py<PyAny>);
+struct Function {
+    function: Py<PyAny>,
+    raised: Arc<Mutex<Option<PyErr>>>,
+}
 
 impl Compute for Function {
     fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
@@ -99,10 +105,16 @@ impl Compute for Function {
             let bytes = |bytes: Vec<u8>| PyBytes::new(py, &bytes).unbind();
             let given: Vec<Option<Py<PyBytes>>> = inputs(&tick).into_iter().map(|input| input.map(bytes)).collect();
             let blank: Vec<Py<PyBytes>> = blank(tick.outputs).into_iter().map(bytes).collect();
-            self.0.call1(py, (tick.tick, given, blank))?.extract::<Vec<Vec<u8>>>(py)
+            self.function.call1(py, (tick.tick, given, blank))?.extract::<Vec<Vec<u8>>>(py)
         });
-        let outputs = computed.map_err(|error| Python::attach(|py| words(py, &error)))?;
-        fill(tick.outputs, &outputs);
+        match computed {
+            Ok(outputs) => fill(tick.outputs, &outputs),
+            Err(error) => {
+                let words = Python::attach(|py| words(py, &error));
+                *self.raised.lock().map_err(|error| error.to_string())? = Some(error);
+                return Err(words);
+            }
+        }
         Ok(())
     }
 }

@@ -70,19 +70,6 @@ def test_real_time_counts_what_python_misses(tmp_path, law):
     assert counters["executed"] > 100
 
 
-def test_a_role_that_raises_ends_the_run_in_order(tmp_path):
-    def controller(tick, inputs, outputs):
-        if tick == 100:
-            outputs.command.speed_rad_s = 1.0
-
-    with pytest.raises(corotate.CorotateError, match="there is no field 'speed_rad_s'") as caught:
-        corotate.run("rigid-pair", set={"duration_s": 1000, "accept": {}}, roles={"controller": controller}, out=tmp_path / "raised")
-    run = caught.value.run
-    [incident] = run.summary["incidents"]
-    assert incident["role"] == "controller" and "Traceback" in incident["last_words"] and "speed_rad_s" in incident["last_words"]
-    assert (tmp_path / "raised/summary.json").exists()
-
-
 def test_an_output_belongs_to_its_tick_and_an_input_stays(tmp_path):
     kept = []
 

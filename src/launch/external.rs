@@ -11,7 +11,8 @@ use crate::sample::RoleState;
 /// A role is named after it has kept the run waiting for so long, ns; then twice as late each time, up to the second.
 const FIRST_WORD_NS: u64 = 5_000_000_000;
 const WORD_INTERVAL_NS: u64 = 60_000_000_000;
-/// Once the ticks run, an external role may keep the run waiting for so long where the scenario sets no limit, s.
+/// Once the ticks run, an external role without counters may keep the run waiting for so long where the scenario sets no limit,
+/// s: it may send the wrong samples.
 const TICKS_LIMIT_S: f64 = 30.0;
 /// The least limit in real time, periods.
 const LIMIT_PERIODS: f64 = 10.0;
@@ -76,14 +77,20 @@ impl ExternalWatch {
         now_ns: u64,
     ) -> Vec<Waiting> {
         let lack = |member: &Member| (member.state() < state).then_some(Lack::State(member.state()));
-        self.look(members, scenario.external_timeout_s.unwrap_or(f64::INFINITY), lack, now_ns)
+        let limit_s = |_: &Member| scenario.external_timeout_s.unwrap_or(f64::INFINITY);
+        self.look(members, limit_s, lack, now_ns)
     }
 
     /// Looks at external roles whose samples are waited for; `scored_tick` is the scorer's next.
     pub fn in_ticks(&mut self, scenario: &Scenario, members: &[Member], scored_tick: u64, now_ns: u64) -> Vec<Waiting> {
         let realtime = scenario.clock == ClockKind::Realtime;
         let least_s = if realtime { LIMIT_PERIODS * scenario.tick_s() } else { 0.0 };
-        let limit_s = scenario.external_timeout_s.unwrap_or(TICKS_LIMIT_S).max(least_s);
+        // One that counts its ticks sends the right ones: if it is alive, it needs time.
+        let limit_s = |member: &Member| match scenario.external_timeout_s {
+            Some(limit_s) => limit_s.max(least_s),
+            None if member.counts() && !realtime => f64::INFINITY,
+            None => TICKS_LIMIT_S.max(least_s),
+        };
         // Nothing is known of what other external roles wait for.
         let next_tick = |role: RoleId| {
             let own = members.iter().find(|member| member.books().any(|(of, _)| of == role))?;
@@ -108,7 +115,7 @@ impl ExternalWatch {
     fn look(
         &mut self,
         members: &[Member],
-        limit_s: f64,
+        limit_s: impl Fn(&Member) -> f64,
         lack: impl Fn(&Member) -> Option<Lack>,
         now_ns: u64,
     ) -> Vec<Waiting> {
@@ -119,6 +126,7 @@ impl ExternalWatch {
                 continue;
             };
             let waited_s = wait.look(lack, now_ns) as f64 / 1e9;
+            let limit_s = limit_s(member);
             if waited_s >= limit_s {
                 let cause = format!("it kept the run waiting for {limit_s} s: {lack}");
                 found.push(Waiting::TooLong {

@@ -3,6 +3,7 @@
 //!
 //! Leads nothing: phases, epoch and credit are the word of the host that launched. Must not score, nor record.
 
+use super::children::END_LIMIT;
 use super::processes::{Supervisor, prepare};
 use super::relay::{FarEnd, RelayWatch};
 use super::supervision::Incident;
@@ -90,7 +91,7 @@ fn end(
     domain: &Domain,
     host: &str,
 ) -> Result<(FarEnd, (u64, u64)), LaunchError> {
-    let shutdown = supervisor.shut_down();
+    let shutdown = supervisor.shut_down(END_LIMIT);
     for report in &shutdown.reports {
         let path = report_path(domain.root(), &report.role);
         let text = serde_json::to_vec(report).expect("a report of plain values is JSON");

@@ -6,7 +6,7 @@ use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
 use crate::analysis::{Claim, claims};
-use crate::config::{RunId, Scenario};
+use crate::config::{ClockKind, RunId, Scenario};
 use crate::files;
 use crate::hosts::{HostReport, HostsSummary};
 use crate::record::RecordingReport;
@@ -249,10 +249,14 @@ impl Judged {
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
         let lost: Vec<&str> =
             lost.flat_map(|incident| incident.with.iter().chain([&incident.role])).map(String::as_str).collect();
-        let interrupted = outcome.signal != 0 || !lost.is_empty();
+        // A run that is stepped ends where its caller leaves it.
+        let ends_early = |report: &RoleReport| report.ticks.elapsed <= scenario.last_tick;
+        let left = scenario.clock == ClockKind::InProcess && outcome.reports.iter().any(ends_early);
+        let interrupted = outcome.signal != 0 || !lost.is_empty() || left;
         let books = Accounting::new(scenario, outcome, interrupted, &lost);
         let criteria = judge(scenario, outcome, &books, &latencies, interrupted);
-        let accepted = accepted(&criteria, interrupted);
+        // A run that lost a role is not accepted, whatever its criteria say.
+        let accepted = accepted(&criteria, interrupted).or((!lost.is_empty()).then_some(false));
         let verdict = verdict(accepted, criteria.is_empty(), interrupted);
         Self { latencies, books, criteria, accepted, verdict }
     }
@@ -375,7 +379,7 @@ impl LinkCounters {
             rejected: read.rejected,
             injected: written.map(|written| written.injected),
         };
-        let lossless = scenario.clock != crate::config::ClockKind::Realtime;
+        let lossless = scenario.clock != ClockKind::Realtime;
         let read_balances = read.received + read.void + read.gaps == covered && (!lossless || read.gaps == 0);
         // Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
         let balanced = read_balances
@@ -527,7 +531,7 @@ fn judge(
         let step = |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
         let worst = latencies.iter().filter(step).map(|stage| stage.figures.p99_us).reduce(f64::max);
         // Without a clock there is no latency to judge; in real time a missing one is a failure.
-        let judged = scenario.clock == crate::config::ClockKind::Realtime;
+        let judged = scenario.clock == ClockKind::Realtime;
         add("step_latency_p99_us_max".to_owned(), limit, worst, judged);
     }
     criteria

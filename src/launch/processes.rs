@@ -51,6 +51,8 @@ const DESCRIPTORS_PER_ROLE: u64 = 24;
 /// Upper bounds on the files that a run makes in shared memory, and beside it: signals, connections, tags of processes.
 const FILES: u64 = 32;
 const FILES_PER_ROLE: u64 = 32;
+/// How long an external role of this host may take to leave a run that a signal ends: it may hang.
+const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
 /// Without any progress for so long the run counts as hung, ns, and periods.
 const HUNG_NS: u64 = 30_000_000_000;
 const HUNG_PERIODS: u64 = 10;
@@ -72,7 +74,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let mut supervisor = Supervisor::start(scenario, launch, domain, &bus, &mut janitor)?;
     let mut scorer = score::open(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
-    let mut shutdown = supervisor.shut_down();
+    let mut shutdown = supervisor.shut_down(if signal == 0 { END_LIMIT } else { SIGNALLED_END_LIMIT });
     shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
     let ShutdownReport { reports, unbooked, mut problems } = shutdown;
     let (hosts, told, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
@@ -400,7 +402,7 @@ impl<'a> Supervisor<'a> {
         self.recorder.supervise(self.janitor);
         self.foxglove.supervise(self.janitor);
         for member in &mut self.members {
-            member.set_over(over);
+            member.in_ticks(over);
             let complete = member.ended_complete(self.scenario, self.domain);
             if let Some(failure) = member.failure(self.scenario, self.janitor) {
                 let incident = match complete {
@@ -474,7 +476,7 @@ impl<'a> Supervisor<'a> {
 
     fn denied(&mut self, own: &[Grant]) -> LaunchError {
         let mut denied: Vec<(String, Grant)> = own.iter().map(|grant| ("launcher".to_owned(), grant.clone())).collect();
-        for report in self.shut_down().reports {
+        for report in self.shut_down(END_LIMIT).reports {
             denied.extend(report.grants.into_iter().map(|grant| (report.role.clone(), grant)));
         }
         denied.retain(|(_, grant)| !grant.granted);
@@ -482,15 +484,20 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Lets the roles go and gathers their reports. Of a role that leaves none, there are its counters, unless it was none of
-    /// ours.
-    pub fn shut_down(&mut self) -> ShutdownReport {
+    /// ours. External roles of this host have `external_limit` to leave.
+    pub fn shut_down(&mut self, external_limit: Duration) -> ShutdownReport {
         self.word.phase = Phase::Stop as u64;
-        let limit_ns = monotonic_ns() + END_LIMIT.as_nanos() as u64;
+        let [limit_ns, external_limit_ns] =
+            [END_LIMIT, external_limit].map(|limit| monotonic_ns() + limit.as_nanos() as u64);
+        let lingers = |member: &mut Member| {
+            let limit_ns = if member.external_here() { external_limit_ns } else { limit_ns };
+            member.lingers() && monotonic_ns() < limit_ns
+        };
         // Told first, and then nobody is waited for who is dead: an external role that was killed has left once its remains
         // are put away.
         let _ = self.announce();
         self.janitor.clear_dead();
-        while self.members.iter_mut().any(Member::lingers) && monotonic_ns() < limit_ns {
+        while self.members.iter_mut().any(lingers) {
             let _ = self.janitor.is_busy();
             // Again and again: who is only just coming up has not heard it yet. A link that fails now changes nothing:
             // whoever does not end by itself is ended.

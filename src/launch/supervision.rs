@@ -131,8 +131,12 @@ pub(super) struct Member {
     generation: u64,
     silent_ns: u64,
     looked_ns: u64,
+    /// True once the run's ticks have begun.
+    in_ticks: bool,
     /// No more tick will be due.
     over: bool,
+    /// True once it has failed for good: nothing more is waited for.
+    lost: bool,
     started_ns: u64,
     restarts: u64,
     /// When the successor is due, and when the failure was noticed, ns.
@@ -165,7 +169,9 @@ impl Member {
             last: Health::default(),
             generation: 1,
             silent_ns: 0,
+            in_ticks: false,
             over: false,
+            lost: false,
             looked_ns: now_ns,
             started_ns: now_ns,
             restarts: 0,
@@ -226,9 +232,14 @@ impl Member {
         Ok(())
     }
 
-    /// Hears whether no more tick will be due.
-    pub fn set_over(&mut self, over: bool) {
-        self.over = over;
+    /// Notes that the ticks run, and whether no more tick will be due.
+    pub fn in_ticks(&mut self, over: bool) {
+        (self.in_ticks, self.over) = (true, over);
+    }
+
+    /// Returns true if the role has counters here: then the launcher sees each tick that it completes.
+    pub fn counts(&self) -> bool {
+        self.ledger.generation() > 0
     }
 
     /// Whether nothing more will come of it, though it need not have come to its last tick: it is seen by its samples alone,
@@ -246,8 +257,13 @@ impl Member {
     pub fn lingers(&mut self) -> bool {
         match &mut self.process {
             Some(process) => process.ended().is_none(),
-            None => self.external && self.health.written(),
+            None => self.external && !self.lost && self.health.written(),
         }
+    }
+
+    /// Returns true if the role is an external one of this host.
+    pub fn external_here(&self) -> bool {
+        self.external && self.host.is_none()
     }
 
     /// Whether and how the role has failed: its process has ended, or it has been silent for too long.
@@ -276,16 +292,20 @@ impl Member {
         Some(Failure { cause, last_words: process.last_words() })
     }
 
-    /// Whether an external role has left, or says nothing any more. One that is only seen by its samples has until the next
-    /// is due; in lockstep that is when the others let it, so there it fails only by leaving. In real time it may have missed
-    /// its last ticks: then it is done, if it is still there once its remains would have been put away.
+    /// Returns how an external role has failed: it left its last words, it is gone, or it is silent in real time. In lockstep a
+    /// role that is silent and alive is computing or waits for the others, so it fails only by leaving, or by
+    /// `launch.external_timeout_s`, which in real time is the limit of a role that is alive. One that is only seen by its samples
+    /// may have missed its last ticks in real time: then it is done, if it is still there once its remains would have been removed.
     fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
-        let fail = |janitor: &Janitor, cause: String| {
-            let last_words = std::fs::read_to_string(words_path(janitor.root(), &self.name)).unwrap_or_default();
-            Some(Failure { cause, last_words })
-        };
+        let left = || "it left before its last tick".to_owned();
+        if state != RoleState::Done
+            && let Ok(last_words) = std::fs::read_to_string(words_path(janitor.root(), &self.name))
+        {
+            return Some(Failure { cause: left(), last_words });
+        }
+        let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
         let timeout_s = match &self.host {
             Some(_) => scenario.hosts.network.silence_timeout_s,
             None => scenario.supervision.heartbeat_timeout_s,
@@ -295,27 +315,29 @@ impl Member {
             return None;
         }
         // Not before: a program that was started again in its seat is not there for a moment.
-        if state == RoleState::Running && !present {
-            return fail(janitor, "it left before its last tick".to_owned());
+        if self.in_ticks && !present {
+            return fail(left());
         }
         // One that was killed has left once its remains are put away.
         if !janitor.is_busy() {
             janitor.clear_dead();
         }
+        if let (true, Some(host)) = (tells, &self.host) {
+            return fail(format!("nothing was heard of it and the host {host} for {limit_s} s"));
+        }
         match (tells, state, scenario.clock) {
-            (true, ..) => match &self.host {
-                Some(host) => fail(janitor, format!("nothing was heard of it and the host {host} for {limit_s} s")),
-                None => fail(janitor, format!("it said nothing for {limit_s} s")),
-            },
+            (true, _, ClockKind::Realtime) => {
+                let limit_s = scenario.external_timeout_s.map_or(limit_s, |external_s| external_s.max(limit_s));
+                let silent = self.silent_ns as f64 > limit_s * 1e9;
+                silent.then(|| fail(format!("it said nothing for {limit_s} s"))).flatten()
+            }
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
                     self.last.state = RoleState::Done as u64;
                 }
                 None
             }
-            (false, RoleState::Running, ClockKind::Realtime) => {
-                fail(janitor, format!("it sent nothing for {limit_s} s"))
-            }
+            (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),
             _ => None,
         }
     }
@@ -358,7 +380,7 @@ impl Member {
             external: self.external,
             with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
             generation: self.generation,
-            tick: if self.external { self.last.stamp.tick } else { crate::runtime::next_tick(&self.ledger) },
+            tick: if self.counts() { crate::runtime::next_tick(&self.ledger) } else { self.last.stamp.tick },
             cause: failure.cause,
             last_words: failure.last_words,
             begins_anew: false,
@@ -379,6 +401,7 @@ impl Member {
             self.books().for_each(|(_, ledger)| ledger.distrust());
         }
         let action = if again { Action::Restarted } else { Action::Stopped };
+        self.lost = !again;
         let incident = Incident { begins_anew, ..self.incident(failure, scenario, action) };
         // Reaped here, before anybody takes the seat.
         self.process = None;

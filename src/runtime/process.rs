@@ -117,9 +117,12 @@ pub enum RoleError {
         /// Its name.
         role: String,
     },
-    /// The run is gone, and nobody is left to report to.
-    #[error("the run is gone: its launcher was killed, or ended without waiting for this role; start it again")]
+    /// The run is gone, and its launcher never told this role to stop.
+    #[error("the run is gone: its launcher was killed; start it again")]
     Gone,
+    /// The launcher ended the run while this role was busy.
+    #[error("the run ended without this role, which did not stop when told to; the run's incidents say why it ended")]
+    Late,
     /// The run was launched on another host, and its time is not to be had.
     #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
     Clock {
@@ -363,7 +366,8 @@ pub fn serve<B: Bus + 'static>(
         privileges::release();
     }
     if bus.is_gone() {
-        return Err(RoleError::Gone);
+        let told = control.schedule().is_ok_and(|word| Phase::from_number(word.phase) == Phase::Stop);
+        return Err(if told { RoleError::Late } else { RoleError::Gone });
     }
     for (of, ledger) in &books {
         // What was asked of the machine is the seat's own, and what was measured before the ticks the leader's.

@@ -1,7 +1,8 @@
 """Runs."""
 
+import contextvars
 import json
-import multiprocessing
+import logging
 import threading
 import time
 from dataclasses import dataclass, field
@@ -10,8 +11,10 @@ from pathlib import Path
 from . import _corotate
 from .recording import Recording
 from .scenario import given, overrides
-from .seat import Samples, serve
+from .roles import RoleProcess, RoleThread, end_thread
+from .seat import Samples
 
+LOG = logging.getLogger("corotate")
 CLOCKS = ("in-process", "lockstep", "realtime")
 
 
@@ -73,9 +76,15 @@ class _Timeout:
         self.end = None if timeout_s is None else time.monotonic() + timeout_s
         self.timeout_s = timeout_s
 
-    def check(self):
+    def left_s(self):
+        """Returns how much time is left, s; None without a limit."""
+        return None if self.end is None else self.end - time.monotonic()
+
+    def check(self, tick=None):
+        """Raises TimeoutError once the time is used up."""
         if self.end is not None and time.monotonic() > self.end:
-            raise TimeoutError(f"the run took longer than {self.timeout_s} s")
+            at = "" if tick is None else f"; it was at tick {tick}"
+            raise TimeoutError(f"the run took longer than {self.timeout_s} s{at}")
 
 
 def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", record=False, out=None, timeout_s=None,
@@ -100,7 +109,8 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     out : path
         The directory for the results; a new one in `runs/` otherwise.
     timeout_s : float
-        A run that takes longer is ended in order, and TimeoutError raised.
+        A run that takes longer is ended in order, and TimeoutError raised, also where a function hangs. In the clock `in-process`
+        the function then runs in a thread. Python cannot end a thread that sleeps: it goes on until it executes Python again.
 
     Returns
     -------
@@ -111,8 +121,12 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     ValueError
         What is wrong with the scenario, with file, line, key and remedy.
     CorotateError
-        Why there is no result. A role that raised ends the run in order: its traceback is in the error and in the run's incident, and
-        the error's `run` is the Run.
+        Why there is no result, or why the run ended before its last tick.
+    What a function raised
+        It ends the run in order, and is raised here, whatever it is. Where it comes from a process its traceback is the cause; an
+        exception that cannot be pickled is a CorotateError with its text.
+
+    An error of a run that left results has them as `run`.
 
     >>> corotate.run("rigid-pair", clock="in-process", set={"duration_s": 9}, out=tmp / "repr").accepted
     True
@@ -121,6 +135,8 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
         raise ValueError(f"there is no clock {clock!r}; give one of {', '.join(CLOCKS)}")
     if roles_in not in ("thread", "process"):
         raise ValueError(f"roles_in={roles_in!r}: give thread or process")
+    # Where pytest shows a frame it shows the docstring too.
+    __tracebackhide__ = True
     text, kind = given(scenario)
     timeout = _Timeout(timeout_s)
     if roles and clock == "in-process":
@@ -129,56 +145,98 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
         if record:
             raise ValueError("a run that is stepped is not recorded; take clock='lockstep'")
         return _stepped(text, kind, set, roles["controller"], timeout, out)
-    changes = overrides({"clock": clock, **set})
-    helpers, failures = {}, []
+    start = RoleThread if roles_in == "thread" else RoleProcess
+    arguments = text, kind, overrides({"clock": clock, **set}), list(roles), record, out and str(out), require_realtime
+    return _launched(arguments, roles, start, timeout)
+
+
+def _launched(arguments, roles, start, timeout):
+    """A run in processes, with functions in the seats of some roles."""
+    __tracebackhide__ = True
+    helpers, wait_s = {}, 0.1
 
     def tell(what, value):
-        timeout.check()
-        if what == "waiting" and not helpers:
+        timeout.check(value if what == "running" else None)
+        if what == "waiting":
             for role, function in roles.items():
-                helpers[role] = _start(value, role, function, roles_in, failures)
+                # The launcher waits for ever for a role that has not come: it knows nothing of one that failed before.
+                if role in helpers and helpers[role].failed():
+                    raise helpers[role].error() or _corotate.CorotateError(f"the {role} ended before the first tick")
+                if role not in helpers:
+                    helpers[role] = start(value, role, function)
+        elif what == "external":
+            LOG.warning("corotate: %s", value)
 
+    made = ended = None
     try:
-        summary, directory = _corotate.run(text, kind, changes, list(roles), record, out and str(out), require_realtime, tell)
+        summary, directory = _corotate.run(*arguments, tell)
+        made, wait_s = Run(json.loads(summary), Path(directory)), 5
+    except _corotate.CorotateError as error:
+        ended = error
     finally:
         for helper in helpers.values():
-            helper.join(30)
-    made = Run(json.loads(summary), Path(directory))
-    if failures:
-        failures[0].run = made
-        raise failures[0]
+            helper.end(wait_s)
+    lost = [incident for incident in made.summary["incidents"] if incident["action"] == "stopped"] if made else []
+    errors = {role: error for role, helper in helpers.items() if (error := helper.error())}
+    first = lost[0]["role"] if lost else next(iter(errors), None)
+    if first in errors and (lost or not made):
+        ended = _with_run(errors[first], made, first)
+    elif lost:
+        incident = lost[0]
+        said = f"; it said: {incident['last_words']}" if incident["last_words"] else ""
+        ended = _with_run(_corotate.CorotateError(f"the {first} failed at tick {incident['tick']}: {incident['cause']}{said}"), made)
+    if ended is not None:
+        raise ended
     return made
 
 
-def _start(domain, role, function, where, failures):
-    """Starts a function in a role's seat."""
-    if where == "process":
-        # A new interpreter: one that was forked would have this one's threads half.
-        helper = multiprocessing.get_context("spawn").Process(target=serve, args=(domain, role, function), daemon=True)
-    else:
-        def guarded():
-            try:
-                serve(domain, role, function)
-            except BaseException as error:  # noqa: B902: whatever it is, it ends the run
-                failures.append(error)
-
-        helper = threading.Thread(target=guarded, name=role, daemon=True)
-    helper.start()
-    return helper
+def _with_run(error, made, role=None):
+    """Adds the run to the exception that ended it."""
+    error.run = made
+    if role is not None and hasattr(error, "add_note"):
+        error.add_note(f"raised by the role {role}" + (f" in the run {made.directory}" if made else ""))
+    return error
 
 
 def _stepped(text, kind, changes, function, timeout, out):
-    """A run in one thread whose controller is a function."""
-    steps = _corotate.Steps(text, kind, overrides({**changes, "clock": "in-process"}))
-    samples = Samples(*steps.seat())
-    blank = samples.blank()
-    while not steps.over():
-        inputs, outputs = samples.inputs(steps.inputs()), samples.outputs(blank)
-        function(steps.tick(), inputs, outputs)
-        steps.act(outputs.close())
-        timeout.check()
-    summary, directory = steps.finish(True, out and str(out))
-    return Run(json.loads(summary), Path(directory))
+    """A run in one thread whose controller is a function. With a limit of time this thread watches another one."""
+    __tracebackhide__ = True
+    made, errors, left = [], [], threading.Event()
+
+    def step():
+        steps = _corotate.Steps(text, kind, overrides({**changes, "clock": "in-process"}))
+        samples = Samples(*steps.seat())
+        blank = samples.blank()
+        while not steps.over() and not left.is_set():
+            inputs, outputs = samples.inputs(steps.inputs()), samples.outputs(blank)
+            function(steps.tick(), inputs, outputs)
+            steps.act(outputs.close())
+        if not left.is_set():
+            summary, directory = steps.finish(True, out and str(out))
+            made.append(Run(json.loads(summary), Path(directory)))
+
+    def guarded():
+        try:
+            step()
+        except BaseException as error:  # Whatever the function raises is its caller's.
+            errors.append(error)
+
+    if timeout.end is None:
+        step()
+        return made[0]
+    thread = threading.Thread(target=contextvars.copy_context().run, args=(guarded,), name="controller", daemon=True)
+    thread.start()
+    try:
+        thread.join(max(timeout.left_s(), 0))
+        if thread.is_alive():
+            timeout.check()
+    finally:
+        left.set()
+        if thread.is_alive():
+            end_thread(thread)
+    if errors:
+        raise errors[0]
+    return made[0]
 
 
 def certificate(scenario, *, set={}):

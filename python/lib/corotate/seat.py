@@ -109,10 +109,12 @@ def serve(domain, role, function):
 
     `domain` is as the `run` of a `Seat`.
     """
+    __tracebackhide__ = True
     domain = _domain(domain)
     samples = Samples(*_corotate.describe(domain, "domain", role)[:2])
 
     def tick(number, inputs, blank):
+        __tracebackhide__ = True
         outputs = samples.outputs(blank)
         function(number, samples.inputs(inputs), outputs)
         return outputs.close()
