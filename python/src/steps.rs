@@ -3,7 +3,7 @@
 use crate::run::{failed, scenario};
 use crate::seat::{Seat, seat_of};
 use corotate::launch::{Summary, make_directory, make_latest, new_run, write_run};
-use corotate::sample::{FieldKind, Stamp};
+use corotate::sample::{FieldKind, Stamp, status};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -12,6 +12,10 @@ use std::time::SystemTime;
 
 /// Words of a stamp.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
+
+/// What a step gives: the command that acts, how many commands were rejected and missed, and how a body's motion has ended.
+type Acted<'py> = (Bound<'py, PyArray1<f64>>, u32, u32, Option<String>);
+type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<Acted<'py>>);
 
 /// A run that is stepped. What is observed is every number of the estimate, then of each driven body's measurement; an action is the
 /// first field of each command.
@@ -23,8 +27,9 @@ pub struct Steps {
     /// Of each input, where its numbers are: first word and count.
     numbers: Vec<Vec<(usize, usize)>>,
     commands: Vec<Vec<u64>>,
-    /// Of each command, how many numbers its first field has.
+    /// Of each command, how many numbers its first field has, and its body.
     actions: Vec<usize>,
+    driven: Vec<String>,
     observation: Vec<f64>,
     over: bool,
     started: SystemTime,
@@ -74,6 +79,7 @@ impl Steps {
             numbers,
             commands: ports.writes.iter().map(|port| vec![0; port.size / size_of::<u64>() - STAMP]).collect(),
             actions: ports.writes.iter().map(|port| port.fields.first().map_or(0, |field| field.count)).collect(),
+            driven: ports.writes.iter().map(|port| port.topic.body.clone()).collect(),
             observation: vec![0.0; length],
             over: false,
             started: SystemTime::now(),
@@ -102,12 +108,9 @@ impl Steps {
         self.steps().map(|steps| steps.tick())
     }
 
-    /// Acts at the tick at hand, and observes the next: what is seen, the metric of the tick, whether it was the last.
-    fn step<'py>(
-        &mut self,
-        py: Python<'py>,
-        action: PyReadonlyArray1<'py, f64>,
-    ) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, bool)> {
+    /// Acts at the tick at hand, and observes the next: what is seen, the metric of the tick, whether it was the last, and, unless
+    /// it was, what the bodies did with their commands.
+    fn step<'py>(&mut self, py: Python<'py>, action: PyReadonlyArray1<'py, f64>) -> PyResult<Stepped<'py>> {
         let action = action.as_slice()?;
         let length: usize = self.actions.iter().sum();
         if action.len() != length {
@@ -121,7 +124,23 @@ impl Steps {
         }
         self.act_and_observe()?;
         let metric = self.steps()?.metric();
-        Ok((self.observation(py), metric, self.over))
+        let (observation, over) = (self.observation(py), self.over);
+        let (mut applied, mut rejected, mut missed, mut loss) = (Vec::with_capacity(length), 0, 0, None);
+        for body in self.steps()?.bodies() {
+            if let (None, Some(end)) = (&loss, body.loss) {
+                loss = Some(format!("{} {end}", body.body));
+            }
+        }
+        for name in &self.driven {
+            let Some(body) = self.steps.iter().flat_map(|steps| steps.bodies()).find(|body| body.body == *name) else {
+                continue;
+            };
+            applied.extend_from_slice(&body.applied);
+            rejected += u32::from(body.status & status::REJECTED != 0);
+            missed += u32::from(body.status & (status::HOLDING | status::SAFE) != 0);
+        }
+        let acted = (!over).then(|| (PyArray1::from_vec(py, applied), rejected, missed, loss));
+        Ok((observation, metric, over, acted))
     }
 
     /// The same with whole commands, as bytes without their stamps.

@@ -37,7 +37,7 @@ pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
 pub use results::{LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub(crate) use score::{lyapunov_floor, score_rig};
-pub use steps::Steps;
+pub use steps::{BodyState, Steps};
 pub use supervision::{Action, Incident};
 pub(crate) use table::plain;
 pub use table::{line_words, table};

@@ -6,12 +6,13 @@
 use super::score::{self, Scorer};
 use super::{LaunchError, Outcome};
 use crate::bus::memory::MemoryBus;
-use crate::bus::{Reader, WordReader};
+use crate::bus::{BusError, Reader, Signal, WordReader};
 use crate::config::{ClockKind, Scenario};
 use crate::runtime::{
     Compute, ComputedTick, Poll, Port, ReadyNode, RoleId, RoleImpl, RunCondition, build, depths, ports, private_ledger,
     report,
 };
+use crate::sample::Field;
 use crate::telemetry::Ledger;
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -47,8 +48,57 @@ pub struct Steps {
     inputs: Vec<Option<Vec<u64>>>,
     outputs: Vec<Port>,
     commands: Rc<RefCell<Vec<Vec<u64>>>>,
+    truths: Vec<TruthReader>,
     tick: u64,
     _bus: MemoryBus,
+}
+
+/// The state of a body at the tick at hand, which no controller sees.
+#[derive(Debug, Clone, Default)]
+pub struct BodyState {
+    /// Its name.
+    pub body: String,
+    /// The bits of its status ([`status`](crate::sample::status)).
+    pub status: u64,
+    /// The command that acts, as numbers.
+    pub applied: Vec<f64>,
+    /// How its motion has ended, as a verb with its object, if it has.
+    pub loss: Option<&'static str>,
+}
+
+/// Reads the state of a body from its truth.
+struct TruthReader {
+    reader: WordReader,
+    /// The first word and the count of the applied command, and the word of the status.
+    applied: (usize, usize),
+    status: Option<usize>,
+    state: BodyState,
+}
+
+impl TruthReader {
+    fn new(port: &Port, bus: &MemoryBus) -> Result<Self, BusError> {
+        let word = |field: &Field| field.offset / size_of::<u64>();
+        let named = |matches: fn(&str) -> bool| port.fields.iter().find(|field| matches(field.name));
+        let applied = named(|name| name.starts_with("applied_"));
+        Ok(Self {
+            reader: port.reader(bus, Reader::Scorer)?,
+            applied: applied.map_or((0, 0), |field| (word(field), field.count)),
+            status: named(|name| name == "status").map(word),
+            state: BodyState { body: port.topic.body.clone(), ..BodyState::default() },
+        })
+    }
+
+    /// Takes the newest truth; without one the state is the one before.
+    fn read(&mut self, scenario: &Scenario) -> Result<(), BusError> {
+        let ((first, count), state) = (self.applied, &mut self.state);
+        while let Some(words) = self.reader.next()? {
+            state.status = self.status.map_or(0, |word| words[word]);
+            state.applied.clear();
+            state.applied.extend(words[first..first + count].iter().map(|bits| f64::from_bits(*bits)));
+            state.loss = scenario.rig.face().loss_words(words);
+        }
+        Ok(())
+    }
 }
 
 /// Hands the caller's commands on.
@@ -96,7 +146,10 @@ impl Steps {
         };
         let nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
         let (inputs, outputs) = (vec![None; readers.len()], of_controller.writes);
-        Ok(Self { scenario, seats, nodes, scorer, readers, inputs, outputs, commands, tick: 0, _bus: bus })
+        let written = seats.iter().flat_map(|(role, _)| ports(&scenario, *role).writes);
+        let truths = written.filter(|port| port.topic.signal == Signal::Truth);
+        let truths = truths.map(|port| TruthReader::new(&port, &bus)).collect::<Result<_, _>>()?;
+        Ok(Self { scenario, seats, nodes, scorer, readers, inputs, outputs, commands, truths, tick: 0, _bus: bus })
     }
 
     /// Lets bodies and observer make the next tick, up to where the controller is to act; false once there is none.
@@ -124,7 +177,13 @@ impl Steps {
                 }
             }
         }
+        self.truths.iter_mut().try_for_each(|truth| truth.read(&self.scenario))?;
         Ok(true)
+    }
+
+    /// The state of every body at the tick at hand.
+    pub fn bodies(&self) -> impl Iterator<Item = &BodyState> {
+        self.truths.iter().map(|truth| &truth.state)
     }
 
     /// What the controller has of the tick at hand: the estimate, then each driven body's measurement, as words with their stamps.

@@ -25,6 +25,8 @@ pub(crate) trait WordView {
     fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
     /// Returns V and the bound on V̇ that a command carries, as [`Rig::lyapunov`].
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)>;
+    /// Returns how the motion of a single body has ended, as [`Rig::loss`].
+    fn loss_words(&self, truth: &[u64]) -> Option<&'static str>;
 }
 
 impl<R: Rig> WordView for R {
@@ -64,6 +66,10 @@ impl<R: Rig> WordView for R {
 
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {
         R::lyapunov(cast(command)?)
+    }
+
+    fn loss_words(&self, truth: &[u64]) -> Option<&'static str> {
+        self.loss(cast(truth)?)
     }
 }
 

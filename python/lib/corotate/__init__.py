@@ -10,7 +10,7 @@ True
 
 import sys as _sys
 
-from . import _corotate
+from . import _corotate, environments as _environments
 from ._corotate import CorotateError, __version__
 from .logs import HiddenRate, Identified, OrbitHold, Synchronizer, identify
 from .recording import Recording
@@ -25,6 +25,8 @@ __all__ = [
 
 # Roles of a run are processes of this interpreter with this package.
 _corotate.started_by(_sys.executable, ["-m", "corotate"])
+
+_environments.register_with_gymnasium()
 
 
 def __getattr__(name):

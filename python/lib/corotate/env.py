@@ -6,34 +6,48 @@ import gymnasium
 import numpy as np
 
 from . import _corotate
-from .scenario import given, overrides
+from .scenario import given, overrides, seed_of
 from .seat import Samples
+
+# What the guards bound, by the beginning of a field's name: of measurements, of estimates, of commands that act.
+RATES, APPLIED = ("omega_", "velocity_"), "applied_"
 
 
 class Env(gymnasium.Env):
-    """A scenario in one thread. The bits are those of a run with the same commands.
+    """A scenario in one thread. The bits are those of a run with the same commands and the same seed.
 
-    Nothing is judged unless `set` has an `accept`. An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`); an
-    action is the first field of each command (`action_names`), bounded by what the command guard believes. The reward is minus the scenario's first metric. An episode is
-    truncated at the scenario's last tick.
+    An observation has every number of the estimate, then of each driven body's measurement, in SI units (`observation_names`), bounded
+    by what the guards believe; a number stays where its sample is missing. An action is the first field of each command
+    (`action_names`), bounded by `action_bound` or else by what the command guard believes; with `normalize_actions` it is from -1 to 1
+    of that. The reward is minus the scenario's first metric.
+
+    An episode is truncated at the scenario's last tick. It is terminated where a body's motion has met the end of its model:
+    `info["reason"]` says how. Each step's `info` has `applied`, the command that acts from then on, in the unit of an action; and how many
+    commands that were due then were `rejected` by the guards and `missed` (absent, late or rejected; the body holds the last one or is
+    safe). The step into the truncation has no tick after it, and none of these.
+
+    A copied or pickled environment has the settings and the random generator, and no episode: `reset` begins one.
     """
 
     metadata = {"render_modes": []}
 
-    def __init__(self, scenario="rigid-pair", *, set={}, action_bound=None):
+    def __init__(self, scenario="rigid-pair", *, set={}, action_bound=None, normalize_actions=False):
         self._given, self._changes = given(scenario), dict(set)
         steps = self._begin({})
         samples = Samples(*steps.seat())
-        names = [f"{body}/{signal}.{name}" for body, signal, dtype in samples.reads for name in self._numbers(dtype)]
-        self.observation_names = names
+        self.observation_names = [f"{body}/{signal}.{name}" for body, signal, dtype in samples.reads for name in self._numbers(dtype)]
         firsts = [(body, signal, dtype.names[0], int(np.prod(dtype[0].shape))) for body, signal, dtype in samples.writes]
         self.action_names = [f"{body}/{signal}.{name}[{index}]" for body, signal, name, count in firsts for index in range(count)]
-        # The last of a rig's bounds is that of its commands.
-        limits = steps.limits()
-        bound = float(action_bound) if action_bound is not None else limits[-1][1] if limits else np.inf
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(steps.observation()),), np.float64)
-        self.action_space = gymnasium.spaces.Box(-bound, bound, (len(self.action_names),), np.float64)
-        self._steps = None
+        bounds = [bound for _, bound in steps.limits()] or [np.inf] * 3
+        bound = bounds[-1] if action_bound is None else float(action_bound)
+        if normalize_actions and not np.isfinite(bound):
+            raise ValueError("normalize_actions=True: the scenario does not bound its commands; give action_bound")
+        self._scale, largest = (bound, 1.0) if normalize_actions else (1.0, bound)
+        most = np.array([self._bound(name, bounds) for name in self.observation_names])
+        self.observation_space = gymnasium.spaces.Box(-most, most, dtype=np.float64)
+        self.action_space = gymnasium.spaces.Box(-largest, largest, (len(self.action_names),), np.float64)
+        self._steps = self._summary = None
+        self._seeded = self._over = False
 
     @staticmethod
     def _numbers(dtype):
@@ -42,24 +56,63 @@ class Env(gymnasium.Env):
             if base == np.float64:
                 yield from [f"{name}[{index}]" for index in range(shape[0])] if shape else [name]
 
+    @staticmethod
+    def _bound(name, bounds):
+        signal, field = name.split("/")[1].split(".", 1)
+        if field.startswith(APPLIED):
+            return bounds[-1]
+        return bounds[signal == "estimate"] if field.startswith(RATES) else np.inf
+
     def _begin(self, more):
-        return _corotate.Steps(*self._given, overrides({"accept": {}, **self._changes, "clock": "in-process", **more}))
+        changes = {**self._changes, "clock": "in-process", **more}
+        try:
+            return _corotate.Steps(*self._given, overrides(changes))
+        except ValueError as error:
+            refused = error
+        # The criteria may need a longer run than is asked for.
+        try:
+            return _corotate.Steps(*self._given, overrides({"accept": {}, **changes}))
+        except ValueError:
+            raise refused from None
+
+    def __getstate__(self):
+        return {**self.__dict__, "_steps": None, "_summary": None}
 
     def reset(self, *, seed=None, options=None):
-        """Begins the run anew; `seed` is the scenario's, of all noise."""
+        """Begins an episode. `seed` is the scenario's, of all noise; without one it is drawn from `np_random`, so that every episode has
+        its own. The first episode without one has the seed of `set`, if that has one. `info["seed"]` is the seed.
+        """
+        if seed is None and not self._seeded and "seed" in self._changes:
+            seed = self._changes["seed"]
+        seed = None if seed is None else seed_of(seed)
         super().reset(seed=seed)
-        self._steps = self._begin({} if seed is None else {"seed": int(seed)})
-        return self._steps.observation(), {}
+        self._seeded = True
+        seed = int(self.np_random.integers(2**63)) if seed is None else seed
+        self._steps, self._summary, self._over = self._begin({"seed": seed}), None, False
+        return self._steps.observation(), {"seed": seed}
 
     def step(self, action):
-        """Acts for one tick."""
+        """Acts for one tick. An action that is not finite, or out of bounds, is given to the loop as it is: see `rejected`."""
         if self._steps is None:
-            raise RuntimeError("call reset() first")
-        observation, metric, over = self._steps.step(np.ascontiguousarray(action, dtype=np.float64))
-        return observation, -metric, False, over, {}
+            raise RuntimeError("there is no episode: call reset() first")
+        if self._over:
+            raise _corotate.CorotateError("the episode is over: call reset() to begin another")
+        action = np.ascontiguousarray(action, dtype=np.float64) * self._scale
+        observation, metric, truncated, acted = self._steps.step(action)
+        if acted is None:
+            self._over = True
+            return observation, -metric, False, True, {}
+        applied, rejected, missed, reason = acted
+        info = {"applied": applied / self._scale, "rejected": rejected, "missed": missed}
+        if reason is not None:
+            self._over = True
+            info["reason"] = reason
+        return observation, -metric, self._over, False, info
 
     def summary(self):
-        """Ends the run and gives its summary, as `Run.summary`."""
-        summary, _ = self._steps.finish(False, None)
-        self._steps = None
-        return json.loads(summary)
+        """Ends the episode and returns its summary, judged by the scenario's criteria, as `Run.summary`; again the same until `reset`."""
+        if self._summary is None:
+            if self._steps is None:
+                raise RuntimeError("there is no episode to sum up: call reset() first")
+            self._summary, self._steps = json.loads(self._steps.finish(False, None)[0]), None
+        return self._summary

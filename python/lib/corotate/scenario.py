@@ -1,6 +1,7 @@
 """What a scenario may be given as. Must not know what is in one."""
 
 import json
+import operator
 import os
 
 
@@ -30,4 +31,16 @@ def toml(value):
 
 def overrides(changes):
     """Changes by key as `KEY=VALUE`."""
+    changes = {**changes, "seed": seed_of(changes["seed"])} if "seed" in changes else changes
     return [f"{key}={toml(value)}" for key, value in changes.items()]
+
+
+def seed_of(value):
+    """A seed as an int: any integer, also numpy's, from 0 to 2**63 - 1, which is what a scenario file can hold."""
+    try:
+        seed = operator.index(value)
+    except TypeError:
+        seed = -1
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed = {value!r}: a seed is an integer from 0 to 2**63 - 1")
+    return seed
