@@ -167,16 +167,18 @@ def _launched(arguments, roles, start, timeout):
         elif what == "external":
             LOG.warning("corotate: %s", value)
 
-    made = ended = None
+    made, ended, lost = None, None, []
     try:
         summary, directory = _corotate.run(*arguments, tell)
-        made, wait_s = Run(json.loads(summary), Path(directory)), 5
+        made = Run(json.loads(summary), Path(directory))
+        lost = [incident for incident in made.summary["incidents"] if incident["action"] == "stopped"]
+        # A role that hangs does not end; one that raised needs a moment to tell of it.
+        wait_s = 1 if lost else 5
     except _corotate.CorotateError as error:
-        ended = error
+        ended, wait_s = error, 1
     finally:
         for helper in helpers.values():
             helper.end(wait_s)
-    lost = [incident for incident in made.summary["incidents"] if incident["action"] == "stopped"] if made else []
     errors = {role: error for role, helper in helpers.items() if (error := helper.error())}
     first = lost[0]["role"] if lost else next(iter(errors), None)
     if first in errors and (lost or not made):
@@ -227,9 +229,9 @@ def _stepped(text, kind, changes, function, timeout, out):
     thread = threading.Thread(target=contextvars.copy_context().run, args=(guarded,), name="controller", daemon=True)
     thread.start()
     try:
-        thread.join(max(timeout.left_s(), 0))
-        if thread.is_alive():
+        while thread.is_alive():
             timeout.check()
+            thread.join(max(timeout.left_s(), 1e-3))
     finally:
         left.set()
         if thread.is_alive():
