@@ -591,12 +591,14 @@ fn what_a_partner_without_books_sends_is_counted_where_it_is_read() {
     let expected = serde_json::json!({
         "service": "corotate/hil-pair/follower/measurement", "reader": "controller", "published": null, "received": 101,
         "skipped": null, "gaps": 0, "unread": null, "void": [null, 0], "stale": 0, "rejected": 60, "injected": null,
+        "rejected_by": {"stamp": 1, "not_finite": 59},
     });
     assert_eq!(*link, expected);
     assert_eq!(summary["books"]["rejected_samples"], 60);
+    assert_eq!(summary["books"]["rejected_by"], link["rejected_by"]);
     assert_eq!(summary["books"]["balanced"], true);
     assert_eq!(summary["state"]["first_disturbed_tick"], BAD_TICK);
-    let told = "corotate/hil-pair/follower/measurement at controller: 60 rejected, 0 stale, 0 void of 101 received";
+    let told = "corotate/hil-pair/follower/measurement at controller: 60 rejected (59 not finite, 1 stamp), 0 stale, 0 void of 101 received";
     assert!(done.stderr.contains(told), "{done:?}");
     let verdict = std::fs::read_to_string(bench.path("verdict.xml")).unwrap();
     for name in ["rejected_samples", "rejected_samples of corotate/hil-pair/follower/measurement at controller"] {

@@ -296,15 +296,30 @@ fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures(
     bench.assert_clean(&[]);
 }
 
-/// Every tick of a plant has a lateness, the skipped ones too: nothing is omitted because nobody was there.
+/// Every tick has an entry in every stage, also those that a controller which stands still for 20 ms misses, and those that a
+/// follower spends with an old command: nothing is omitted because nobody was there.
 #[test]
-fn lateness_is_counted_for_every_tick() {
+fn every_stage_counts_every_tick() {
     let bench = Bench::new();
-    let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}"]);
-    for role in ["leader", "follower"] {
-        let lateness = summary["latencies"].as_array().unwrap().iter();
-        let lateness = lateness.clone().find(|stage| stage["role"] == role && stage["stage"] == "lateness").unwrap();
-        assert_eq!(lateness["count"], 1001, "{role}");
+    let stall = "fault=[{kind=\"stall\", role=\"controller\", from_tick=300, stall_ms=20.0}]";
+    let summary = bench.summary("rigid-pair", &["--duration", "1", "--set", "accept={}", "--set", stall]);
+    let stages = summary["latencies"].as_array().unwrap();
+    let find = |role: &str, stage: &str| {
+        stages.iter().find(|found| found["role"] == role && found["stage"] == stage).unwrap().clone()
+    };
+    for (role, told) in [
+        ("leader", &["lateness", "step"][..]),
+        ("follower", &["lateness", "step"]),
+        ("observer", &["hop", "step", "age"]),
+        ("controller", &["hop", "step", "age"]),
+    ] {
+        told.iter().for_each(|stage| assert_eq!(find(role, stage)["count"], 1001, "{role} {stage}"));
+    }
+    for (role, stage) in [("controller", "hop"), ("controller", "step"), ("controller", "age"), ("follower", "age")] {
+        let found = find(role, stage);
+        let us = |key: &str| found[key].as_f64().unwrap();
+        assert!(us("max_us") > 15e3 && us("p99_us") > 5e3 && us("missed") > 10.0, "{found:#}");
+        assert_eq!(found["ahead"], 0, "{found:#}");
     }
 }
 

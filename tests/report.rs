@@ -266,7 +266,8 @@ fn latencies_are_drawn_from_the_histograms_of_the_run() {
     assert_eq!(table.len(), summary["latencies"].as_array().unwrap().len() + 1);
     for (row, stage) in table[1..].iter().zip(summary["latencies"].as_array().unwrap()) {
         assert_eq!(row[2], stage["count"].to_string());
-        assert_eq!(row[6], format!("{:.2}", stage["max_us"].as_f64().unwrap()));
+        assert_eq!(row[3], stage["missed"].to_string());
+        assert_eq!(row[7], format!("{:.2}", stage["max_us"].as_f64().unwrap()));
     }
     // A row for every role, and shades in it.
     let strip = text(section(&page, "lateness"));

@@ -159,11 +159,7 @@ fn receive(
         lost += content.number - first - tick;
         tick = content.number - first + 1;
     }
-    let report = |stage: &str, latency: &Latency| {
-        let (histogram, clipped) = latency.encode();
-        StageReport { stage: stage.to_owned(), histogram, clipped }
-    };
-    Ok(Answer::Received { due: report("due", &due), sent: report("sent", &sent), lost })
+    Ok(Answer::Received { due: StageReport::new("due", &due), sent: StageReport::new("sent", &sent), lost })
 }
 
 /// A peer as its parent sees it.

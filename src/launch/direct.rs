@@ -207,6 +207,7 @@ impl<'a, R: Rig> Run<'a, R> {
                 stale: 0,
                 void: 0,
                 rejected: 0,
+                rejected_by: std::collections::BTreeMap::new(),
                 last_tick: received.checked_sub(1),
             }
         });

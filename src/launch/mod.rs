@@ -39,8 +39,8 @@ pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub(crate) use score::{lyapunov_floor, score_rig};
 pub use steps::{BodyState, Steps};
 pub use supervision::{Action, Incident};
-pub(crate) use table::plain;
 pub use table::{line_words, table};
+pub(crate) use table::{plain, reasons};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;

@@ -115,6 +115,9 @@ pub struct Summary {
     pub recording: Option<RecordingReport>,
     /// Everything that was asked of the machine.
     pub privileges: Vec<RoleGrant>,
+    /// Roles with a process of their own that report no privileges.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub privileges_unknown: Vec<String>,
 }
 
 /// A criterion and its verdict.
@@ -147,6 +150,9 @@ pub struct Accounting {
     pub missed_ticks: u64,
     /// Samples received and not believed, all links together.
     pub rejected_samples: u64,
+    /// The same by reason.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched, and stalls.
     pub injected_faults: u64,
 }
@@ -174,6 +180,9 @@ pub struct LinkCounters {
     pub stale: u64,
     /// Samples received and not believed.
     pub rejected: u64,
+    /// The same by reason.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched on the writing end.
     pub injected: Option<u64>,
 }
@@ -203,6 +212,9 @@ pub struct StageFigures {
     pub role: String,
     /// The stage.
     pub stage: String,
+    /// The role whose stamps lie ahead of this role's clock, so that there are no figures.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stamps_of: Option<String>,
     /// The figures.
     #[serde(flatten)]
     pub figures: Percentiles,
@@ -244,7 +256,7 @@ pub(crate) struct Judged {
 
 impl Judged {
     pub fn new(scenario: &Scenario, outcome: &Outcome) -> Self {
-        let mut latencies = latencies(&outcome.reports);
+        let mut latencies = latencies(scenario, &outcome.reports);
         latencies.extend(incident_figures(&outcome.incidents));
         let lost = outcome.incidents.iter().filter(|incident| incident.action == Action::Stopped);
         let lost: Vec<&str> =
@@ -309,6 +321,7 @@ impl Summary {
             hosts: HostsSummary::of(&outcome.hosts),
             recording: outcome.recording.clone(),
             privileges: privileges(outcome),
+            privileges_unknown: privileges_unknown(scenario, outcome),
         }
     }
 }
@@ -341,12 +354,17 @@ impl Accounting {
             let written = written.map(|(_, written)| *written);
             links.push(LinkCounters::new(&report.role, written, in_flight, read, scenario, &mut problems));
         }
+        let mut rejected_by = BTreeMap::new();
+        for (reason, count) in links.iter().flat_map(|link| &link.rejected_by) {
+            *rejected_by.entry(reason.clone()).or_default() += count;
+        }
         Self {
             balanced: problems.is_empty(),
             problems,
             unbooked: outcome.unbooked.clone(),
             missed_ticks: reports.iter().map(|report| report.ticks.missed + report.ticks.starved).sum(),
             rejected_samples: links.iter().map(|link| link.rejected).sum(),
+            rejected_by,
             injected_faults: written.iter().map(|(_, link)| link.injected).sum::<u64>()
                 + reports.iter().map(|report| report.ticks.stalled + report.ticks.scripted).sum::<u64>(),
             roles: reports.iter().map(|report| (report.role.clone(), report.ticks)).collect(),
@@ -377,6 +395,7 @@ impl LinkCounters {
             void: (written.map(|written| written.void), read.void),
             stale: read.stale,
             rejected: read.rejected,
+            rejected_by: read.rejected_by.clone(),
             injected: written.map(|written| written.injected),
         };
         let lossless = scenario.clock != ClockKind::Realtime;
@@ -447,16 +466,21 @@ fn incident_figures(incidents: &[Incident]) -> Vec<StageFigures> {
     let figures = |((role, stage), latency): ((&str, &str), Latency)| StageFigures {
         role: role.to_owned(),
         stage: stage.to_owned(),
+        stamps_of: None,
         figures: latency.percentiles(),
         latency,
     };
     stages.into_iter().map(figures).collect()
 }
 
-fn latencies(reports: &[RoleReport]) -> Vec<StageFigures> {
+fn latencies(scenario: &Scenario, reports: &[RoleReport]) -> Vec<StageFigures> {
     let figures = |report: &RoleReport, stage: &crate::telemetry::StageReport| {
-        let latency = stage.latency();
-        StageFigures { role: report.role.clone(), stage: stage.stage.clone(), figures: latency.percentiles(), latency }
+        let (latency, role, stage) = (stage.latency(), report.role.clone(), stage.stage.clone());
+        let figures = latency.percentiles();
+        // An age begins at the leader, a hop at who sent the input; all else is measured by one clock.
+        let sender = if stage == "hop" && role == "controller" { RoleId::Observer } else { RoleId::Plant(0) };
+        let stamps_of = (!figures.are_shown()).then(|| sender.name(scenario).to_owned());
+        StageFigures { role, stage, stamps_of, figures, latency }
     };
     reports.iter().flat_map(|report| report.stages.iter().map(move |stage| figures(report, stage))).collect()
 }
@@ -477,6 +501,18 @@ fn privileges(outcome: &Outcome) -> Vec<RoleGrant> {
         report.grants.iter().map(|grant| RoleGrant { role: report.role.clone(), grant: grant.clone() })
     });
     own.chain(roles).collect()
+}
+
+/// The processes of which it is not known what they were granted: where others tell, those that tell nothing.
+fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
+    if scenario.clock != crate::config::ClockKind::Realtime {
+        return Vec::new();
+    }
+    let tells = |name: &str| outcome.reports.iter().any(|report| report.role == name && !report.grants.is_empty());
+    let asked = outcome.reports.iter().any(|report| !report.grants.is_empty());
+    let hosts = RoleId::all(scenario).into_iter().filter(|role| *role == role.host(scenario));
+    let names = hosts.map(|role| role.name(scenario).to_owned());
+    names.filter(|name| outcome.unbooked.contains(name) || asked && !tells(name)).collect()
 }
 
 /// Whether what was judged holds; none if nothing was, or if the run was `interrupted` before anything failed.
@@ -529,7 +565,10 @@ fn judge(
     }
     if let Some(limit) = accept.step_latency_p99_us_max {
         let step = |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
-        let worst = latencies.iter().filter(step).map(|stage| stage.figures.p99_us).reduce(f64::max);
+        let worst = latencies.iter().filter(step).map(|stage| stage.figures.p99_us);
+        // What has no figure was not measured.
+        let worst = worst.reduce(|worst, p99| if worst.is_nan() { worst } else { f64::max(p99, worst) });
+        let worst = worst.filter(|worst| !worst.is_nan());
         // Without a clock there is no latency to judge; in real time a missing one is a failure.
         let judged = scenario.clock == ClockKind::Realtime;
         add("step_latency_p99_us_max".to_owned(), limit, worst, judged);
@@ -558,15 +597,16 @@ pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io
     }
     let latency = directory.join(LATENCY);
     files::create_directories(&latency).map_err(|error| named(&latency, &error))?;
-    for stage in &summary.latencies {
+    let shown = || summary.latencies.iter().filter(|stage| stage.figures.are_shown());
+    for stage in shown() {
         let path = latency.join(format!("{}.{}.hgrm", stage.role, stage.stage));
         write(&path, |out| write_hgrm(&stage.latency, run.as_deref(), out))?;
     }
-    let names: Vec<String> = summary.latencies.iter().map(|stage| format!("{}.{}", stage.role, stage.stage)).collect();
+    let names: Vec<String> = shown().map(|stage| format!("{}.{}", stage.role, stage.stage)).collect();
     let run_s = summary.last_tick as f64 / summary.tick_hz;
     write(&latency.join(LATENCY_LOG), |out| {
         write_hlog(
-            names.iter().map(String::as_str).zip(summary.latencies.iter().map(|stage| &stage.latency)),
+            names.iter().map(String::as_str).zip(shown().map(|stage| &stage.latency)),
             run_s,
             run.as_deref(),
             out,

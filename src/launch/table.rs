@@ -5,6 +5,7 @@ use super::{Incident, Summary};
 use crate::analysis::digits;
 use crate::hosts::{HostsSummary, Silence};
 use crate::serial::LineCounters;
+use crate::telemetry::Percentiles;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use std::collections::BTreeMap;
@@ -102,9 +103,12 @@ fn results(summary: &Summary, text: &mut String) {
     }
     let _ = writeln!(text, "\n{rows}\n\n{}", summary.verdict);
     if let Some(score) = summary.score.certificate {
-        let judged = score.held + score.broken;
-        let _ =
-            writeln!(text, "\nbound on dV/dt held for {} of {judged} steps, {} not judged", score.held, score.unjudged);
+        let (held, broken, judged) = (score.held, score.broken, score.held + score.broken);
+        let told = match broken {
+            0 => format!("held at all of {judged} steps"),
+            _ => format!("broken at {broken} of {judged} steps, held at {held}"),
+        };
+        let _ = writeln!(text, "\nbound on dV/dt {told}, {} not judged", score.unjudged);
     }
     for (signal, told) in &summary.score.statuses {
         let told: Vec<String> = told.iter().map(|(name, ticks)| format!("{name} at {ticks}")).collect();
@@ -140,15 +144,33 @@ fn verdict(holds: Option<bool>) -> String {
     .to_owned()
 }
 
-fn latencies(summary: &Summary) -> Table {
-    let mut rows = plain(&["latency, us", "stage", "count", "p50", "p90", "p99", "p99.9", "max"]);
+fn latencies(summary: &Summary) -> String {
+    let mut rows = plain(&["latency, us", "stage", "count", "missed", "p50", "p90", "p99", "p99.9", "max"]);
+    // One line per sender, not per stage.
+    let mut ahead = BTreeMap::<&str, (f64, Vec<String>)>::new();
     for stage in &summary.latencies {
         let f = &stage.figures;
-        let mut row = vec![stage.role.clone(), stage.stage.clone(), f.count.to_string()];
-        row.extend([f.p50_us, f.p90_us, f.p99_us, f.p999_us, f.max_us].map(|us| format!("{us:.2}")));
+        let mut row = vec![stage.role.clone(), stage.stage.clone(), f.count.to_string(), f.missed.to_string()];
+        row.extend([f.p50_us, f.p90_us, f.p99_us, f.p999_us, f.max_us].map(us));
         rows.add_row(row);
+        if let Some(sender) = &stage.stamps_of {
+            let (most_us, stages) = ahead.entry(sender).or_default();
+            *most_us = most_us.max(f.ahead_max_us);
+            stages.push(format!("{} of {} at {}", stage.stage, stage.role, f.ahead));
+        }
     }
-    rows
+    let mut text = rows.to_string();
+    for (sender, (most_us, stages)) in ahead {
+        let (most, stages) = (digits(most_us / 1e3), stages.join(", "));
+        let _ =
+            write!(text, "\nstamps of {sender} lie up to {most} ms ahead of this clock ({stages} ticks): not shown");
+    }
+    text
+}
+
+/// A figure of a latency; a dash if the stamps are not of one clock.
+fn us(us: f64) -> String {
+    if us.is_nan() { "-".to_owned() } else { format!("{us:.2}") }
 }
 
 fn books(summary: &Summary, text: &mut String) {
@@ -167,12 +189,18 @@ fn books(summary: &Summary, text: &mut String) {
         let _ = writeln!(text, "scripted faults: acted {} times", books.injected_faults);
     }
     if books.rejected_samples > 0 {
-        let _ = writeln!(text, "{} samples rejected by their readers", books.rejected_samples);
+        let reasons = reasons(&books.rejected_by);
+        let _ = writeln!(text, "{} samples rejected by their readers{reasons}", books.rejected_samples);
     }
     let met = |link: &&LinkCounters| link.published.is_none() || link.rejected + link.stale + link.void.1 > 0;
     for link in books.links.iter().filter(met) {
         let LinkCounters { service, reader, received, rejected, stale, void, .. } = link;
-        let _ = write!(text, "  {service} at {reader}: {rejected} rejected, {stale} stale, {} void", void.1);
+        let _ = write!(
+            text,
+            "  {service} at {reader}: {rejected} rejected{}, {stale} stale, {} void",
+            reasons(&link.rejected_by),
+            void.1
+        );
         let _ = match link.published {
             Some(_) => writeln!(text),
             None => writeln!(text, " of {received} received"),
@@ -196,6 +224,13 @@ fn books(summary: &Summary, text: &mut String) {
             state.hash, state.clean_ticks, state.clean_hash
         ),
     };
+}
+
+/// Why samples were rejected, in words.
+pub(crate) fn reasons(rejected_by: &BTreeMap<String, u64>) -> String {
+    let all: Vec<String> =
+        rejected_by.iter().map(|(name, count)| format!("{count} {}", name.replace('_', " "))).collect();
+    if all.is_empty() { String::new() } else { format!(" ({})", all.join(", ")) }
 }
 
 fn hosts(summary: &HostsSummary, text: &mut String) {
@@ -238,12 +273,24 @@ fn hosts(summary: &HostsSummary, text: &mut String) {
         let short = link.service.splitn(3, '/').nth(2).unwrap_or(&link.service).to_owned();
         let mut row = vec![short, format!("{} to {}", link.from, link.to), count(link.sent), count(link.received)];
         row.extend([link.lost.to_string(), link.stale.to_string()]);
-        let us = link.one_way.map(|way| [way.p50_us, way.p99_us, way.max_us].map(|us| format!("{us:.0}")));
+        let shown = link.one_way.filter(Percentiles::are_shown);
+        let us = shown.map(|way| [way.p50_us, way.p99_us, way.max_us].map(|us| format!("{us:.0}")));
         row.extend(us.unwrap_or_else(|| ["-".to_owned(), "-".to_owned(), "-".to_owned()]));
         rows.add_row(row);
     }
+    let _ = writeln!(text, "\n{rows}");
+    for (link, way) in
+        summary.links.iter().filter_map(|link| Some((link, link.one_way.filter(|way| !way.are_shown())?)))
+    {
+        let Percentiles { ahead, ahead_max_us, .. } = way;
+        let _ = writeln!(
+            text,
+            "{}: sent stamps lie up to {ahead_max_us:.1} us ahead of the clock of {} ({ahead} samples): times not shown",
+            link.service, link.to
+        );
+    }
     let error_us = summary.clock_error_us();
-    let _ = writeln!(text, "\n{rows}\ntimes between hosts are known to {error_us:.1} us\n");
+    let _ = writeln!(text, "times between hosts are known to {error_us:.1} us\n");
 }
 
 fn privileges(summary: &Summary, text: &mut String) {
@@ -251,7 +298,11 @@ fn privileges(summary: &Summary, text: &mut String) {
         return;
     }
     let granted = summary.privileges.iter().filter(|entry| entry.grant.granted).count();
-    let _ = writeln!(text, "privileges: {granted} of {} granted", summary.privileges.len());
+    let unknown = match summary.privileges_unknown.join(", ") {
+        names if names.is_empty() => names,
+        names => format!("; unknown of {names}: no report of any"),
+    };
+    let _ = writeln!(text, "privileges: {granted} of {} granted{unknown}", summary.privileges.len());
     // One line per reason, not per role.
     let mut denied: BTreeMap<(&str, &str), Vec<&str>> = BTreeMap::new();
     for entry in summary.privileges.iter().filter(|entry| !entry.grant.granted) {

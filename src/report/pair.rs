@@ -11,6 +11,7 @@ use super::percentiles::{Curve, pictures};
 use super::pictures::ERROR_FLOOR;
 use super::source::Source;
 use super::summary::{Metric, Summary};
+use super::tables::figures_cells;
 use super::traces::{Key, Traces, trace};
 use crate::analysis::digits;
 use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
@@ -313,9 +314,8 @@ fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
         let name = run.name;
         let stages = run.source.summary.iter().flat_map(|summary| &summary.latencies);
         let row = move |stage: &super::summary::Stage| {
-            let us = [stage.p50_us, stage.p99_us, stage.p999_us, stage.max_us].map(|value| format!("{value:.2}"));
-            let mut row = vec![stage.role.clone(), stage.stage.clone(), name.to_owned(), stage.count.to_string()];
-            row.extend(us);
+            let mut row = vec![stage.role.clone(), stage.stage.clone(), name.to_owned()];
+            row.extend(figures_cells(&stage.figures));
             row
         };
         stages.map(row).collect::<Vec<_>>()
@@ -324,6 +324,6 @@ fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
     // Stable: stages stay in the order of the summary, the two of one beside each other.
     let places: Vec<(String, String)> = rows.iter().map(|row| (row[0].clone(), row[1].clone())).collect();
     rows.sort_by_key(|row| places.iter().position(|place| place.0 == row[0] && place.1 == row[1]));
-    let head = vec!["role", "stage", "run", "count", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
+    let head = vec!["role", "stage", "run", "count", "missed", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
     Block::table("", head, rows)
 }

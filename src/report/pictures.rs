@@ -361,10 +361,17 @@ pub fn lateness(source: &Source, traces: &Traces, time: &Axis) -> Section {
     let told = |row: &&super::traces::RoleTrace| row.lateness_us.iter().next().is_some();
     let rows: Vec<(String, &Columns<Extremes>)> =
         traces.roles.iter().filter(told).map(|row| (row.role.clone(), &row.lateness_us)).collect();
-    if rows.is_empty() {
+    let early = traces.roles.iter().filter(|row| row.early.0 > 0).map(|row| {
+        let (samples, us) = row.early;
         let text =
-            "This clock has no due times, so nothing was late; a run in real time shows a strip here.".to_owned();
-        return Section { id: "lateness", title: "Lateness over time", blocks: vec![Block::Text(text)] };
+            format!("The stamps of {samples} samples of {} lie up to {us:.1} µs before their ticks were due", row.role);
+        Block::Text(text + ": its clock is another, and they are not drawn.")
+    });
+    let early: Vec<Block> = early.collect();
+    if rows.is_empty() {
+        let text = "This clock has no due times, so nothing was late; a run in real time shows a strip here.";
+        let blocks = if early.is_empty() { vec![Block::Text(text.to_owned())] } else { early };
+        return Section { id: "lateness", title: "Lateness over time", blocks };
     }
     let shade = |extremes: &Extremes| (!extremes.is_empty()).then(|| extremes.max.max(1.0).log10() / SHADE_DECADES);
     let picture = strip("lateness of every role over time", time, &rows, tick_s, shade);
@@ -378,6 +385,7 @@ pub fn lateness(source: &Source, traces: &Traces, time: &Axis) -> Section {
             format!("{:.0}–{:.0} µs", from(index), from(index + 1))
         }
     });
-    let blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), Block::Scale(scale.collect())];
+    let mut blocks = vec![Block::Figures(vec![(picture, caption.to_owned())]), Block::Scale(scale.collect())];
+    blocks.extend(early);
     Section { id: "lateness", title: "Lateness over time", blocks }
 }

@@ -5,7 +5,7 @@
 use super::ReportError;
 use super::percentiles::{Curve, read_curve};
 use super::summary::Summary;
-use crate::config::{RunId, Scenario};
+use crate::config::{ClockKind, RunId, Scenario};
 use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY};
 use crate::record::Recording;
 use std::fs;
@@ -72,10 +72,13 @@ impl Source {
         }
         let curves = curves(&at(LATENCY), summary.as_ref())?;
         if curves.is_empty() {
-            missing.push(
-                "there are no latencies: there is no latency/ in the directory (a run in one thread measures none)"
-                    .to_owned(),
-            );
+            let clock = scenario.as_ref().map(|scenario| scenario.clock);
+            let reason = match clock {
+                Some(ClockKind::InProcess) => " (a run in one thread measures none)",
+                Some(ClockKind::Lockstep) => " (a run in lockstep measures none: it does not look at the time)",
+                Some(ClockKind::Realtime) | None => "",
+            };
+            missing.push(format!("there are no latencies: there is no latency/ in the directory{reason}"));
         }
         let found = Self { summary, scenario, recording, curves, missing };
         found.require_one_run(path)?;

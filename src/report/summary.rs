@@ -2,7 +2,7 @@
 
 use crate::config::RunId;
 use crate::hosts::HostsSummary;
-use crate::telemetry::{Grant, Ticks, WatchReport};
+use crate::telemetry::{Grant, Percentiles, Ticks, WatchReport};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 
@@ -136,6 +136,8 @@ pub struct Accounting {
     pub links: Vec<Link>,
     pub missed_ticks: u64,
     pub rejected_samples: u64,
+    #[serde(default)]
+    pub rejected_by: BTreeMap<String, u64>,
     pub injected_faults: u64,
 }
 
@@ -150,6 +152,8 @@ pub struct Link {
     pub void: (Option<u64>, u64),
     pub stale: u64,
     pub rejected: u64,
+    #[serde(default)]
+    pub rejected_by: BTreeMap<String, u64>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -163,11 +167,8 @@ pub struct State {
 pub struct Stage {
     pub role: String,
     pub stage: String,
-    pub count: u64,
-    pub p50_us: f64,
-    pub p99_us: f64,
-    pub p999_us: f64,
-    pub max_us: f64,
+    #[serde(flatten)]
+    pub figures: Percentiles,
 }
 
 #[derive(Debug, Deserialize)]

@@ -5,7 +5,7 @@ use super::source::Source;
 use super::traces::Traces;
 use crate::analysis::{apart, digits};
 use crate::hosts::{HostReport, LinkEnd, Silence};
-use crate::launch::State;
+use crate::launch::{State, reasons};
 use crate::telemetry::{Percentiles, Ticks};
 
 /// A scripted fault as it stands in the scenario.
@@ -162,13 +162,20 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
 /// The figures of every stage.
 pub fn latencies(source: &Source) -> Block {
     let row = |stage: &super::summary::Stage| {
-        let us = |value: f64| format!("{value:.2}");
-        let [p50, p99, p999, max] = [stage.p50_us, stage.p99_us, stage.p999_us, stage.max_us].map(us);
-        strings(&[&stage.role, &stage.stage, &stage.count, &p50, &p99, &p999, &max])
+        let mut row = strings(&[&stage.role, &stage.stage]);
+        row.extend(figures_cells(&stage.figures));
+        row
     };
     let rows = source.summary.iter().flat_map(|summary| &summary.latencies).map(row).collect();
-    let head = vec!["role", "stage", "count", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
+    let head = vec!["role", "stage", "count", "missed", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];
     Block::table("", head, rows)
+}
+
+/// Count, missed, 50 %, 99 %, 99.9 % and the largest of a stage; dashes where the stamps are not of one clock.
+pub fn figures_cells(figures: &Percentiles) -> [String; 6] {
+    let us = |value: f64| if value.is_nan() { "–".to_owned() } else { format!("{value:.2}") };
+    let Percentiles { count, missed, p50_us, p99_us, p999_us, max_us, .. } = *figures;
+    [count.to_string(), missed.to_string(), us(p50_us), us(p99_us), us(p999_us), us(max_us)]
 }
 
 fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
@@ -184,9 +191,10 @@ pub fn books(source: &Source) -> Section {
         let scripted = !faults(source).is_empty() || books.injected_faults > 0;
         let acted = format!("; scripted faults acted {} times", books.injected_faults);
         blocks.push(Block::Text(format!(
-            "{balance} Missed or starved: {} ticks; rejected: {} samples{}.",
+            "{balance} Missed or starved: {} ticks; rejected: {} samples{}{}.",
             books.missed_ticks,
             books.rejected_samples,
+            reasons(&books.rejected_by),
             if scripted { &acted } else { "" }
         )));
         blocks.extend(books.problems.iter().map(|problem| Block::Text(problem.clone())));
@@ -208,7 +216,7 @@ pub fn books(source: &Source) -> Section {
                 &void,
                 &told(link.unread),
                 &link.stale,
-                &link.rejected,
+                &format!("{}{}", link.rejected, reasons(&link.rejected_by)),
             ])
         };
         let rows = books.links.iter().map(row).collect();
@@ -265,7 +273,7 @@ fn hosts(source: &Source) -> Vec<Block> {
     let row = |link: &LinkEnd| {
         let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
         let us = |of: fn(&Percentiles) -> f64| {
-            link.one_way.as_ref().map_or("–".to_owned(), |way| format!("{:.0}", of(way)))
+            link.one_way.filter(Percentiles::are_shown).map_or("–".to_owned(), |way| format!("{:.0}", of(&way)))
         };
         let way = format!("{} to {}", link.from, link.to);
         let [p50, p99] = [us(|way| way.p50_us), us(|way| way.p99_us)];
@@ -329,12 +337,12 @@ pub fn certificate(source: &Source) -> Section {
         blocks.extend(others.map(|warning| Block::Text(format!("Warning: {warning}."))));
     }
     if let Some(score) = &summary.score.certificate {
-        blocks.push(Block::Text(format!(
-            "The bound on dV/dt held for {} of {} steps; {} could not be judged.",
-            score.held,
-            score.held + score.broken,
-            score.unjudged
-        )));
+        let (held, broken, judged) = (score.held, score.broken, score.held + score.broken);
+        let told = match broken {
+            0 => format!("held at all of {judged} steps"),
+            _ => format!("was broken at {broken} of {judged} steps and held at {held}"),
+        };
+        blocks.push(Block::Text(format!("The bound on dV/dt {told}; {} could not be judged.", score.unjudged)));
     }
     let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(limit.value)]).collect();
     let caption = "What samples are held against".to_owned();

@@ -53,6 +53,8 @@ pub struct RoleTrace {
     service: String,
     pub samples: Columns<Count>,
     pub lateness_us: Columns<Extremes>,
+    /// Samples that were sent before their tick was due, by their stamps, and by how much at the most, µs.
+    pub early: (u64, f64),
 }
 
 /// One metric.
@@ -187,7 +189,12 @@ impl Tracer {
             role.samples.at(tick).0 += 1;
             if self.epoch_ns > 0 {
                 let due_ns = self.epoch_ns as f64 + tick as f64 * self.period_ns as f64;
-                role.lateness_us.at(tick).take((stamp.sent_ns as f64 - due_ns).max(0.0) / 1e3);
+                let late_us = (stamp.sent_ns as f64 - due_ns) / 1e3;
+                if late_us >= 0.0 {
+                    role.lateness_us.at(tick).take(late_us);
+                } else if stamp.sent_ns > 0 {
+                    role.early = (role.early.0 + 1, role.early.1.max(-late_us));
+                }
             }
         }
         if self.accepted(index, tick, sample) {

@@ -4,7 +4,7 @@
 
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
 use crate::config::{Checks, ConfigError, Document, keys_of};
-use crate::role::{Body, Estimator, Guard, Law, SingleBody};
+use crate::role::{Body, Estimator, Guard, Law, Refusal, SingleBody};
 use crate::sample::{Field, FieldKind, Message, Sample};
 use crate::state::{Persist, Words};
 use serde::Serialize;
@@ -157,6 +157,12 @@ impl<S: Message + ?Sized> Guard<S> for Bounded {
     fn accepts(&mut self, sample: &S) -> bool {
         let words = sample.words();
         self.bounds.iter().all(|(word, bound)| f64::from_bits(words[*word]).abs() <= *bound)
+    }
+
+    fn refusal(&self, sample: &S) -> Refusal {
+        let words = sample.words();
+        let refused = self.bounds.iter().map(|(word, _)| f64::from_bits(words[*word])).find(|value| !value.is_finite());
+        refused.map_or(Refusal::OutOfRange, |_| Refusal::NotFinite)
     }
 }
 

@@ -11,6 +11,54 @@ use crate::state::{Persist, Words, persist_fields};
 pub trait Guard<S: ?Sized> {
     /// Whether the sample is to be believed. One that is becomes what the next are compared with.
     fn accepts(&mut self, sample: &S) -> bool;
+
+    /// Returns why the sample that was just judged is not accepted; called for such samples only.
+    fn refusal(&self, _sample: &S) -> Refusal {
+        Refusal::Other
+    }
+}
+
+/// Why a sample is not accepted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// A number is infinite or none.
+    NotFinite,
+    /// A value lies beyond its bound.
+    OutOfRange,
+    /// A value changed faster than the body can.
+    TooFast,
+    /// A value stayed the same to the last bit for too long.
+    Stuck,
+    /// A component that the reader needs is absent.
+    Incomplete,
+    /// The stamp's tick or generation cannot be.
+    Stamp,
+    /// By a guard that gives no reason.
+    Other,
+}
+
+impl Refusal {
+    /// All of them, in the order of their counters.
+    pub const ALL: [Self; 7] =
+        [Self::NotFinite, Self::OutOfRange, Self::TooFast, Self::Stuck, Self::Incomplete, Self::Stamp, Self::Other];
+
+    /// The key in `summary.json`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::NotFinite => "not_finite",
+            Self::OutOfRange => "out_of_range",
+            Self::TooFast => "too_fast",
+            Self::Stuck => "stuck",
+            Self::Incomplete => "incomplete",
+            Self::Stamp => "stamp",
+            Self::Other => "other",
+        }
+    }
+
+    /// The reason why values fail a bound on their magnitude.
+    pub fn of_values(values: &[f64]) -> Self {
+        if values.iter().all(|value| value.is_finite()) { Self::OutOfRange } else { Self::NotFinite }
+    }
 }
 
 /// Believes everything: for those who watch and do not act.
@@ -58,6 +106,8 @@ pub struct Plausible<const N: usize> {
     /// Bit i set: component i of that sample was believed. Its `believed_tick` is `before_tick` then, which is not kept up: see
     /// [`spell_out`](Self::spell_out).
     current: u64,
+    /// Why the last sample that was not believed was not.
+    refusal: Refusal,
 }
 
 impl<const N: usize> Plausible<N> {
@@ -75,6 +125,7 @@ impl<const N: usize> Plausible<N> {
             repeated: [0; N],
             trusted: true,
             current: 0,
+            refusal: Refusal::Other,
         }
     }
 
@@ -131,16 +182,23 @@ impl<const N: usize> Plausible<N> {
     ) -> bool {
         self.spell_out();
         let counts = self.bounds.repeats != u64::MAX;
-        let mut believed = true;
+        let mut refusal = None;
         for (i, &value) in values.iter().enumerate() {
             if counts {
                 self.repeated[i] = if value == self.before[i] { self.repeated[i] + 1 } else { 0 };
             }
-            believed &= valid >> i & 1 == 0
-                || (self.in_range(i, value)
-                    && self.repeated[i] <= self.bounds.repeats
-                    && self.reached(i, value, stamp.tick, &change));
+            if valid >> i & 1 == 0 || refusal.is_some() {
+                continue;
+            }
+            refusal = match () {
+                () if !self.in_range(i, value) => Some(Refusal::of_values(&[value])),
+                () if self.repeated[i] > self.bounds.repeats => Some(Refusal::Stuck),
+                () if !self.reached(i, value, stamp.tick, &change) => Some(Refusal::TooFast),
+                () => None,
+            };
         }
+        let believed = refusal.is_none();
+        self.refusal = refusal.unwrap_or(self.refusal);
         if believed {
             self.believe(stamp, values, valid);
         }
@@ -170,6 +228,11 @@ impl<const N: usize> Plausible<N> {
     fn set_current(&mut self) {
         let current = |i: &usize| self.believed_tick[*i] == Some(self.before_tick);
         self.current = (0..N).filter(current).fold(0, |current, i| current | 1 << i);
+    }
+
+    /// Why the last sample that was not believed was not.
+    pub fn refusal(&self) -> Refusal {
+        self.refusal
     }
 
     /// The bounds that it judges by.
@@ -406,6 +469,8 @@ mod tests {
         one.persist(&mut Kept(&mut kept));
         let mut other = guard();
         other.persist(&mut crate::state::Restore(&kept));
+        // Why a sample was refused is asked at once or never.
+        other.refusal = one.refusal;
         assert_eq!(one, other);
     }
 
@@ -443,5 +508,23 @@ mod tests {
         assert_eq!(believed, 4, "the first, and three repetitions");
         assert!(!accepts(&mut guard, 10, [0.501, 0.501, 0.5], 7), "one component is stuck still");
         assert!(accepts(&mut guard, 11, [0.502, 0.502, 0.501], 7), "it moves again");
+    }
+
+    #[test]
+    fn what_is_refused_has_its_reason() {
+        let mut guard = Plausible::new(Bounds { repeats: 2, ..guard().bounds });
+        assert!(accepts(&mut guard, 0, [0.5; 3], 7));
+        for (tick, value, reason) in [
+            (1, f64::NAN, Refusal::NotFinite),
+            (2, f64::INFINITY, Refusal::NotFinite),
+            (3, -3.0, Refusal::OutOfRange),
+            (4, 1.5, Refusal::TooFast),
+        ] {
+            let values = [value, 0.5 + tick as f64 * 1e-4, 0.5 + tick as f64 * 1e-4];
+            assert!(!accepts(&mut guard, tick, values, 7), "{value}");
+            assert_eq!(guard.refusal(), reason, "{value}");
+        }
+        let stuck = (5..12).map(|tick| accepts(&mut guard, tick, [0.5; 3], 7)).last();
+        assert_eq!((stuck, guard.refusal()), (Some(false), Refusal::Stuck));
     }
 }

@@ -5,6 +5,7 @@
 mod bridge;
 mod controller;
 mod group;
+mod missed;
 mod observer;
 mod plant;
 mod ports;
@@ -32,6 +33,7 @@ use crate::state::{Count, Persist, Restore, Words};
 use crate::telemetry::{
     Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, Ticks, WatchReport,
 };
+use missed::MissedTicks;
 use plant::PlantNode;
 use std::path::Path;
 

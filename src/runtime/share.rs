@@ -103,6 +103,11 @@ impl Computer {
         exchange.asked_ns.filter(|_| exchange.tick == Some(tick))
     }
 
+    /// Returns true if the device makes the estimate that this role, a controller, works on.
+    pub fn makes_estimate(&self) -> bool {
+        matches!(self, Self::Device(share) if share.part == Part::Controller)
+    }
+
     /// Whether an answer is waited for, or what is to be asked.
     pub fn pending(&self) -> bool {
         let Self::Device(share) = self else { return false };
@@ -227,8 +232,11 @@ impl Exchange {
 
     /// Asks no more for the tick at hand.
     fn end(&mut self) {
-        if self.asked_ns.is_some() && !self.answered {
+        if let Some(asked_ns) = self.asked_ns.filter(|_| !self.answered) {
             self.link.give_up();
+            if self.grid.is_some() {
+                self.serial.record_missed(asked_ns, monotonic_ns());
+            }
         }
         (self.tick, self.asked_ns, self.answered) = (None, None, false);
     }

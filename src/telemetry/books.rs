@@ -5,6 +5,7 @@
 use super::ledger::Ledger;
 use super::{LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
 use crate::control::{Breaches, Watchdog};
+use crate::role::Refusal;
 use crate::state::persist_fields;
 
 /// The counters of a role's ticks.
@@ -184,7 +185,8 @@ pub struct ReadCounters {
     /// The tick after the last that is counted.
     covered: u64,
     void: u64,
-    rejected: u64,
+    /// In the order of [`Refusal::ALL`].
+    rejected: [u64; Refusal::ALL.len()],
 }
 
 persist_fields!(ReadCounters, taken, received, gaps, stale, covered, void, rejected);
@@ -220,16 +222,16 @@ impl ReadCounters {
     }
 
     /// Enters the sample of a tick that was received and is not believed.
-    pub fn rejected(&mut self, tick: u64) {
+    pub fn rejected(&mut self, tick: u64, refusal: Refusal) {
         if tick >= self.covered {
-            self.stray();
+            self.rejected[refusal as usize] += 1;
         }
         self.received(tick);
     }
 
     /// Enters a sample that is not believed and may not even be of the tick that it names.
     pub fn stray(&mut self) {
-        self.rejected += 1;
+        self.rejected[Refusal::Stamp as usize] += 1;
     }
 
     #[inline]
@@ -256,7 +258,13 @@ impl ReadCounters {
             gaps: self.gaps,
             stale: self.stale,
             void: self.void,
-            rejected: self.rejected,
+            rejected: self.rejected.iter().sum(),
+            rejected_by: Refusal::ALL
+                .into_iter()
+                .zip(self.rejected)
+                .filter(|(_, count)| *count > 0)
+                .map(|(refusal, count)| (refusal.name().to_owned(), count))
+                .collect(),
             last_tick: self.covered.checked_sub(1),
         }
     }

@@ -21,6 +21,6 @@ pub use export::{write_hgrm, write_hlog};
 pub(crate) use handover::{find, keep};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
-pub use latency::{Latency, MAX_LATENCY_NS, Percentiles};
+pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
 pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

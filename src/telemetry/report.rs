@@ -1,8 +1,9 @@
 //! What a role says of its run when it ends: the counters, the hash, the histograms, the privileges.
 
-use super::{Checkpoints, Latency};
+use super::{Checkpoints, Latency, Tallies};
 use crate::serial::LineCounters;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// A role's account of itself.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -124,6 +125,9 @@ pub struct LinkRead {
     /// Samples that were received and not believed; they count as received where they were of the tick that was due.
     #[serde(default)]
     pub rejected: u64,
+    /// The same by reason, by the names of [`Refusal`](crate::role::Refusal); reasons that there was none of are left out.
+    #[serde(default)]
+    pub rejected_by: BTreeMap<String, u64>,
     /// The tick of the last sample.
     pub last_tick: Option<u64>,
 }
@@ -135,23 +139,30 @@ pub struct StageReport {
     pub stage: String,
     /// HdrHistogram V2 encoding, ns.
     pub histogram: Vec<u8>,
-    /// Values beyond the histogram's range.
-    pub clipped: u64,
+    /// What is counted beside it.
+    #[serde(flatten)]
+    pub tallies: Tallies,
 }
 
 impl StageReport {
     /// Packs the stages that have values.
     pub fn all(stages: &[(&str, &Latency)]) -> Vec<Self> {
-        let pack = |(stage, latency): &(&str, &Latency)| {
-            let (histogram, clipped) = latency.encode();
-            Self { stage: (*stage).to_owned(), histogram, clipped }
-        };
-        stages.iter().filter(|(_, latency)| !latency.is_empty()).map(pack).collect()
+        stages
+            .iter()
+            .filter(|(_, latency)| !latency.is_empty())
+            .map(|(stage, latency)| Self::new(stage, latency))
+            .collect()
+    }
+
+    /// Packs one stage.
+    pub fn new(stage: &str, latency: &Latency) -> Self {
+        let (histogram, tallies) = latency.encode();
+        Self { stage: stage.to_owned(), histogram, tallies }
     }
 
     /// The latencies; empty if the bytes are damaged.
     pub fn latency(&self) -> Latency {
-        Latency::decode(&self.histogram, self.clipped).unwrap_or_default()
+        Latency::decode(&self.histogram, self.tallies).unwrap_or_default()
     }
 }
 

@@ -292,10 +292,12 @@ impl Feed {
     /// Enters how late a role sent, and how long after its input.
     fn time(&self, index: usize, grid: Grid, model: &mut Model) {
         let (feed, role) = (&self.roles[index], &mut model.roles[index]);
-        for stamp in self.taps[feed.output].news.iter().filter(|stamp| stamp.tick <= model.last_tick) {
-            role.lateness.push(stamp.sent_ns.saturating_sub(grid.due_ns(stamp.tick)));
-            if let Some(input_ns) = feed.input.and_then(|input| self.taps[input].sent_ns(stamp.tick)) {
-                role.step.push(stamp.sent_ns.saturating_sub(input_ns));
+        let stamped = |stamp: &&Stamp| stamp.tick <= model.last_tick && stamp.sent_ns > 0;
+        for stamp in self.taps[feed.output].news.iter().filter(stamped) {
+            role.lateness.push(grid.due_ns(stamp.tick), stamp.sent_ns);
+            let input_ns = feed.input.and_then(|input| self.taps[input].sent_ns(stamp.tick));
+            if let Some(input_ns) = input_ns.filter(|ns| *ns > 0) {
+                role.step.push(input_ns, stamp.sent_ns);
             }
         }
     }

@@ -115,24 +115,29 @@ impl Rate {
     }
 }
 
-/// The last latencies of one kind, ns.
+/// The last latencies of one kind, ns; negative ones too: then the stamps are not of one clock.
 #[derive(Debug, Clone, Default)]
 pub struct Window {
-    values: VecDeque<u64>,
+    values: VecDeque<i64>,
 }
 
 impl Window {
-    /// Takes one.
-    pub fn push(&mut self, ns: u64) {
+    /// Takes the one between two stamps.
+    pub fn push(&mut self, from_ns: u64, to_ns: u64) {
         if self.values.len() == WINDOW {
             self.values.pop_front();
         }
-        self.values.push_back(ns);
+        self.values.push_back(to_ns.wrapping_sub(from_ns) as i64);
     }
 
-    /// The median and what 99 % are at most, µs.
+    /// How far the stamp that should be the earlier one lies ahead at the most, µs; none if it never does.
+    pub fn ahead_us(&self) -> Option<f64> {
+        self.values.iter().min().filter(|ns| **ns < 0).map(|ns| ns.unsigned_abs() as f64 / 1e3)
+    }
+
+    /// The median and what 99 % are at most, µs. Of use only where no stamp lies [ahead](Self::ahead_us).
     pub fn percentiles_us(&self) -> Option<[f64; 2]> {
-        let mut sorted: Vec<u64> = self.values.iter().copied().collect();
+        let mut sorted: Vec<i64> = self.values.iter().copied().collect();
         sorted.sort_unstable();
         let last = sorted.len().checked_sub(1)?;
         // The nearest rank, as HdrHistogram counts.
@@ -294,10 +299,13 @@ mod tests {
     fn percentiles_are_of_the_last_values() {
         let mut window = Window::default();
         assert!(window.percentiles_us().is_none());
-        (1..=100).for_each(|us| window.push(us * 1000));
+        (1..=100).for_each(|us| window.push(0, us * 1000));
         assert_eq!(window.percentiles_us(), Some([50.0, 99.0]));
-        (0..WINDOW).for_each(|_| window.push(3000));
+        (0..WINDOW).for_each(|_| window.push(0, 3000));
         assert_eq!(window.percentiles_us(), Some([3.0, 3.0]), "the old ones are gone");
+        assert_eq!(window.ahead_us(), None);
+        window.push(1_000_500, 500);
+        assert_eq!(window.ahead_us(), Some(1000.0), "the sender's clock is another");
     }
 
     #[test]

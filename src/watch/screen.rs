@@ -120,7 +120,10 @@ fn role_line(role: &RoleLine) -> Line<'static> {
     let rate = role.rate.per_s().map_or("-".to_owned(), |rate| format!("{rate:.0}"));
     let of = |window: &super::Window| {
         let pair = |[p50, p99]: [f64; 2]| format!("{}/{}", short(p50), short(p99));
-        window.percentiles_us().map_or("-".to_owned(), pair)
+        match window.ahead_us() {
+            Some(us) => format!("ahead {}", short(us)),
+            None => window.percentiles_us().map_or("-".to_owned(), pair),
+        }
     };
     let alarmed = |alarm: bool| if alarm { ALARM } else { Style::new() };
     Line::from(vec![
@@ -231,7 +234,7 @@ mod tests {
     fn model() -> Model {
         let mut leader = RoleLine::new("leader");
         (leader.state, leader.generation, leader.tick, leader.missed) = (RoleState::Running, 2, 1234, 7);
-        (1..=100).for_each(|us| leader.lateness.push(us * 1000));
+        (1..=100).for_each(|us| leader.lateness.push(0, us * 1000));
         let mut error = Series::new("sync_error_rad_s");
         (0..300).for_each(|k| error.push(10_f64.powf(-f64::from(k) / 30.0)));
         Model {

@@ -6,7 +6,7 @@ use super::roles::{POSITION, VELOCITY};
 use crate::config::Checks;
 use crate::model::{CentralField, OrbitState};
 use crate::rig::{Figure, SURE_DEVIATIONS};
-use crate::role::{Bounds, Guard, Plausible};
+use crate::role::{Bounds, Guard, Plausible, Refusal};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector4;
@@ -162,6 +162,20 @@ impl Guard<OrbitMeasurement> for MeasurementGuard {
                 .state
                 .accepts_within(&sample.stamp, &state, sample.valid, |_, i, from, ticks| limits.change(i, from, ticks))
     }
+
+    fn refusal(&self, sample: &OrbitMeasurement) -> Refusal {
+        let ([a, b], radius) = (sample.applied_du_s2, sample.radius_du);
+        let largest = self.limits.thrust_du_s2 * (1.0 + ROUNDING);
+        if sample.valid & self.needed != self.needed {
+            Refusal::Incomplete
+        } else if !(a.abs() <= largest && b.abs() <= largest) {
+            Refusal::of_values(&[a, b])
+        } else if sample.valid & 1 == 1 && !self.limits.radius_possible(radius, self.radius_offset) {
+            Refusal::of_values(&[radius])
+        } else {
+            self.state.refusal()
+        }
+    }
 }
 
 /// Guards estimates: the region, the speed, and that components which are not valid are said to be guesses.
@@ -184,6 +198,14 @@ impl Guard<OrbitEstimate> for EstimateGuard {
         let [vr, vtheta] = sample.velocity_du_s;
         told && placed && sample.angle_rad.is_finite() && vr.abs() <= speed && vtheta.abs() <= speed
     }
+
+    fn refusal(&self, sample: &OrbitEstimate) -> Refusal {
+        let (all, [vr, vtheta]) = (POSITION | VELOCITY, sample.velocity_du_s);
+        if sample.valid & all != all && sample.status & status::INITIAL == 0 {
+            return Refusal::Incomplete;
+        }
+        Refusal::of_values(&[sample.radius_du, sample.angle_rad, vr, vtheta])
+    }
 }
 
 /// Guards commands: the thrusters can do what is asked.
@@ -198,6 +220,10 @@ impl Guard<OrbitCommand> for CommandGuard {
     #[inline]
     fn accepts(&mut self, sample: &OrbitCommand) -> bool {
         sample.thrust_du_s2.iter().all(|thrust| thrust.abs() <= self.thrust_du_s2)
+    }
+
+    fn refusal(&self, sample: &OrbitCommand) -> Refusal {
+        Refusal::of_values(&sample.thrust_du_s2)
     }
 }
 

@@ -8,7 +8,7 @@ use super::limits::Motion;
 use crate::control::{FleetLaw, InFlight};
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rig::Fleet;
-use crate::role::{Body, Bounds, Guard, Law, Pursuit};
+use crate::role::{Body, Bounds, Guard, Law, Pursuit, Refusal};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
 };
@@ -340,6 +340,19 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
         }
         believed
     }
+
+    fn refusal(&self, sample: &FleetMeasurement) -> Refusal {
+        let (rates, applied) = (sample.vector(OMEGA), sample.vector(APPLIED));
+        if sample.told_bodies() != self.believed[0].len() as u64 {
+            Refusal::Incomplete
+        } else if !applied.into_iter().all(|applied| within(applied, self.acceleration_max_rad_s2)) {
+            of_vectors(applied)
+        } else if !self.in_range(rates) {
+            of_vectors(rates)
+        } else {
+            Refusal::TooFast
+        }
+    }
 }
 
 /// Guards commands of a fleet: the actuators can do all that is asked.
@@ -356,6 +369,16 @@ impl Guard<FleetCommand> for FleetCommandGuard {
         let asked = sample.vector(ACCELERATION);
         sample.told_bodies() == self.count && asked.into_iter().all(|asked| within(asked, self.acceleration_max_rad_s2))
     }
+
+    fn refusal(&self, sample: &FleetCommand) -> Refusal {
+        if sample.told_bodies() == self.count { of_vectors(sample.vector(ACCELERATION)) } else { Refusal::Incomplete }
+    }
+}
+
+/// Why vectors of all bodies fail a bound on their magnitude.
+fn of_vectors(vectors: [&[f64]; 3]) -> Refusal {
+    let finite = |values: &&[f64]| Refusal::of_values(values) != Refusal::NotFinite;
+    if vectors.iter().all(finite) { Refusal::OutOfRange } else { Refusal::NotFinite }
 }
 
 /// Whether all values are at most so large; what is no number is not.

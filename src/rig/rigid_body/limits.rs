@@ -7,7 +7,7 @@ use crate::config::Checks;
 use crate::model::RigidBody;
 use crate::rate::ALL;
 use crate::rig::{Figure, SURE_DEVIATIONS};
-use crate::role::{Bounds, Guard, Plausible, Pursuit};
+use crate::role::{Bounds, Guard, Plausible, Pursuit, Refusal};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
@@ -243,6 +243,16 @@ impl Guard<RateMeasurement> for MeasurementGuard {
                 (self.pursuit.active() || !self.rate.contains(&sample.omega_rad_s)) && self.follows(sample)
             }
     }
+
+    fn refusal(&self, sample: &RateMeasurement) -> Refusal {
+        if sample.valid & self.needed != self.needed {
+            Refusal::Incomplete
+        } else if !within(&sample.applied_rad_s2, self.acceleration_rad_s2) {
+            Refusal::of_values(&sample.applied_rad_s2)
+        } else {
+            self.rate.refusal()
+        }
+    }
 }
 
 /// Guards estimates: their range, how fast the body and the observer's correction let them change, and that a component
@@ -262,6 +272,16 @@ impl Guard<RateEstimate> for EstimateGuard {
             && sample.innovation_rad_s.is_finite()
             && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, ALL)
     }
+
+    fn refusal(&self, sample: &RateEstimate) -> Refusal {
+        if sample.valid & ALL != ALL && sample.status & (status::INITIAL | status::DEGRADED) == 0 {
+            Refusal::Incomplete
+        } else if !(within(&sample.coefficients, f64::MAX) && sample.innovation_rad_s.is_finite()) {
+            Refusal::NotFinite
+        } else {
+            self.rate.refusal()
+        }
+    }
 }
 
 /// Guards commands: the actuators can do what is asked.
@@ -276,6 +296,10 @@ impl Guard<RateCommand> for CommandGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateCommand) -> bool {
         within(&sample.acceleration_rad_s2, self.acceleration_rad_s2)
+    }
+
+    fn refusal(&self, sample: &RateCommand) -> Refusal {
+        Refusal::of_values(&sample.acceleration_rad_s2)
     }
 }
 

@@ -6,7 +6,7 @@
 use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
-use crate::role::{Guard, Unguarded};
+use crate::role::{Guard, Refusal, Unguarded};
 use crate::runtime::disturb::LateSamples;
 use crate::sample::{Stamp, VOID};
 use crate::state::{Persist, Words};
@@ -293,7 +293,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         }
         if generation < known && self.doubted.replace(generation) != Some(generation) {
             self.last = Some((stamp.tick, known));
-            self.counters.rejected(stamp.tick);
+            self.counters.rejected(stamp.tick, Refusal::Stamp);
             return Newest::Rejected;
         }
         self.doubted = None;
@@ -309,7 +309,8 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             self.counters.received(stamp.tick);
             return Newest::AtHand;
         }
-        self.counters.rejected(stamp.tick);
+        let refusal = sample.map_or(Refusal::Other, |sample| self.guard.refusal(sample));
+        self.counters.rejected(stamp.tick, refusal);
         Newest::Rejected
     }
 

@@ -3,8 +3,8 @@
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
 use super::{
-    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
-    restore,
+    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
+    commit_last, length, restore,
 };
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
@@ -34,6 +34,9 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     asked: bool,
     asked_ns: u64,
     command_origin_ns: Option<u64>,
+    /// When the chain of the command that was applied last began, ns; it may still be held.
+    acting_ns: Option<u64>,
+    missed: MissedTicks,
     reply: Reply<R>,
     lateness: Latency,
     serial: Latency,
@@ -80,6 +83,8 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             asked: false,
             asked_ns: 0,
             command_origin_ns: None,
+            acting_ns: None,
+            missed: MissedTicks::default(),
             reply: Reply {
                 event: CommandEvent::NotDue,
                 measurement: Measurement::<R>::default(),
@@ -99,7 +104,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
         for missed in self.counters.next()..tick {
-            self.lateness.record(self.grid.due_ns(missed), now_ns);
+            self.lateness.record_missed(self.grid.due_ns(missed), now_ns);
         }
         self.skip_to(tick);
     }
@@ -153,9 +158,15 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             self.counters.safe();
         }
         if self.clock == Clock::Monotonic {
+            let (event, missed) = (*event, self.missed.before(tick));
+            self.enter_missed(missed, now_ns);
             self.serial.record(self.asked_ns, now_ns);
-            if let (CommandEvent::Applied, Some(origin_ns)) = (event, self.command_origin_ns) {
-                self.age.record(origin_ns, now_ns);
+            match (event, self.command_origin_ns) {
+                (CommandEvent::Applied, Some(origin_ns)) => {
+                    self.acting_ns = Some(origin_ns);
+                    self.age.record(origin_ns, now_ns);
+                }
+                _ => self.acting_ns.iter().for_each(|acting_ns| self.age.record_missed(*acting_ns, now_ns)),
             }
         }
         self.asked = false;
@@ -163,6 +174,14 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         commit(self);
         self.measurement.dispatch()?;
         Ok(Poll::Executed)
+    }
+
+    /// Enters ticks that were missed into the stages, by when each was due: the command before them acted.
+    fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
+        for due_ns in due_ns {
+            self.serial.record_missed(due_ns, until_ns);
+            self.acting_ns.iter().for_each(|acting_ns| self.age.record_missed(*acting_ns, due_ns));
+        }
     }
 
     /// Does not execute the next tick, as a scripted fault has it: the device is not asked, and has missed it too.
@@ -207,6 +226,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     /// The device is where it is: it needs nothing of what a predecessor knew.
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.grid = grid;
+        self.missed.start(self.clock, grid, self.counters.next());
         if self.clock == Clock::Monotonic {
             self.command.expect(AcceptedTicks::Due(grid));
         }
@@ -275,6 +295,8 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_tick()?;
+        let (missed, until_ns) = self.missed.rest(self.counters.next());
+        self.enter_missed(missed, until_ns);
         commit_last(self);
         Ok(())
     }
@@ -330,6 +352,7 @@ impl<R: Rig, B: Bus> Persistent for BridgeNode<R, B> {
 
     fn state<W: Words>(&mut self, words: &mut W) {
         self.command.persist(words);
+        self.acting_ns.persist(words);
         self.measurement.persist_late(words);
     }
 }

@@ -2,8 +2,8 @@
 
 use super::ports::driven;
 use super::{
-    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
-    restore,
+    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
+    commit_last, length, restore,
 };
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
@@ -39,6 +39,7 @@ struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
     /// When the command at hand was begun and sent, ns; sent at 0 if there is none.
     began_ns: u64,
     sent_ns: u64,
+    missed: MissedTicks,
 }
 
 impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B: Bus> Channel<L, G, B> {
@@ -51,7 +52,8 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     ) -> Result<Self, BusError> {
         let measurement = seat.input(body, Signal::Measurement, guard)?;
         let controller = Controller::new(law);
-        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0 })
+        let missed = MissedTicks::default();
+        Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
     }
 
     /// Looks for the measurement of a tick; whether it is known what has become of it.
@@ -94,6 +96,10 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         computed: Option<(&Computer, usize)>,
     ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
+        if silent {
+            // There is to be no command: none is missed.
+            let _ = self.missed.before(estimate.stamp().tick);
+        }
         self.ready &= !silent && computed.is_none_or(|(computing, index)| computing.has(index));
         let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
             self.command.stage_void(estimate.stamp().tick);
@@ -114,18 +120,20 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
 
     /// Takes in what a command leaves to be done.
     #[inline]
-    fn finish_tick(
-        &mut self,
-        timed: bool,
-        origin_ns: u64,
-        step: &mut Latency,
-        age: &mut Latency,
-    ) -> Result<(), NodeError> {
-        if timed && self.ready {
-            step.record(self.began_ns, self.sent_ns);
-            age.record(origin_ns, self.sent_ns);
+    fn finish_tick(&mut self, stages: Option<&mut Stages>) -> Result<(), NodeError> {
+        if let Some(stages) = stages.filter(|_| self.ready) {
+            let missed = self.missed.before(stages.tick);
+            stages.enter_missed(missed, self.began_ns);
+            stages.step.record(self.began_ns, self.sent_ns);
+            stages.age.record(stages.origin_ns, self.sent_ns);
         }
         Ok(self.command.finish()?)
+    }
+
+    /// Enters the ticks before `tick`, which would be next, of which there were no commands until the end.
+    fn enter_rest(&mut self, tick: u64, stages: &mut Stages) {
+        let (missed, until_ns) = self.missed.rest(tick);
+        stages.enter_missed(missed, until_ns);
     }
 
     fn state<W: Words>(&mut self, words: &mut W)
@@ -149,6 +157,31 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 }
 
+/// The distributions of the stages, and the tick that is entered.
+#[derive(Default)]
+struct Stages {
+    tick: u64,
+    /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
+    origin_ns: u64,
+    estimate_sent_ns: u64,
+    received_ns: u64,
+    missed: MissedTicks,
+    hop: Latency,
+    step: Latency,
+    age: Latency,
+}
+
+impl Stages {
+    /// Enters commands that there were none of, by when their ticks were due.
+    #[inline]
+    fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
+        for due_ns in due_ns {
+            self.step.record_missed(due_ns, until_ns);
+            self.age.record_missed(due_ns, until_ns);
+        }
+    }
+}
+
 /// A controller with its links and counters.
 pub struct ControllerNode<R: Rig, B: Bus> {
     rig: R,
@@ -164,13 +197,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     computing: Option<Computer>,
     /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
     look: usize,
-    /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
-    origin_ns: u64,
-    estimate_sent_ns: u64,
-    received_ns: u64,
-    hop: Latency,
-    step: Latency,
-    age: Latency,
+    stages: Stages,
 }
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
@@ -203,12 +230,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             ledger: seat.ledger.reopened(),
             computing,
             look: 0,
-            origin_ns: 0,
-            estimate_sent_ns: 0,
-            received_ns: 0,
-            hop: Latency::default(),
-            step: Latency::default(),
-            age: Latency::default(),
+            stages: Stages::default(),
         })
     }
 
@@ -353,7 +375,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
 
     #[inline]
     fn execute(&mut self) -> Result<Poll, NodeError> {
-        self.received_ns = self.clock.now_ns();
+        self.stages.received_ns = self.clock.now_ns();
+        let mut began_ns = self.stages.received_ns;
         let Some(stamp) = self.estimate.sample().map(|estimate| *estimate.stamp()) else { return Ok(Poll::Waiting) };
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
@@ -363,7 +386,13 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             let fleets = self.fleets.iter().map(Channel::words);
             let estimate = std::iter::once(self.estimate.sample().map(Message::words));
             match computing.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
-                Computed::Done => self.received_ns = computing.asked_ns(stamp.tick).unwrap_or(self.received_ns),
+                Computed::Done => {
+                    began_ns = computing.asked_ns(stamp.tick).unwrap_or(began_ns);
+                    // A device that makes the estimate too was asked before that was sent.
+                    if !computing.makes_estimate() {
+                        self.stages.received_ns = began_ns;
+                    }
+                }
                 Computed::Waiting => return Ok(Poll::Waiting),
                 Computed::Missed => {
                     self.skip_to(stamp.tick + 1);
@@ -380,7 +409,6 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let Some(estimate) = self.estimate.sample() else { return Ok(Poll::Waiting) };
         let silent = self.watchdog.latched_at().is_some();
         let clock = self.clock;
-        let mut began_ns = self.received_ns;
         let mut starved = false;
         for (index, channel) in self.channels.iter_mut().enumerate() {
             let computed = self.computing.as_ref().map(|computing| (computing, index));
@@ -392,7 +420,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         for fleet in &mut self.fleets {
             began_ns = fleet.execute(estimate, silent, (clock, began_ns), &mut starved, None)?;
         }
-        (self.origin_ns, self.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
+        (self.stages.origin_ns, self.stages.estimate_sent_ns) = (stamp.origin_ns, stamp.sent_ns);
+        self.stages.tick = stamp.tick;
         self.skip_to(stamp.tick);
         if starved {
             self.counters.starved(stamp.tick);
@@ -432,6 +461,10 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         }
         self.dispatch()?;
         self.finish_commands()?;
+        let next = self.counters.next();
+        self.stages.missed.start(self.clock, grid, next);
+        self.channels.iter_mut().for_each(|channel| channel.missed.start(self.clock, grid, next));
+        self.fleets.iter_mut().for_each(|fleet| fleet.missed.start(self.clock, grid, next));
         self.skip_to(first_tick);
         Ok(())
     }
@@ -479,21 +512,27 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     #[inline]
     fn finish_tick(&mut self) -> Result<(), NodeError> {
-        let timed = self.clock == Clock::Monotonic;
-        if timed {
-            self.hop.record(self.estimate_sent_ns, self.received_ns);
+        let mut stages = (self.clock == Clock::Monotonic).then_some(&mut self.stages);
+        if let Some(Stages { tick, estimate_sent_ns, received_ns, missed, hop, .. }) = stages.as_deref_mut() {
+            missed.before(*tick).for_each(|due_ns| hop.record_missed(due_ns, *received_ns));
+            hop.record(*estimate_sent_ns, *received_ns);
         }
         for channel in &mut self.channels {
-            channel.finish_tick(timed, self.origin_ns, &mut self.step, &mut self.age)?;
+            channel.finish_tick(stages.as_deref_mut())?;
         }
         for fleet in &mut self.fleets {
-            fleet.finish_tick(timed, self.origin_ns, &mut self.step, &mut self.age)?;
+            fleet.finish_tick(stages.as_deref_mut())?;
         }
         Ok(())
     }
 
     fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_commands()?;
+        let (next, stages) = (self.counters.next(), &mut self.stages);
+        let (missed, until_ns) = stages.missed.rest(next);
+        missed.for_each(|due_ns| stages.hop.record_missed(due_ns, until_ns));
+        self.channels.iter_mut().for_each(|channel| channel.enter_rest(next, stages));
+        self.fleets.iter_mut().for_each(|fleet| fleet.enter_rest(next, stages));
         commit_last(self);
         Ok(())
     }
@@ -523,7 +562,8 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     }
 
     fn stages(&self) -> Vec<StageReport> {
-        let mut stages = StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)]);
+        let Stages { hop, step, age, .. } = &self.stages;
+        let mut stages = StageReport::all(&[("hop", hop), ("step", step), ("age", age)]);
         let line = self.computing.as_ref().and_then(Computer::line);
         stages.extend(line.into_iter().flat_map(|(_, serial)| StageReport::all(&[("serial", &serial)])));
         stages

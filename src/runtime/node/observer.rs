@@ -1,8 +1,8 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
 use super::{
-    Inherited, LOOK_NS, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
-    restore,
+    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
+    commit_last, length, restore,
 };
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
@@ -19,6 +19,7 @@ use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
 struct Instants {
+    tick: u64,
     origin: u64,
     sent: u64,
     received: u64,
@@ -37,6 +38,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     /// What computes the estimate in the place of the observer, if that is somebody else.
     computing: Option<Computer>,
     instants: Instants,
+    missed: MissedTicks,
     hop: Latency,
     step: Latency,
     age: Latency,
@@ -56,6 +58,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             ledger: seat.ledger.reopened(),
             computing,
             instants: Instants::default(),
+            missed: MissedTicks::default(),
             hop: Latency::default(),
             step: Latency::default(),
             age: Latency::default(),
@@ -96,7 +99,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
             done = clock.now_ns();
             sample.stamp_mut().sent_ns = done;
         })?;
-        self.instants = Instants { origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
+        self.instants = Instants { tick: stamp.tick, origin: stamp.origin_ns, sent: stamp.sent_ns, received, done };
         self.skip_to(stamp.tick);
         self.counters.executed();
         commit(self);
@@ -122,6 +125,16 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         self.counters.pass(true);
         self.send_void(tick)?;
         Ok(Poll::Missed)
+    }
+
+    /// Enters ticks that were missed into every stage, by when each was due.
+    #[inline]
+    fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
+        for due_ns in due_ns {
+            for stage in [&mut self.hop, &mut self.step, &mut self.age] {
+                stage.record_missed(due_ns, until_ns);
+            }
+        }
     }
 
     fn send_void(&mut self, tick: u64) -> Result<(), NodeError> {
@@ -156,6 +169,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
         }
         self.estimate.dispatch()?;
         self.estimate.finish()?;
+        self.missed.start(self.clock, grid, self.counters.next());
         self.skip_to(first_tick);
         Ok(())
     }
@@ -194,7 +208,9 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     #[inline]
     fn finish_tick(&mut self) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
-            let Instants { origin, sent, received, done } = self.instants;
+            let Instants { tick, origin, sent, received, done } = self.instants;
+            let missed = self.missed.before(tick);
+            self.enter_missed(missed, received);
             self.hop.record(sent, received);
             self.step.record(received, done);
             self.age.record(origin, done);
@@ -204,6 +220,8 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn finish(&mut self) -> Result<(), NodeError> {
         self.estimate.finish()?;
+        let (missed, until_ns) = self.missed.rest(self.counters.next());
+        self.enter_missed(missed, until_ns);
         commit_last(self);
         Ok(())
     }

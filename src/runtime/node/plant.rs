@@ -1,7 +1,8 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
 use super::{
-    Inherited, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length, restore,
+    Inherited, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
+    restore,
 };
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
@@ -41,6 +42,9 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     unfinished: Option<u64>,
     /// So many ticks up to the next were missed: the body moves over them by itself, at once, before it is looked at again.
     behind: u64,
+    /// When the chain of the command that was applied last began at the leader, ns; it may still be held.
+    acting_ns: Option<u64>,
+    missed: MissedTicks,
     lateness: Latency,
     age: Latency,
     step: Latency,
@@ -79,6 +83,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             inherited: Inherited::Nothing,
             unfinished: None,
             behind: 0,
+            acting_ns: None,
+            missed: MissedTicks::default(),
             lateness: Latency::default(),
             age: Latency::default(),
             step: Latency::default(),
@@ -115,9 +121,28 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
         for missed in self.counters.next()..tick {
-            self.lateness.record(self.grid.due_ns(missed), now_ns);
+            self.lateness.record_missed(self.grid.due_ns(missed), now_ns);
         }
         self.skip_to(tick);
+    }
+
+    /// Enters ticks that were missed into the stages, by when each was due: the command before them acted.
+    #[inline]
+    fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
+        for due_ns in due_ns {
+            self.step.record_missed(due_ns, until_ns);
+            self.acting_ns.iter().for_each(|acting_ns| self.age.record_missed(*acting_ns, due_ns));
+        }
+    }
+
+    /// Enters the age of the command that acts at a tick, be it that of the tick or held for want of one.
+    #[inline]
+    fn enter_age(&mut self, event: CommandEvent, now_ns: u64) {
+        let Some(acting_ns) = self.acting_ns else { return };
+        match event {
+            CommandEvent::Applied => self.age.record(acting_ns, now_ns),
+            _ => self.age.record_missed(acting_ns, now_ns),
+        }
     }
 
     /// Does what a predecessor was committed to. From then on its body moved by itself, and its actuators protected it.
@@ -171,7 +196,12 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     fn execute(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
         self.plant.advance_alone_to(tick, std::mem::take(&mut self.behind));
-        let event = self.take_command(tick, now_ns)?;
+        let missed = self.missed.before(tick);
+        self.enter_missed(missed, now_ns);
+        let event = self.take_command(tick)?;
+        if self.clock == Clock::Monotonic {
+            self.enter_age(event, now_ns);
+        }
         if event.missed() {
             self.counters.starved(tick);
         }
@@ -203,7 +233,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 
     #[inline]
-    fn take_command(&mut self, tick: u64, now_ns: u64) -> Result<CommandEvent, NodeError> {
+    fn take_command(&mut self, tick: u64) -> Result<CommandEvent, NodeError> {
         if self.command.is_none() {
             return Ok(self.plant.command(tick, None));
         }
@@ -218,8 +248,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             Due::Missing => return Ok(self.plant.command(tick, None)),
             Due::Here(command) => (self.plant.command(tick, Some(command)), command.stamp().origin_ns),
         };
-        if event == CommandEvent::Applied && self.clock == Clock::Monotonic {
-            self.age.record(origin_ns, now_ns);
+        if event == CommandEvent::Applied {
+            self.acting_ns = Some(origin_ns);
         }
         Ok(event)
     }
@@ -267,6 +297,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
 
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.grid = grid;
+        self.missed.start(self.clock, grid, self.counters.next());
         if let (Some(command), Clock::Monotonic) = (&mut self.command, self.clock) {
             command.expect(AcceptedTicks::Due(grid));
         }
@@ -334,6 +365,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
 
     fn finish(&mut self) -> Result<(), NodeError> {
         self.finish_tick()?;
+        let (missed, until_ns) = self.missed.rest(self.counters.next());
+        self.enter_missed(missed, until_ns);
         commit_last(self);
         Ok(())
     }
@@ -389,6 +422,7 @@ impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
         self.plant.persist(words);
         self.unfinished.persist(words);
         self.behind.persist(words);
+        self.acting_ns.persist(words);
         self.command.iter_mut().for_each(|command| command.persist(words));
         if let Some(line) = &mut self.line {
             line.persist(words, |command, words| command.borrow_mut().words_mut().persist(words));
