@@ -34,15 +34,43 @@ fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
         "clock source",
         "/dev/shm",
         "leftover domains",
-        "lateness",
+        "ticks",
     ] {
         assert_eq!(checks.iter().filter(|(check, _)| *check == name).count(), 1, "{name}: {checks:?}");
     }
     let remedied = |check: &Value| check["verdict"] == "ok" || check["remedy"].is_string();
     assert!(report["checks"].as_array().unwrap().iter().all(remedied), "{report}");
-    assert_eq!(report["lateness"]["percentiles"]["count"], 1000, "a wake per period of 1 ms");
-    let text = bench.run(&["doctor", "--seconds", "0"]);
-    assert!(!text.stdout.contains("lateness") && text.stdout.contains("for rigid-pair in real time"), "{text:?}");
+    // What is judged is what ran: every role's ticks, and no others.
+    let trial = &report["trial"];
+    let number = |value: &Value| value.as_u64().unwrap();
+    let roles = trial["roles"].as_object().unwrap();
+    assert_eq!((trial["ticks"].as_u64(), roles.len()), (Some(1001), 4), "{trial}");
+    assert!(roles.values().all(|ticks| number(&ticks["executed"]) + number(&ticks["missed"]) == 1001), "{trial}");
+    let worst = roles.values().map(|ticks| number(&ticks["missed"]) + number(&ticks["starved"])).max();
+    assert_eq!(trial["missed"].as_u64(), worst, "{trial}");
+    assert_eq!(trial["lateness"]["count"], 2002, "a wake of each body per tick");
+    bench.assert_clean(&[]);
+}
+
+/// Nothing is called fit that was not measured, and what cannot keep its rate is not fit.
+#[test]
+fn fit_has_a_number_behind_it() {
+    let bench = Bench::new();
+    let done = bench.run(&["doctor", "--seconds", "0", "--json"]);
+    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let bad = checks(&report).iter().any(|(_, verdict)| *verdict == "bad");
+    assert_eq!(report["fit"].as_bool(), bad.then_some(false), "{report}");
+    assert!(report["trial"].is_null() && done.code == Some(if bad { 3 } else { 0 }), "{done:?}");
+    // A period of 10 us is shorter than any tick of four processes.
+    let file = bench.path("fast.toml");
+    let shipped = corotate::config::SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap().1;
+    let text = shipped.lines().map(|line| if line.starts_with("tick_hz") { "tick_hz = 100000.0" } else { line });
+    std::fs::write(&file, text.collect::<Vec<_>>().join("\n")).unwrap();
+    let done = bench.run(&["doctor", file.to_str().unwrap(), "--seconds", "1", "--json"]);
+    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let verdict = checks(&report).into_iter().find(|(name, _)| *name == "ticks").map(|(_, verdict)| verdict);
+    assert_eq!((verdict, report["fit"].as_bool(), done.code), (Some("bad"), Some(false), Some(3)), "{report}");
+    bench.assert_clean(&[]);
 }
 
 #[test]

@@ -1,17 +1,17 @@
-//! Is this machine fit for real time? What the kernel and its limits say, and how late bare sleeps really are.
+//! Is this machine fit for real time? What the kernel and its limits say, and how many ticks of the scenario it misses.
 //!
 //! | file | duty |
 //! |---|---|
 //! | `machine` | reads /proc, /sys and /dev below a root, and judges each line |
-//! | `lateness` | sleeps for some seconds with the privileges that are granted, and judges that |
+//! | `trial` | judges what the roles of the scenario reported of some seconds in real time |
 //!
-//! Must not change the machine, and must not fail: what the system does not tell is said to be unknown.
+//! Must not change the machine, nor start the run, and must not fail: what the system does not tell is said to be unknown.
 
-mod lateness;
 mod machine;
+mod trial;
 
-pub use lateness::{Lateness, measure};
 pub use machine::{Demand, Machine};
+pub use trial::Trial;
 
 use crate::bus::domain::{DomainError, Found};
 use crate::telemetry::Host;
@@ -80,20 +80,21 @@ pub struct Diagnosis {
     host: Host,
     /// The scenario whose demands the machine is held to.
     pub scenario: String,
-    /// Whether no line is bad.
-    pub fit: bool,
+    /// Whether the scenario was run and no line is bad; none if no line is bad and it was not run.
+    pub fit: Option<bool>,
     /// The lines.
     pub checks: Vec<Check>,
-    /// The measurement, if there was one.
-    pub lateness: Option<Lateness>,
+    /// What the run came to, if there was one.
+    pub trial: Option<Trial>,
 }
 
 impl Diagnosis {
     /// Puts a report together.
-    pub fn new(scenario: &str, mut checks: Vec<Check>, lateness: Option<Lateness>) -> Self {
-        checks.extend(lateness.iter().map(Lateness::check));
-        let fit = checks.iter().all(|check| check.verdict < Verdict::Bad);
-        Self { schema: SCHEMA, host: Host::this(), scenario: scenario.to_owned(), fit, checks, lateness }
+    pub fn new(scenario: &str, mut checks: Vec<Check>, trial: Option<Trial>) -> Self {
+        checks.extend(trial.iter().map(Trial::check));
+        let bad = checks.iter().any(|check| check.verdict == Verdict::Bad);
+        let fit = if bad { Some(false) } else { trial.as_ref().map(|_| true) };
+        Self { schema: SCHEMA, host: Host::this(), scenario: scenario.to_owned(), fit, checks, trial }
     }
 
     /// The report as one line of JSON.
@@ -114,9 +115,14 @@ impl fmt::Display for Diagnosis {
         }
         let count = |verdict| self.checks.iter().filter(|check| check.verdict == verdict).count();
         let (bad, warn) = (count(Verdict::Bad), count(Verdict::Warn));
+        let measured = self.trial.as_ref().map_or("not measured".to_owned(), Trial::words);
+        let scenario = &self.scenario;
         match self.fit {
-            true => writeln!(f, "fit for {} in real time; {warn} to improve", self.scenario),
-            false => writeln!(f, "not fit for {} in real time: {bad} bad, {warn} to improve", self.scenario),
+            Some(true) => writeln!(f, "fit for {scenario} in real time: {measured}; {warn} to improve"),
+            Some(false) => {
+                writeln!(f, "not fit for {scenario} in real time: {measured}; {bad} bad, {warn} to improve")
+            }
+            None => writeln!(f, "not measured for {scenario} in real time; {warn} to improve"),
         }
     }
 }
@@ -151,11 +157,15 @@ mod tests {
     #[test]
     fn one_bad_line_is_enough_and_every_other_line_says_what_to_do() {
         let warned = vec![Check::ok("a", "1"), Check::warn("b", "2", "mend b")];
-        let fit = Diagnosis::new("test", warned.clone(), None);
-        assert!(fit.fit && fit.to_string().ends_with("fit for test in real time; 1 to improve\n"), "{fit}");
+        let unmeasured = Diagnosis::new("test", warned.clone(), None);
+        assert!(unmeasured.fit.is_none(), "what did not run is not fit");
+        assert!(unmeasured.to_string().ends_with("not measured for test in real time; 1 to improve\n"), "{unmeasured}");
+        let fit = Diagnosis::new("test", warned.clone(), Some(Trial::new(5000.0, 15_001, &[], &[])));
+        let last = "fit for test in real time: 0 of 15001 ticks would be missed in 3 s at 5000 Hz; 1 to improve\n";
+        assert!(fit.fit == Some(true) && fit.to_string().ends_with(last), "{fit}");
         let checks = [warned, vec![Check::bad("c", "3", "mend c")]].concat();
         let unfit = Diagnosis::new("test", checks, None);
-        assert!(!unfit.fit && unfit.to_string().contains("mend c"));
+        assert!(unfit.fit == Some(false) && unfit.to_string().contains("mend c"));
         let json: serde_json::Value = serde_json::from_str(&unfit.to_json()).unwrap();
         assert_eq!((json["fit"].as_bool(), json["checks"][2]["verdict"].as_str()), (Some(false), Some("bad")));
         assert_eq!(json["checks"][1]["remedy"], "mend b");

@@ -1,13 +1,13 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
 use super::hosts::{self, KeyArguments};
-use super::scenario::load;
+use super::run::catch_signals;
+use super::scenario::{Change, load};
 use super::{Exit, fail, say};
 use crate::bus::domain::{DomainError, domains, remove_dead_domains};
-use crate::config::Scenario;
-use crate::doctor::{Demand, Diagnosis, Lateness, Machine, leftovers, measure};
+use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, leftovers};
 use crate::hosts::Address;
-use crate::system::remedy;
+use crate::launch::{Launch, Progress, run};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 pub struct Arguments {
     /// The scenario that the machine is to be fit for; without one, the first that ships with the program
     file: Option<PathBuf>,
-    /// How long to measure the lateness of bare sleeps, s; 0 leaves it out
+    /// How long to run the scenario in real time, s; 0 leaves it out
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u32).range(0..=86_400))]
     seconds: u32,
     /// Remove what dead runs of this user left behind
@@ -34,13 +34,16 @@ pub struct Arguments {
 }
 
 const EXAMPLES: &str = "\
-Exit codes: 0 fit, 3 not fit: some line is bad
+Exit codes: 0 no line is bad, 3 not fit: some line is bad
+
+The scenario runs in a domain of its own: every role at its core, priority and
+rate, without faults, criteria and results; external roles are ours.
 
 Examples:
   corotate doctor                  every line with what to do about it, after
-                                   ten seconds of sleeping
+                                   ten seconds of ticks
   corotate doctor fast.toml --seconds 60
-                                   for that scenario's tick, cores and memory,
+                                   for that scenario's roles, rate and cores,
                                    measured for a minute
   corotate doctor --link tcp/127.0.0.1:7447
                                    the clock of the host that launches, and how
@@ -60,24 +63,56 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
     let mut checks = Machine::at(Path::new("/")).examine(&Demand::of(&scenario));
     checks.push(leftovers(cleared.and_then(|_| domains())));
-    let lateness = match (arguments.seconds > 0).then(|| sleep(&scenario, arguments.seconds)).transpose() {
-        Ok(lateness) => lateness,
-        Err(exit) => return exit,
+    let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {
+        Ok(trial) => trial,
+        Err(Unmeasured::Exit(exit)) => return exit,
+        Err(Unmeasured::Failed(check)) => {
+            checks.push(check);
+            None
+        }
     };
-    let diagnosis = Diagnosis::new(&scenario.name, checks, lateness);
+    let diagnosis = Diagnosis::new(&scenario.name, checks, trial);
     let text = if arguments.json { diagnosis.to_json() } else { diagnosis.to_string() };
     match say(&text) {
         Err(gone) => gone,
-        Ok(()) if diagnosis.fit => Exit::Ok,
-        Ok(()) => Exit::NotAccepted,
+        Ok(()) if diagnosis.fit == Some(false) => Exit::NotAccepted,
+        Ok(()) => Exit::Ok,
     }
 }
 
-/// Measures, with its progress on a terminal.
-fn sleep(scenario: &Scenario, seconds: u32) -> Result<Lateness, Exit> {
-    let style = ProgressStyle::with_template("{bar:40} measuring lateness, {eta} left");
-    let bar = ProgressBar::new(1000).with_style(style.expect("the template is a constant that parses"));
-    let lateness = measure(scenario, f64::from(seconds), &mut |done| bar.set_position((1e3 * done) as u64));
+/// Why there is no measurement.
+enum Unmeasured {
+    /// The run failed, and the line says why.
+    Failed(Check),
+    /// It was not to be: the error is told.
+    Exit(Exit),
+}
+
+/// Runs the scenario for some seconds, with its progress on a terminal.
+fn attempt(arguments: &Arguments) -> Result<Trial, Unmeasured> {
+    let duration = format!("duration_s={}", arguments.seconds);
+    // Nothing of the run is to go wrong by the script, nor to wait for somebody else.
+    let overrides =
+        ["clock=realtime", &duration, "accept={}", "fault=[]", "watchdog={}", "launch.external=[]", "host=[]"];
+    let scenario = load(arguments.file.as_deref(), overrides.map(Change::Set))
+        .map_err(|error| Unmeasured::Failed(Trial::failed(error)))?;
+    let signal = catch_signals().map_err(|error| Unmeasured::Exit(fail(Exit::Failure, &error)))?;
+    let style = ProgressStyle::with_template("{bar:40} running in real time, {eta} left");
+    let bar = ProgressBar::new(scenario.last_tick).with_style(style.expect("the template is a constant that parses"));
+    let mut show = |progress: &Progress<'_>| {
+        if let Progress::Running { tick, .. } = progress {
+            bar.set_position(*tick);
+        }
+    };
+    let outcome = run(&scenario, &mut Launch::new(&signal, &mut show));
     bar.finish_and_clear();
-    lateness.map_err(|error| fail(Exit::Failure, &format!("cannot start a thread: {error}; {}", remedy(&error))))
+    let outcome = outcome.map_err(|error| Unmeasured::Failed(Trial::failed(error.to_string())))?;
+    if outcome.signal != 0 {
+        return Err(Unmeasured::Exit(Exit::Signal(outcome.signal)));
+    }
+    if let Some(incident) = outcome.incidents.first() {
+        return Err(Unmeasured::Failed(Trial::failed(incident.to_string())));
+    }
+    let tick_hz = 1e9 / scenario.period_ns as f64;
+    Ok(Trial::new(tick_hz, scenario.last_tick + 1, &outcome.reports, &outcome.grants))
 }
