@@ -1,7 +1,7 @@
 //! Fleets: many followers in one process. Each gets the bits that it gets alone, under every clock; what happens to a
 //! follower happens to all of a fleet at once.
 
-use crate::common::{Bench, await_some, send_signal, shipped};
+use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
 use corotate::config::Scenario;
@@ -129,8 +129,8 @@ fn a_fleet_that_is_killed_goes_on_where_it_was() {
 fn a_fleet_that_is_killed_from_outside_comes_back_and_settles() {
     let bench = Bench::new();
     let file = shipped("rigid-fleet");
-    let limits = "accept={settled_by_s=5.0, sync_error_rad_s_max=1e-3}";
-    let arguments = ["run", file.to_str().unwrap(), "--tick-hz", "100", "--duration", "6", "--set", limits, "--json"];
+    let limits = format!("accept={{settled_by_s=5.0, sync_error_rad_s_max=1e-3, {ANY_TICKS}}}");
+    let arguments = ["run", file.to_str().unwrap(), "--tick-hz", "100", "--duration", "6", "--set", &limits, "--json"];
     let running = bench.start(&arguments);
     let fleet = bench.await_ticks("fleet");
     let domains = bench.domains();

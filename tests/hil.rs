@@ -98,7 +98,7 @@ fn cases_of(bench: &Bench) -> Vec<(String, Option<String>)> {
 
 /// Asserts that the run was accepted as a CI would see it.
 fn assert_accepted(bench: &Bench) {
-    let expected = ["run", "books", "estimate_error_rad_s_max", "sync_error_rad_s_max"];
+    let expected = ["run", "books", "estimate_error_rad_s_max", "sync_error_rad_s_max", "unscored_ticks_max"];
     assert_eq!(cases_of(bench), expected.map(|name| (name.to_owned(), None)));
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Needs the feature `hooks`, which compiles those places into the program; `tests/run` turns it on.
 
-use crate::common::{Bench, Done, Running, shipped};
+use crate::common::{ANY_TICKS, Bench, Done, Running, shipped};
 use serde_json::Value;
 
 const ROLES: [&str; 4] = ["leader", "follower", "observer", "controller"];
@@ -70,12 +70,8 @@ fn in_lockstep_a_role_that_stands_still_is_killed_and_brought_back() {
 /// In real time the others go on: ticks are missed, counted, and the follower stays where its expiry keeps it.
 #[test]
 fn in_real_time_a_killed_or_stopped_role_is_back_and_the_follower_is_bounded_meanwhile() {
-    let more = [
-        "--tick-hz=200",
-        "--duration=3",
-        "--set=accept={settled_by_s=0,sync_error_rad_s_max=3}",
-        "--set=supervision.heartbeat_timeout_s=0.5",
-    ];
+    let accept = format!("--set=accept={{settled_by_s=0,sync_error_rad_s_max=3,{ANY_TICKS}}}");
+    let more = ["--tick-hz=200", "--duration=3", &accept, "--set=supervision.heartbeat_timeout_s=0.5"];
     // Counted at 200 Hz: about the second half of the run's first second.
     let places = ["staged 150", "in-commit 153", "committed 152", "sent 151", "waiting 150"];
     let cases = ROLES.iter().flat_map(|role| places.iter().flat_map(move |p| ["KILL", "STOP"].map(|s| (*role, *p, s))));

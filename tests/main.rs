@@ -53,4 +53,5 @@ mod report;
 mod serial;
 mod strangers;
 mod timing;
+mod verdicts;
 mod watch;

@@ -1,7 +1,7 @@
 //! Roles that share a process (`launch.processes`), any of them: the same bits and the same books under every clock, one life
 //! for all of them, and no room for anybody else.
 
-use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
+use crate::common::{ANY_TICKS, Bench, Done, Running, await_some, send_signal, shipped};
 use serde_json::Value;
 
 const BOTH: [&str; 2] = ["--set", "launch.processes=[['observer','controller']]"];
@@ -121,7 +121,8 @@ fn killed(bench: &Bench, arguments: &[&str]) -> Running {
 
 #[test]
 fn whoever_kills_the_process_kills_both_and_both_come_back() {
-    let slow: &[&str] = &["--duration=4", "--tick-hz=200", "--set=accept={settled_by_s=0,sync_error_rad_s_max=3}"];
+    let accept = format!("--set=accept={{settled_by_s=0,sync_error_rad_s_max=3,{ANY_TICKS}}}");
+    let slow: &[&str] = &["--duration=4", "--tick-hz=200", &accept];
     let endless: &[&str] = &["--duration=100000", "--set=accept={}"];
     for (clock, arguments) in [("realtime", slow), ("lockstep", endless)] {
         let bench = Bench::new();

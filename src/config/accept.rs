@@ -3,7 +3,10 @@
 //! Must not judge; what a run came to is held against it by `launch`.
 
 use super::nearest;
+use super::raw::{Accept as Raw, RawTicks};
+use super::reader::keys_of;
 use super::scenario::Checks;
+use serde::Deserialize;
 use std::collections::BTreeMap;
 
 /// Acceptance criteria. Without any, nothing is judged.
@@ -17,53 +20,188 @@ pub struct Accept {
     pub peak_from_s: f64,
     /// Declared bound per metric of the rig: it may never be larger from `peak_from_s` on, whatever happens.
     pub metric_peak: BTreeMap<String, f64>,
-    /// Most ticks that all roles together may miss.
-    pub missed_ticks_max: Option<u64>,
+    /// The most ticks that roles may miss. One number limits the missed and starved ticks of all roles together.
+    pub missed_ticks_max: Option<TickLimit>,
+    /// The most ticks at which an input that was due may be absent.
+    pub starved_ticks_max: Option<TickLimit>,
+    /// The most ticks at which a driven body may apply its safe command.
+    pub safe_ticks_max: Option<TickLimit>,
+    /// The most ticks that may be without a score. What is not scored beyond that leaves metrics unjudged.
+    pub unscored_ticks_max: Option<TickAmount>,
     /// Limit of the 99th percentile of the estimate and of the control step, µs.
     pub step_latency_p99_us_max: Option<f64>,
 }
 
-/// Checks the criteria. Without a rig, `metrics` are not known and nothing is said of criteria that may be theirs.
+/// A limit on ticks.
+#[derive(Debug, Clone, PartialEq)]
+pub enum TickLimit {
+    /// For every role.
+    All(TickAmount),
+    /// By role; roles that are not named have no limit.
+    ByRole(BTreeMap<String, TickAmount>),
+}
+
+/// An amount of ticks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TickAmount {
+    /// So many.
+    Count(u64),
+    /// This part of the ticks, 0 to 1.
+    Share(f64),
+}
+
+impl TickAmount {
+    /// The amount of `ticks`, in whole ticks.
+    pub fn of(self, ticks: u64) -> u64 {
+        match self {
+            Self::Count(count) => count,
+            // A part in a million more: 1 % of 300 ticks is 3, whatever the rounding.
+            Self::Share(share) => (share * ticks as f64 * (1.0 + 1e-9)) as u64,
+        }
+    }
+}
+
+impl Accept {
+    /// Returns true if no criterion is stated: then nothing is judged, by a default neither.
+    pub fn is_empty(&self) -> bool {
+        let ticks = [&self.missed_ticks_max, &self.starved_ticks_max, &self.safe_ticks_max];
+        self.metric_max.is_empty()
+            && self.metric_peak.is_empty()
+            && ticks.into_iter().all(Option::is_none)
+            && self.unscored_ticks_max.is_none()
+            && self.step_latency_p99_us_max.is_none()
+    }
+}
+
+/// The criteria of metrics, by keys that are the rig's.
+#[derive(Deserialize)]
+pub(super) struct Metrics {
+    #[serde(default)]
+    pub accept: BTreeMap<String, f64>,
+}
+
+/// Returns true if a key is every rig's, so that no metric can have it.
+pub(super) fn is_common(key: &str) -> bool {
+    keys_of::<Raw>().contains(&key)
+}
+
+/// What criteria are checked against. Without a rig, `metrics` are not known and nothing is said of criteria that may be theirs.
+pub(super) struct Setting<'a> {
+    pub duration_s: f64,
+    pub metrics: Option<&'a [&'a str]>,
+    pub roles: Option<&'a [&'a str]>,
+    /// The roles that can apply a safe command.
+    pub driven: &'a [&'a str],
+}
+
+/// Checks the criteria.
 pub(super) fn resolve(
-    raw: &BTreeMap<String, f64>,
-    duration_s: f64,
-    metrics: Option<&[&str]>,
+    raw: &Raw,
+    metrics: &BTreeMap<String, f64>,
+    setting: &Setting<'_>,
     checks: &mut Checks<'_>,
 ) -> Accept {
-    let mut accept = Accept::default();
-    for (key, &value) in raw {
+    let mut accept = Accept {
+        settled_by_s: instant("settled_by_s", raw.settled_by_s, setting, checks),
+        peak_from_s: instant("peak_from_s", raw.peak_from_s, setting, checks),
+        missed_ticks_max: limit("missed_ticks_max", raw.missed_ticks_max.as_ref(), setting.roles, checks),
+        starved_ticks_max: limit("starved_ticks_max", raw.starved_ticks_max.as_ref(), setting.roles, checks),
+        safe_ticks_max: limit(
+            "safe_ticks_max",
+            raw.safe_ticks_max.as_ref(),
+            setting.roles.and(Some(setting.driven)),
+            checks,
+        ),
+        step_latency_p99_us_max: raw.step_latency_p99_us_max,
+        ..Accept::default()
+    };
+    let latency = raw.step_latency_p99_us_max;
+    latency.into_iter().for_each(|value| not_negative("accept.step_latency_p99_us_max", value, checks));
+    match limit("unscored_ticks_max", raw.unscored_ticks_max.as_ref(), None, checks) {
+        Some(TickLimit::All(amount)) => accept.unscored_ticks_max = Some(amount),
+        Some(TickLimit::ByRole(_)) => checks.refuse(
+            "accept.unscored_ticks_max",
+            "ticks are scored for all roles together; give a number, or a share such as \"1 %\"",
+        ),
+        None => {}
+    }
+    for (key, &value) in metrics {
         let path = format!("accept.{key}");
-        checks
-            .require(value >= 0.0, &path, || format!("{value} is below zero, which no result can be; give 0 or more"));
-        match key.as_str() {
-            "settled_by_s" => {
-                accept.settled_by_s = value;
-                check_instant(&path, value, duration_s, checks);
-            }
-            "peak_from_s" => {
-                accept.peak_from_s = value;
-                check_instant(&path, value, duration_s, checks);
-            }
-            "missed_ticks_max" => {
-                accept.missed_ticks_max = Some(value as u64);
-                checks.require(value.fract() == 0.0, &path, || {
-                    format!("{value} is no count of ticks; give a whole number")
-                });
-            }
-            "step_latency_p99_us_max" => accept.step_latency_p99_us_max = Some(value),
-            _ => {
-                let Some(metrics) = metrics else { continue };
-                if !take_metric(&mut accept, key, value, metrics) {
-                    checks.refuse(&path, format!("unknown criterion; {}", known(key, metrics)));
-                }
-            }
+        not_negative(&path, value, checks);
+        let Some(metrics) = setting.metrics else { continue };
+        if !take_metric(&mut accept, key, value, metrics) {
+            checks.refuse(&path, format!("unknown criterion; {}", known(key, metrics)));
         }
     }
     let peaks = !accept.metric_peak.is_empty();
-    checks.require(peaks || metrics.is_none() || !raw.contains_key("peak_from_s"), "accept.peak_from_s", || {
+    checks.require(peaks || setting.metrics.is_none() || raw.peak_from_s.is_none(), "accept.peak_from_s", || {
         "is from when on peaks count, and no criterion is a peak; add one that ends in _peak, or remove it".to_owned()
     });
     accept
+}
+
+fn not_negative(path: &str, value: f64, checks: &mut Checks<'_>) {
+    checks.require(value >= 0.0, path, || format!("{value} is below zero, which no result can be; give 0 or more"));
+}
+
+fn instant(key: &str, value: Option<f64>, setting: &Setting<'_>, checks: &mut Checks<'_>) -> f64 {
+    let Some(value) = value else { return 0.0 };
+    let path = format!("accept.{key}");
+    not_negative(&path, value, checks);
+    let duration_s = setting.duration_s;
+    if value > duration_s {
+        checks.warn(
+            &path,
+            format!("the run ends at {duration_s} s, before {value} s: what counts from then on is not judged"),
+        );
+    }
+    value
+}
+
+/// Checks a limit on ticks, and its roles where they are known.
+fn limit(key: &str, raw: Option<&RawTicks>, roles: Option<&[&str]>, checks: &mut Checks<'_>) -> Option<TickLimit> {
+    let path = format!("accept.{key}");
+    match raw? {
+        RawTicks::ByRole(by_role) => {
+            let mut limits = BTreeMap::new();
+            for (role, raw) in by_role {
+                let path = format!("{path}.{role}");
+                let amount = amount(&path, raw, checks);
+                if let Some(roles) = roles {
+                    checks.require(roles.contains(&role.as_str()), &path, || {
+                        format!("there is no such role to count ticks of; {}", nearest(role, roles))
+                    });
+                }
+                limits.extend(amount.map(|amount| (role.clone(), amount)));
+            }
+            Some(TickLimit::ByRole(limits))
+        }
+        raw => amount(&path, raw, checks).map(TickLimit::All),
+    }
+}
+
+fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmount> {
+    match raw {
+        RawTicks::Count(count) => {
+            not_negative(path, *count, checks);
+            checks.require(count.fract() == 0.0, path, || {
+                format!("{count} is no count of ticks; give a whole number, or a share such as \"1 %\"")
+            });
+            Some(TickAmount::Count(*count as u64))
+        }
+        RawTicks::Share(text) => {
+            let percent = text.strip_suffix('%').and_then(|number| number.trim().parse::<f64>().ok());
+            let percent = percent.filter(|percent| (0.0..=100.0).contains(percent));
+            checks.require(percent.is_some(), path, || {
+                format!("`{text}` is no share of ticks; give one from \"0 %\" to \"100 %\", or a number of ticks")
+            });
+            percent.map(|percent| TickAmount::Share(percent / 100.0))
+        }
+        RawTicks::ByRole(_) => {
+            checks.refuse(path, "a role has one limit; give a number, or a share such as \"1 %\"");
+            None
+        }
+    }
 }
 
 /// Takes a limit of a metric; false if it is none.
@@ -78,18 +216,9 @@ fn take_metric(accept: &mut Accept, key: &str, value: f64, metrics: &[&str]) -> 
     true
 }
 
-fn check_instant(path: &str, value: f64, duration_s: f64, checks: &mut Checks<'_>) {
-    checks.require(value < duration_s, path, || {
-        format!(
-            "{value} s is not before the end of the run at {duration_s} s, so nothing would be judged; lower it or raise \
-             duration_s, or judge nothing with --set accept={{}}"
-        )
-    });
-}
-
 fn known(key: &str, metrics: &[&str]) -> String {
     let of = |suffix: &'static str| metrics.iter().map(move |metric| format!("{metric}{suffix}"));
-    let others = ["settled_by_s", "peak_from_s", "missed_ticks_max", "step_latency_p99_us_max"].map(str::to_owned);
-    let known: Vec<String> = of("_max").chain(of("_peak")).chain(others).collect();
+    let common = keys_of::<Raw>().iter().map(|key| (*key).to_owned());
+    let known: Vec<String> = of("_max").chain(of("_peak")).chain(common).collect();
     nearest(key, &known.iter().map(String::as_str).collect::<Vec<_>>())
 }

@@ -424,7 +424,7 @@ fn is_below(path: &str, key: &str) -> bool {
 fn parse_value(text: &str) -> Option<Value> {
     let parsed = toml::from_str::<Table>(&format!("v = {text}")).ok().filter(|table| table.len() == 1);
     let bare = || {
-        let word = !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_./".contains(c));
+        let word = !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_./%".contains(c));
         word.then(|| Value::String(text.to_owned()))
     };
     parsed.and_then(|mut table| table.remove("v")).or_else(bare)

@@ -75,6 +75,26 @@ impl ConfigError {
         }
     }
 
+    /// The same mistake; a top-level key that is one of the keys of tables, or like one, is told as that key.
+    pub(super) fn within(self, nested: &[String]) -> Self {
+        match self {
+            Self::UnknownKey { place, key, remedy } => {
+                let remedy = nested_remedy(&key, nested).unwrap_or(remedy);
+                Self::UnknownKey { place, key, remedy }
+            }
+            Self::Invalid { mut problems } => {
+                for problem in &mut problems {
+                    let remedy = nested_remedy(&problem.key, nested);
+                    if let Some(remedy) = remedy.filter(|_| problem.reason.starts_with(UNKNOWN)) {
+                        problem.reason = format!("{UNKNOWN}; {remedy}");
+                    }
+                }
+                Self::Invalid { problems }
+            }
+            error => error,
+        }
+    }
+
     /// Whether it is the same mistake.
     pub(super) fn is(&self, other: &Self) -> bool {
         self.to_string() == other.to_string()
@@ -98,13 +118,26 @@ impl ConfigError {
     fn into_problems(self) -> Result<Vec<Problem>, Self> {
         match self {
             Self::UnknownKey { place, key, remedy } => {
-                Ok(vec![Problem { place, key, reason: format!("unknown key; {remedy}") }])
+                Ok(vec![Problem { place, key, reason: format!("{UNKNOWN}; {remedy}") }])
             }
             Self::Value { place, key, reason } => Ok(vec![Problem { place, key, reason }]),
             Self::Invalid { problems } => Ok(problems),
             error => Err(error),
         }
     }
+}
+
+/// What is said of a key that is not known.
+const UNKNOWN: &str = "unknown key";
+
+/// "did you mean" for the key of a table whose last part is a top-level key's name, or much like it.
+fn nested_remedy(key: &str, nested: &[String]) -> Option<String> {
+    if key.contains(['.', '[']) || key.len() > 64 {
+        return None;
+    }
+    let likeness = |path: &&String| strsim::jaro_winkler(key, path.rsplit('.').next().unwrap_or(path));
+    let best = nested.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
+    (likeness(&best) > 0.9).then(|| format!("did you mean `{best}`?"))
 }
 
 /// One value that makes no sense.

@@ -155,6 +155,12 @@ impl One<'_, '_, '_> {
             let fault = Fault { from_tick, ticks, occurrence, seed: fault::seed(seed, index), action };
             faults.push(ScriptedFault { role: self.raw.role.clone(), body, fault });
         }
+        let last_tick = self.setting.last_tick;
+        if from_tick > last_tick {
+            let key = self.key("from_tick");
+            self.checks.warn(&key, format!("{from_tick} is after the last tick {last_tick}: the fault does not act"));
+            faults.clear();
+        }
         Some(faults)
     }
 
@@ -183,10 +189,7 @@ impl One<'_, '_, '_> {
     }
 
     fn check_time(&mut self) {
-        let (raw, last_tick) = (self.raw, self.setting.last_tick);
-        self.require(raw.from_tick <= last_tick, "from_tick", || {
-            format!("{} is after the last tick {last_tick}; lower it or raise duration_s", raw.from_tick)
-        });
+        let raw = self.raw;
         self.require(raw.ticks >= 1, "ticks", || "0 ticks are none; give at least 1, or remove the fault".to_owned());
         if raw.kind == Kind::Freeze {
             self.require(raw.from_tick >= 1, "from_tick", || {

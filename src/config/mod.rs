@@ -16,7 +16,7 @@ mod schema;
 mod shape;
 mod watchdog;
 
-pub use accept::Accept;
+pub use accept::{Accept, TickAmount, TickLimit};
 pub use document::{Document, read_text};
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;

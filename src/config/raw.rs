@@ -34,7 +34,7 @@ pub(super) struct Raw {
     #[serde(default)]
     pub watchdog: Watchdog,
     #[serde(default)]
-    pub accept: BTreeMap<String, f64>,
+    pub accept: Accept,
     #[serde(default, skip_serializing_if = "Network::is_default")]
     pub network: Network,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -220,6 +220,38 @@ pub struct Supervision {
     pub restarts_max: u64,
     /// The least time between two starts of one role, s.
     pub restart_interval_s: f64,
+}
+
+/// The criteria that every rig has. Those of metrics are keys of the rig's.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Accept {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub settled_by_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peak_from_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub missed_ticks_max: Option<RawTicks>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub starved_ticks_max: Option<RawTicks>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub safe_ticks_max: Option<RawTicks>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub unscored_ticks_max: Option<RawTicks>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub step_latency_p99_us_max: Option<f64>,
+}
+
+/// A limit on ticks as typed.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "this is no limit on ticks; give a number, a share such as \"1 %\", or a table such as { controller = 5 }"
+)]
+pub(super) enum RawTicks {
+    Count(f64),
+    Share(String),
+    ByRole(BTreeMap<String, RawTicks>),
 }
 
 /// What is done about a role that failed, by role.

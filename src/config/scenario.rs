@@ -3,7 +3,9 @@
 use super::fault::{self, ScriptedFault};
 use super::hosts::{self, Hosts};
 use super::raw::{Launch, Policy, Raw};
-use super::{ClockKind, ConfigError, Document, Problem, Realtime, RunId, Supervision, accept, nearest, watchdog};
+use super::{
+    ClockKind, ConfigError, Document, Problem, Realtime, RunId, Shape, Supervision, accept, nearest, watchdog,
+};
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::{self, AnyRig, Context};
 use crate::role::{Actuation, Rearm};
@@ -75,6 +77,8 @@ pub struct Scenario {
     pub resolved: toml::Table,
     /// Files that it names: key and path.
     pub files: Vec<(String, PathBuf)>,
+    /// What has no effect in a run of this length, by key.
+    pub warnings: Vec<String>,
     /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
     pub run: Option<RunId>,
 }
@@ -109,16 +113,23 @@ impl Scenario {
         document.refuse_lists(&[&rig::tables()[..], &TABLES].concat())?;
         let sections = document.split_off(&rig::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
+        let metrics = document.split_off_within("accept", |key| !accept::is_common(key));
+        let metrics = metrics.read_into::<accept::Metrics>();
         let mut checks = Checks::new(&document);
-        let raw: Raw = match document.read_into() {
-            Ok(raw) => raw,
-            Err(error) => {
+        let (raw, metrics) = match (document.read_into::<Raw>(), metrics) {
+            (Ok(raw), Ok(metrics)) => (raw, metrics.accept),
+            (raw, metrics) => {
                 // The rig's own sections are read all the same; of what they say nothing can be judged.
                 let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0, actuation_delay_ticks: 1 };
-                let read = |rig: &str| rig::resolve(rig, &sections, context, &mut checks).err();
-                let own = document.text("rig").and_then(read);
+                let own = document.text("rig").map(|rig| rig::resolve(rig, &sections, context, &mut checks));
+                let rig = own.as_ref().and_then(|own| own.as_ref().ok()?.0.as_ref());
+                let nested = nested_keys(document.text("rig"), rig);
                 checks.problems.retain(|problem| problem.key == "rig");
-                return Err(error.and(own.into_iter().chain(checks.finish::<()>(None).err())));
+                let others = checks.finish::<()>(None).err();
+                let errors = raw.err().map(|error| error.within(&nested)).into_iter().chain(metrics.err());
+                let mut errors = errors.chain(own.and_then(Result::err)).chain(others);
+                let first = errors.next().expect("one of them was refused");
+                return Err(first.and(errors));
             }
         };
         check_common(&raw, &mut checks);
@@ -135,8 +146,7 @@ impl Scenario {
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         // Nothing is concluded from a length or a tick that is refused.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
-        let metrics = rig.as_ref().map(AnyRig::metrics);
-        let accept = accept::resolve(&raw.accept, duration_s, metrics.as_deref(), &mut checks);
+        let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_ref(), &mut checks);
         check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
         let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
         hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
@@ -150,12 +160,14 @@ impl Scenario {
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
             watch = watchdog::resolve(&raw.watchdog, &maxima.watchdog, rig, tick_s, duration_s, &mut checks);
         }
-        let files = checks.files.take();
+        let (files, warnings) = (checks.files.take(), std::mem::take(&mut checks.warnings));
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
-        if let Some(toml::Value::Table(watchdog)) = resolved.get_mut("watchdog") {
-            watchdog.extend(maxima.watchdog.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
+        for (table, keys) in [("watchdog", maxima.watchdog), ("accept", metrics)] {
+            if let Some(toml::Value::Table(table)) = resolved.get_mut(table) {
+                table.extend(keys.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
+            }
         }
         Ok(Self {
             name: raw.name,
@@ -180,6 +192,7 @@ impl Scenario {
             rig,
             resolved,
             files,
+            warnings,
             run: document.run(),
         })
     }
@@ -236,18 +249,24 @@ impl Scenario {
 pub struct Checks<'a> {
     document: &'a Document,
     problems: Vec<Problem>,
+    warnings: Vec<String>,
     files: RefCell<Vec<(String, PathBuf)>>,
 }
 
 impl<'a> Checks<'a> {
     pub(crate) fn new(document: &'a Document) -> Self {
-        Self { document, problems: Vec::new(), files: RefCell::default() }
+        Self { document, problems: Vec::new(), warnings: Vec::new(), files: RefCell::default() }
     }
 
     /// Notes that the value at `key` makes no sense.
     pub fn refuse(&mut self, key: &str, reason: impl Into<String>) {
         let place = self.document.place(key);
         self.problems.push(Problem { place, key: key.to_owned(), reason: reason.into() });
+    }
+
+    /// Notes that the value at `key` has no effect: the scenario is valid all the same.
+    pub fn warn(&mut self, key: &str, reason: impl std::fmt::Display) {
+        self.warnings.push(format!("{key}: {reason}"));
     }
 
     /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
@@ -281,6 +300,41 @@ impl<'a> Checks<'a> {
             _ => Err(ConfigError::Invalid { problems: self.problems }),
         }
     }
+}
+
+/// Checks the criteria against what is known of the rig.
+fn resolve_accept(
+    raw: &Raw,
+    metrics: &BTreeMap<String, f64>,
+    duration_s: f64,
+    rig: Option<&AnyRig>,
+    checks: &mut Checks<'_>,
+) -> accept::Accept {
+    let (names, roles) = (rig.map(AnyRig::metrics), rig.map(AnyRig::roles));
+    let bodies = rig.map_or(&[][..], AnyRig::bodies);
+    let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
+    let setting = accept::Setting { duration_s, metrics: names.as_deref(), roles: roles.as_deref(), driven: &driven };
+    accept::resolve(&raw.accept, metrics, &setting, checks)
+}
+
+/// The keys of tables, as `accept.settled_by_s`, with those that the rig of this name gives names to.
+fn nested_keys(name: Option<&str>, rig: Option<&AnyRig>) -> Vec<String> {
+    let mut nested = Vec::new();
+    let shapes = rig::shapes();
+    let own = shapes.iter().filter(|(rig, _)| name == Some(*rig)).flat_map(|(_, keys)| keys);
+    let Shape::Table { keys: common, .. } = Shape::of::<Raw>() else { unreachable!("a scenario is a table") };
+    for key in own.chain(&common) {
+        if let Shape::Table { keys, .. } = &key.shape {
+            nested.extend(keys.iter().map(|inner| format!("{}.{}", key.name, inner.name)));
+        }
+    }
+    let rig_keys = rig.into_iter().flat_map(|rig| {
+        let metrics = rig.metrics().into_iter();
+        let criteria = metrics.flat_map(|metric| [format!("accept.{metric}_max"), format!("accept.{metric}_peak")]);
+        criteria.chain(rig.monitors().into_iter().map(|(name, _)| format!("watchdog.{name}_max"))).collect::<Vec<_>>()
+    });
+    nested.extend(rig_keys);
+    nested
 }
 
 fn tick_possible(tick_hz: f64) -> bool {

@@ -25,8 +25,9 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
         properties.insert(key.name.to_owned(), of_key(key, "", &notes, None));
     }
     properties["rig"] = with_note(json!({ "enum": names }), "rig", &notes, None);
-    // Bounds of quantities that the rig tells.
+    // Bounds of quantities and metrics that the rig tells.
     properties["watchdog"]["patternProperties"] = json!({ "_max$": { "type": "number" } });
+    properties["accept"]["additionalProperties"] = json!({ "type": "number" });
     // An editor completes from here, whichever the rig is.
     for section in rig::sections() {
         let of = |(name, keys): &(&str, Vec<Key>)| {

@@ -36,9 +36,14 @@ pub(super) fn resolve(
         }
         bounds.max[index] = *max;
     }
-    checks.require(raw.from_s >= 0.0 && raw.from_s < duration_s, "watchdog.from_s", || {
-        format!("{} s is not within the run of {duration_s} s; give an instant from 0 on, before its end", raw.from_s)
+    let from_s = raw.from_s;
+    checks.require(from_s >= 0.0, "watchdog.from_s", || {
+        format!("{from_s} s is before the run; give an instant from 0 on, before its end at {duration_s} s")
     });
+    if from_s >= duration_s {
+        checks
+            .warn("watchdog.from_s", format!("the run ends at {duration_s} s, before {from_s} s: nothing is watched"));
+    }
     let watches = bounds != WatchBounds { from_tick: bounds.from_tick, ..WatchBounds::NONE };
     let safe = raw.on_breach == OnBreach::Safe;
     checks.require(watches || !safe, "watchdog.on_breach", || {

@@ -167,7 +167,7 @@ impl<'a, R: Rig> Run<'a, R> {
     }
 
     fn outcome(mut self, ticks: u64, signal: usize) -> Outcome {
-        let score = self.scoring.finish();
+        let score = self.scoring.finish(core::iter::repeat_n(ticks, self.bodies.len() + 1));
         let reports = RoleId::all(self.scenario).into_iter().map(|role| self.report(role, ticks)).collect();
         Outcome {
             reports,

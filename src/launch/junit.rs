@@ -109,13 +109,15 @@ fn cases(summary: &Summary) -> Vec<Case> {
 
 fn judge(criterion: &Criterion) -> Verdict {
     let limit = criterion.limit;
+    let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
     match (criterion.holds, criterion.value) {
         (Some(true), _) => Verdict::Passed,
-        (Some(false), Some(value)) => Verdict::Failed(format!("{value:e} is above the limit {limit:e}")),
+        (Some(false), Some(value)) => Verdict::Failed(format!("{role}{value:e} is above the limit {limit:e}")),
         (Some(false), None) => Verdict::Failed(format!("nothing was measured; the limit is {limit:e}")),
-        (None, _) => Verdict::Skipped(
-            "not judged: this clock does not measure it, or the run ended before it applies".to_owned(),
-        ),
+        (None, _) => {
+            let reason = criterion.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
+            Verdict::Skipped(format!("not judged{reason}"))
+        }
     }
 }
 
@@ -151,7 +153,8 @@ mod tests {
     use super::*;
 
     fn criterion(value: Option<f64>, holds: Option<bool>) -> Criterion {
-        Criterion { name: "sync_error_rad_s_max".to_owned(), limit: 1e-6, value, holds }
+        let name = "sync_error_rad_s_max".to_owned();
+        Criterion { name, limit: 1e-6, value, holds, role: None, reason: None, default: false }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
 mod children;
+mod criteria;
 mod direct;
 mod external;
 mod foxglove;
@@ -23,13 +24,14 @@ mod supervision;
 mod table;
 mod trace;
 
+pub use criteria::{Criterion, Unjudged, tick_words};
 pub(crate) use direct::run_rig as run_directly;
 pub use janitor::janitor;
 #[cfg(feature = "hosts")]
 pub use join::{FarOutcome, join};
 pub use junit::junit;
-pub use outcome::{Criterion, Outcome, Summary, write_run};
 pub(crate) use outcome::{Judged, State, state_hash};
+pub use outcome::{Outcome, Summary, write_run};
 #[cfg(feature = "hosts")]
 pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;

@@ -2,6 +2,7 @@
 //!
 //! Must not soften anything: what was not measured is said to be so, and counters that do not balance are a failure.
 
+use super::criteria::{Criterion, Judge, accepted, verdict};
 use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
@@ -11,7 +12,7 @@ use crate::files;
 use crate::hosts::{HostReport, HostsSummary};
 use crate::record::RecordingReport;
 use crate::rig::Figure;
-use crate::runtime::RoleId;
+use crate::runtime::{RoleId, ports};
 use crate::serial::LineCounters;
 use crate::system::utc;
 use crate::telemetry::{
@@ -120,19 +121,6 @@ pub struct Summary {
     pub privileges_unknown: Vec<String>,
 }
 
-/// A criterion and its verdict.
-#[derive(Debug, Clone, Serialize)]
-pub struct Criterion {
-    /// The key in `[accept]`.
-    pub name: String,
-    /// The limit.
-    pub limit: f64,
-    /// The value; none if it was not measured.
-    pub value: Option<f64>,
-    /// Whether it holds; none if it cannot be judged.
-    pub holds: Option<bool>,
-}
-
 /// The counters of a run.
 #[derive(Debug, Serialize)]
 pub struct Accounting {
@@ -146,6 +134,9 @@ pub struct Accounting {
     pub roles: BTreeMap<String, Ticks>,
     /// Per reading end.
     pub links: Vec<LinkCounters>,
+    /// Per external role that keeps no counters: ticks of which its readers had no sample.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub absent_ticks: BTreeMap<String, u64>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
     /// Samples received and not believed, all links together.
@@ -247,7 +238,7 @@ impl State {
 pub(crate) struct Judged {
     latencies: Vec<StageFigures>,
     pub books: Accounting,
-    criteria: Vec<Criterion>,
+    pub(super) criteria: Vec<Criterion>,
     /// Whether every criterion that could be judged holds; none if none could be.
     pub accepted: Option<bool>,
     /// The same in words.
@@ -266,10 +257,11 @@ impl Judged {
         let left = scenario.clock == ClockKind::InProcess && outcome.reports.iter().any(ends_early);
         let interrupted = outcome.signal != 0 || !lost.is_empty() || left;
         let books = Accounting::new(scenario, outcome, interrupted, &lost);
-        let criteria = judge(scenario, outcome, &books, &latencies, interrupted);
+        let judge = Judge { scenario, outcome, books: &books, latencies: &latencies, interrupted };
+        let criteria = judge.criteria();
         // A run that lost a role is not accepted, whatever its criteria say.
         let accepted = accepted(&criteria, interrupted).or((!lost.is_empty()).then_some(false));
-        let verdict = verdict(accepted, criteria.is_empty(), interrupted);
+        let verdict = verdict(accepted, &criteria, interrupted);
         Self { latencies, books, criteria, accepted, verdict }
     }
 }
@@ -310,7 +302,7 @@ impl Summary {
             criteria,
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
-            notes: scenario.rig.notes(),
+            notes: scenario.rig.notes().into_iter().chain(scenario.warnings.iter().cloned()).collect(),
             limits: scenario.rig.limits(),
             watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),
             certificates: claims(scenario),
@@ -358,7 +350,14 @@ impl Accounting {
         for (reason, count) in links.iter().flat_map(|link| &link.rejected_by) {
             *rejected_by.entry(reason.clone()).or_default() += count;
         }
+        let elapsed = reports.iter().map(|report| report.ticks.elapsed).max().unwrap_or(0);
+        let absent_ticks = outcome.unbooked.iter().filter_map(|role| {
+            let came = links_of(scenario, role, &links).map(|link| link.received + link.void.1).min()?;
+            // A reader need not have looked for the last sample, nor for commands that act after the end.
+            Some((role.clone(), elapsed.saturating_sub(came + scenario.actuation_delay_ticks)))
+        });
         Self {
+            absent_ticks: absent_ticks.collect(),
             balanced: problems.is_empty(),
             problems,
             unbooked: outcome.unbooked.clone(),
@@ -371,6 +370,18 @@ impl Accounting {
             links,
         }
     }
+}
+
+/// The reading ends of what a role sends.
+pub(super) fn links_of<'a>(
+    scenario: &Scenario,
+    role: &str,
+    links: &'a [LinkCounters],
+) -> impl Iterator<Item = &'a LinkCounters> {
+    let id = RoleId::all(scenario).into_iter().find(|id| id.name(scenario) == role);
+    let writes = id.map_or(Vec::new(), |id| ports(scenario, id).writes);
+    let services: Vec<String> = writes.iter().map(|port| port.topic.to_string()).collect();
+    links.iter().filter(move |link| services.contains(&link.service))
 }
 
 impl LinkCounters {
@@ -513,67 +524,6 @@ fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
     let hosts = RoleId::all(scenario).into_iter().filter(|role| *role == role.host(scenario));
     let names = hosts.map(|role| role.name(scenario).to_owned());
     names.filter(|name| outcome.unbooked.contains(name) || asked && !tells(name)).collect()
-}
-
-/// Whether what was judged holds; none if nothing was, or if the run was `interrupted` before anything failed.
-fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool> {
-    let judged = criteria.iter().filter_map(|criterion| criterion.holds);
-    judged.reduce(|all, one| all && one).filter(|all| !(*all && interrupted))
-}
-
-fn verdict(accepted: Option<bool>, no_criteria: bool, interrupted: bool) -> String {
-    match accepted {
-        Some(true) => "accepted",
-        Some(false) => "not accepted",
-        None if no_criteria => "not judged: the scenario has no criteria",
-        None if interrupted => "not judged: the run was stopped before its end",
-        None => "not judged: this clock measures none of the criteria",
-    }
-    .to_owned()
-}
-
-/// Holds the results against the criteria. What a run that was `interrupted` did not get to is not judged.
-fn judge(
-    scenario: &Scenario,
-    outcome: &Outcome,
-    books: &Accounting,
-    latencies: &[StageFigures],
-    interrupted: bool,
-) -> Vec<Criterion> {
-    let accept = &scenario.accept;
-    let mut criteria = Vec::new();
-    let mut add = |name: String, limit: f64, value: Option<f64>, judged: bool| {
-        let holds = judged.then(|| value.is_some_and(|value| value <= limit));
-        criteria.push(Criterion { name, limit, value, holds });
-    };
-    for (metric, limit) in &accept.metric_max {
-        let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
-        let value = score.and_then(|score| score.settled_max);
-        add(format!("{metric}_max"), *limit, value, value.is_some() || !interrupted);
-    }
-    for (metric, limit) in &accept.metric_peak {
-        let score = outcome.score.metrics.iter().find(|score| score.name == *metric);
-        let value = score.and_then(|score| score.peak);
-        add(format!("{metric}_peak"), *limit, value, value.is_some() || !interrupted);
-    }
-    // Asked for or not: a run that lost a body is not accepted.
-    if outcome.score.faulted_ticks > 0 {
-        add("faulted_ticks_max".to_owned(), 0.0, Some(outcome.score.faulted_ticks as f64), true);
-    }
-    if let Some(limit) = accept.missed_ticks_max {
-        add("missed_ticks_max".to_owned(), limit as f64, Some(books.missed_ticks as f64), true);
-    }
-    if let Some(limit) = accept.step_latency_p99_us_max {
-        let step = |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
-        let worst = latencies.iter().filter(step).map(|stage| stage.figures.p99_us);
-        // What has no figure was not measured.
-        let worst = worst.reduce(|worst, p99| if worst.is_nan() { worst } else { f64::max(p99, worst) });
-        let worst = worst.filter(|worst| !worst.is_nan());
-        // Without a clock there is no latency to judge; in real time a missing one is a failure.
-        let judged = scenario.clock == ClockKind::Realtime;
-        add("step_latency_p99_us_max".to_owned(), limit, worst, judged);
-    }
-    criteria
 }
 
 /// Writes a run's files into `directory`, which exists: `scenario.toml`, `summary.json`, `hashes.txt`, `latency/`.

@@ -25,6 +25,9 @@ pub struct Score {
     pub metrics: Vec<MetricScore>,
     /// How the live certificate fared, if the rig has one.
     pub certificate: Option<CertificateScore>,
+    /// Samples received per signal that is scored, by service.
+    #[serde(skip)]
+    pub received: Vec<(String, u64)>,
     /// Per signal, at how many ticks its status said what; only what was said.
     pub statuses: BTreeMap<String, BTreeMap<&'static str, u64>>,
     /// Per incident: from its tick until every metric with a limit was within it for good, or until the next incident, s.
@@ -73,6 +76,12 @@ pub struct MetricScore {
     pub settled_at_s: Option<f64>,
     /// The integral of its square over the run: (its unit)² s; a tick at which it could not be scored adds nothing.
     pub ise: f64,
+    /// Ticks from `accept.settled_by_s` on that were passed over without a value.
+    #[serde(skip)]
+    pub settled_blank: u64,
+    /// Ticks from `accept.peak_from_s` on that were passed over without a value.
+    #[serde(skip)]
+    pub peak_blank: u64,
     /// What is accepted; infinite without a limit.
     #[serde(skip)]
     limit: f64,
@@ -199,6 +208,14 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         }
     }
 
+    /// How many samples were received.
+    fn samples(&mut self) -> u64 {
+        match self {
+            Self::One(input) => input.counters().samples(),
+            Self::Fleet(input) => input.counters().samples(),
+        }
+    }
+
     /// That of the sample at hand.
     fn stamp(&self) -> Option<&Stamp> {
         match self {
@@ -234,6 +251,7 @@ pub(super) struct Scoring<R: Rig> {
     driven: Vec<DrivenBody>,
     /// Of the estimate, and of every body's truth.
     statuses: Vec<Statuses>,
+    services: Vec<String>,
     next_tick: u64,
     /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
     incidents: Vec<(u64, u64)>,
@@ -248,6 +266,8 @@ impl<R: Rig> Scoring<R> {
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
         let estimates = Statuses::new(&rig.bodies()[0].name, Signal::Estimate);
         let truths = bodies.clone().map(|body| Statuses::new(&body.name, Signal::Truth));
+        let names = bodies.clone().map(|body| (&body.name, Signal::Truth));
+        let signals = core::iter::once((&rig.bodies()[0].name, Signal::Estimate)).chain(names);
         let metric = |name: &&str| MetricScore {
             name: (*name).to_owned(),
             last: f64::NAN,
@@ -256,6 +276,8 @@ impl<R: Rig> Scoring<R> {
             peak_tick: None,
             settled_at_s: None,
             ise: 0.0,
+            settled_blank: 0,
+            peak_blank: 0,
             limit: scenario.accept.metric_max.get(*name).copied().unwrap_or(f64::INFINITY),
             last_above: None,
         };
@@ -266,6 +288,7 @@ impl<R: Rig> Scoring<R> {
             delay_ticks: scenario.actuation_delay_ticks,
             driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
             statuses: core::iter::once(estimates).chain(truths).collect(),
+            services: signals.map(|(body, signal)| topic(scenario, body, signal).to_string()).collect(),
             next_tick: 0,
             incidents: Vec::new(),
             values: vec![f64::NAN; rig.metrics().len()],
@@ -275,6 +298,7 @@ impl<R: Rig> Scoring<R> {
                 faulted_ticks: 0,
                 metrics: rig.metrics().iter().map(metric).collect(),
                 certificate: None,
+                received: Vec::new(),
                 statuses: BTreeMap::new(),
                 recoveries_s: Vec::new(),
             },
@@ -345,8 +369,10 @@ impl<R: Rig> Scoring<R> {
         self.incidents.iter().map(recovery).collect()
     }
 
-    /// Closes the account.
-    pub fn finish(&mut self) -> Score {
+    /// Closes the account. `received` holds how many samples came, of the estimate and of every body's truth.
+    pub fn finish(&mut self, received: impl Iterator<Item = u64>) -> Score {
+        let services = self.services.iter().cloned();
+        self.score.received = services.zip(received).collect();
         self.score.recoveries_s = self.recoveries_s();
         if let Some(certificate) = &mut self.score.certificate {
             let steps = self.next_tick * self.driven.len() as u64;
@@ -437,6 +463,8 @@ fn at<B: Bus, S: Carried + ?Sized, G: Guard<S>>(input: &Input<B, S, G>, tick: u6
 impl MetricScore {
     fn take(&mut self, tick: u64, value: f64, accept: &Accept, time_s: f64) {
         if value.is_nan() {
+            self.settled_blank += u64::from(time_s >= accept.settled_by_s);
+            self.peak_blank += u64::from(time_s >= accept.peak_from_s);
             return;
         }
         self.last = value;
@@ -493,6 +521,8 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
             }
             self.score_tick();
         }
-        Ok(self.scoring.finish())
+        let estimates = self.estimate.counters().samples();
+        let truths = self.truths.iter_mut().map(TruthInput::samples);
+        Ok(self.scoring.finish(core::iter::once(estimates).chain(truths)))
     }
 }

@@ -99,9 +99,15 @@ fn results(summary: &Summary, text: &mut String) {
         let number = |value: f64| if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
         let value = criterion.value.map_or("not measured".to_owned(), number);
         let limit = number(criterion.limit);
-        rows.add_row([criterion.name.clone(), value, "-".to_owned(), limit, "-".to_owned(), verdict(criterion.holds)]);
+        let dash = || "-".to_owned();
+        rows.add_row([criterion.label(), value, dash(), limit, dash(), verdict(criterion.holds)]);
     }
     let _ = writeln!(text, "\n{rows}\n\n{}", summary.verdict);
+    for criterion in &summary.criteria {
+        if let Some(reason) = &criterion.reason {
+            let _ = writeln!(text, "{} is not judged: {reason}", criterion.name);
+        }
+    }
     if let Some(score) = summary.score.certificate {
         let (held, broken, judged) = (score.held, score.broken, score.held + score.broken);
         let told = match broken {

@@ -86,6 +86,7 @@ fn json(path: &Path, scenario: &Scenario) -> String {
         "clock": scenario.clock.name(),
         "tick_hz": 1.0 / scenario.tick_s(),
         "notes": scenario.rig.notes(),
+        "warnings": scenario.warnings,
         "limits": scenario.rig.limits(),
         "followers": claims(scenario),
     });
@@ -100,6 +101,7 @@ fn tell(path: &Path, scenario: &Scenario) -> String {
 }
 
 fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
+    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "# warning: {warning}"))?;
     scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
     for limit in scenario.rig.limits() {
         writeln!(text, "# limit: {}: {}", limit.name, digits(limit.value))?;

@@ -11,7 +11,7 @@ use crate::files;
 use crate::hosts::{Address, HostSeat};
 use crate::launch::{
     Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, make_directory, make_latest,
-    new_run, table, write_run,
+    new_run, table, tick_words, write_run,
 };
 use crate::runtime::seat_path;
 use crate::system::{remedy, tell};
@@ -93,9 +93,10 @@ A name always means the scenario that ships with the program, as
 or NAME.toml. runs/latest leads to the newest run in runs/.
 
 The last line is PASS if every criterion of [accept] that was judged holds, FAIL
-if one does not or the run was not sound, NOT JUDGED if nothing could be held
-against a criterion. It ends the table on stdout; with --json it is on stderr.
-A run that could not begin has an error instead.
+if one does not or the run was not sound, NOT JUDGED if nothing was broken but
+the run is no proof: no criteria, stopped, shorter than settled_by_s, not scored.
+It names ticks that roles missed, starved or were safe at. It ends the table on
+stdout; with --json it is on stderr. A run that could not begin has an error.
 
 Examples:
   corotate run rigid-trio          a scenario that ships with the program
@@ -324,8 +325,15 @@ impl Verdict {
         Self { exit, word, reason: reason.into() }
     }
 
-    /// Judges a run, and says on stderr what is wrong with it.
+    /// Judges a run, and says on stderr what is wrong with it. Ticks that were missed, starved or safe are always named.
     fn of(summary: &Summary) -> Self {
+        let verdict = Self::without_ticks(summary);
+        let ticks = tick_words(&summary.books);
+        let reason = if ticks.is_empty() { verdict.reason } else { format!("{}; {ticks}", verdict.reason) };
+        Self { reason, ..verdict }
+    }
+
+    fn without_ticks(summary: &Summary) -> Self {
         if !summary.books.balanced {
             let exit = fail(Exit::Failure, &"the counters do not balance: samples or ticks are unaccounted for");
             return Self::new(exit, FAIL, "the counters do not balance");
@@ -340,7 +348,8 @@ impl Verdict {
         let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
         for criterion in &broken {
             let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
-            remark(&format!("accept.{}: {value}, limit {:e}", criterion.name, criterion.limit));
+            let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
+            remark(&format!("accept.{}: {role}{value}, limit {:e}", criterion.name, criterion.limit));
         }
         let ended = (summary.signal != 0).then(|| format!("ended in order by signal {}", summary.signal));
         ended.iter().for_each(|ended| remark(ended));

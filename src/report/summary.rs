@@ -55,6 +55,10 @@ pub struct Criterion {
     pub limit: f64,
     pub value: Option<f64>,
     pub holds: Option<bool>,
+    pub role: Option<String>,
+    pub reason: Option<String>,
+    #[serde(default)]
+    pub default: bool,
 }
 
 /// Numbers that were not finite are none: JSON has no infinity.

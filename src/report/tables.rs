@@ -65,7 +65,12 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
         let row = |criterion: &super::summary::Criterion| {
             let value =
                 criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:.2e}"));
-            vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), held(criterion.holds).to_owned()]
+            let default = criterion.default.then(|| "default".to_owned());
+            let about: Vec<String> =
+                [default, criterion.role.clone(), criterion.reason.clone()].into_iter().flatten().collect();
+            let about = if about.is_empty() { String::new() } else { format!(" ({})", about.join(", ")) };
+            let verdict = format!("{}{about}", held(criterion.holds));
+            vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), verdict]
         };
         let rows: Vec<_> = summary.criteria.iter().map(row).collect();
         if rows.is_empty() {

@@ -192,6 +192,11 @@ pub struct ReadCounters {
 persist_fields!(ReadCounters, taken, received, gaps, stale, covered, void, rejected);
 
 impl ReadCounters {
+    /// How many samples were received, rejected ones too.
+    pub fn samples(&self) -> u64 {
+        self.received
+    }
+
     /// How many samples were taken off the link, whatever they were worth.
     #[inline]
     pub fn taken(&self) -> u64 {

@@ -232,21 +232,25 @@ fn actuators_real_time_and_launch_have_limits() {
 fn criteria_are_known_and_can_be_met() {
     assert_all_refused(&[
         ("accept.settled_by_s", "-1", "below zero", "give 0 or more"),
-        ("accept.settled_by_s", "10.0", "nothing would be judged", "lower it or raise duration_s"),
-        ("accept.settled_by_s", "20", "nothing would be judged", "lower it or raise duration_s"),
         ("accept.settled_by_s", "\"8 s\"", "got string", "give a number"),
         ("accept.sync_error_rad_s_max", "-1e-6", "below zero", "give 0 or more"),
         ("accept.missed_ticks_max", "0.5", "no count of ticks", "give a whole number"),
         ("accept.missed_ticks_max", "-1", "below zero", "give 0 or more"),
         ("accept.missed_ticks_max", "1e300", "no quantity", "give"),
-        ("accept.missed_ticks_max", "\"0\"", "got string", "give a number"),
+        ("accept.missed_ticks_max", "\"0\"", "no share of ticks", "a number of ticks"),
+        ("accept.safe_ticks_max", "\"101 %\"", "no share of ticks", "from \"0 %\" to \"100 %\""),
+        ("accept.starved_ticks_max", "true", "no limit on ticks", "give a number, a share"),
+        ("accept.starved_ticks_max", "{ controler = 1 }", "no such role", "did you mean `controller`?"),
+        ("accept.safe_ticks_max", "{ controller = 1 }", "no such role", "known here: follower"),
+        ("accept.missed_ticks_max", "{ controller = { x = 1 } }", "a role has one limit", "give a number"),
+        ("accept.missed_ticks_max", "{ controller = -1 }", "below zero", "give 0 or more"),
+        ("accept.unscored_ticks_max", "{ leader = 1 }", "all roles together", "give a number"),
         ("accept.step_latency_p99_us_max", "-3", "below zero", "give 0 or more"),
         ("accept.sync_eror_rad_s_max", "1", "unknown criterion", "did you mean `sync_error_rad_s_max`?"),
         ("accept.sync_error_rad_s", "1", "unknown criterion", "did you mean `sync_error_rad_s_max`?"),
         ("accept.foo", "1", "unknown criterion", "known here: sync_error_rad_s_max"),
         ("accept._max", "1", "unknown criterion", "known here: sync_error_rad_s_max"),
     ]);
-    assert_refused(&with(PAIR, "duration_s", "5"), "accept.settled_by_s", &["nothing would be judged", "lower it"]);
 }
 
 /// The values of a key with each of their numbers, if it has any, replaced.

@@ -14,6 +14,18 @@ use std::time::{Duration, Instant};
 /// Nothing here takes so long, however loaded the machine is; what does, hangs.
 pub const WATCHDOG: Duration = Duration::from_secs(300);
 
+/// Limits nothing but metrics: for a run in real time that is not about missed ticks.
+pub const ANY_TICKS: &str =
+    "missed_ticks_max={}, starved_ticks_max={}, safe_ticks_max={}, unscored_ticks_max=\"100 %\"";
+
+/// Such a run of a scenario that has criteria.
+pub const WITHOUT_TICK_LIMITS: [&str; 4] = [
+    "--set=accept.missed_ticks_max={}",
+    "--set=accept.starved_ticks_max={}",
+    "--set=accept.safe_ticks_max={}",
+    "--set=accept.unscored_ticks_max=\"100 %\"",
+];
+
 /// A place to run in, with nothing of any other run in it.
 pub struct Bench {
     directory: tempfile::TempDir,

@@ -30,7 +30,7 @@ class Run:
 
     @property
     def accepted(self):
-        """Whether every criterion of `[accept]` holds; None if nothing was judged."""
+        """Whether every criterion of `[accept]` holds; None if nothing, or not all, could be judged: `summary["verdict"]` says why."""
         return self.summary["accepted"]
 
     @property

@@ -1,0 +1,470 @@
+//! The criteria of a run: each value beside its limit, and what follows for the run as a whole.
+//!
+//! Must not pass what was not seen: a criterion that lacks a part of what it is about is not judged, and with it the run.
+
+use super::outcome::{Accounting, StageFigures, links_of};
+use super::{Action, Outcome};
+use crate::config::{ClockKind, Scenario, TickAmount, TickLimit};
+use crate::fault::{Action as FaultAction, Interruption};
+use crate::telemetry::Ticks;
+use serde::{Serialize, Serializer};
+use std::fmt;
+
+/// The part of a role's ticks that may be missed, and starved, where a scenario states no limit.
+const DEFAULT_SHARE: TickAmount = TickAmount::Share(0.01);
+/// How long it may take until the death of a role is noticed, s.
+const NOTICED_S: f64 = 0.1;
+
+/// A criterion and its verdict.
+#[derive(Debug, Clone, Serialize)]
+pub struct Criterion {
+    /// The key in `[accept]`.
+    pub name: String,
+    /// The limit.
+    pub limit: f64,
+    /// The value; none if it was not measured.
+    pub value: Option<f64>,
+    /// True if it holds, false if not; none if it cannot be judged.
+    pub holds: Option<bool>,
+    /// The role with the largest value, where each has its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub role: Option<String>,
+    /// Why it is not judged.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<Unjudged>,
+    /// True if the scenario states no such limit, and the default holds.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub default: bool,
+}
+
+/// Why a criterion is not judged.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Unjudged {
+    /// The clock does not measure it, whatever happens.
+    Clock,
+    /// The run was stopped before it applies.
+    Stopped,
+    /// By the scenario the run ends before it applies: the key of the instant, and the instant, s.
+    Early(&'static str, f64),
+    /// So many of so many ticks from an instant on, s, have no score.
+    Unscored(u64, u64, f64),
+    /// The role keeps no counters.
+    Unbooked,
+}
+
+impl fmt::Display for Unjudged {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Clock => f.write_str("this clock does not measure it"),
+            Self::Stopped => f.write_str("the run was stopped before it applies"),
+            Self::Early(key, instant_s) => write!(f, "ends before {key} ({instant_s} s)"),
+            Self::Unscored(unscored, ticks, from_s) => {
+                write!(f, "{unscored} of {ticks} ticks from {from_s} s on were not scored")
+            }
+            Self::Unbooked => f.write_str("the role keeps no counters"),
+        }
+    }
+}
+
+impl Serialize for Unjudged {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl Criterion {
+    fn new(name: impl Into<String>, limit: f64, value: Option<f64>) -> Self {
+        let holds = Some(value.is_some_and(|value| value <= limit));
+        Self { name: name.into(), limit, value, holds, role: None, reason: None, default: false }
+    }
+
+    /// The name, with what a reader must know of it.
+    pub(super) fn label(&self) -> String {
+        let role = self.role.as_ref().map_or(String::new(), |role| format!(", {role}"));
+        format!("{}{}{role}", self.name, if self.default { " (default)" } else { "" })
+    }
+
+    /// The same, not judged for a reason. A limit that is exceeded is exceeded all the same.
+    fn unless(mut self, reason: Option<Unjudged>) -> Self {
+        let exceeded = self.value.is_some_and(|value| value > self.limit);
+        if reason.is_some() && !exceeded {
+            (self.holds, self.reason) = (None, reason);
+        }
+        self
+    }
+}
+
+/// The ticks of one role.
+struct Counted<'a> {
+    role: &'a str,
+    elapsed: u64,
+    missed: Option<u64>,
+    starved: Option<u64>,
+    safe: Option<u64>,
+}
+
+/// The judge of one run.
+pub(super) struct Judge<'a> {
+    pub scenario: &'a Scenario,
+    pub outcome: &'a Outcome,
+    pub books: &'a Accounting,
+    pub latencies: &'a [StageFigures],
+    pub interrupted: bool,
+}
+
+impl Judge<'_> {
+    /// Holds the results against the criteria.
+    pub fn criteria(&self) -> Vec<Criterion> {
+        let accept = &self.scenario.accept;
+        let mut criteria = self.metrics();
+        let score = &self.outcome.score;
+        // Asked for or not: a run that lost a body is not accepted.
+        if score.faulted_ticks > 0 {
+            criteria.push(Criterion::new("faulted_ticks_max", 0.0, Some(score.faulted_ticks as f64)));
+        }
+        if !accept.is_empty() {
+            criteria.extend(self.ticks());
+        }
+        if let Some(amount) = accept.unscored_ticks_max {
+            let unscored = self.unscored(0, score.unscored_ticks);
+            let limit = amount.of(self.ticks_from(0)) as f64;
+            criteria.push(Criterion::new("unscored_ticks_max", limit, Some(unscored as f64)));
+        }
+        if let Some(limit) = accept.step_latency_p99_us_max {
+            let step =
+                |stage: &&StageFigures| stage.stage == "step" && ["observer", "controller"].contains(&&*stage.role);
+            let worst = self.latencies.iter().filter(step).map(|stage| stage.figures.p99_us);
+            // A stage without a figure was not measured, and then the worst is not known.
+            let worst = worst.reduce(|worst, p99| if worst.is_nan() { worst } else { f64::max(p99, worst) });
+            let worst = worst.filter(|worst| !worst.is_nan());
+            // Without a clock there is no latency to judge; in real time a missing one is a failure.
+            let reason = (self.scenario.clock != ClockKind::Realtime).then_some(Unjudged::Clock);
+            criteria.push(Criterion::new("step_latency_p99_us_max", limit, worst).unless(reason));
+        }
+        criteria
+    }
+
+    fn metrics(&self) -> Vec<Criterion> {
+        let (accept, score) = (&self.scenario.accept, &self.outcome.score);
+        let find = |metric: &String| score.metrics.iter().find(|score| score.name == *metric);
+        let settled = accept.metric_max.iter().map(|(metric, limit)| {
+            let score = find(metric);
+            let (value, blank) =
+                (score.and_then(|score| score.settled_max), score.map_or(0, |score| score.settled_blank));
+            let criterion = Criterion::new(format!("{metric}_max"), *limit, value);
+            criterion.unless(self.unseen("settled_by_s", accept.settled_by_s, value, blank))
+        });
+        let peaks = accept.metric_peak.iter().map(|(metric, limit)| {
+            let score = find(metric);
+            let (value, blank) = (score.and_then(|score| score.peak), score.map_or(0, |score| score.peak_blank));
+            let criterion = Criterion::new(format!("{metric}_peak"), *limit, value);
+            criterion.unless(self.unseen("peak_from_s", accept.peak_from_s, value, blank))
+        });
+        settled.chain(peaks).collect()
+    }
+
+    /// Why a metric cannot be judged from an instant on, if it cannot: `blank` ticks from there on have none.
+    fn unseen(&self, key: &'static str, from_s: f64, value: Option<f64>, blank: u64) -> Option<Unjudged> {
+        let last_tick = self.scenario.last_tick;
+        if self.scenario.time_s(last_tick) < from_s {
+            return Some(Unjudged::Early(key, from_s));
+        }
+        let from_tick = ((from_s / self.scenario.tick_s()).ceil() as u64).min(last_tick);
+        if self.interrupted {
+            return value.is_none().then_some(Unjudged::Stopped);
+        }
+        // What was never measured does not hold.
+        value?;
+        let ticks = self.ticks_from(from_tick);
+        let blank = self.unscored(from_tick, blank);
+        let allowed = match self.scenario.accept.unscored_ticks_max {
+            Some(amount) => amount.of(ticks),
+            // A tick that a role missed is without a sample, and counted as missed. One that was sent and not scored may have
+            // been the worst.
+            None if self.lost_samples() == Some(0) => DEFAULT_SHARE.of(ticks),
+            None => 0,
+        };
+        (blank > allowed).then_some(Unjudged::Unscored(blank, ticks, from_s))
+    }
+
+    /// How many ticks there are from one on.
+    fn ticks_from(&self, from_tick: u64) -> u64 {
+        self.scenario.last_tick + 1 - from_tick
+    }
+
+    /// How many ticks from one on are without a score: those that the scorer passed over, and those that it did not come to.
+    fn unscored(&self, from_tick: u64, passed_over: u64) -> u64 {
+        let score = &self.outcome.score;
+        let end = score.scored_ticks + score.unscored_ticks;
+        let rest = if self.interrupted { 0 } else { (self.scenario.last_tick + 1).saturating_sub(end.max(from_tick)) };
+        passed_over + rest
+    }
+
+    /// How many samples were sent to the scorer and did not reach it; none if no writer keeps counters.
+    fn lost_samples(&self) -> Option<u64> {
+        let written = || self.outcome.reports.iter().flat_map(|report| &report.written);
+        let received = self.outcome.score.received.iter();
+        let lost = received.filter_map(|(service, received)| {
+            let writer = written().find(|link| link.service == *service)?;
+            Some(writer.published.saturating_sub(*received))
+        });
+        lost.reduce(|all, one| all + one)
+    }
+
+    /// The criteria on ticks that were missed, starved and safe, stated or by default.
+    fn ticks(&self) -> Vec<Criterion> {
+        let accept = &self.scenario.accept;
+        let roles = self.roles();
+        let scripted = self.scripted_ticks();
+        // A number counts every tick; a share grants what the scenario's own faults take, besides.
+        let granted = |amount: TickAmount, ticks: u64| match amount {
+            TickAmount::Count(count) => count,
+            TickAmount::Share(_) => amount.of(ticks) + scripted,
+        };
+        let mut criteria = Vec::new();
+        for (name, limit, count, default) in [
+            (
+                "missed_ticks_max",
+                &accept.missed_ticks_max,
+                (|role| role.missed) as fn(&Counted<'_>) -> Option<u64>,
+                DEFAULT_SHARE,
+            ),
+            ("starved_ticks_max", &accept.starved_ticks_max, |role| role.starved, DEFAULT_SHARE),
+            ("safe_ticks_max", &accept.safe_ticks_max, |role| role.safe, TickAmount::Share(0.0)),
+        ] {
+            match limit {
+                // The number that older scenarios have.
+                Some(TickLimit::All(TickAmount::Count(limit))) if name == "missed_ticks_max" => {
+                    let all =
+                        roles.iter().map(|role| role.missed.unwrap_or(0) + role.starved.unwrap_or(0)).sum::<u64>();
+                    criteria.push(Criterion::new(name, *limit as f64, Some(all as f64)));
+                }
+                Some(TickLimit::All(amount)) => {
+                    criteria.extend(worst(name, &roles, count, |ticks| granted(*amount, ticks)))
+                }
+                Some(TickLimit::ByRole(by_role)) => criteria.extend(by_role.iter().map(|(role, amount)| {
+                    let counted = roles.iter().find(|counted| counted.role == role);
+                    let value = counted.and_then(count).map(|ticks| ticks as f64);
+                    let limit = granted(*amount, counted.map_or(0, |counted| counted.elapsed)) as f64;
+                    let reason = value.is_none().then_some(Unjudged::Unbooked);
+                    Criterion::new(format!("{name}.{role}"), limit, value).unless(reason)
+                })),
+                None => {
+                    let by_default = worst(name, &roles, count, |ticks| granted(default, ticks));
+                    criteria.extend(by_default.map(|criterion| Criterion { default: true, ..criterion }));
+                }
+            }
+        }
+        let absent = self.absent_roles();
+        if let Some(role) = absent.first() {
+            let role = Some((*role).to_owned());
+            criteria.push(Criterion { role, ..Criterion::new("absent_roles_max", 0.0, Some(absent.len() as f64)) });
+        }
+        criteria
+    }
+
+    /// The roles' counts. What a role without counters missed is what its readers lack.
+    fn roles(&self) -> Vec<Counted<'_>> {
+        let booked = self.books.roles.iter().map(|(role, ticks)| {
+            let Ticks { elapsed, missed, starved, safe, .. } = *ticks;
+            Counted { role, elapsed, missed: Some(missed), starved: Some(starved), safe: Some(safe) }
+        });
+        let elapsed = self.elapsed();
+        let unbooked = self.books.absent_ticks.iter();
+        let unbooked =
+            unbooked.map(|(role, absent)| Counted { role, elapsed, missed: Some(*absent), starved: None, safe: None });
+        booked.chain(unbooked).collect()
+    }
+
+    /// How many ticks the run came to.
+    fn elapsed(&self) -> u64 {
+        let booked = self.books.roles.values().map(|ticks| ticks.elapsed).max();
+        booked.unwrap_or(if self.interrupted { 0 } else { self.scenario.last_tick + 1 })
+    }
+
+    /// The roles that no sample came of any more at the end of the run.
+    fn absent_roles(&self) -> Vec<&str> {
+        if self.interrupted {
+            return Vec::new();
+        }
+        let elapsed = self.elapsed();
+        let late =
+            DEFAULT_SHARE.of(elapsed).max(self.scenario.command_timeout_ticks) + self.scenario.actuation_delay_ticks;
+        let absent = |role: &&String| {
+            let covered = links_of(self.scenario, role, &self.books.links)
+                .map(|link| link.received + link.void.1 + link.gaps)
+                .max();
+            covered.is_some_and(|covered| covered + late < elapsed)
+        };
+        self.books.unbooked.iter().filter(absent).map(String::as_str).collect()
+    }
+
+    /// How many ticks scripted faults may have cost any one role.
+    fn scripted_ticks(&self) -> u64 {
+        let (scenario, period_ns) = (self.scenario, self.scenario.period_ns);
+        let stall_ticks = scenario.faults.iter().map(|fault| match fault.fault.action {
+            FaultAction::Role(Interruption::Stall { ns }) => ns.div_ceil(period_ns),
+            _ => 0,
+        });
+        let stalls = self.books.roles.values().map(|ticks| ticks.stalled).sum::<u64>() * stall_ticks.max().unwrap_or(0);
+        let killed = |role: &str| {
+            let kill = |fault: &&crate::config::ScriptedFault| {
+                matches!(fault.fault.action, FaultAction::Role(Interruption::Kill))
+            };
+            scenario.faults.iter().filter(kill).any(|fault| fault.role == role)
+        };
+        let outages = self.outcome.incidents.iter().filter(|incident| {
+            incident.action == Action::Restarted
+                && incident.with.iter().chain([&incident.role]).any(|role| killed(role))
+        });
+        let seconds =
+            outages.filter_map(|incident| incident.outage_s).map(|outage_s| outage_s + NOTICED_S).sum::<f64>();
+        self.books.injected_faults + stalls + (seconds / scenario.tick_s()).ceil() as u64
+    }
+}
+
+/// The criterion of the role that is closest to its limit, or furthest beyond; none if nobody counts such ticks.
+fn worst(
+    name: &str,
+    roles: &[Counted<'_>],
+    count: impl Fn(&Counted<'_>) -> Option<u64>,
+    limit: impl Fn(u64) -> u64,
+) -> Option<Criterion> {
+    let counted = roles.iter().filter_map(|role| Some((role.role, count(role)?, limit(role.elapsed))));
+    let (role, ticks, limit) = counted.max_by_key(|(_, ticks, limit)| (*ticks as i128 - *limit as i128, *ticks))?;
+    let role = (ticks > 0).then(|| role.to_owned());
+    Some(Criterion { role, ..Criterion::new(name, limit as f64, Some(ticks as f64)) })
+}
+
+/// Whether a run is accepted, by what is said of its criteria; none if nothing was judged, if the run was `interrupted` before
+/// anything failed, or if something could not be judged that the run should have shown.
+pub(super) fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool> {
+    if criteria.iter().any(|criterion| criterion.holds == Some(false)) {
+        return Some(false);
+    }
+    // What holds by default alone is no test.
+    let judged = criteria.iter().any(|criterion| criterion.holds.is_some() && !criterion.default);
+    (judged && !interrupted && first_open(criteria).is_none()).then_some(true)
+}
+
+/// The first reason for which a run cannot be accepted.
+fn first_open(criteria: &[Criterion]) -> Option<&Unjudged> {
+    criteria.iter().filter_map(|criterion| criterion.reason.as_ref()).find(|reason| **reason != Unjudged::Clock)
+}
+
+/// The verdict in words.
+pub(super) fn verdict(accepted: Option<bool>, criteria: &[Criterion], interrupted: bool) -> String {
+    match accepted {
+        Some(true) => "accepted".to_owned(),
+        Some(false) => "not accepted".to_owned(),
+        None if criteria.is_empty() => "not judged: the scenario has no criteria".to_owned(),
+        None if interrupted => "not judged: the run was stopped before its end".to_owned(),
+        None => match first_open(criteria) {
+            Some(reason) => format!("not judged: {reason}"),
+            None => "not judged: this clock measures none of the criteria".to_owned(),
+        },
+    }
+}
+
+/// The ticks that roles missed, lacked an input for, or were safe at, by role: `missed: controller 12; safe: follower 3`. Empty if
+/// there are none.
+pub fn tick_words(books: &Accounting) -> String {
+    let words = ["missed", "starved", "safe"].into_iter().filter_map(|kind| {
+        let booked = books.roles.iter().map(|(role, ticks)| {
+            let count = match kind {
+                "missed" => ticks.missed,
+                "starved" => ticks.starved,
+                _ => ticks.safe,
+            };
+            (role, count)
+        });
+        let absent = books.absent_ticks.iter().filter(|_| kind == "missed").map(|(role, ticks)| (role, *ticks));
+        let counted = booked.chain(absent).filter(|(_, ticks)| *ticks > 0);
+        let by_role: Vec<String> = counted.map(|(role, ticks)| format!("{role} {ticks}")).collect();
+        (!by_role.is_empty()).then(|| format!("{kind}: {}", by_role.join(", ")))
+    });
+    words.collect::<Vec<_>>().join("; ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::SHIPPED;
+    use crate::launch::outcome::Judged;
+    use crate::launch::{Launch, run};
+    use std::sync::atomic::AtomicUsize;
+
+    /// A run that is well, of a scenario with these changes, and what is judged of it once it has been changed.
+    fn judged(overrides: &[&str], change: impl FnOnce(&mut Outcome)) -> (Option<bool>, String, Vec<Criterion>) {
+        let overrides: Vec<String> =
+            ["clock=in-process"].iter().chain(overrides).map(|text| (*text).to_owned()).collect();
+        let scenario = Scenario::parse(SHIPPED[0].1, "test", &overrides).unwrap();
+        let signal = AtomicUsize::new(0);
+        let mut outcome = run(&scenario, &mut Launch::new(&signal, &mut |_| {})).unwrap();
+        change(&mut outcome);
+        let judged = Judged::new(&scenario, &outcome);
+        (judged.accepted, judged.verdict, judged.criteria)
+    }
+
+    fn ticks<'o>(outcome: &'o mut Outcome, role: &str) -> &'o mut Ticks {
+        &mut outcome.reports.iter_mut().find(|report| report.role == role).unwrap().ticks
+    }
+
+    fn broken(criteria: &[Criterion]) -> Vec<(&str, Option<&str>)> {
+        let broken = criteria.iter().filter(|criterion| criterion.holds == Some(false));
+        broken.map(|criterion| (&*criterion.name, criterion.role.as_deref())).collect()
+    }
+
+    /// 151 of 10001 ticks, as a slow controller misses them, are more than the share that is granted; stated or by default.
+    #[test]
+    fn more_than_the_share_of_a_roles_ticks_is_not_accepted() {
+        let metrics = "accept={settled_by_s=8, sync_error_rad_s_max=1e-6}";
+        for overrides in [&[][..], &[metrics]] {
+            for (missed, accepted) in [(100, Some(true)), (101, Some(false)), (151, Some(false))] {
+                let miss = |outcome: &mut Outcome| {
+                    ticks(outcome, "controller").missed = missed;
+                    ticks(outcome, "follower").starved = missed;
+                };
+                let (found, _, criteria) = judged(overrides, miss);
+                assert_eq!(found, accepted, "{missed}: {criteria:?}");
+                let expected = [("missed_ticks_max", Some("controller")), ("starved_ticks_max", Some("follower"))];
+                assert_eq!(broken(&criteria), if missed > 100 { &expected[..] } else { &[] });
+            }
+            let (found, _, criteria) = judged(overrides, |outcome| ticks(outcome, "follower").safe = 1);
+            assert_eq!((found, broken(&criteria)), (Some(false), vec![("safe_ticks_max", Some("follower"))]));
+        }
+    }
+
+    /// Of ticks without a score, those that roles missed are granted to a share; not one whose samples were sent.
+    #[test]
+    fn a_metric_is_not_judged_by_ticks_that_were_not_scored() {
+        let peak = "accept={peak_from_s=5, sync_error_rad_s_peak=1e-3, missed_ticks_max={}, starved_ticks_max={}}";
+        let pass = |blank, lost| {
+            judged(&[peak], |outcome| {
+                outcome.score.metrics[0].peak_blank = blank;
+                outcome.score.received[0].1 -= lost;
+            })
+        };
+        for (blank, lost, accepted) in
+            [(0, 0, Some(true)), (50, 0, Some(true)), (51, 0, None), (1, 1, None), (0, 1, Some(true))]
+        {
+            let (found, verdict, criteria) = pass(blank, lost);
+            assert_eq!(found, accepted, "{blank} {lost}: {criteria:?}");
+            let reason = accepted.is_none().then_some(Unjudged::Unscored(blank, 5001, 5.0));
+            assert_eq!((&criteria[0].reason, criteria[0].value.is_some()), (&reason, true));
+            assert_eq!(verdict.starts_with("not judged: "), accepted.is_none(), "{verdict}");
+        }
+        let stated = peak.replace("peak_from_s=5", "peak_from_s=5, unscored_ticks_max=60");
+        let lose = |outcome: &mut Outcome| {
+            (outcome.score.metrics[0].peak_blank, outcome.score.received[0].1) = (60, 0);
+            (outcome.score.scored_ticks, outcome.score.unscored_ticks) = (9941, 60);
+        };
+        assert_eq!(judged(&[&stated], lose).0, Some(true));
+        // A tail that nothing came of is not scored either; what is above its limit is above it, whatever is missing.
+        assert_eq!(judged(&[peak], |outcome| outcome.score.scored_ticks -= 100).0, None);
+        let worse = |outcome: &mut Outcome| {
+            (outcome.score.metrics[0].peak_blank, outcome.score.metrics[0].peak) = (4000, Some(0.6));
+        };
+        assert_eq!(judged(&[peak], worse).0, Some(false));
+    }
+}

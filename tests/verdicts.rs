@@ -1,0 +1,163 @@
+//! No run is a PASS that did not show what its scenario asks for: ticks missed, starved, safe or not scored, roles that are gone,
+//! runs that are too short.
+
+use crate::common::{ANY_TICKS, Bench, Done, await_some, send_signal};
+use corotate::config::{SHIPPED, Scenario};
+use serde_json::Value;
+
+const SIGKILL: i32 = 9;
+const SIGCONT: i32 = 18;
+const SIGSTOP: i32 = 19;
+
+fn summary(done: &Done) -> Value {
+    serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"))
+}
+
+fn criterion<'a>(summary: &'a Value, name: &str) -> &'a Value {
+    let mut criteria = summary["criteria"].as_array().unwrap().iter();
+    criteria.find(|criterion| criterion["name"] == name).unwrap_or_else(|| panic!("{name}: {summary:#}"))
+}
+
+/// The last line, where stdout is JSON.
+fn last_line(done: &Done) -> &str {
+    done.stderr.lines().last().unwrap_or_default()
+}
+
+/// A run in one thread whose controller misses 100 ticks in a row by its script, with these criteria.
+fn with_misses(accept: &str) -> Done {
+    let fault = r#"--set=fault=[{kind="miss", role="controller", from_tick=2000, ticks=100}]"#;
+    let accept = format!("--set=accept={{{accept}}}");
+    Bench::new().run(&["run", "rigid-pair", "--clock=in-process", "--duration=5", "--json", fault, &accept])
+}
+
+#[test]
+fn a_number_counts_every_tick_and_a_share_grants_what_faults_take() {
+    let settled = "settled_by_s=4.5, sync_error_rad_s_max=1.0";
+    // The controller misses 100 ticks, the follower starves at 100 and is safe at 81.
+    for (limits, code, name, value, limit) in [
+        ("", 0, "missed_ticks_max", 100, 150),
+        ("", 0, "starved_ticks_max", 100, 150),
+        ("", 0, "safe_ticks_max", 81, 100),
+        (", missed_ticks_max=200", 0, "missed_ticks_max", 200, 200),
+        (", missed_ticks_max=199", 3, "missed_ticks_max", 200, 199),
+        (", missed_ticks_max={controller=99}", 3, "missed_ticks_max.controller", 100, 99),
+        (", missed_ticks_max={observer=0}", 0, "missed_ticks_max.observer", 0, 0),
+        (", starved_ticks_max={follower=99}", 3, "starved_ticks_max.follower", 100, 99),
+        (", starved_ticks_max={follower=\"0 %\"}", 0, "starved_ticks_max.follower", 100, 100),
+        (", safe_ticks_max=81", 0, "safe_ticks_max", 81, 81),
+        (", safe_ticks_max=80", 3, "safe_ticks_max", 81, 80),
+        (", unscored_ticks_max=0", 0, "unscored_ticks_max", 0, 0),
+    ] {
+        let done = with_misses(&format!("{settled}{limits}"));
+        assert_eq!(done.code, Some(code), "{limits}: {done:?}");
+        let summary = summary(&done);
+        let found = criterion(&summary, name);
+        assert_eq!((&found["value"], &found["limit"]), (&(value as f64).into(), &(limit as f64).into()), "{limits}");
+        assert_eq!(found["default"], if limits.is_empty() { true.into() } else { Value::Null }, "{limits}");
+        assert_eq!((&found["holds"], &summary["accepted"]), (&(code == 0).into(), &(code == 0).into()), "{limits}");
+        assert!(last_line(&done).ends_with("; missed: controller 100; starved: follower 100; safe: follower 81"));
+    }
+}
+
+/// Without criteria nothing is judged, by a default neither, and what was missed is named all the same.
+#[test]
+fn without_criteria_the_last_line_names_what_was_missed() {
+    let done = with_misses("");
+    assert_eq!((done.code, &summary(&done)["criteria"]), (Some(0), &Value::Array(Vec::new())), "{done:?}");
+    let expected =
+        "NOT JUDGED: the scenario has no criteria; missed: controller 100; starved: follower 100; safe: follower 81";
+    assert_eq!(last_line(&done), expected);
+}
+
+/// Also where its metrics would be accepted.
+#[test]
+fn a_run_whose_external_controller_is_killed_is_not_accepted() {
+    let bench = Bench::new();
+    let accept = "--set=accept={sync_error_rad_s_max=100.0}";
+    let run = ["run", "rigid-pair", "--clock=realtime", "--tick-hz=200", "--duration=4", "--json", "--out=out"];
+    let running = bench.start(&[&run[..], &["--external=controller", accept]].concat());
+    let domain = await_some(|| bench.domains().pop());
+    await_some(|| domain.join("controller.seat.json").exists().then_some(()));
+    let controller = bench.start(&["controller", "--domain", domain.to_str().unwrap()]);
+    bench.await_commits("controller", 100);
+    send_signal(controller.pid(), SIGKILL);
+    controller.wait();
+    let done = running.wait();
+    let summary = summary(&done);
+    assert!([Some(3), Some(4)].contains(&done.code), "{done:?}");
+    assert_eq!(summary["accepted"], false, "{summary:#}");
+    assert!(last_line(&done).starts_with("FAIL: ") && last_line(&done).contains("starved: follower"), "{done:?}");
+    bench.assert_clean(&[domain]);
+}
+
+/// What the scorer had no room for while its process stood still may have been the worst.
+#[test]
+fn ticks_that_were_not_scored_leave_a_peak_unjudged() {
+    let bench = Bench::new();
+    let limits = "peak_from_s=0.5, sync_error_rad_s_peak=100.0, settled_by_s=3.0, estimate_error_rad_s_max=100.0";
+    let roles = ANY_TICKS.rsplit_once(", unscored").unwrap().0;
+    let accept = format!("--set=accept={{{limits}, {roles}}}");
+    let run = ["run", "rigid-pair", "--clock=realtime", "--tick-hz=200", "--duration=9", "--json", "--out=out"];
+    let running = bench.start(&[&run[..], &[&accept]].concat());
+    bench.await_commits("leader", 150);
+    running.signal(SIGSTOP);
+    bench.await_commits("leader", 150 + 800);
+    running.signal(SIGCONT);
+    let done = running.wait();
+    let summary = summary(&done);
+    assert_eq!((done.code, &summary["accepted"]), (Some(0), &Value::Null), "{done:?}");
+    let peak = criterion(&summary, "sync_error_rad_s_peak");
+    assert!(peak["holds"].is_null() && peak["value"].is_number(), "{peak}");
+    let reason = peak["reason"].as_str().unwrap();
+    assert!(reason.contains("not scored") && last_line(&done).starts_with("NOT JUDGED: "), "{done:?}");
+    bench.assert_clean(&[]);
+}
+
+#[test]
+fn a_run_that_ends_before_it_is_judged_runs_and_says_so() {
+    let bench = Bench::new();
+    for (name, text) in SHIPPED {
+        let scenario = Scenario::parse(text, name, &["duration_s=0.3".to_owned()]).unwrap();
+        assert!(scenario.warnings[0].starts_with("accept.settled_by_s: "), "{name}: {:?}", scenario.warnings);
+    }
+    // What may be claimed of the others takes a debug build a while.
+    for name in ["rigid-pair", "faults", "inertia"] {
+        let short = ["run", name, "--clock=in-process", "--duration=0.3", "--json", "--out=out", "--junit=v.xml"];
+        let done = bench.run(&short);
+        assert_eq!(done.code, Some(0), "{name}: {done:?}");
+        let summary = summary(&done);
+        assert_eq!(summary["accepted"], Value::Null, "{name}");
+        assert!(last_line(&done).starts_with("NOT JUDGED: ends before settled_by_s"), "{name}: {done:?}");
+        for criterion in summary["criteria"].as_array().unwrap() {
+            let metric = criterion["name"].as_str().unwrap().contains("error");
+            assert_eq!(
+                (criterion["holds"].is_null(), criterion["reason"].is_string()),
+                (metric, metric),
+                "{criterion}"
+            );
+        }
+        let verdict = std::fs::read_to_string(bench.path("v.xml")).unwrap();
+        assert!(verdict.contains("<skipped") && !verdict.contains("<failure"), "{verdict}");
+        let checked = bench.run(&["check", name, "--set=duration_s=0.3", "--json"]);
+        let warnings = serde_json::from_str::<Value>(&checked.stdout).unwrap()["warnings"].to_string();
+        assert!(checked.code == Some(0) && warnings.contains("accept.settled_by_s"), "{name}: {checked:?}");
+    }
+}
+
+#[test]
+fn a_key_that_lacks_its_table_is_suggested_with_it() {
+    let bench = Bench::new();
+    for (set, meant) in [
+        ("sync_error_rad_s_max=1", "accept.sync_error_rad_s_max"),
+        ("sync_error_rad_s_peak=1", "accept.sync_error_rad_s_peak"),
+        ("settled_by_s=1", "accept.settled_by_s"),
+        ("gain_per_s=[1,1,1]", "controller.gain_per_s"),
+        ("lock_memory=false", "realtime.lock_memory"),
+        ("energy_drift_max=1", "watchdog.energy_drift_max"),
+        ("tick_herz=1", "tick_hz"),
+    ] {
+        let done = bench.run(&["check", "rigid-pair", "--set", set]);
+        let words = format!("did you mean `{meant}`?");
+        assert!(done.code == Some(2) && done.stderr.contains(&words), "{set}: {done:?}");
+    }
+}
