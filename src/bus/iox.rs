@@ -14,7 +14,7 @@ pub use single::{IoxReader, IoxWriter};
 
 use self::latest::LatestWriter;
 use self::opening::{Connections, Refusal};
-use self::single::{Current, Lane};
+use self::single::{Current, Lane, NO_KEY};
 use super::domain::Domain;
 use super::notifier::{NOTIFIERS_BYTES, Notifiers};
 use super::{Bus, BusError, Depths, Reader, Signal, Topic};
@@ -325,8 +325,8 @@ impl Bus for IoxBus {
             _ => Lane::None,
         };
         let (node, notifier, topic) = (self.node.clone(), self.notifiers.of(topic), topic.clone());
-        let (current, pending, newest) = (Current::None, None, (0, 0));
-        Ok(IoxReader { node, service, subscriber, current, pending, newest, lane, idle: 0, notifier, topic })
+        let (current, shown, pending, newest) = (Current::None, [NO_KEY; 2], None, (0, 0));
+        Ok(IoxReader { node, service, subscriber, current, shown, pending, newest, lane, idle: 0, notifier, topic })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {

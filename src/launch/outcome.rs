@@ -330,7 +330,7 @@ impl Accounting {
             }
         }
         for (_, link) in &written {
-            if link.published + link.void + link.skipped != link.last_tick.map_or(0, |tick| tick + 1) {
+            if !link.balances() {
                 problems.push(format!("{}: published and skipped do not add up", link.service));
             }
         }
@@ -393,16 +393,16 @@ impl LinkCounters {
         scenario: &Scenario,
         problems: &mut Vec<String>,
     ) -> Self {
-        let covered = read.last_tick.map_or(0, |tick| tick + 1);
-        let sent = |written: &LinkWritten| written.last_tick.map_or(0, |tick| tick + 1) + u64::from(in_flight);
+        let in_flight = u64::from(in_flight);
+        let unread = |written: &LinkWritten| (written.covered() + in_flight).saturating_sub(read.covered());
         let counters = Self {
             service: read.service.clone(),
             reader: reader.to_owned(),
-            published: written.map(|written| written.published + u64::from(in_flight)),
+            published: written.map(|written| written.published + in_flight),
             received: read.received,
             skipped: written.map(|written| written.skipped),
             gaps: read.gaps,
-            unread: written.map(|written| sent(written).saturating_sub(covered)),
+            unread: written.map(unread),
             void: (written.map(|written| written.void), read.void),
             stale: read.stale,
             rejected: read.rejected,
@@ -410,16 +410,7 @@ impl LinkCounters {
             injected: written.map(|written| written.injected),
         };
         let lossless = scenario.clock != ClockKind::Realtime;
-        let read_balances = read.received + read.void + read.gaps == covered && (!lossless || read.gaps == 0);
-        // Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
-        let balanced = read_balances
-            && written.is_none_or(|written| {
-                let published = written.published + u64::from(in_flight);
-                let unread = sent(written).saturating_sub(covered);
-                covered <= sent(written)
-                    && read.stale <= written.extra
-                    && published + written.void + written.skipped == read.received + read.void + read.gaps + unread
-            });
+        let balanced = read.balances(lossless) && written.is_none_or(|written| read.agrees(written, in_flight));
         if !balanced {
             let writer = written.map_or("its writer keeps no books".to_owned(), |written| {
                 format!("{} published, {} extra, {} void", written.published, written.extra, written.void)

@@ -1,5 +1,7 @@
 //! The two ends of a link: what was sent, received, lost, not believed, and its hash.
 
+#[cfg(test)]
+mod balance;
 mod input;
 mod kept;
 mod output;
@@ -28,7 +30,8 @@ mod tests {
     }
 
     /// Keeps a state.
-    struct Store(Vec<u64>);
+    #[derive(Clone, Default)]
+    pub(super) struct Store(pub(super) Vec<u64>);
 
     impl Words for Store {
         fn word(&mut self, value: &mut u64) {
@@ -37,7 +40,7 @@ mod tests {
     }
 
     const EXTENT: Extent = Extent { last_tick: 100, kept_samples: 24 };
-    const WORDS: usize = size_of::<RateCommand>() / size_of::<u64>();
+    pub(super) const WORDS: usize = size_of::<RateCommand>() / size_of::<u64>();
 
     fn topic() -> Topic {
         Topic { scenario: "s".to_owned(), body: "b".to_owned(), signal: Signal::Command }

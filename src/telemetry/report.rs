@@ -132,6 +132,40 @@ pub struct LinkRead {
     pub last_tick: Option<u64>,
 }
 
+impl LinkWritten {
+    /// How many ticks are counted.
+    pub fn covered(&self) -> u64 {
+        self.last_tick.map_or(0, |tick| tick + 1)
+    }
+
+    /// Returns true if the counters add up.
+    pub fn balances(&self) -> bool {
+        self.published + self.void + self.skipped == self.covered()
+    }
+}
+
+impl LinkRead {
+    /// How many ticks are counted.
+    pub fn covered(&self) -> u64 {
+        self.last_tick.map_or(0, |tick| tick + 1)
+    }
+
+    /// Returns true if the counters add up. A link that is `lossless` has no gaps.
+    pub fn balances(&self, lossless: bool) -> bool {
+        self.received + self.void + self.gaps == self.covered() && (!lossless || self.gaps == 0)
+    }
+
+    /// Returns true if the counters add up with those of the writing end, which sent `in_flight` samples more than it counted.
+    ///
+    /// Only what was sent beyond one sample per tick can be stale; a broken stamp may also look like another tick's.
+    pub fn agrees(&self, written: &LinkWritten, in_flight: u64) -> bool {
+        let (covered, sent) = (self.covered(), written.covered() + in_flight);
+        let published = written.published + in_flight;
+        let ticks = self.received + self.void + self.gaps + sent.saturating_sub(covered);
+        covered <= sent && self.stale <= written.extra && published + written.void + written.skipped == ticks
+    }
+}
+
 /// One stage's latencies.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct StageReport {

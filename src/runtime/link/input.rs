@@ -283,7 +283,10 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             return Newest::None;
         }
         if self.late.as_mut().is_some_and(|late| late.contains(stamp.tick)) {
-            self.counters.stale();
+            // One that a successor of the writer sends may be a repetition: see `Output::dispatch_rest`.
+            if !self.repeated && generation == known {
+                self.counters.stale();
+            }
             return Newest::None;
         }
         self.repeated = false;
@@ -323,11 +326,12 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// Whether a sample can be of this tick, which is newer than the newest.
     #[inline]
     fn possible(&self, tick: u64) -> bool {
-        tick <= self.counters.covered()
+        // Where samples are late, one with a broken tick may come after the next one was sent.
+        tick <= self.counters.covered() && self.late.is_none()
             || match self.accepted_ticks {
                 AcceptedTicks::Unknown => true,
                 AcceptedTicks::Next => false,
-                AcceptedTicks::Due(grid) => grid.due_ns(tick) <= monotonic_ns(),
+                AcceptedTicks::Due(grid) => tick <= grid.tick_at(monotonic_ns()),
             }
     }
 

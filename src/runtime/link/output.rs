@@ -280,7 +280,8 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             let late =
                 self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
             let (sample, kept): (&S, _) = (self.sample.borrow(), self.kept.as_ref());
-            // What a successor sends first, its predecessor may have sent: whoever reads it has to look at what is kept.
+            // What a successor sends first, its predecessor may have sent: its readers have to look at what is kept, or do not
+            // count it if it is late.
             let (first, generation) = (std::mem::take(&mut self.succeeds), self.generation);
             self.port.fill(|slot| {
                 match late {
@@ -302,7 +303,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                 if late.is_none() {
                     stamp.generation ^= lives;
                 }
-                if first && kept.is_some() {
+                if first && (kept.is_some() || late.is_some()) {
                     stamp.generation = generation | stamp.generation & VOID;
                 }
             })?;
