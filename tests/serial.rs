@@ -8,8 +8,10 @@ use crate::common::{Bench, Done, Running, await_some, shipped};
 use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::Line;
+use corotate::sample::{RateCommand, Sample};
 use corotate::serial::{
-    BodySeat, ControllerSeat, Decoder, Device, FlightSeat, Hello, MAX_FRAME, ObserverSeat, Seat, encode,
+    BodySeat, ControllerSeat, Decoder, Device, FlightSeat, Hello, MAX_FRAME, MAX_PAYLOAD, Message, ObserverSeat,
+    Reason, Refuse, Seat, Welcome, encode, parse, write,
 };
 use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
@@ -680,6 +682,39 @@ fn a_device_of_another_rig_is_refused_by_both_types() {
         Some(Powered::of_rig(path, scenario, "follower"))
     };
     refused(orbit, &[], 2, &["corotate/orbit/command/v1", "corotate/rigid-body/command/v2"]);
+}
+
+/// The answer of a device to a greeting.
+fn answered(message: Message<'_>) -> Vec<u8> {
+    framed(write(0, message, &mut [0; MAX_PAYLOAD]).unwrap())
+}
+
+const COMMAND: &str = "corotate/rigid-body/command/v2";
+/// The same type name over other fields.
+const SWAPPED: &str = "corotate/rigid-body/command/v2#00000000";
+
+#[test]
+fn a_device_with_other_fields_under_the_same_type_name_is_refused() {
+    let reply = |_: &[u8]| answered(Message::Refuse(Refuse { reason: Reason::Samples, detail: SWAPPED }));
+    refused(|path: &Path| Some(impostor(path, reply)), &[], 2, &[SWAPPED, RateCommand::LAYOUT]);
+}
+
+/// A device of protocol version 2 from before layouts had hashes. This one falls silent after the greeting.
+#[test]
+fn a_device_that_knows_type_names_only_is_greeted_so_and_named() {
+    let bare = |path: &Path| {
+        let reply = |payload: &[u8]| match parse(payload) {
+            Ok((_, Message::Hello(hello))) if hello.reads == COMMAND && !hello.writes.contains('#') => {
+                answered(Message::Welcome(Welcome { run: hello.run, next_tick: 0, device: "old 1" }))
+            }
+            Ok((_, Message::Hello(_))) => {
+                answered(Message::Refuse(Refuse { reason: Reason::Samples, detail: COMMAND }))
+            }
+            _ => Vec::new(),
+        };
+        Some(impostor(path, reply))
+    };
+    refused(bare, &["--patience", "2"], 1, &["old 1 (states no layouts", "has not answered for"]);
 }
 
 #[test]

@@ -66,10 +66,10 @@ enum event { NOT_DUE, APPLIED, REFUSED, HELD, EXPIRED, SAFE };
 
 static const char NAME[] = "follower in C 1";
 static const char ROLE[] = "follower";
-static const char READS[] = "corotate/rigid-body/command/v2";
-static const char MEASUREMENT[] = "corotate/rigid-body/measurement/v1";
-static const char TRUTH[] = "corotate/rigid-body/truth/v1";
-static const char WRITES[] = "corotate/rigid-body/measurement/v1 corotate/rigid-body/truth/v1";
+static const char READS[] = "corotate/rigid-body/command/v2#ff8ce508";
+static const char MEASUREMENT[] = "corotate/rigid-body/measurement/v1#bcfd8b41";
+static const char TRUTH[] = "corotate/rigid-body/truth/v1#6b083b5d";
+static const char WRITES[] = "corotate/rigid-body/measurement/v1#bcfd8b41 corotate/rigid-body/truth/v1#6b083b5d";
 enum { COMMAND_BYTES = 5 * 8, MEASUREMENT_BYTES = 8 * 8, TRUTH_BYTES = 7 * 8 };
 
 static uint32_t crc32(const uint8_t *bytes, size_t count) {

@@ -19,6 +19,8 @@ pub trait Carried: Message + 'static {
 
     /// Name and version of the layout.
     fn type_name() -> &'static str;
+    /// The type name with a hash of the fields.
+    fn layout() -> &'static str;
     /// The fields after the stamp, in order.
     fn fields(bodies: usize) -> Vec<Field>;
     /// One of all zeros.
@@ -46,6 +48,10 @@ impl<S: Sample> Carried for S {
 
     fn type_name() -> &'static str {
         S::TYPE_NAME
+    }
+
+    fn layout() -> &'static str {
+        S::LAYOUT
     }
 
     fn fields(_bodies: usize) -> Vec<Field> {
@@ -81,6 +87,10 @@ impl<L: FleetLayout> Carried for FleetSample<L> {
 
     fn type_name() -> &'static str {
         L::TYPE_NAME
+    }
+
+    fn layout() -> &'static str {
+        L::LAYOUT
     }
 
     fn fields(bodies: usize) -> Vec<Field> {

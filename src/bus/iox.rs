@@ -137,7 +137,7 @@ struct Wire<S>(S);
 unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
     // SAFETY: unsafe by the trait's declaration only; a constant asks nothing of its caller.
     unsafe fn type_name() -> &'static str {
-        S::TYPE_NAME
+        S::LAYOUT
     }
 }
 
@@ -198,7 +198,12 @@ impl IoxBus {
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
         self.open(topic, end, || {
             let builder = self.builder::<Wire<S>>(topic, &Qos::of(topic.signal, self.depths))?;
-            Ok(if self.makes { builder.open_or_create()? } else { builder.open()? })
+            let opened = if self.makes {
+                builder.open_or_create().map_err(Refusal::from)
+            } else {
+                builder.open().map_err(Refusal::from)
+            };
+            opened.map_err(|refusal| self.explain(refusal, topic, S::LAYOUT))
         })
     }
 
@@ -209,7 +214,12 @@ impl IoxBus {
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
         self.open(topic, end, || {
             let builder = self.builder::<[fleet::Word<L>]>(topic, &Qos::of_fleet(topic.signal, self.depths))?;
-            Ok(if self.makes { builder.open_or_create()? } else { builder.open()? })
+            let opened = if self.makes {
+                builder.open_or_create().map_err(Refusal::from)
+            } else {
+                builder.open().map_err(Refusal::from)
+            };
+            opened.map_err(|refusal| self.explain(refusal, topic, L::LAYOUT))
         })
     }
 
@@ -439,8 +449,44 @@ mod tests {
         let bus = bus(&domain);
         let _writer = bus.writer::<RateTruth>(&topic(), 1).unwrap();
         assert!(matches!(bus.writer::<RateTruth>(&topic(), 1), Err(BusError::Open { .. })));
-        let error = bus.reader::<RateCommand>(&topic(), Reader::Role).err().unwrap();
-        assert!(error.to_string().contains("IncompatibleTypes"), "{error}");
+        let error = bus.reader::<RateCommand>(&topic(), Reader::Role).err().unwrap().to_string();
+        assert!([RateTruth::LAYOUT, RateCommand::LAYOUT].iter().all(|layout| error.contains(layout)), "{error}");
+    }
+
+    crate::sample! {
+        /// As a program was built first.
+        Built = "test/Sample/v1" {
+            /// One.
+            speed_rad_s: f64,
+            /// Another.
+            current_a: f64,
+        }
+    }
+
+    crate::sample! {
+        /// The same after two fields were swapped, under the same name.
+        Swapped = "test/Sample/v1" {
+            /// Another.
+            current_a: f64,
+            /// One.
+            speed_rad_s: f64,
+        }
+    }
+
+    #[test]
+    fn refuses_fields_that_were_swapped_under_the_same_type_name() {
+        let domain = OwnedDomain::create(0).unwrap();
+        let (ours, theirs) = (bus(&domain), IoxBus::join(domain.domain(), "watcher", bus(&domain).depths).unwrap());
+        let _writer = ours.writer::<Built>(&topic(), 1).unwrap();
+        let refused = [
+            ours.reader::<Swapped>(&topic(), Reader::Role).err().unwrap().to_string(),
+            theirs.reader::<Swapped>(&topic(), Reader::Scorer).err().unwrap().to_string(),
+        ];
+        for error in refused {
+            assert!([Built::LAYOUT, Swapped::LAYOUT].iter().all(|layout| error.contains(layout)), "{error}");
+            assert!(error.contains(&topic().to_string()), "{error}");
+        }
+        assert!(ours.reader::<Built>(&topic(), Reader::Role).is_ok());
     }
 
     /// A foreign program is told this version: it must be the one that is linked.

@@ -99,7 +99,7 @@ fn layouts(scenario: &Scenario) -> BTreeMap<String, String> {
         ports(scenario, role).writes.into_iter().map(|port| {
             let fields: Vec<String> =
                 port.fields.iter().map(|field| format!("{}@{}x{}", field.name, field.offset, field.count)).collect();
-            (port.topic.to_string(), format!("{} {} {}", port.type_name, port.size, fields.join(" ")))
+            (port.topic.to_string(), format!("{} {} {}", port.layout, port.size, fields.join(" ")))
         })
     };
     RoleId::all(scenario).into_iter().flat_map(of).collect()

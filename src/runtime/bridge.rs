@@ -9,10 +9,10 @@ use super::process::{RoleError, find_role, in_domain, join, require_process, tak
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::role::Rearm;
-use crate::sample::Stamp;
+use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
-    Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Refuse, Samples, Terms, VERSION,
-    fits_version_1,
+    Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse, Samples, Terms,
+    VERSION, fits_version_1,
 };
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +21,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const REOPEN_NS: u64 = 100_000_000;
 /// Between two looks at the line while the device is greeted for the first time, ns.
 const LOOK_NS: u64 = 1_000_000;
+/// For so long refusals of earlier greetings are ignored once a device is greeted by type names alone, ns.
+const BARE_NS: u64 = 1_000_000_000;
 /// How many bytes are taken from the line at once, and how often in one turn: garbage must not hold up a tick.
 const CHUNK: usize = 512;
 const CHUNKS: usize = 4;
@@ -135,6 +137,8 @@ struct Greeting {
     role: String,
     reads: String,
     writes: String,
+    /// Since when the samples are named without the hashes of their layouts, ns.
+    bare_since_ns: Option<u64>,
 }
 
 impl Greeting {
@@ -151,9 +155,23 @@ impl Greeting {
             writes: &self.writes,
         }
     }
+
+    /// Names the samples without the hashes of their layouts from now on if the device refuses because it knows none: then it
+    /// names one of them so itself. Returns false if that is not why it refuses.
+    fn drop_hashes(&mut self, refuse: &Refuse<'_>, now_ns: u64) -> bool {
+        let mut names = self.reads.split(' ').chain(self.writes.split(' '));
+        if refuse.reason != Reason::Samples || !names.any(|name| type_name_of(name) == refuse.detail) {
+            return false;
+        }
+        let bare = |names: &str| names.split(' ').map(type_name_of).collect::<Vec<_>>().join(" ");
+        let since_ns = *self.bare_since_ns.get_or_insert(now_ns);
+        (self.reads, self.writes) = (bare(&self.reads), bare(&self.writes));
+        // Refusals of earlier greetings may still be on their way.
+        now_ns.saturating_sub(since_ns) < BARE_NS
+    }
 }
 
-/// The samples that pass over the line: type names, and bytes after the stamp.
+/// The samples that pass over the line: names of their layouts, and bytes after the stamp.
 struct Layouts {
     reads: Vec<(&'static str, usize)>,
     writes: Vec<(&'static str, usize)>,
@@ -166,7 +184,7 @@ impl Layouts {
         for role in roles {
             let ports = ports(scenario, *role);
             let kept = usize::from(roles.len() > 1 && *role == RoleId::Controller);
-            let layout = |port: &super::node::Port| (port.type_name, port.size - size_of::<Stamp>());
+            let layout = |port: &super::node::Port| (port.layout, port.size - size_of::<Stamp>());
             layouts.reads.extend(ports.reads.iter().skip(kept).map(layout));
             layouts.writes.extend(ports.writes.iter().map(layout));
         }
@@ -240,6 +258,7 @@ impl DeviceLink {
             role,
             reads: Layouts::names(&layouts.reads),
             writes: Layouts::names(&layouts.writes),
+            bare_since_ns: None,
         };
         let patience_ns = (seat.patience_s * 1e9) as u64;
         let line = Line::open(&seat.path, seat.baud)?;
@@ -268,7 +287,10 @@ impl DeviceLink {
                     name = Some(printable(welcome.device));
                 }
             })?;
-            if let Some(name) = name {
+            if let Some(mut name) = name {
+                if self.greeting.bare_since_ns.is_some() || self.host.version() < VERSION {
+                    name.push_str(" (states no layouts: its samples are trusted by their type names)");
+                }
                 self.host.wait_anew();
                 return Ok(Some(name));
             }
@@ -330,6 +352,7 @@ impl DeviceLink {
             for &byte in &bytes[..count] {
                 match self.host.push(byte, now_ns) {
                     None => {}
+                    Some(Heard::Refused(refuse)) if self.greeting.drop_hashes(&refuse, now_ns) => {}
                     Some(Heard::Refused(refuse)) => return Err(refused(&self.line, &self.greeting, &refuse)),
                     Some(Heard::OtherVersion(theirs)) => {
                         return Err(DeviceError::Version { path: self.line.path().to_owned(), theirs });
@@ -394,7 +417,6 @@ fn printable(text: &str) -> String {
 }
 
 fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError {
-    use crate::serial::Reason;
     let detail = printable(refuse.detail);
     let reason = match refuse.reason {
         Reason::Samples => format!(

@@ -79,7 +79,10 @@ struct Transport {
 struct SignalDescription {
     signal: &'static str,
     service: String,
+    /// The type by which the service is opened: a versioned name and the hash of the layout.
     type_name: &'static str,
+    /// That hash.
+    layout: &'static str,
     /// Bytes.
     size: usize,
     /// Whether it travels as a slice of words of 8 bytes, which the type name is of.
@@ -193,7 +196,8 @@ impl SignalDescription {
         Self {
             signal: signal.name(),
             service: port.topic.to_string(),
-            type_name: port.type_name,
+            type_name: port.layout,
+            layout: port.layout.split_once('#').map_or("", |(_, hash)| hash),
             size: port.size,
             fields: Stamp::FIELDS.iter().chain(&port.fields).map(FieldDescription::new).collect(),
             slice: port.fleet,

@@ -3,7 +3,7 @@
 //! A header, then vectors of three components as structures of arrays: component 1 of every body, component 2 of every body,
 //! component 3. Everything is a word of 8 bytes, so the bytes are those of a message whose arrays have that fixed length.
 
-use super::{Field, FieldKind, Message, Stamp};
+use super::{Field, FieldKind, LayoutName, Message, Stamp};
 use bytemuck::TransparentWrapper;
 use core::fmt;
 use core::marker::PhantomData;
@@ -23,6 +23,10 @@ pub trait FleetLayout: fmt::Debug + Send + Sync + 'static {
     const TYPE_NAME: &'static str;
     /// The names of its vectors, in order; the unit is the last part of each.
     const VECTORS: &'static [&'static str];
+    /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
+    const LAYOUT_NAME: LayoutName = LayoutName::of_fleet(Self::TYPE_NAME, Self::VECTORS);
+    /// The type name with a hash of the vectors.
+    const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 }
 
 /// A sample of a fleet, in place.

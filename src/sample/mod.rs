@@ -7,6 +7,7 @@
 #[cfg(feature = "runtime")]
 mod definition;
 mod fleet;
+mod layout;
 mod orbit;
 mod rigid;
 mod run;
@@ -16,6 +17,7 @@ pub use definition::{CDR_HEADER, Column, Layout, MESSAGE_ENCODING, SCHEMA_ENCODI
 pub use fleet::{
     CommandLayout, FleetCommand, FleetLayout, FleetMeasurement, FleetSample, FleetTruth, MeasurementLayout, TruthLayout,
 };
+pub use layout::{LayoutName, type_name_of};
 pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
@@ -129,6 +131,10 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     const TYPE_NAME: &'static str;
     /// The fields after the stamp, in order.
     const FIELDS: &'static [Field];
+    /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
+    const LAYOUT_NAME: LayoutName = LayoutName::of(Self::TYPE_NAME, Self::FIELDS);
+    /// The type name with a hash of the fields: by it the ends of links, seats and devices know that they mean the same.
+    const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 
     /// Whether all of its numbers are numbers, and finite.
     fn finite(&self) -> bool {

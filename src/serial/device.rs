@@ -128,12 +128,12 @@ impl Mouth {
     }
 }
 
-/// The first of a device's own type names that is not the one asked for.
+/// The first of a device's own layouts that is not the one asked for.
 fn unlike(asked: &str, own: impl Iterator<Item = Layout>) -> Option<&'static str> {
     let mut asked = asked.split(' ').filter(|name| !name.is_empty());
     for layout in own {
-        if asked.next() != Some(layout.type_name) {
-            return Some(layout.type_name);
+        if asked.next() != Some(layout.name) {
+            return Some(layout.name);
         }
     }
     asked.next().map(|_| "fewer samples")

@@ -6,8 +6,8 @@ use crate::sample::{Message as _, RateCommand, RateMeasurement, RateTruth};
 use std::fmt::Write;
 
 const DOCUMENT: &str = include_str!("../../docs/serial-protocol.md");
-const READS: &str = "corotate/rigid-body/command/v2";
-const WRITES: &str = "corotate/rigid-body/measurement/v1 corotate/rigid-body/truth/v1";
+const READS: &str = "corotate/rigid-body/command/v2#ff8ce508";
+const WRITES: &str = "corotate/rigid-body/measurement/v1#bcfd8b41 corotate/rigid-body/truth/v1#6b083b5d";
 
 fn bytes(text: &str) -> Vec<u8> {
     text.split_whitespace().map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect()

@@ -14,7 +14,7 @@ pub const MAX_CONTENT: usize = 960;
 pub const MAX_SAMPLES: usize = 32;
 /// The longest name or reason in a message, bytes.
 pub const MAX_TEXT: usize = 64;
-/// The longest list of type names in a message, bytes.
+/// The longest list of layouts in a message, bytes.
 pub const MAX_NAMES: usize = 448;
 
 /// What is said on the line.
@@ -52,7 +52,8 @@ pub struct Hello<'a> {
     pub manual_rearm: bool,
     /// The seat that the device takes: a body's name, `observer`, `controller`, or `observer controller` for both.
     pub role: &'a str,
-    /// The versioned type names of the samples in [`Tick::inputs`], in order, with a blank between two.
+    /// The names of the layouts of the samples in [`Tick::inputs`], in order, with a blank between two: versioned type names with
+    /// hashes, or without them to a device that knows none.
     pub reads: &'a str,
     /// Those of [`Answer::outputs`].
     pub writes: &'a str,

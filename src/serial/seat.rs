@@ -12,8 +12,8 @@ const CATCH_UP_TICKS: u64 = 100_000;
 /// A sample as both ends must agree on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
-    /// Its versioned type name.
-    pub type_name: &'static str,
+    /// [`Sample::LAYOUT`].
+    pub name: &'static str,
     /// Bytes after its stamp.
     pub length: usize,
 }
@@ -21,7 +21,7 @@ pub struct Layout {
 impl Layout {
     /// That of a sample.
     pub const fn of<S: Sample>() -> Self {
-        Self { type_name: S::TYPE_NAME, length: content_length::<S>() }
+        Self { name: S::LAYOUT, length: content_length::<S>() }
     }
 }
 

@@ -41,7 +41,7 @@ impl Body for Spinner {
     }
 }
 
-const WRITES: &str = "corotate/rigid-body/measurement/v1 corotate/rigid-body/truth/v1";
+const WRITES: &str = "corotate/rigid-body/measurement/v1#bcfd8b41 corotate/rigid-body/truth/v1#6b083b5d";
 const MEASUREMENT: usize = content_length::<RateMeasurement>();
 const TRUTH: usize = content_length::<RateTruth>();
 
@@ -58,7 +58,7 @@ fn hello(run: u64, realtime: bool) -> Hello<'static> {
         timeout_ticks: TIMEOUT_TICKS,
         manual_rearm: false,
         role: "follower",
-        reads: RateCommand::TYPE_NAME,
+        reads: RateCommand::LAYOUT,
         writes: WRITES,
     }
 }
@@ -520,12 +520,15 @@ fn another_run_begins_at_the_initial_state() {
 
 #[test]
 fn who_does_not_fit_is_refused_by_name() {
-    let measurement = RateMeasurement::TYPE_NAME;
+    let (command, measurement) = (RateCommand::LAYOUT, RateMeasurement::LAYOUT);
     for (reads, writes, own) in [
-        ("corotate/rigid-body/command/v0", WRITES, RateCommand::TYPE_NAME),
-        ("corotate/rigid-body/command/v2 more", WRITES, "fewer samples"),
-        (RateCommand::TYPE_NAME, measurement, RateTruth::TYPE_NAME),
-        ("", "", RateCommand::TYPE_NAME),
+        ("corotate/rigid-body/command/v0", WRITES, command),
+        // Other fields under the same type name, and a host that states none.
+        ("corotate/rigid-body/command/v2#00000000", WRITES, command),
+        (RateCommand::TYPE_NAME, WRITES, command),
+        ("corotate/rigid-body/command/v2#ff8ce508 more", WRITES, "fewer samples"),
+        (command, measurement, RateTruth::LAYOUT),
+        ("", "", command),
     ] {
         let mut rig = Rig::new(Hello { reads, writes, ..hello(1, true) }, CLEAN, 1);
         assert_eq!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Samples, own.to_owned())));

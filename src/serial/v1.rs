@@ -1,10 +1,11 @@
 //! Version 1 of the protocol, as its hosts spoke it: a device of that version may still be a driven body.
 //!
-//! Must not know anything but that body's three samples: version 1 had no other role.
+//! Must not know anything but that body's three samples: version 1 had no other role, and no hashes of layouts.
 
 use super::frame::{MAX_PAYLOAD, TooLong};
 use super::message::{Answer, Hello, MAX_CONTENT, Message, ParseError, Refuse, Samples, Tick, Welcome};
 use crate::role::CommandEvent;
+use crate::sample::type_name_of;
 use serde::{Deserialize, Serialize};
 
 /// The first byte of its payloads.
@@ -76,9 +77,9 @@ pub fn write<'a>(sequence: u32, message: Message<'_>, payload: &'a mut [u8; MAX_
                 timeout_ticks,
                 manual_rearm,
                 body: role,
-                command: reads,
-                measurement,
-                truth,
+                command: type_name_of(reads),
+                measurement: type_name_of(measurement),
+                truth: type_name_of(truth),
             })
         }
         Message::Tick(Tick { tick, inputs }) => {
@@ -135,8 +136,8 @@ mod tests {
             timeout_ticks: 4,
             manual_rearm: false,
             role: "b",
-            reads: "c",
-            writes: "m t",
+            reads: "c#1",
+            writes: "m#2 t#3",
         };
         let expected = [1, 9, 0, 1, 1, 2, 3, 4, 0, 1, b'b', 1, b'c', 1, b'm', 1, b't'];
         assert_eq!(write(9, Message::Hello(hello), &mut payload).unwrap(), expected);

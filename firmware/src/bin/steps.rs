@@ -110,8 +110,8 @@ fn exchange() -> Option<u32> {
         timeout_ticks: 20,
         manual_rearm: false,
         role: "observer controller",
-        reads: "corotate/rigid-body/measurement/v1 corotate/rigid-body/measurement/v1",
-        writes: "corotate/rigid-body/estimate/v2 corotate/rigid-body/command/v2",
+        reads: "corotate/rigid-body/measurement/v1#bcfd8b41 corotate/rigid-body/measurement/v1#bcfd8b41",
+        writes: "corotate/rigid-body/estimate/v2#d53fab65 corotate/rigid-body/command/v2#ff8ce508",
     };
     device.receive(frame(Message::Hello(hello), &mut room)?, 0, |_| {});
     let mut answered = 0;

@@ -28,7 +28,7 @@ pub(super) struct Word<L: FleetLayout> {
 unsafe impl<L: FleetLayout> ZeroCopySend for Word<L> {
     // SAFETY: unsafe by the trait's declaration only; a constant asks nothing of its caller.
     unsafe fn type_name() -> &'static str {
-        L::TYPE_NAME
+        L::LAYOUT
     }
 }
 

@@ -2,16 +2,20 @@
 //!
 //! Must not wait longer than it is told to, nor clean up after anybody.
 
-use super::{IoxBus, cause};
+use super::{IoxBus, Ipc, cause, config};
 use crate::bus::{BusError, Topic};
 use crate::clock::{monotonic_ns, sleep_until};
+use crate::sample::type_name_of;
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
+use iceoryx2::service::Service as _;
 use iceoryx2::service::builder::blackboard::BlackboardCreateError;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeCreateError, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
 };
+use iceoryx2::service::messaging_pattern::MessagingPattern;
+use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as PatternDetails;
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -43,7 +47,7 @@ impl IoxBus {
                 Err(refusal) => refusal,
             };
             let limit_ns = match refusal.passes {
-                Passes::Never => 0,
+                Passes::Never | Passes::NeverOfOtherType => 0,
                 Passes::WhenFinished => self.opening_ns,
                 Passes::WhenVacated => VACATE_NS.min(self.opening_ns),
             };
@@ -62,11 +66,39 @@ impl IoxBus {
                 self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
             let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
             reason = format!("{reason} for {limit_s} s: the process that creates it makes no progress{files}");
-        } else {
+        } else if passes != Passes::NeverOfOtherType {
             let remedy = format!("is another process of this run its {end}, or of another version?");
             reason = cause::reason(|| format!("{reason}; {remedy}"));
         }
         BusError::Open { service: topic.to_string(), end, reason }
+    }
+
+    /// Adds to a refusal what a signal's samples are in the run and in this program, if that is why.
+    pub(super) fn explain(&self, refusal: Refusal, topic: &Topic, ours: &str) -> Refusal {
+        if refusal.passes != Passes::NeverOfOtherType {
+            return refusal;
+        }
+        let theirs = self.type_of(topic).unwrap_or_else(|| "another type".to_owned());
+        let cause = if type_name_of(&theirs) == type_name_of(ours) {
+            "the fields were changed without a new version in the type name"
+        } else {
+            "the types differ"
+        };
+        let reason = format!(
+            "its samples are `{theirs}` in this run and `{ours}` in this program: {cause}; build all programs of the run from one \
+             source, and raise the version in a type name whenever its fields change"
+        );
+        Refusal { reason, ..refusal }
+    }
+
+    /// The type of a signal's samples in this run, as far as it is known.
+    fn type_of(&self, topic: &Topic) -> Option<String> {
+        let name = topic.to_string().as_str().try_into().ok()?;
+        let config = config(self.domain.root(), &self.domain).ok()?;
+        let details = Ipc::details(&name, &config, MessagingPattern::PublishSubscribe).ok()??;
+        let details = details.static_details.messaging_pattern();
+        let PatternDetails::PublishSubscribe(details) = details else { return None };
+        Some(details.message_type_details().payload.type_name().to_string())
     }
 }
 
@@ -74,6 +106,8 @@ impl IoxBus {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Passes {
     Never,
+    /// Not at all: the signal carries another type.
+    NeverOfOtherType,
     /// Once somebody else has finished what he makes, or this process the handling of a signal.
     WhenFinished,
     /// Once the remains of a dead process are put away.
@@ -105,6 +139,7 @@ impl From<PublishSubscribeOpenError> for Refusal {
             match error {
                 Error::Interrupt | Error::HangsInCreation | Error::IsMarkedForDestruction => Passes::WhenFinished,
                 Error::ExceedsMaxNumberOfNodes => Passes::WhenVacated,
+                Error::IncompatibleTypes => Passes::NeverOfOtherType,
                 _ => Passes::Never,
             },
         )

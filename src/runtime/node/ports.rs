@@ -16,6 +16,8 @@ pub struct Port {
     pub topic: Topic,
     /// Name and version of the layout.
     pub type_name: &'static str,
+    /// The same with a hash of the fields, by which services and devices know it.
+    pub layout: &'static str,
     /// The length of a sample, bytes.
     pub size: usize,
     /// The fields after the stamp, in order.
@@ -139,8 +141,9 @@ fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usiz
 fn port<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
     let bodies = fleet.unwrap_or(1);
     let size = S::length(bodies) * size_of::<u64>();
-    let (type_name, fields, ends) = (S::type_name(), S::fields(bodies), Ends::of::<S>());
-    Port { topic, type_name, size, fields, fleet: fleet.is_some(), bodies, ends }
+    let (type_name, layout) = (S::type_name(), S::layout());
+    let (fields, ends) = (S::fields(bodies), Ends::of::<S>());
+    Port { topic, type_name, layout, size, fields, fleet: fleet.is_some(), bodies, ends }
 }
 
 #[cfg(test)]
