@@ -1,7 +1,7 @@
 //! Instructions per estimate-and-control step, and per tick of a run in one thread, counted by callgrind: a regression shows
 //! however noisy the machine is.
 //!
-//! `cargo bench --features hooks,foxglove,parquet,pdf,hosts --bench instructions` (the features of the tests: others inline
+//! `cargo bench --features hooks,foxglove,parquet,hosts --bench instructions` (the features of the tests: others inline
 //! differently) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs
 //! valgrind. The figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
 

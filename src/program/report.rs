@@ -24,7 +24,7 @@ pub struct Arguments {
     /// Show this field too, such as leader/estimate.omega_rad_s or one element of it, …[2]; again for more
     #[arg(long, value_name = "FIELD")]
     show: Vec<String>,
-    /// Write every figure as a picture of its own to this directory: SVG, and PDF if built with it
+    /// Write every figure as a picture of its own to this directory, as SVG
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show the page in a browser (xdg-open)
@@ -118,8 +118,7 @@ fn exit_of(error: &ReportError) -> Exit {
         ReportError::Read { .. }
         | ReportError::Write { .. }
         | ReportError::Counterpart { .. }
-        | ReportError::Campaign(JournalError::Read { .. })
-        | ReportError::Pdf { .. } => Exit::Failure,
+        | ReportError::Campaign(JournalError::Read { .. }) => Exit::Failure,
         ReportError::Nothing { .. }
         | ReportError::NoRun { .. }
         | ReportError::Summary { .. }

@@ -16,7 +16,6 @@
 //! | `campaign` | another page: the table of a campaign |
 //! | `axis`, `frame`, `chart` | pictures as SVG |
 //! | `html`, `page` | the page |
-//! | `pdf` | figures as PDF, with the feature |
 //!
 //! Must not judge a run: verdicts are those of its summary. Must not leave out silently: what is missing is said.
 
@@ -31,8 +30,6 @@ mod html;
 mod model;
 mod page;
 mod pair;
-#[cfg(feature = "pdf")]
-mod pdf;
 mod percentiles;
 mod pictures;
 mod source;
@@ -131,14 +128,6 @@ pub enum ReportError {
         /// Why.
         reason: String,
     },
-    /// A figure cannot be made a PDF.
-    #[error("{figure} cannot be made a PDF: {reason}")]
-    Pdf {
-        /// Its name.
-        figure: String,
-        /// Why.
-        reason: String,
-    },
     /// The page cannot be written.
     #[error("cannot write {}: {source}; name another file with --out", path.display())]
     Write {
@@ -183,28 +172,20 @@ impl Report {
         &self.figures
     }
 
-    /// Writes every figure to a file of its own in a directory; with the feature `pdf` also as PDF.
+    /// Writes every figure to a file of its own in a directory, as SVG.
     ///
     /// # Errors
-    /// [`ReportError::Write`], [`ReportError::Pdf`].
+    /// [`ReportError::Write`].
     pub fn write_figures(&self, directory: &Path) -> Result<(), ReportError> {
         let failed = |path: &Path| {
             let path = path.to_owned();
             |source| ReportError::Write { path, source }
         };
         crate::files::create_directories(directory).map_err(failed(directory))?;
-        let write = |name: &str, bytes: &[u8]| {
-            let path = directory.join(name);
-            crate::files::write(&path, bytes).map_err(failed(&path))
-        };
-        #[cfg(feature = "pdf")]
-        let printer = pdf::Printer::new()?;
-        for (name, svg) in &self.figures {
-            write(&format!("{name}.svg"), svg.as_bytes())?;
-            #[cfg(feature = "pdf")]
-            write(&format!("{name}.pdf"), &printer.print(name, svg)?)?;
-        }
-        Ok(())
+        self.figures.iter().try_for_each(|(name, svg)| {
+            let path = directory.join(format!("{name}.svg"));
+            crate::files::write(&path, svg.as_bytes()).map_err(failed(&path))
+        })
     }
 
     /// Writes the page.
