@@ -72,7 +72,7 @@ fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
 #[test]
 fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
     let bench = bench();
-    well(bench.run(&["sweep", "./map.toml", "--out", "results", "-q"]));
+    let told = well(bench.run(&["sweep", "./map.toml", "--out", "results"])).stdout;
     let html = page(&bench, &["--figures", "figures"]);
     let (page, table) = (parse(&html), Table::read(&bench.path("results")).unwrap());
     let sections: Vec<&str> = page
@@ -106,9 +106,20 @@ fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
     let refused =
         rows(section(&page, "reasons"))[1..].iter().map(|row| row[0].parse::<usize>().unwrap()).sum::<usize>();
     assert!(invalid > 0 && refused == invalid, "{refused} {invalid}");
+    // Every case is counted once, under its verdict; how it ended is told of those.
+    let (mut cases, mut ended, mut nested) = (0, 0, false);
+    for word in told.lines().nth(1).unwrap().split([' ', ',']) {
+        nested |= word.starts_with('(');
+        let count = word.trim_matches(['(', ')']).parse::<usize>().unwrap_or(0);
+        *(if nested { &mut ended } else { &mut cases }) += count;
+        nested &= !word.ends_with(')');
+    }
+    assert_eq!((cases, ended), (18, invalid), "{told}");
+    assert!(told.starts_with("map: 18 cases and 3 margin points; "), "{told}");
     assert!(html.contains("the bar across the scale is the limit, 0.02"));
     let margins = rows(section(&page, "margins"));
     assert_eq!(margins.len(), 1 + table.margins[0].points.len());
+    assert_eq!(margins[0], ["tick_hz", "holds at", "fails at", "runs"]);
     // What a row of the worst cases says is run as it stands, and comes to the same.
     let worst = rows(section(&page, "worst"));
     let command: Vec<&str> = worst[1][1].split(' ').collect();

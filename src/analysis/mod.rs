@@ -307,6 +307,19 @@ pub fn digits(value: f64) -> String {
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
+/// Formats a number that is known to a tolerance, with one decimal more than the tolerance has; a whole number stands as it is.
+pub fn to_tolerance(value: f64, tolerance: f64) -> String {
+    let power = |value: f64| value.abs().log10().floor() as i32;
+    let last = power(tolerance) - 1;
+    if value.fract() == 0.0 && value.abs() < 1e15 {
+        format!("{value:.0}")
+    } else if (1e-3..1e15).contains(&value.abs()) {
+        format!("{value:.*}", (-last).clamp(0, 17) as usize)
+    } else {
+        format!("{value:.*e}", (power(value) - last).clamp(0, 17) as usize)
+    }
+}
+
 /// Two numbers that are compared, with enough digits to be told apart.
 pub fn apart(a: f64, b: f64) -> [String; 2] {
     let few = [a, b].map(digits);
@@ -331,6 +344,23 @@ mod tests {
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
         let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap().1;
         claims(&Scenario::parse(text, "test", &overrides).unwrap()).remove(0)
+    }
+
+    #[test]
+    fn a_tolerance_says_how_many_digits_a_number_has() {
+        for (value, tolerance, text) in [
+            (0.5541015625000001, 0.01, "0.554"),
+            (3.642_089_843_75, 0.5, "3.64"),
+            (-12.26, 5.0, "-12.3"),
+            (41.0, 5.0, "41"),
+            (0.0, 0.01, "0"),
+            (123_456.7, 1000.0, "123457"),
+            (5.123_456_789e-6, 1e-9, "5.1235e-6"),
+            (1e-5, 0.01, "1e-5"),
+            (1e20, 1.0, "1.00000000000000000e20"),
+        ] {
+            assert_eq!(to_tolerance(value, tolerance), text);
+        }
     }
 
     /// Rates from an independent program: the product of the one-tick transitions of (e, command on its way, ε), linearised

@@ -4,9 +4,11 @@
 //! case is run.
 
 use super::axis::{self, Varied};
-use super::table::{Find, Margin, Row};
+use super::table::{Axis, Find, Margin, MarginPoint, Parameter, Row};
+use crate::analysis::{digits, to_tolerance};
 use crate::config::{Checks, Document};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use toml::Value;
 
 /// The most halvings, from whatever range to whatever tolerance.
@@ -62,6 +64,38 @@ pub(super) struct Searched {
     /// Where the campaign names it.
     pub place: String,
     whole: bool,
+}
+
+impl Margin {
+    /// Returns the points as a table, head and rows: each by its values of what is varied, then where the margin lies, known to the
+    /// tolerance. Cases are named where these values do not tell the points apart.
+    pub fn rows(&self, axes: &[Axis]) -> (Vec<String>, Vec<Vec<String>>) {
+        let told = |axis: &usize| self.points.iter().any(|point| point.parameter(*axis).is_some());
+        let keys: Vec<usize> = (0..axes.len()).filter(|axis| axes[*axis].values.len() != 1).filter(told).collect();
+        let parameter = |parameter: &Parameter| match parameter {
+            Parameter::Number(number) => digits(*number),
+            other => other.to_string(),
+        };
+        let named = |point: &MarginPoint| -> Vec<String> {
+            keys.iter().map(|axis| point.parameter(*axis).map_or("-".to_owned(), parameter)).collect()
+        };
+        let mut rows: Vec<Vec<String>> = self.points.iter().map(named).collect();
+        let alike = rows.len() > rows.iter().collect::<BTreeSet<_>>().len();
+        let bound = |end: Option<f64>| end.map_or("nowhere".to_owned(), |value| to_tolerance(value, self.tolerance));
+        for (row, point) in rows.iter_mut().zip(&self.points) {
+            row.extend(alike.then(|| point.case.to_string()));
+            row.extend(point.bracket.map(bound));
+        }
+        let head = keys.iter().map(|axis| axes[*axis].name()).chain(alike.then_some("case"));
+        (head.chain(["holds at", "fails at"]).map(str::to_owned).collect(), rows)
+    }
+}
+
+impl MarginPoint {
+    /// The value of an axis at this point; none of the key that is moved.
+    pub fn parameter(&self, axis: usize) -> Option<&Parameter> {
+        self.parameters.get(axis)?.as_ref()
+    }
 }
 
 /// Where a bisection ended.

@@ -42,6 +42,9 @@ pub struct Counts {
     pub not_judged: u64,
     /// How many cases ended how; only what occurred.
     pub exits: BTreeMap<&'static str, u64>,
+    /// How many cases of each verdict (accepted, not accepted, not judged) did not simply run to their last tick, by how they ended.
+    #[serde(skip)]
+    pub otherwise: [BTreeMap<&'static str, u64>; 3],
     /// Points of margins.
     pub margin_points: u64,
 }
@@ -49,11 +52,16 @@ pub struct Counts {
 impl Counts {
     fn take(&mut self, row: &Row) {
         self.rows += 1;
-        *match row.accepted {
-            Some(true) => &mut self.accepted,
-            Some(false) => &mut self.not_accepted,
-            None => &mut self.not_judged,
-        } += 1;
+        let [accepted, refused, unjudged] = &mut self.otherwise;
+        let (count, otherwise) = match row.accepted {
+            Some(true) => (&mut self.accepted, accepted),
+            Some(false) => (&mut self.not_accepted, refused),
+            None => (&mut self.not_judged, unjudged),
+        };
+        *count += 1;
+        if row.exit != End::Completed {
+            *otherwise.entry(row.exit.name()).or_default() += 1;
+        }
         *self.exits.entry(row.exit.name()).or_default() += 1;
     }
 }

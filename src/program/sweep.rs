@@ -4,11 +4,12 @@ use super::campaign;
 use super::run::catch_signals;
 use super::{Exit, fail, print, remark};
 use crate::campaign::{
-    Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
+    Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
 };
 use crate::config::{ClockKind, Scenario};
 use crate::launch::{Launch, Progress, RUNS, Summary, claim, make_directory, new_run, plain, write_run};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -128,7 +129,7 @@ fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
     let threads = arguments.threads.map(usize::from);
     let threads = threads.or_else(|| std::thread::available_parallelism().ok().map(usize::from)).unwrap_or(1);
     let began = Instant::now();
-    let (bar, mut before) = (bar(arguments.quiet), None);
+    let (bar, mut before) = (bar(arguments.quiet, pieces(&campaign)), None);
     let swept = campaign.sweep(
         &directory,
         &mut Sweep {
@@ -154,7 +155,7 @@ fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
     };
     let done = swept.done - before.unwrap_or(0);
     let telling = Telling { json: arguments.json, quiet: arguments.quiet };
-    tell(telling, &directory, &head(&campaign, &swept, done, began.elapsed(), threads), counts)?;
+    tell(telling, &directory, &head(&campaign, &swept, counts, done, began.elapsed(), threads), counts)?;
     record_worst(arguments, &campaign, &directory, &signal)?;
     Ok(Exit::Ok)
 }
@@ -183,13 +184,18 @@ fn newest(campaign: &Campaign) -> Option<PathBuf> {
     found.pop()
 }
 
-fn bar(quiet: bool) -> ProgressBar {
+/// What a campaign's pieces of work are.
+fn pieces(campaign: &Campaign) -> &'static str {
+    if campaign.table().margins.is_empty() { "cases" } else { "cases and margin points" }
+}
+
+fn bar(quiet: bool, pieces: &str) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }
-    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} cases, {per_sec}, {eta} left");
+    let style = ProgressStyle::with_template(&format!("{{bar:40}} {{pos}}/{{len}} {pieces}, {{per_sec}}, {{eta}} left"));
     // Drawn on stderr, and only if that is a terminal.
-    ProgressBar::new(0).with_style(style.expect("the template is a constant that parses"))
+    ProgressBar::new(0).with_style(style.expect("the template parses"))
 }
 
 fn interrupted(
@@ -202,23 +208,24 @@ fn interrupted(
     let number = signal.load(std::sync::atomic::Ordering::Relaxed);
     let file = arguments.file.as_deref().unwrap_or(Path::new(campaign.name())).display();
     let words = format!(
-        "ended in order by signal {number}: {} of {} cases and margins are done; go on with `corotate sweep {file} --out {}` \
+        "ended in order by signal {number}: {} of {} {} are done; go on with `corotate sweep {file} --out {}` \
          and the other options as they were",
         swept.done,
         swept.all,
+        pieces(campaign),
         directory.display()
     );
     fail(Exit::Signal(number), &words)
 }
 
 /// The first line: what was done, and how fast.
-fn head(campaign: &Campaign, swept: &Swept, done: u64, took: Duration, threads: usize) -> String {
-    let all = match swept.all {
-        1 => "1 case".to_owned(),
-        all => format!("{all} cases"),
-    };
-    let all = if campaign.table().margins.is_empty() { all } else { format!("{all} and margins") };
-    let threads = if threads == 1 { "1 thread".to_owned() } else { format!("{threads} threads") };
+fn head(campaign: &Campaign, swept: &Swept, counts: &Counts, done: u64, took: Duration, threads: usize) -> String {
+    let counted = |count: u64, one: &str| if count == 1 { format!("1 {one}") } else { format!("{count} {one}s") };
+    let mut all = counted(counts.rows, "case");
+    if counts.margin_points > 0 {
+        all += &format!(" and {}", counted(counts.margin_points, "margin point"));
+    }
+    let threads = counted(threads as u64, "thread");
     match done {
         0 => format!("{}: {all}, all of them done before", campaign.name()),
         _ => {
@@ -239,8 +246,10 @@ fn tell(telling: Telling, directory: &Path, head: &str, counts: &Counts) -> Resu
         .and_then(|bytes| serde_json::from_slice(&bytes).map_err(|error| error.to_string()))
         .map_err(|error| failed(format!("{}: {error}", path.display())))?;
     if !telling.quiet {
+        let axes: Vec<Axis> = serde_json::from_value(summary["axes"].clone()).unwrap_or_default();
         let margins: Vec<Margin> = serde_json::from_value(summary["margins"].clone()).unwrap_or_default();
-        let text = format!("{head}\n{}\n{}results in {}\n", words(counts), margin_words(&margins), directory.display());
+        let margins = margin_words(&axes, &margins);
+        let text = format!("{head}\n{}\n{margins}results in {}\n", words(counts), directory.display());
         if telling.json {
             text.lines().for_each(crate::system::tell);
         } else {
@@ -256,28 +265,27 @@ fn tell(telling: Telling, directory: &Path, head: &str, counts: &Counts) -> Resu
 }
 
 fn words(counts: &Counts) -> String {
-    let Counts { accepted, not_accepted, not_judged, exits, .. } = counts;
-    let mut text = format!("accepted {accepted}, not accepted {not_accepted}, not judged {not_judged}");
-    for (exit, count) in exits.iter().filter(|(exit, _)| **exit != "completed") {
-        let _ = write!(text, "; {exit} {count}");
-    }
-    text
+    let Counts { accepted, not_accepted, not_judged, otherwise, .. } = counts;
+    let verdicts = [("accepted", accepted), ("not accepted", not_accepted), ("not judged", not_judged)];
+    let verdict = |((verdict, count), otherwise): ((&str, &u64), &BTreeMap<&str, u64>)| {
+        let ends: Vec<String> = otherwise.iter().map(|(end, count)| format!("{count} {end}")).collect();
+        let ends = if ends.is_empty() { String::new() } else { format!(" ({})", ends.join(", ")) };
+        format!("{verdict} {count}{ends}")
+    };
+    verdicts.into_iter().zip(otherwise).map(verdict).collect::<Vec<_>>().join(", ")
 }
 
-/// The margins as a table: one row per point, as many as fit a screen.
-fn margin_words(margins: &[Margin]) -> String {
+/// The margins as a table: one row per point, by what is varied, as many as fit a screen.
+fn margin_words(axes: &[Axis], margins: &[Margin]) -> String {
     const SHOWN: usize = 20;
     let mut text = String::new();
     for margin in margins {
         let find = format!("{:?}", margin.find).to_lowercase();
         let _ = writeln!(text, "\n{find} {} such that {}, to {}", margin.key, margin.such_that, margin.tolerance);
-        let mut rows = plain(&["case", "margin", "holds at", "not at"]);
-        let shown = |value: Option<f64>| value.map_or("-".to_owned(), |value| value.to_string());
-        for point in margin.points.iter().take(SHOWN) {
-            let [holds, not] = point.bracket;
-            rows.add_row([point.case.to_string(), shown(point.value), shown(holds), shown(not)]);
-        }
-        let _ = writeln!(text, "{rows}");
+        let (head, rows) = margin.rows(axes);
+        let mut shown = plain(&head.iter().map(String::as_str).collect::<Vec<_>>());
+        shown.add_rows(rows.into_iter().take(SHOWN));
+        let _ = writeln!(text, "{shown}");
         if margin.points.len() > SHOWN {
             let _ = writeln!(text, "and {} more in summary.json", margin.points.len() - SHOWN);
         }

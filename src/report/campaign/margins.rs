@@ -4,9 +4,8 @@
 
 use super::facts::Facts;
 use super::shades::{by_factors, range};
-use super::spread::shown;
 use crate::analysis::digits;
-use crate::campaign::{Find, Margin, MarginPoint, Parameter};
+use crate::campaign::{Find, Margin, MarginPoint};
 use crate::report::axis::Axis;
 use crate::report::chart::{Line, Picture};
 use crate::report::frame::{Frame, LEFT, RIGHT, TOP, WIDTH};
@@ -55,34 +54,16 @@ fn blocks(facts: &Facts<'_>, margin: &Margin) -> Vec<Block> {
 
 /// The axes on which a margin's points lie.
 fn axes(facts: &Facts<'_>, margin: &Margin) -> Vec<usize> {
-    let known = |axis: &usize| margin.points.iter().any(|point| at(point, *axis).is_some());
+    let known = |axis: &usize| margin.points.iter().any(|point| point.parameter(*axis).is_some());
     (0..facts.spreads.len()).filter(|axis| facts.spreads[*axis].varies()).filter(known).collect()
 }
 
-fn at(point: &MarginPoint, axis: usize) -> Option<&Parameter> {
-    point.parameters.get(axis)?.as_ref()
-}
-
 fn table(facts: &Facts<'_>, margin: &Margin) -> Block {
-    let axes = axes(facts, margin);
-    let names = axes.iter().map(|axis| facts.spreads[*axis].name.clone());
-    let others = ["margin", "holds at", "not at", "bracket", "runs"].map(str::to_owned);
-    let head: Vec<String> = ["case".to_owned()].into_iter().chain(names).chain(others).collect();
-    let number = |value: Option<f64>| value.map_or("–".to_owned(), digits);
-    let row = |point: &MarginPoint| {
-        let [good, bad] = point.bracket;
-        let width = good.zip(bad).map(|(good, bad)| (good - bad).abs());
-        let value = match (point.value, bad) {
-            (None, _) => "none in the range".to_owned(),
-            (Some(value), None) => format!("beyond {}", digits(value)),
-            (Some(value), Some(_)) => digits(value),
-        };
-        let mut row = vec![point.case.to_string()];
-        row.extend(axes.iter().map(|axis| at(point, *axis).map_or("–".to_owned(), shown)));
-        row.extend([value, number(good), number(bad), number(width), point.runs.to_string()]);
-        row
-    };
-    Block::table(&margin.key, head, margin.points.iter().take(ROWS).map(row).collect())
+    let (mut head, mut rows) = margin.rows(&facts.table.axes);
+    head.push("runs".to_owned());
+    rows.iter_mut().zip(&margin.points).for_each(|(row, point)| row.push(point.runs.to_string()));
+    rows.truncate(ROWS);
+    Block::table(&margin.key, head, rows)
 }
 
 /// A margin along an axis of numbers, a line for each value of another.
@@ -107,11 +88,11 @@ fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
     let (mut lines, mut open) = (Vec::new(), 0);
     for group in 0..cells.map_or(1, |cells| cells.count) {
         let of = |point: &&MarginPoint| match (second, cells) {
-            (Some(axis), Some(cells)) => at(point, axis).and_then(|value| cells.of(value)) == Some(group),
+            (Some(axis), Some(cells)) => point.parameter(axis).and_then(|value| cells.of(value)) == Some(group),
             _ => true,
         };
         let mut points: Vec<(f64, &MarginPoint)> =
-            margin.points.iter().filter(of).filter_map(|point| Some((at(point, across)?.number()?, point))).collect();
+            margin.points.iter().filter(of).filter_map(|point| Some((point.parameter(across)?.number()?, point))).collect();
         points.sort_by(|one, other| one.0.total_cmp(&other.0));
         let class = CLASSES[group % LINES];
         for (place, point) in &points {

@@ -21,22 +21,21 @@ fn number(value: Option<f64>) -> String {
 /// What was run, what is varied, and how to run it again.
 pub fn result(facts: &Facts<'_>) -> Section {
     let (table, rows) = (facts.table, &facts.table.rows);
-    let count = |holds: &dyn Fn(&Row) -> bool| rows.iter().filter(|row| holds(row)).count().to_string();
-    let ended = |end: End| move |row: &Row| row.exit == end;
-    let counts = [
-        ("cases of the campaign", table.cases.to_string()),
-        ("cases run", rows.len().to_string()),
-        ("accepted", count(&|row| row.accepted == Some(true))),
-        ("not accepted", count(&|row| row.accepted == Some(false))),
-        ("not judged", count(&|row| row.accepted.is_none() && ran(row))),
-        ("a body was lost", count(&ended(End::Lost))),
-        ("stopped by a role that failed", count(&ended(End::Stopped))),
-        ("no valid scenario", count(&ended(End::Invalid))),
-        ("not run, or without balance", count(&ended(End::Failed))),
+    let mut told = vec![("cases of the campaign", table.cases), ("cases run", rows.len() as u64)];
+    let ends = [
+        ("of these, a body was lost", End::Lost),
+        ("of these, stopped by a role that failed", End::Stopped),
+        ("of these, no valid scenario", End::Invalid),
+        ("of these, not run, or without balance", End::Failed),
     ];
-    // What did not occur is not told, but for the first four.
-    let told = counts.into_iter().enumerate().filter(|(place, (_, count))| *place < 4 || count != "0");
-    let rows = told.map(|(_, (name, count))| vec![name.to_owned(), count]).collect();
+    for (name, verdict) in [("accepted", Some(true)), ("not accepted", Some(false)), ("not judged", None)] {
+        let of: Vec<&Row> = rows.iter().filter(|row| row.accepted == verdict).collect();
+        // What did not occur is not told, but for the first four.
+        told.extend((verdict.is_some() || !of.is_empty()).then_some((name, of.len() as u64)));
+        let ended = ends.map(|(name, end)| (name, of.iter().filter(|row| row.exit == end).count() as u64));
+        told.extend(ended.into_iter().filter(|(_, count)| *count > 0));
+    }
+    let rows = told.into_iter().map(|(name, count)| vec![name.to_owned(), count.to_string()]).collect();
     let mut blocks = vec![Block::table("", vec!["", "cases"], rows), axes(facts)];
     let repeats = facts.repeats();
     if repeats > 1 {
