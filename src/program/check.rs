@@ -19,6 +19,9 @@ pub struct Arguments {
     /// Override any key of the scenarios
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Print each scenario with every default, its claims as comments: a scenario file again
+    #[arg(long, conflicts_with = "json")]
+    resolved: bool,
     /// Print what is claimed of each scenario as one line of JSON (corotate/check/v1)
     #[arg(long)]
     json: bool,
@@ -26,8 +29,9 @@ pub struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
-  corotate check pair.toml         the scenario with every default, and what
-                                   may be claimed of its loop
+  corotate check pair.toml         what may be claimed of its loop
+  corotate check --resolved pair.toml > full.toml
+                                   the scenario with every default
   corotate check --json pair.toml  those claims for programs
   corotate check config/*.toml > /dev/null
                                    are they all valid? exit code 2 if not";
@@ -52,10 +56,19 @@ pub fn check(arguments: &Arguments) -> Exit {
 fn checked(arguments: &Arguments, path: &Path) -> Result<String, String> {
     if campaign::is_meant(path) {
         let campaign = campaign::load(path, &arguments.set)?;
-        return Ok(if arguments.json { campaign_json(path, &campaign) } else { tell_campaign(path, &campaign) });
+        if arguments.json {
+            return Ok(campaign_json(path, &campaign));
+        }
+        let told = tell_campaign(path, &campaign);
+        return Ok(if arguments.resolved { resolved(&told, campaign.to_toml()) } else { told });
     }
     let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
-    Ok(if arguments.json { json(path, &scenario) } else { tell(path, &scenario) })
+    if arguments.json {
+        return Ok(json(path, &scenario));
+    }
+    let mut told = format!("{}: valid\n", path.display());
+    tell_claims(&scenario, &mut told).expect("a string takes every text");
+    Ok(if arguments.resolved { resolved(&told, &scenario.to_toml()) } else { told })
 }
 
 fn campaign_json(path: &Path, campaign: &Campaign) -> String {
@@ -70,11 +83,16 @@ fn campaign_json(path: &Path, campaign: &Campaign) -> String {
     format!("{value}\n")
 }
 
-/// The campaign with its scenario in it: the whole is a campaign file.
+/// What is told as comments, then the file that resolves to itself: the whole is a file of the same kind.
+fn resolved(told: &str, file: &str) -> String {
+    let comments: String = told.lines().map(|line| format!("# {line}\n")).collect();
+    format!("{comments}{file}\n")
+}
+
 fn tell_campaign(path: &Path, campaign: &Campaign) -> String {
     let cases = campaign.cases();
     let words = if cases == 1 { "1 case".to_owned() } else { format!("{cases} cases") };
-    format!("# {}: valid, {words}, identity {}\n{}\n", path.display(), campaign.identity(), campaign.to_toml())
+    format!("{}: valid, {words}, identity {}\n", path.display(), campaign.identity())
 }
 
 /// What is claimed of a scenario, for programs.
@@ -93,22 +111,15 @@ fn json(path: &Path, scenario: &Scenario) -> String {
     format!("{value}\n")
 }
 
-/// The scenario as resolved, and what is claimed of it as comments, so that the whole is a scenario file.
-fn tell(path: &Path, scenario: &Scenario) -> String {
-    let mut text = format!("# {}: valid\n{}\n", path.display(), scenario.to_toml());
-    tell_claims(scenario, &mut text).expect("a string takes every text");
-    text
-}
-
 fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
-    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "# warning: {warning}"))?;
-    scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "# note: {note}"))?;
+    scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
+    scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
     for limit in scenario.rig.limits() {
-        writeln!(text, "# limit: {}: {}", limit.name, digits(limit.value))?;
+        writeln!(text, "limit: {}: {}", limit.name, digits(limit.value))?;
     }
     let claims = claims(scenario);
     if claims.is_empty() {
-        writeln!(text, "# no body is driven, so there is no loop to claim anything of")?;
+        writeln!(text, "no body is driven, so there is no loop to claim anything of")?;
     }
     let late = match scenario.actuation_delay_ticks {
         1 => "one tick".to_owned(),
@@ -118,37 +129,37 @@ fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
 }
 
 fn tell_claim(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result {
-    writeln!(text, "# {}, the law in continuous time", claim.body)?;
+    writeln!(text, "{}, the law in continuous time", claim.body)?;
     for bound in &claim.bounds {
-        writeln!(text, "#   {}: {}", bound.name, digits(bound.value))?;
+        writeln!(text, "  {}: {}", bound.name, digits(bound.value))?;
     }
     for condition in &claim.conditions {
         let verdict = if condition.holds { "holds" } else { "does not hold" };
         let [value, required] = apart(condition.value, condition.required);
         let margin = digits(condition.value - condition.required);
-        writeln!(text, "#   {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
+        writeln!(text, "  {}: {value} > {required} {verdict}, margin {margin}", condition.name)?;
     }
     match claim.continuous_rate_per_s {
-        Some(rate) => writeln!(text, "#   its error falls at least as exp(-{} t)", digits(rate))?,
-        None if claim.conditions.is_empty() => writeln!(text, "#   this rig proves nothing of it")?,
-        None => writeln!(text, "#   no constant rate: the observer's gain varies")?,
+        Some(rate) => writeln!(text, "  its error falls at least as exp(-{} t)", digits(rate))?,
+        None if claim.conditions.is_empty() => writeln!(text, "  this rig proves nothing of it")?,
+        None => writeln!(text, "  no constant rate: the observer's gain varies")?,
     }
-    writeln!(text, "# {}, the loop that runs: sampled, held, {late} late", claim.body)?;
+    writeln!(text, "{}, the loop that runs: sampled, held, {late} late", claim.body)?;
     match (claim.loop_rate_per_s, &claim.reason) {
-        (Some(rate), _) => writeln!(text, "#   once it is small, the error falls as exp(-{} t)", digits(rate))?,
-        (None, reason) => writeln!(text, "#   no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
+        (Some(rate), _) => writeln!(text, "  once it is small, the error falls as exp(-{} t)", digits(rate))?,
+        (None, reason) => writeln!(text, "  no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
     }
     for floor in &claim.floors {
-        writeln!(text, "#   floor to expect: {} {}", floor.name, digits(floor.value))?;
+        writeln!(text, "  floor to expect: {} {}", floor.name, digits(floor.value))?;
     }
     for reach in &claim.reaches {
         let (metric, limit, from) = (&reach.metric, digits(reach.limit), digits(reach.from));
         match reach.after_s {
-            Some(after_s) => writeln!(text, "#   {metric} from {from} to {limit}: {} s at that rate", digits(after_s))?,
-            None => writeln!(text, "#   {metric} from {from} to {limit}: never, it is below the floor")?,
+            Some(after_s) => writeln!(text, "  {metric} from {from} to {limit}: {} s at that rate", digits(after_s))?,
+            None => writeln!(text, "  {metric} from {from} to {limit}: never, it is below the floor")?,
         }
     }
     // The reason why no rate is claimed is a warning too, and is told above.
     let mut others = claim.warnings.iter().filter(|warning| claim.reason.as_ref() != Some(*warning));
-    others.try_for_each(|warning| writeln!(text, "#   warning: {warning}"))
+    others.try_for_each(|warning| writeln!(text, "  warning: {warning}"))
 }
