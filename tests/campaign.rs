@@ -240,7 +240,7 @@ values = [[2.0, 0.0]]
 "#;
     let bench = bench(campaign);
     let told = sweep(&bench, &["--out", "map"]);
-    assert!(told.stdout.contains("invalid 1"), "{told:?}");
+    assert!(told.stdout.contains("not judged 2 (1 invalid)"), "{told:?}");
     let rows = Table::read(&bench.path("map")).unwrap().rows;
     assert_eq!(rows[0].exit, End::Invalid);
     assert!(

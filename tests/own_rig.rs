@@ -126,6 +126,13 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
     for drawn in ["speed, rad/s", "load, N m", "current, A", "speed_error_rad_s"] {
         assert!(html.contains(drawn), "{drawn}");
     }
+    // Errors of different units have pictures of their own, and nothing is drawn that other rigs asked for.
+    for (drawn, count) in
+        [(">error, rad/s<", 1), (">error, N m<", 1), ("error, in the unit", 0), ("logarithm of time", 0)]
+    {
+        // As wide as the page, and as narrow as a phone.
+        assert_eq!(html.matches(drawn).count(), 2 * count, "{drawn}");
+    }
 }
 
 /// A role is killed and started anew, watched and seen in its seat; the same bits.

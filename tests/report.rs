@@ -553,7 +553,7 @@ fn two_runs_are_shown_over_each_other() {
     let html = pair(&faulted);
     check_page(&html);
     let page = parse(&html);
-    assert_eq!(sections(&page), ["verdict", "differences", "fields", "errors", "motion"]);
+    assert_eq!(sections(&page), ["verdict", "scenarios", "differences", "fields", "errors", "motion"]);
     let done = bench.run(&["diff", plain.to_str().unwrap(), faulted.to_str().unwrap(), "--json"]);
     let differences: Value = serde_json::from_str(&done.stdout).unwrap();
     let firsts = differences["signals"].as_array().unwrap().iter().filter_map(|s| s["first"]["tick"].as_u64());
@@ -561,9 +561,18 @@ fn two_runs_are_shown_over_each_other() {
     let words = text(section(&page, "differences"));
     assert!((4000..4010).contains(&first) && words.contains(&format!("at tick {first} ")), "{first}: {words}");
     assert!(html.contains("first difference</text>") && html.contains("leader, A") && html.contains("leader, B"));
+    // What was changed, key by key, and nothing else.
+    let differing = rows(section(&page, "scenarios"));
+    let keys: Vec<&str> = differing[1..].iter().map(|row| row[0].as_str()).collect();
+    assert_eq!(keys, ["from_tick", "kind", "probability", "role", "ticks"].map(|key| format!("fault[0].{key}")));
+    assert_eq!(differing[1][1..], ["–", "4000"]);
     // A run and itself.
     let same = pair(&plain);
     assert!(same.contains("✓ no value differs") && !same.contains("first difference</text>"));
+    let same = parse(&same);
+    assert!(
+        rows(section(&same, "scenarios")).is_empty() && text(section(&same, "scenarios")).contains("same scenario")
+    );
     // Without recordings there is what was told.
     assert_eq!(bench.run(&["run", "rigid-pair", "--clock", "in-process", "--out", "bare"]).code, Some(0));
     let bare = pair_without_fields(&bench, &plain, &bench.path("bare"));
@@ -602,7 +611,7 @@ const READER: &str = r#"<script>
 const svg = document.querySelector("svg.time"), box = svg.getBoundingClientRect();
 const at = (kind, part) => svg.dispatchEvent(new PointerEvent(kind, { clientX: box.left + part * box.width, clientY: box.top + box.height / 2, bubbles: true }));
 at("pointermove", 0.5);
-const told = svg.parentNode.querySelector(".readout").textContent;
+const told = svg.closest("figure").querySelector(".readout").textContent;
 at("pointerdown", 0.4); at("pointermove", 0.5); at("pointerup", 0.6);
 const ticks = [...svg.querySelectorAll("g.ticks text")].map((text) => text.textContent).join(" ");
 const other = [...document.querySelectorAll("svg.time")].at(-1).querySelector("svg.plot").getAttribute("viewBox");
@@ -611,27 +620,94 @@ const back = [...document.querySelectorAll("svg.plot")].every((plot) => plot.get
 document.title = [told, ticks, !other.startsWith("64 ") && back, svg.querySelectorAll("g.ticks text").length].join("|");
 </script></body>"#;
 
-#[test]
-fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely() {
-    let Some(browser) = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
+/// What a browser makes of a page once its scripts have run; none where there is no browser.
+fn in_browser(bench: &Bench, html: &str) -> Option<String> {
+    let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
         std::process::Command::new(name).arg("--version").output().is_ok_and(|output| output.status.success())
-    }) else {
-        return common::skipped("the page in a browser", "there is no chromium (Debian: apt install chromium)");
-    };
-    let bench = Bench::new();
-    let html = page(&bench, &run(&bench, "rigid-pair", &[]));
-    let path = bench.path("read.html");
-    std::fs::write(&path, html.replace("</body>", READER)).unwrap();
+    })?;
+    std::fs::write(bench.path("read.html"), html).unwrap();
     let profile = format!("--user-data-dir={}", bench.path("profile").display());
-    let url = format!("file://{}", path.display());
+    let url = format!("file://{}", bench.path("read.html").display());
     let options =
         ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"];
     let dumped =
         std::process::Command::new(browser).args(options).args([&profile, "--dump-dom", &url]).output().unwrap();
-    let dom = String::from_utf8_lossy(&dumped.stdout);
+    let dom = String::from_utf8_lossy(&dumped.stdout).into_owned();
+    assert!(dom.contains("<title>"), "{}", String::from_utf8_lossy(&dumped.stderr));
+    Some(dom)
+}
+
+/// Looks at every page in a frame, and tells in the title what of it is out of sight, or too small to be read.
+const MEASURE: &str = r#"<script>
+addEventListener("load", () => {
+  const told = [...document.querySelectorAll("iframe")].flatMap((frame) => {
+    const page = frame.contentDocument, width = frame.contentWindow.innerWidth;
+    const seen = (selector) => [...page.querySelectorAll(selector)].filter((node) => node.getBoundingClientRect().width > 0);
+    const cut = (node) => node.getBoundingClientRect().right > width || node.closest(".table, figure").scrollWidth > node.closest(".table, figure").clientWidth;
+    const found = seen("figure > svg, figure > div > svg, #verdict td:last-child").filter(cut).map((node) => node.getAttribute("aria-label") || node.textContent);
+    if (page.scrollingElement.scrollWidth > width) found.push("the page");
+    for (const picture of seen("svg.time")) {
+      const labels = [...picture.querySelectorAll("g.ticks text")].map((label) => label.getBoundingClientRect());
+      if (!labels.length || labels.at(-1).right > width || labels[0].height < 8) found.push("labels of " + picture.getAttribute("aria-label"));
+    }
+    if (!seen("figure svg").length) found.push("every picture");
+    return found.map((name) => `${frame.title} at ${width}: ${name}`);
+  });
+  document.title = `${document.querySelectorAll("iframe").length} pages;` + told.join("; ");
+});
+</script>"#;
+
+#[test]
+fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
+    let bench = Bench::new();
+    let (faulted, plain) = (run(&bench, "faults", &[]), run(&bench, "rigid-pair", &["--duration", "9"]));
+    let campaign = "name = \"map\"\nbase = \"rigid-pair\"\nset = { duration_s = 0.5, accept = {} }\n\
+                    axis = [{ key = \"tick_hz\", values = [100.0, 200.0] }, { key = \"controller.gain_per_s\", values = [2.0, 4.0] }]\n";
+    std::fs::write(bench.path("map.toml"), campaign).unwrap();
+    assert_eq!(bench.run(&["sweep", "./map.toml", "--out", "map", "-q"]).code, Some(0));
+    let row = |n: u32| {
+        format!("{0},{1},{2},{3}\n", 0.01 * f64::from(n), (0.02 * f64::from(n)).sin(), (0.03 * f64::from(n)).cos(), 0.5)
+    };
+    let log: String = ["t_s,wx_rad_s,wy_rad_s,wz_rad_s\n".to_owned()].into_iter().chain((0..500).map(row)).collect();
+    std::fs::write(bench.path("log.csv"), log).unwrap();
+    let estimate = ["estimate", "log.csv", "--hidden", "z", "--inertia", "1,2,2.5", "--page", "log.html"];
+    assert_eq!(bench.run(&estimate).code, Some(0));
+    let log = std::fs::read_to_string(bench.path("log.html")).unwrap();
+    // What was read, what was done, what came of it: three paragraphs of whole sentences, and no verdict.
+    let paragraphs = section(&parse(&log), "result").children().filter(|node| node.has_tag_name("p")).count();
+    assert!(paragraphs == 3 && !log.contains("class=\"verdict"), "{paragraphs}");
+    let pages = [
+        ("run", page(&bench, &faulted)),
+        ("comparison", pair_without_fields(&bench, &plain, &faulted)),
+        ("campaign", page(&bench, &bench.path("map"))),
+        ("log", log),
+    ];
+    let quoted = |html: &str| html.replace('&', "&amp;").replace('"', "&quot;");
+    let frame = |name: &str, html: &str, width: u32| {
+        format!(
+            "<iframe title=\"{name}\" width=\"{width}\" height=\"844\" style=\"border: 0\" srcdoc=\"{}\"></iframe>",
+            quoted(html)
+        )
+    };
+    let frames: String =
+        [390, 1280].iter().flat_map(|width| pages.iter().map(|(name, html)| frame(name, html, *width))).collect();
+    let Some(dom) = in_browser(&bench, &format!("<!DOCTYPE html><title></title>{MEASURE}<body>{frames}</body>")) else {
+        return common::skipped("the width of pages", "there is no chromium (Debian: apt install chromium)");
+    };
+    let title = dom.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next()).unwrap();
+    assert_eq!(title, "8 pages;");
+}
+
+#[test]
+fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely() {
+    let bench = Bench::new();
+    let html = page(&bench, &run(&bench, "rigid-pair", &[]));
+    let Some(dom) = in_browser(&bench, &html.replace("</body>", READER)) else {
+        return common::skipped("the page in a browser", "there is no chromium (Debian: apt install chromium)");
+    };
     let title = dom.split("<title>").nth(1).and_then(|rest| rest.split("</title>").next()).unwrap_or_default();
     let parts: Vec<&str> = title.split('|').collect();
-    let [told, ticks, same, all] = parts[..] else { panic!("{title}: {}", String::from_utf8_lossy(&dumped.stderr)) };
+    let [told, ticks, same, all] = parts[..] else { panic!("{title}") };
     // The middle of the picture is a little before the middle of its axis, by the margins.
     assert!(told.starts_with("t = 4.6") && told.contains("; leader: ") && told.contains("; observer: "), "{told}");
     let closer: Vec<f64> = ticks.split(' ').map(|tick| tick.parse().unwrap()).collect();

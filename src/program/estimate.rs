@@ -164,12 +164,12 @@ pub fn estimate(arguments: &Arguments) -> Exit {
     if let Some(Err(error)) = table.map(Table::end) {
         return unwritten(&arguments.table, error);
     }
-    let told = tell(arguments, &request, &estimation);
+    let told = tell(&request, &estimation);
     if let (Some(page), Some(path)) = (page, &arguments.page) {
         let facts = HiddenFacts {
             title: arguments.data.display().to_string(),
             axis: AXES[request.axis - 1],
-            lines: told.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect(),
+            paragraphs: told.split("\n\n").map(paragraph).collect(),
             segments: &estimation.segments,
         };
         if let Err(error) = files::write(path, page.html(&facts).as_bytes()) {
@@ -178,7 +178,10 @@ pub fn estimate(arguments: &Arguments) -> Exit {
     }
     let text = match arguments.json {
         true => format!("{}\n", to_json(&request, &estimation)),
-        false => harmless(&told),
+        false => {
+            let files = [&arguments.table, &arguments.page].into_iter().flatten();
+            files.fold(harmless(&told), |text, path| format!("{text}{}\n", path.display()))
+        }
     };
     say(&text).err().unwrap_or(Exit::Ok)
 }
@@ -356,13 +359,18 @@ fn overall(segments: &[(String, SegmentScore)]) -> Option<Overall> {
     })
 }
 
-fn tell(arguments: &Arguments, request: &Request, estimation: &Estimation) -> String {
+/// Returns a part of what is told without its indents, each sentence on a line of its own: a deeper indent continues one.
+fn paragraph(part: &str) -> String {
+    part.trim().replace("\n    ", " ").replace("\n  ", "\n")
+}
+
+fn tell(request: &Request, estimation: &Estimation) -> String {
     let mut text = String::new();
-    tell_all(arguments, request, estimation, &mut text).expect("a string takes every text");
+    tell_all(request, estimation, &mut text).expect("a string takes every text");
     text
 }
 
-fn tell_all(arguments: &Arguments, request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
+fn tell_all(request: &Request, estimation: &Estimation, text: &mut String) -> std::fmt::Result {
     tell_log(&estimation.log, text)?;
     let [a1, a2, a3] = request.coefficients.into();
     let hidden = AXES[request.axis - 1];
@@ -385,7 +393,7 @@ fn tell_all(arguments: &Arguments, request: &Request, estimation: &Estimation, t
     if let (true, Some(choice)) = (estimation.chosen, &estimation.choice) {
         writeln!(
             text,
-            "  that rate is chosen: noise ({:.1e} rad/s) and model balance at {:.2} 1/s; segments of {:.2} s ask for {:.2} 1/s\n  \
+            "  that rate is chosen: noise ({:.1e} rad/s) and model balance at {:.2} 1/s; segments of {:.2} s ask for {:.2} 1/s\n    \
              to forget their first estimate; --decay sets another",
             choice.noise_rad_s, choice.balance_per_s, choice.segment_s, choice.forgetting_per_s
         )?;
@@ -423,7 +431,7 @@ fn tell_all(arguments: &Arguments, request: &Request, estimation: &Estimation, t
             writeln!(text, "  {name}: {error:.4} of {measured:.3} rad/s, {} samples", score.samples)?;
         }
     }
-    [&arguments.table, &arguments.page].into_iter().flatten().try_for_each(|path| writeln!(text, "{}", path.display()))
+    Ok(())
 }
 
 fn to_json(request: &Request, estimation: &Estimation) -> Value {

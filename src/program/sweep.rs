@@ -193,7 +193,8 @@ fn bar(quiet: bool, pieces: &str) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }
-    let style = ProgressStyle::with_template(&format!("{{bar:40}} {{pos}}/{{len}} {pieces}, {{per_sec}}, {{eta}} left"));
+    let style =
+        ProgressStyle::with_template(&format!("{{bar:40}} {{pos}}/{{len}} {pieces}, {{per_sec}}, {{eta}} left"));
     // Drawn on stderr, and only if that is a terminal.
     ProgressBar::new(0).with_style(style.expect("the template parses"))
 }

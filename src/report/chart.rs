@@ -37,6 +37,8 @@ pub struct Line {
 pub struct Picture {
     /// The SVG.
     pub svg: String,
+    /// The same for a screen on which a picture as wide as the page has no room.
+    pub narrow: Option<String>,
     /// What it is called.
     pub title: String,
     /// Class and label of every line.
@@ -180,7 +182,8 @@ pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line])
         &mut svg,
     );
     let _ = write!(svg, "<use class=\"names\" href=\"#names-{name}\"/></svg>");
-    Picture { svg, legend: legend(lines), title: title.to_owned() }
+    let narrow = matches!(size, Size::Whole(_)).then(|| over_time(title, x, y, lines).svg);
+    Picture { svg, narrow, legend: legend(lines), title: title.to_owned() }
 }
 
 /// Lines over any axis.
@@ -191,8 +194,8 @@ pub fn plain(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
 /// The same in any size.
 pub fn plain_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
     // Without the rows of names, which are those of linear time.
-    let frame = if let Size::Whole(_) = size { Size::Whole(0).frame() } else { size.frame() };
-    draw(&frame, title, x, y, lines)
+    let Size::Whole(_) = size else { return draw(&size.frame(), title, x, y, lines) };
+    Picture { narrow: Some(plain(title, x, y, lines).svg), ..draw(&Size::Whole(0).frame(), title, x, y, lines) }
 }
 
 fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
@@ -200,7 +203,7 @@ fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Pictu
     frame.axes(x, y, &mut svg);
     lines.iter().for_each(|line| frame.line(line, x, y, &mut svg));
     svg.push_str("</svg>");
-    Picture { svg, legend: legend(lines), title: title.to_owned() }
+    Picture { svg, narrow: None, legend: legend(lines), title: title.to_owned() }
 }
 
 /// Paths in a plane, both axes of one scale.
@@ -353,7 +356,7 @@ pub fn strip<C: Column>(
     let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
     frame.frame(&mut svg);
     svg.push_str("<use href=\"#marks-half\"/><use href=\"#names-half\"/></svg>");
-    Picture { svg, legend: Vec::new(), title: title.to_owned() }
+    Picture { svg, narrow: None, legend: Vec::new(), title: title.to_owned() }
 }
 
 #[cfg(test)]

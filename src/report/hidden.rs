@@ -48,8 +48,8 @@ pub struct HiddenFacts<'a> {
     pub title: String,
     /// The letter of the hidden axis.
     pub axis: &'a str,
-    /// What was done, a sentence or two.
-    pub lines: Vec<String>,
+    /// What was done.
+    pub paragraphs: Vec<String>,
     /// Names and scores of all segments, in their order.
     pub segments: &'a [(String, SegmentScore)],
 }
@@ -104,7 +104,7 @@ impl HiddenPage {
                 facts.axis,
                 env!("CARGO_PKG_VERSION")
             ),
-            verdict: ("not judged".to_owned(), None),
+            verdict: (String::new(), None),
             remarks: Vec::new(),
             marks: String::new(),
             sections,
@@ -147,7 +147,7 @@ fn spread(order: &[usize]) -> Vec<usize> {
 }
 
 fn result(facts: &HiddenFacts<'_>) -> Vec<Block> {
-    let mut blocks: Vec<Block> = facts.lines.iter().cloned().map(Block::Text).collect();
+    let mut blocks: Vec<Block> = facts.paragraphs.iter().cloned().map(Block::Text).collect();
     let mut errors: Vec<f64> =
         facts.segments.iter().map(|(_, score)| score.error_rad_s).filter(|error| error.is_finite()).collect();
     errors.sort_by(f64::total_cmp);
@@ -252,13 +252,18 @@ mod tests {
             segments.push((format!("<{segment}>"), score));
         }
         assert!(page.traces.len() == SEGMENTS && page.traces[0].points.len() < POINTS);
-        let facts =
-            HiddenFacts { title: "a<b".to_owned(), axis: "z", lines: vec!["&".to_owned()], segments: &segments };
+        let facts = HiddenFacts {
+            title: "a<b".to_owned(),
+            axis: "z",
+            paragraphs: vec!["&\n1".to_owned()],
+            segments: &segments,
+        };
         let html = page.html(&facts);
         assert!(html.len() < 1 << 20, "{}", html.len());
         let document = roxmltree::Document::parse(html.trim_start_matches("<!DOCTYPE html>")).unwrap();
         assert!(document.descendants().filter(|node| node.has_tag_name("figure")).count() >= DRAWN);
         assert!(html.contains("Of the first 128 of 200 segments") && !html.contains("NaN"));
+        assert!(html.contains("<p>&amp;<br/>\n1</p>") && !html.contains("class=\"verdict"), "nothing is judged");
         let empty = HiddenPage::default().html(&HiddenFacts { segments: &[], ..facts });
         assert!(roxmltree::Document::parse(empty.trim_start_matches("<!DOCTYPE html>")).is_ok());
     }

@@ -19,7 +19,7 @@ pub struct Model {
     pub run: Option<RunId>,
     /// When and how that was made.
     pub subtitle: String,
-    /// The verdict in a word, and whether it is a good one; none where nobody judged.
+    /// The verdict in a word, and whether it is a good one; none where nobody judged. Empty where there is nothing to judge.
     pub verdict: (String, Option<bool>),
     /// What a reader must know before all else.
     pub remarks: Vec<String>,
@@ -43,7 +43,7 @@ pub struct Section {
 /// A piece of a section.
 #[derive(Debug)]
 pub enum Block {
-    /// A paragraph.
+    /// A paragraph, with the breaks of its lines.
     Text(String),
     /// Rows under a head. Cells that are numbers stand to the right; one between backticks is a command.
     Table {

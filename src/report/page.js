@@ -3,6 +3,14 @@
 "use strict";
 (() => {
   const SVG = document.querySelector("svg")?.namespaceURI;
+  /* Where a figure tells what is under the pointer; one for both of its sizes. */
+  const readoutOf = (svg) => {
+    const caption = svg.closest("figure").querySelector("figcaption");
+    const readout = caption.querySelector(".readout") || document.createElement("span");
+    readout.className = "readout";
+    caption.append(readout);
+    return readout;
+  };
   const numbers = (text) => text.split(" ").map(Number);
   const charts = [...document.querySelectorAll("svg.time")].map((svg) => {
     const [left, top, width, height] = numbers(svg.dataset.plot);
@@ -11,10 +19,7 @@
       label: path.dataset.label,
       points: path.getAttribute("d").split(/[ML]/).slice(1).map((at) => numbers(at.split("h")[0])),
     }));
-    const readout = document.createElement("span");
-    readout.className = "readout";
-    svg.parentNode.querySelector("figcaption").append(readout);
-    return { svg, plot, left, top, width, height, lines, readout, time: numbers(svg.dataset.x), value: numbers(svg.dataset.y),
+    return { svg, plot, left, top, width, height, lines, readout: readoutOf(svg), time: numbers(svg.dataset.x), value: numbers(svg.dataset.y),
       logarithmic: svg.dataset.scale === "log", names: svg.querySelector("use.names"), ticks: svg.querySelector("g.ticks"),
       all: svg.querySelector("g.ticks").innerHTML };
   });
@@ -71,9 +76,7 @@
   /* What a cell or a case is, under its picture, also where nothing hovers. */
   for (const svg of document.querySelectorAll("figure > svg:not(.time)")) {
     if (!svg.querySelector("title")) continue;
-    const readout = document.createElement("span");
-    readout.className = "readout";
-    svg.parentNode.querySelector("figcaption").append(readout);
+    const readout = readoutOf(svg);
     const tell = ({ target }) => { readout.textContent = target.querySelector(":scope > title")?.textContent || ""; };
     svg.addEventListener("pointerover", tell);
     svg.addEventListener("pointerdown", tell);

@@ -13,15 +13,15 @@ const SCRIPT: &str = include_str!("page.js");
 /// Writes the page.
 pub fn page(model: &Model) -> String {
     let mut html = String::from("<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n");
-    let title = escape(&model.title);
+    let title = [&*model.title, &model.verdict.0].into_iter().filter(|part| !part.is_empty()).map(escape);
+    let title = title.collect::<Vec<_>>().join(": ");
     let run = model.run.map_or(String::new(), |run| format!(", {}", run.comment()));
     // Writing to a string does not fail.
     let _ = write!(
         html,
         "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
-         <meta name=\"color-scheme\" content=\"light dark\"/>\n{GENERATOR}{run}\"/>\n<title>{title}: {}</title>\n<style>\n{STYLE}</style>\n\
+         <meta name=\"color-scheme\" content=\"light dark\"/>\n{GENERATOR}{run}\"/>\n<title>{title}</title>\n<style>\n{STYLE}</style>\n\
          </head>\n<body>\n{}\n<main>\n",
-        escape(&model.verdict.0),
         model.marks
     );
     header(model, &mut html);
@@ -68,12 +68,10 @@ fn header(model: &Model, html: &mut String) {
         Some(false) => ("bad", "✗ "),
         None => ("open", ""),
     };
-    let (title, subtitle) = (escape(&model.title), escape(&model.subtitle));
-    let _ = write!(
-        html,
-        "<header>\n<h1>{title} <span class=\"verdict {class}\">{sign}{}</span></h1>\n<p>{subtitle}</p>\n",
-        escape(word)
-    );
+    let (title, subtitle, word) = (escape(&model.title), escape(&model.subtitle), escape(word));
+    let badge = format!(" <span class=\"verdict {class}\">{sign}{word}</span>");
+    let badge = if word.is_empty() { "" } else { &badge };
+    let _ = write!(html, "<header>\n<h1>{title}{badge}</h1>\n<p>{subtitle}</p>\n");
     for remark in &model.remarks {
         let _ = writeln!(html, "<p class=\"remark\">{}</p>", escape(remark));
     }
@@ -93,7 +91,7 @@ fn section(section: &Section, html: &mut String) {
 fn block(block: &Block, html: &mut String) {
     match block {
         Block::Text(text) => {
-            let _ = writeln!(html, "<p>{}</p>", escape(text));
+            let _ = writeln!(html, "<p>{}</p>", escape(text).replace('\n', "<br/>\n"));
         }
         Block::Table { caption, head, rows } if !rows.is_empty() => table(caption, head, rows, html),
         Block::Table { .. } => {}
@@ -122,6 +120,11 @@ fn block(block: &Block, html: &mut String) {
     }
 }
 
+/// A name that is broken on a small screen at its joints, not at any letter.
+fn breakable(text: &str) -> String {
+    escape(text).replace('/', "/<wbr/>").replace('_', "_<wbr/>")
+}
+
 fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String) {
     html.push_str("<div class=\"table\"><table>\n");
     if !caption.is_empty() {
@@ -135,14 +138,14 @@ fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String
     let classes: Vec<&str> = (0..head.len()).map(|column| if numeric(column) { " class=\"n\"" } else { "" }).collect();
     html.push_str("<thead><tr>");
     for (name, class) in head.iter().zip(&classes) {
-        let _ = write!(html, "<th{class}>{}</th>", escape(name));
+        let _ = write!(html, "<th{class}>{}</th>", breakable(name));
     }
     html.push_str("</tr></thead>\n<tbody>\n");
     for row in rows {
         html.push_str("<tr>");
         for (cell, class) in row.iter().zip(&classes) {
             let command = cell.strip_prefix('`').and_then(|cell| cell.strip_suffix('`'));
-            let told = command.map_or_else(|| escape(cell), |command| format!("<code>{}</code>", escape(command)));
+            let told = command.map_or_else(|| breakable(cell), |command| format!("<code>{}</code>", escape(command)));
             let _ = write!(html, "<td{class}>{told}</td>");
         }
         html.push_str("</tr>\n");
@@ -151,7 +154,17 @@ fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String
 }
 
 fn figure(picture: &Picture, caption: &str, html: &mut String) {
-    let _ = write!(html, "<figure>\n{}\n<figcaption>", picture.svg);
+    html.push_str("<figure>\n");
+    let _ = match &picture.narrow {
+        None => write!(html, "{}\n<figcaption>", picture.svg),
+        Some(narrow) => {
+            write!(
+                html,
+                "<div class=\"broad\">{}</div>\n<div class=\"narrow\">{narrow}</div>\n<figcaption>",
+                picture.svg
+            )
+        }
+    };
     for (class, label) in &picture.legend {
         let _ = write!(
             html,

@@ -8,18 +8,21 @@ use super::chart::{Line, Marks, Picture, Size, marks, over_time, over_time_in, p
 use super::columns::{Columns, Extremes};
 use super::model::{Block, Model, Section, latency_section};
 use super::percentiles::{Curve, pictures};
-use super::pictures::ERROR_FLOOR;
+use super::pictures::{by_unit, error_axis};
 use super::source::Source;
 use super::summary::{Metric, Summary};
 use super::tables::figures_cells;
-use super::traces::{Key, Traces, trace};
+use super::traces::{Key, MetricTrace, Traces, trace};
 use crate::analysis::digits;
 use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
 use crate::rig;
+use std::collections::BTreeSet;
 
 /// The first run is drawn solid and thin on the second, which is dashed and wide: where they are the same, both are seen.
 const CLASSES: [[&str; 2]; 4] =
     [["o d0", "o d1 wide"], ["b d0", "b d1 wide"], ["g d0", "g d1 wide"], ["p d0", "p d1 wide"]];
+/// Lists of more values are compared by their elements.
+const LISTED: usize = 12;
 /// What the runs are called in legends.
 const NAMES: [&str; 2] = ["A", "B"];
 
@@ -62,7 +65,7 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     let time = Axis::time(runs.iter().map(Run::end_s).fold(runs[0].tick_s.max(1e-9), f64::max));
     let flag = first.map(|(_, first)| (first.tick as f64 * runs[0].tick_s, "first difference".to_owned()));
     let (marks, whole) = marks(&time, &Marks { incidents: flag.into_iter().collect(), ..Marks::default() });
-    let mut sections = vec![told(&runs), differences(compared.as_ref(), runs[0].tick_s)];
+    let mut sections = vec![told(&runs), scenarios(&runs), differences(compared.as_ref(), runs[0].tick_s)];
     if !shown.is_empty() {
         let figures = shown.iter().map(|name| field(name, &runs, whole, &time)).collect::<Result<_, _>>()?;
         sections.push(Section { id: "fields", title: "Fields", blocks: vec![Block::Figures(figures)] });
@@ -161,6 +164,55 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
     Section { id: "verdict", title: "What was told of them", blocks: vec![table] }
 }
 
+/// The keys of the scenarios that differ.
+fn scenarios(runs: &[Run<'_>; 2]) -> Section {
+    let [a, b] = runs.each_ref().map(|run| run.source.scenario.as_ref());
+    let block = match (a, b) {
+        (Some(a), Some(b)) => {
+            let mut rows = Vec::new();
+            differing_tables("", &a.resolved, &b.resolved, &mut rows);
+            match rows.len() {
+                0 => Block::Text("Both ran the same scenario: every key has the same value.".to_owned()),
+                _ => Block::table("", vec!["key", "A", "B"], rows),
+            }
+        }
+        _ => Block::Text("The scenarios cannot be compared: one of the runs does not tell its own.".to_owned()),
+    };
+    Section { id: "scenarios", title: "What differs between the scenarios", blocks: vec![block] }
+}
+
+fn differing_tables(key: &str, a: &toml::Table, b: &toml::Table, rows: &mut Vec<Vec<String>>) {
+    let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+    for name in keys {
+        let key = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+        differing(&key, a.get(name), b.get(name), rows);
+    }
+}
+
+/// Adds a row for every key below this one whose values differ.
+fn differing(key: &str, a: Option<&toml::Value>, b: Option<&toml::Value>, rows: &mut Vec<Vec<String>>) {
+    use toml::Value::{Array, Table};
+    let none = toml::Table::new();
+    match (a, b) {
+        _ if a == b => {}
+        (Some(Table(a)), Some(Table(b))) => differing_tables(key, a, b, rows),
+        (Some(Table(of)), None) if !of.is_empty() => differing_tables(key, of, &none, rows),
+        (None, Some(Table(of))) if !of.is_empty() => differing_tables(key, &none, of, rows),
+        // Lists of tables, and those too long to be read, by their elements.
+        (Some(Array(of)), _) | (_, Some(Array(of))) if of.len() > LISTED || of.iter().any(toml::Value::is_table) => {
+            let lists = [a, b].map(|value| value.and_then(toml::Value::as_array).map_or(&[][..], Vec::as_slice));
+            for index in 0..lists[0].len().max(lists[1].len()) {
+                let [a, b] = lists.map(|list| list.get(index));
+                differing(&format!("{key}[{index}]"), a, b, rows);
+            }
+        }
+        _ => {
+            let text = |value: Option<&toml::Value>| value.map_or("–".to_owned(), toml::Value::to_string);
+            rows.push(vec![key.to_owned(), text(a), text(b)]);
+        }
+    }
+}
+
 /// The first difference, and every signal's.
 fn differences(compared: Option<&Result<Comparison, String>>, tick_s: f64) -> Section {
     let mut blocks = Vec::new();
@@ -231,25 +283,22 @@ fn field(name: &str, runs: &[Run<'_>; 2], whole: Size, time: &Axis) -> Result<(P
 }
 
 fn errors(runs: &[Run<'_>; 2], whole: Size, time: &Axis) -> Section {
-    let mut lines = Vec::new();
-    let mut columns = Vec::new();
-    for run in runs {
-        for (place, metric) in run.traces.iter().flat_map(|traces| &traces.metrics).enumerate() {
-            if metric.values.iter().any(|(_, extremes)| !extremes.is_empty()) {
-                lines.push(run.line(place, metric.name, &metric.values));
-                columns.push(&metric.values);
-            }
-        }
-    }
-    let mut blocks = Vec::new();
-    if !lines.is_empty() {
-        let (low, high) = range(columns, true);
-        let y = Axis::decades("error, in the unit of each", (low.max(ERROR_FLOOR), high.max(ERROR_FLOOR)));
-        let picture = over_time_in(whole, "errors of both over time, logarithmic", time, &y, &lines);
-        blocks
-            .push(Block::Figures(vec![(picture, "Every tick of each run, scored from its own recording.".to_owned())]));
-    }
-    Section { id: "errors", title: "Synchronisation and estimation error", blocks }
+    let of = |run| {
+        let Run { traces, .. }: &Run<'_> = run;
+        let metrics = traces.iter().flat_map(|traces| &traces.metrics);
+        metrics.map(move |metric| (run, metric)).filter(|(_, metric)| metric.values.iter().any(|(_, e)| !e.is_empty()))
+    };
+    let caption = "Every tick of each run, scored from its own recording.";
+    let figure = |(unit, shown): (String, Vec<(&Run<'_>, &MetricTrace)>)| {
+        let (y, title) = error_axis(&unit, shown.iter().map(|(_, metric)| &metric.values));
+        let place = |name| shown.iter().position(|(_, metric)| metric.name == name).unwrap_or(0);
+        let line = |(run, metric): &(&Run<'_>, &MetricTrace)| run.line(place(metric.name), metric.name, &metric.values);
+        let lines: Vec<Line> = shown.iter().map(line).collect();
+        let title = format!("{title} of both over time, logarithmic");
+        Block::Figures(vec![(over_time_in(whole, &title, time, &y, &lines), caption.to_owned())])
+    };
+    let blocks = by_unit(runs.iter().flat_map(of), |(_, metric)| metric.name).into_iter().map(figure).collect();
+    Section { id: "errors", title: "Errors", blocks }
 }
 
 fn motion(runs: &[Run<'_>; 2], time: &Axis) -> Section {
@@ -259,7 +308,7 @@ fn motion(runs: &[Run<'_>; 2], time: &Axis) -> Section {
         match picture {
             rig::Picture::Plane(of) => figures.extend(paths(&of, runs)),
             rig::Picture::Graph(of) => figures.extend(graph(&of, runs, time)),
-            rig::Picture::Inputs(_) | rig::Picture::Lyapunov(_) => {}
+            rig::Picture::Inputs(_) | rig::Picture::Lyapunov(_) | rig::Picture::Onset => {}
         }
     }
     let blocks = if figures.is_empty() { Vec::new() } else { vec![Block::Figures(figures)] };

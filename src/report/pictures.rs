@@ -12,7 +12,7 @@ use crate::config::Scenario;
 use crate::rig;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
-pub const ERROR_FLOOR: f64 = 1e-18;
+const ERROR_FLOOR: f64 = 1e-18;
 /// V below this is drawn at the foot: the square of that.
 const LYAPUNOV_FLOOR: f64 = 1e-34;
 /// Colour and dash pattern of the driven bodies.
@@ -87,7 +87,7 @@ fn motion(scenario: &Scenario, traces: &Traces, full: Option<&Traces>, time: &Ax
             rig::Picture::Plane(of) => figures.extend(plane_figure(&of, traces, full)),
             rig::Picture::Graph(of) => figures.extend(graph(&of, traces, full, time, tick_s)),
             rig::Picture::Inputs(of) => figures.extend(inputs(&of, traces, time, tick_s)),
-            rig::Picture::Lyapunov(_) => {}
+            rig::Picture::Lyapunov(_) | rig::Picture::Onset => {}
         }
     }
     let mut blocks = vec![Block::Text(decimation(traces, scenario.tick_s()))];
@@ -221,38 +221,88 @@ fn inputs(of: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figure
     figures
 }
 
+/// Returns what is measured in each unit, in the order in which the units occur: an axis has one.
+pub fn by_unit<T>(metrics: impl IntoIterator<Item = T>, name: impl Fn(&T) -> &str) -> Vec<(String, Vec<T>)> {
+    let mut units: Vec<(String, Vec<T>)> = Vec::new();
+    for metric in metrics {
+        let (_, unit) = rig::named(name(&metric));
+        match units.iter_mut().find(|(known, _)| *known == unit) {
+            Some((_, metrics)) => metrics.push(metric),
+            None => units.push((unit, vec![metric])),
+        }
+    }
+    units
+}
+
+/// The logarithmic axis of errors in a unit, and the name of their picture.
+pub fn error_axis<'a>(unit: &str, all: impl IntoIterator<Item = &'a Columns<Extremes>>) -> (Axis, String) {
+    let (low, high) = range(all, true);
+    let (label, title) = match unit {
+        "" => ("error".to_owned(), "errors".to_owned()),
+        unit => (format!("error, {unit}"), format!("errors in {unit}")),
+    };
+    (Axis::decades(&label, (low.max(ERROR_FLOOR), high.max(ERROR_FLOOR))), title)
+}
+
 fn errors(source: &Source, scenario: &Scenario, traces: &Traces, frames: &Frames<'_>) -> Section {
-    let (tick_s, time) = (scenario.tick_s(), frames.time);
     let told = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
     let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(told).collect();
-    let (low, high) = range(shown.iter().map(|metric| &metric.values), true);
-    let y = Axis::decades("error, in the unit of each", (low.max(ERROR_FLOOR), high.max(ERROR_FLOOR)));
-    let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * tick_s);
+    let rates = rates(scenario, &shown);
+    let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * scenario.tick_s());
+    let figures = by_unit(shown, |metric| metric.name)
+        .into_iter()
+        .flat_map(|(unit, shown)| errors_in(&unit, &shown, &rates, scenario, end_s, frames));
+    let blocks = unseen(traces).into_iter().chain(figures).chain([rescored(source, traces)]).collect();
+    Section { id: "errors", title: "Errors", blocks }
+}
+
+/// The errors that have one unit over time, and over its logarithm for a rig that wants that.
+fn errors_in(
+    unit: &str,
+    shown: &[&MetricTrace],
+    rates: &[Rate],
+    scenario: &Scenario,
+    end_s: f64,
+    frames: &Frames<'_>,
+) -> Vec<Block> {
+    let tick_s = scenario.tick_s();
+    let (y, title) = error_axis(unit, shown.iter().map(|metric| &metric.values));
     let of = |(metric, class): (&&MetricTrace, &'static str)| Line::of(class, metric.name, &metric.values, tick_s);
-    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS).map(of).collect();
-    lines.extend(limits(scenario, &shown, end_s));
+    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS.into_iter().cycle()).map(of).collect();
+    lines.extend(limits(scenario, shown, end_s));
     let mut early = lines.clone();
-    lines.extend(falling(scenario, &shown, y.foot(), end_s));
-    let caption = "Errors on a logarithmic axis, every tick scored as the launcher scores it. The straight lines fall at the \
-                   rate of the sampled loop, where one is claimed, and at the observer's, from the first error on: what is \
-                   claimed is the rate of fall once the error is small, not the constant before it. Zeros are drawn at the foot.";
-    let picture = over_time_in(frames.whole, "errors over time, logarithmic", time, &y, &lines);
-    let mut figures = vec![Block::Figures(vec![(picture, caption.to_owned())])];
-    if end_s > tick_s {
+    let falling: Vec<Line> = rates.iter().filter_map(|rate| rate.line(shown, y.foot(), end_s)).collect();
+    let mut caption = "Every tick scored as the launcher scores it. Zeros are drawn at the foot.".to_owned();
+    if !falling.is_empty() {
+        caption += " A straight line falls at the rate that its label gives, from the first error on: that is the rate once the \
+                    error is small.";
+    }
+    lines.extend(falling);
+    let picture = over_time_in(frames.whole, &format!("{title} over time, logarithmic"), frames.time, &y, &lines);
+    let mut figures = vec![Block::Figures(vec![(picture, caption)])];
+    let onset = scenario.rig.pictures().iter().any(|picture| matches!(picture, rig::Picture::Onset));
+    if onset && end_s > tick_s {
         // What begins at tick 0 is drawn from the first tick on.
         let later = |(at, value): &(f64, f64)| (at.max(tick_s), *value);
         early.iter_mut().flat_map(|line| &mut line.parts).for_each(|part| *part = part.iter().map(later).collect());
-        let (title, time) = ("errors over the logarithm of time", Axis::log_time(tick_s, end_s));
+        let (title, time) = (format!("{title} over the logarithm of time"), Axis::log_time(tick_s, end_s));
         let caption =
             "The same over the logarithm of time, from the first tick on: what happens at the beginning has room.";
-        figures.push(Block::Figures(vec![(plain_in(frames.whole, title, &time, &y, &early), caption.to_owned())]));
+        figures.push(Block::Figures(vec![(plain_in(frames.whole, &title, &time, &y, &early), caption.to_owned())]));
     }
-    let blocks = unseen(traces).into_iter().chain(figures).chain([rescored(source, traces)]).collect();
-    Section { id: "errors", title: "Synchronisation and estimation error", blocks }
+    figures
 }
 
-/// Lines from the first errors on, that fall at the loop's rate and at the observer's.
-fn falling(scenario: &Scenario, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Vec<Line> {
+/// A rate at which a metric is to fall.
+struct Rate {
+    metric: &'static str,
+    class: &'static str,
+    label: &'static str,
+    per_s: f64,
+}
+
+/// The loop's rate, where one is claimed, of the first metric; and the observer's, of the estimate's error.
+fn rates(scenario: &Scenario, shown: &[&MetricTrace]) -> Vec<Rate> {
     let rates: Vec<Option<f64>> = claims(scenario).iter().map(|claim| claim.loop_rate_per_s).collect();
     // The plot shows the worst body: no line unless there is one for every body.
     let claimed =
@@ -260,14 +310,23 @@ fn falling(scenario: &Scenario, shown: &[&MetricTrace], foot: f64, end_s: f64) -
     let estimate = shown.iter().find(|metric| metric.name.starts_with("estimate_error"));
     let both =
         [("grey d2", "loop", claimed, shown.first()), ("grey d4", "observer", observer_rate(scenario), estimate)];
-    let line = |(class, name, rate, metric): (&'static str, &str, Option<f64>, Option<&&MetricTrace>)| {
-        let (rate, metric) = (rate.filter(|rate| rate.is_finite() && *rate > 0.0)?, metric?);
-        let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
-        let to_s = ((from / foot).ln() / rate).min(end_s);
-        let end = (to_s, from * (-rate * to_s).exp());
-        (to_s > 0.0).then(|| Line::through(class, &format!("{name}: exp(−{} t)", digits(rate)), vec![(0.0, from), end]))
+    let rate = |(class, label, per_s, metric): (&'static str, &'static str, Option<f64>, Option<&&MetricTrace>)| {
+        let per_s = per_s.filter(|rate| rate.is_finite() && *rate > 0.0)?;
+        Some(Rate { metric: metric?.name, class, label, per_s })
     };
-    both.into_iter().filter_map(line).collect()
+    both.into_iter().filter_map(rate).collect()
+}
+
+impl Rate {
+    /// A line that falls at this rate from the first error on, if its metric is among those that are shown.
+    fn line(&self, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Option<Line> {
+        let metric = shown.iter().find(|metric| metric.name == self.metric)?;
+        let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
+        let to_s = ((from / foot).ln() / self.per_s).min(end_s);
+        let end = (to_s, from * (-self.per_s * to_s).exp());
+        let label = format!("{}: exp(−{} t)", self.label, digits(self.per_s));
+        (to_s > 0.0).then(|| Line::through(self.class, &label, vec![(0.0, from), end]))
+    }
 }
 
 /// What `[accept]` allows, from when on it does.
@@ -281,7 +340,7 @@ fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> 
     ];
     let mut lines = Vec::new();
     for (what, limits, from_s, classes) in kinds {
-        for (metric, class) in shown.iter().zip(classes) {
+        for (metric, class) in shown.iter().zip(classes.into_iter().cycle()) {
             if let Some(limit) = limits.get(metric.name).filter(|_| from_s < end_s) {
                 let label = format!("{what} {}", metric.name);
                 lines.push(Line::through(class, &label, vec![(from_s, *limit), (end_s, *limit)]));

@@ -388,6 +388,7 @@ impl Rig for OrbitRig {
             graph("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
             graph("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
             graph("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
+            Picture::Onset,
         ]
     }
 

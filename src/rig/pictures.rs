@@ -15,6 +15,8 @@ pub enum Picture {
     Inputs(Inputs),
     /// A Lyapunov function that commands tell ([`super::Rig::lyapunov`]), in a section of its own.
     Lyapunov(Lyapunov),
+    /// The errors over the logarithm of time too, where what happens in the first ticks has room.
+    Onset,
 }
 
 /// Paths in a plane.

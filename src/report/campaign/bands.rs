@@ -121,7 +121,7 @@ pub fn along(facts: &Facts<'_>, axis: usize, alone: bool) -> Vec<(Picture, Strin
             caption +=
                 " Where a body was lost the value is beyond all others: a band that meets the upper edge goes there.";
         }
-        figures.push((Picture { svg, title, legend: legend.chain(bands).collect() }, caption));
+        figures.push((Picture { svg, narrow: None, title, legend: legend.chain(bands).collect() }, caption));
     }
     figures.extend(shares(facts, name, &stretches, &x, &frame));
     figures
@@ -193,7 +193,7 @@ fn shares(
     let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
     let caption =
         "Of the cases with a verdict, the part that was accepted; where a line crosses the dashed one, it is half.";
-    Some((Picture { svg, title, legend }, caption.to_owned()))
+    Some((Picture { svg, narrow: None, title, legend }, caption.to_owned()))
 }
 
 /// How many of the cases have a value no larger than this one.
@@ -219,5 +219,5 @@ pub fn distribution(title: &str, label: &str, sorted: &[f64], of: usize, limit: 
     lines.iter().for_each(|line| frame.line(line, &x, &y, &mut svg));
     svg.push_str("</svg>");
     let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
-    Some(Picture { svg, title: title.to_owned(), legend })
+    Some(Picture { svg, narrow: None, title: title.to_owned(), legend })
 }

@@ -226,7 +226,7 @@ impl<'a> Map<'a> {
         let borders = self.draw(&frame, paint, &mut svg);
         paint.scale(&frame, self.facts.limit, &self.others(paint), &mut svg);
         svg.push_str("</svg>");
-        Picture { svg, title, legend: legend(borders) }
+        Picture { svg, narrow: None, title, legend: legend(borders) }
     }
 }
 
@@ -261,7 +261,7 @@ pub fn panels(maps: &[(String, Map<'_>)], shades: &Shades) -> Option<Picture> {
     others.dedup();
     paint.scale(&whole, first.facts.limit, &others, &mut svg);
     svg.push_str("</svg>");
-    Some(Picture { svg, title, legend: legend(borders) })
+    Some(Picture { svg, narrow: None, title, legend: legend(borders) })
 }
 
 fn legend(borders: [bool; 2]) -> Vec<(&'static str, String)> {

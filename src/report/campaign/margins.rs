@@ -91,8 +91,12 @@ fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
             (Some(axis), Some(cells)) => point.parameter(axis).and_then(|value| cells.of(value)) == Some(group),
             _ => true,
         };
-        let mut points: Vec<(f64, &MarginPoint)> =
-            margin.points.iter().filter(of).filter_map(|point| Some((point.parameter(across)?.number()?, point))).collect();
+        let mut points: Vec<(f64, &MarginPoint)> = margin
+            .points
+            .iter()
+            .filter(of)
+            .filter_map(|point| Some((point.parameter(across)?.number()?, point)))
+            .collect();
         points.sort_by(|one, other| one.0.total_cmp(&other.0));
         let class = CLASSES[group % LINES];
         for (place, point) in &points {
@@ -137,5 +141,5 @@ fn picture(facts: &Facts<'_>, margin: &Margin) -> Option<(Picture, String)> {
         caption += " Other axes are varied too: their points are in the same lines.";
     }
     let legend = lines.iter().map(|line| (line.class, line.label.clone())).collect();
-    Some((Picture { svg, title, legend }, caption))
+    Some((Picture { svg, narrow: None, title, legend }, caption))
 }

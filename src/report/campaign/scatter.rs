@@ -122,5 +122,5 @@ pub fn scatter(facts: &Facts<'_>, axes: [usize; 2], shades: Option<&Shades>) -> 
         shades.scale(&frame, facts.limit, &others, &mut svg);
     }
     svg.push_str("</svg>");
-    Picture { svg, title, legend: Vec::new() }
+    Picture { svg, narrow: None, title, legend: Vec::new() }
 }

@@ -280,7 +280,7 @@ fn margins_are_told_with_their_brackets_and_what_is_beyond_the_range() {
             row.descendants().filter_map(|node| node.text().filter(|_| node.is_text())).collect::<Vec<_>>().join("|")
         })
         .collect();
-    assert_eq!(rows[1..], ["1|12.25|12.5|9", "2|40|nowhere|9", "3|nowhere|0|9"]);
+    assert_eq!(rows[1..], ["1|12.25|12.50|9", "2|40|nowhere|9", "3|nowhere|0|9"]);
     let plot = picture(&document, "margin of delay along gain");
     let arrows =
         plot.descendants().filter(|node| node.attribute("class").is_some_and(|class| class.starts_with("arrow")));

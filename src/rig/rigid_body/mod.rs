@@ -492,6 +492,7 @@ impl Rig for RigidBodyRig {
                 function: "V = ½(|e|² + ε²) of [D](15)",
                 bound: "the bound of [D](18)",
             }),
+            Picture::Onset,
         ]
     }
 
