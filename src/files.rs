@@ -3,15 +3,17 @@
 //! Must not know what the files hold.
 
 use crate::system::random_bits;
-use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, PROC_SUPER_MAGIC};
-use rustix::fs::{fstat, fstatfs, ftruncate, mkdirat, openat, readlinkat, renameat, statat, symlinkat, unlinkat};
+use rustix::fs::{AtFlags, CWD, FileType, FlockOperation, Mode, OFlags, PROC_SUPER_MAGIC};
+use rustix::fs::{
+    fcntl_setfl, flock, fstat, fstatfs, ftruncate, mkdirat, openat, readlinkat, renameat, statat, symlinkat, unlinkat,
+};
 use rustix::io::Errno;
 use std::ffi::OsString;
-use std::fs::{self, File, Metadata};
-use std::io;
-use std::os::fd::{AsRawFd, OwnedFd};
+use std::fs::{self, File, Metadata, OpenOptions};
+use std::io::{self, Read};
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
 
 /// Rights of others than the owner.
@@ -156,6 +158,62 @@ pub(crate) fn require_own(file: &File) -> io::Result<()> {
     Err(io::Error::other(format!("not a file of this program: {reason}")))
 }
 
+/// Opens a regular file, and refuses anything else. It never waits for another process, as opening a FIFO does.
+///
+/// # Errors
+/// Those of the system; [`InvalidInput`](io::ErrorKind::InvalidInput) for what is not a regular file.
+pub fn open_with(path: &Path, options: &mut OpenOptions, flags: OFlags) -> io::Result<File> {
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY | flags;
+    let irregular = || io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file");
+    match options.custom_flags(flags.bits() as i32).open(path) {
+        // A socket, or a FIFO that has no reader, cannot be opened so.
+        Err(error) if error.raw_os_error() == Some(libc::ENXIO) => Err(irregular()),
+        file => file.and_then(|file| if file.metadata()?.is_file() { Ok(file) } else { Err(irregular()) }),
+    }
+}
+
+/// Opens a regular file to read it, as [`open_with`] does; links are followed.
+///
+/// # Errors
+/// As [`open_with`].
+pub fn open(path: &Path) -> io::Result<File> {
+    open_with(path, OpenOptions::new().read(true), OFlags::empty())
+}
+
+/// Reads a regular file, as [`open`] opens it.
+///
+/// # Errors
+/// As [`open_with`].
+pub fn read(path: &Path) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// Locks an open file until it is closed, however the process ends. Returns false if the path leads to another file by now:
+/// the process that held the lock has removed the file, and a lock on it protects nothing.
+///
+/// # Errors
+/// Those of the system; [`WouldBlock`](io::ErrorKind::WouldBlock) if another process holds the lock.
+pub fn lock(file: &File, path: &Path) -> io::Result<bool> {
+    lock_now(file)?;
+    let held = file.metadata()?;
+    let same = |at_path: Metadata| (at_path.dev(), at_path.ino()) == (held.dev(), held.ino());
+    Ok(fs::symlink_metadata(path).is_ok_and(same))
+}
+
+/// Locks a file, or fails at once where another process has. A signal is no reason to fail.
+fn lock_now(file: impl AsFd) -> Result<(), Errno> {
+    let mut locked = Err(Errno::INTR);
+    for _ in 0..ATTEMPTS {
+        locked = flock(&file, FlockOperation::NonBlockingLockExclusive);
+        if locked != Err(Errno::INTR) {
+            break;
+        }
+    }
+    locked
+}
+
 /// A directory that is open, so that what is done in it happens there, whatever becomes of its name.
 #[derive(Debug)]
 pub struct Directory(OwnedFd);
@@ -235,7 +293,7 @@ fn locate(path: &Path) -> io::Result<Place> {
 }
 
 /// Opens a file to write it anew, as [`File::create`] does, but follows no link of another user, and writes to no file that
-/// has a second name: that may be anywhere.
+/// has a second name: that may be anywhere. Refuses a file that another process has opened so.
 ///
 /// # Errors
 /// Those of the system.
@@ -249,16 +307,29 @@ pub fn create(path: &Path) -> io::Result<File> {
         }
         let new = WRITE | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW;
         let file = match openat(&directory.0, &name, new, Mode::from_raw_mode(0o666)) {
-            Err(Errno::EXIST) => openat(&directory.0, &name, WRITE | OFlags::NOFOLLOW, Mode::empty()),
-            made => return Ok(made?.into()),
+            // Without waiting for the reader of a FIFO.
+            Err(Errno::EXIST) => {
+                openat(&directory.0, &name, WRITE | OFlags::NOFOLLOW | OFlags::NONBLOCK, Mode::empty())
+            }
+            made => {
+                let file = made?;
+                let _ = lock_now(&file);
+                return Ok(file.into());
+            }
         };
         let file = match file {
             // It went, or a link came, meanwhile.
             Err(Errno::NOENT | Errno::LOOP) => continue,
+            Err(Errno::NXIO) => return Err(io::Error::other("it is a socket, or a FIFO that has no reader")),
             file => file?,
         };
+        fcntl_setfl(&file, OFlags::empty())?;
         let about = fstat(&file)?;
         if FileType::from_raw_mode(about.st_mode) == FileType::RegularFile {
+            // A file system without locks is not refused for it.
+            if lock_now(&file) == Err(Errno::WOULDBLOCK) {
+                return Err(io::Error::other("another process is writing it"));
+            }
             if about.st_nlink > 1 {
                 unlinkat(&directory.0, &name, AtFlags::empty())?;
                 continue;

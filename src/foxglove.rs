@@ -49,11 +49,6 @@ pub struct FoxgloveSeat {
 /// Why a run could not be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum FoxgloveError {
-    /// No run was found.
-    #[error(
-        "no run of this user is under way; start one with `corotate run --foxglove`, or name its domain's directory"
-    )]
-    NoRun,
     /// The run could not be joined.
     #[error(transparent)]
     Run(#[from] RoleError),
@@ -92,7 +87,7 @@ pub enum FoxgloveError {
 /// # Errors
 /// [`FoxgloveError`].
 pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
-    let root = run_under_way(seat.domain.as_deref()).map_err(RoleError::from)?.ok_or(FoxgloveError::NoRun)?;
+    let root = run_under_way(seat.domain.as_deref()).map_err(RoleError::from)?;
     let (domain, scenario) = join_whole(&root)?;
     let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;

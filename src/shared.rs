@@ -6,7 +6,7 @@
 //!
 //! Must not know what the atomics mean.
 
-use crate::files::require_own;
+use crate::files::{open_with, require_own};
 use memmap2::MmapRaw;
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use std::fs::{File, OpenOptions};
@@ -60,7 +60,7 @@ impl Atomic for AtomicU32 {
 
 /// Opens a file of ours, through no link: somebody else could shorten his, and whoever touches what is gone is killed.
 fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
-    let file = options.read(true).write(true).custom_flags(OFlags::NOFOLLOW.bits() as i32).open(path)?;
+    let file = open_with(path, options.read(true).write(true), OFlags::NOFOLLOW)?;
     require_own(&file)?;
     Ok(file)
 }

@@ -16,8 +16,18 @@ const DELAYS: [usize; 3] = [1, 2, 5];
 
 /// A run of a scenario among processes, or recorded in one thread by its nodes.
 fn run_program(bench: &Bench, scenario: &str, clock: &str, further: &[String]) -> Value {
-    let arguments =
-        ["run", scenario, "--json", "--clock", clock, "--out", clock, "--set=accept={}", "--set=record=true"];
+    let arguments = [
+        "run",
+        scenario,
+        "--json",
+        "--clock",
+        clock,
+        "--out",
+        clock,
+        "--overwrite",
+        "--set=accept={}",
+        "--set=record=true",
+    ];
     let sets: Vec<&str> = further.iter().flat_map(|set| ["--set", set]).collect();
     let done = bench.run(&[&arguments[..], &sets].concat());
     assert_eq!(done.code, Some(0), "{further:?}: {done:?}");

@@ -202,7 +202,18 @@ fn a_case_is_reproduced_under_other_clocks() {
         [("map.toml", 17, "in-process"), ("map.toml", 4, "lockstep"), ("map/campaign.toml", 11, "lockstep")]
     {
         let case_number = case.to_string();
-        let done = bench.run(&["run", file, "--case", &case_number, "--clock", clock, "--json", "--out", "run"]);
+        let done = bench.run(&[
+            "run",
+            file,
+            "--case",
+            &case_number,
+            "--clock",
+            clock,
+            "--json",
+            "--out",
+            "run",
+            "--overwrite",
+        ]);
         assert!(matches!(done.code, Some(0 | 3)), "{done:?}");
         let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
         let row = &table.rows[case];

@@ -65,7 +65,7 @@ fn await_seat(bench: &Bench, role: &str) -> PathBuf {
 /// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
 fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
     let scenario = file("pair.toml");
-    let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out"];
+    let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out", "--overwrite"];
     let running = bench.start(&[&common[..], &PATIENT, arguments].concat());
     let seat = await_seat(bench, "follower");
     (running, seat)

@@ -133,7 +133,7 @@ impl Target {
         let out = bench.path("out").to_str().unwrap().to_owned();
         let mut words = vec!["run".to_owned(), file];
         words.extend(clock.iter().chain(&set).map(ToString::to_string));
-        words.extend(["--out".to_owned(), out]);
+        words.extend(["--out".to_owned(), out, "--overwrite".to_owned()]);
         if matches!(self, Self::Run | Self::Tree) {
             words.push("--record".to_owned());
         }
@@ -166,7 +166,7 @@ impl Target {
         let file = bench.path("part.mcap");
         let words = match self {
             Self::Run | Self::Realtime | Self::Tree => scenario,
-            Self::Record => vec!["record", "--domain", domain, "--out", file.to_str().unwrap()],
+            Self::Record => vec!["record", "--domain", domain, "--out", file.to_str().unwrap(), "--overwrite"],
             Self::Watch => vec!["watch", domain, "--once", "1"],
             Self::Role => vec!["observer", "--domain", domain],
         };

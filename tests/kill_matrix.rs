@@ -12,7 +12,16 @@ const RUNNING: [&str; 6] = ["staged 901", "committing 903", "in-commit 904", "co
 /// Starts a run whose `role` fails at a place by a signal.
 fn start(bench: &Bench, role: &str, place: &str, signal: &str, more: &[&str]) -> Running {
     let file = shipped("rigid-pair");
-    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--set", "launch.startup_timeout_s=20"];
+    let common = [
+        "run",
+        file.to_str().unwrap(),
+        "--json",
+        "--out",
+        "out",
+        "--overwrite",
+        "--set",
+        "launch.startup_timeout_s=20",
+    ];
     let mut command = bench.command();
     command.args([&common[..], more].concat()).env("COROTATE_HOOK", format!("{role} {place} {signal}"));
     Running::new(&mut command)

@@ -22,7 +22,7 @@ const HARD: [u64; 9] = [
 /// Runs a shipped scenario and gives its recording.
 fn record(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
     let file = shipped(scenario);
-    let fixed = ["run", file.to_str().unwrap(), "--record", "--out", scenario, "--set", "accept={}"];
+    let fixed = ["run", file.to_str().unwrap(), "--record", "--out", scenario, "--overwrite", "--set", "accept={}"];
     let done = bench.run(&[&fixed, options].concat());
     assert_eq!(done.code, Some(0), "{done:?}");
     bench.path(scenario).join("run.mcap")

@@ -205,14 +205,14 @@ fn a_role_by_hand_does_not_outlive_a_killed_launcher() {
 #[test]
 fn who_joins_a_run_that_ends_ends_too() {
     let bench = Bench::new();
-    let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}", "--out", "out"];
+    let words = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "20", "--set", "accept={}"];
     for attempt in 0..12 {
         let run = bench.start(&words);
         let domain = await_some(|| bench.domains().pop());
         // Not to wait for anything: each attempt joins at another place of the run.
         std::thread::sleep(std::time::Duration::from_millis(30 * attempt));
         let domain = domain.to_str().unwrap();
-        let record = bench.start(&["record", "--domain", domain, "--out", "part.mcap"]);
+        let record = bench.start(&["record", "--domain", domain, "--out", "part.mcap", "--overwrite"]);
         let watch = bench.start(&["watch", domain, "--once", "600"]);
         for joiner in [record, watch] {
             let done = joiner.wait();

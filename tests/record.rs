@@ -23,7 +23,7 @@ const SIGSTOP: i32 = 19;
 /// Runs a shipped scenario with a recording; gives the run's end and the recording.
 fn record(bench: &Bench, scenario: &str, out: &str, arguments: &[&str]) -> (Done, PathBuf) {
     let file = shipped(scenario);
-    let common = ["run", file.to_str().unwrap(), "--record", "--out", out, "--set", "accept={}"];
+    let common = ["run", file.to_str().unwrap(), "--record", "--overwrite", "--out", out, "--set", "accept={}"];
     (bench.run(&[&common, arguments].concat()), bench.path(out).join("run.mcap"))
 }
 

@@ -112,7 +112,8 @@ fn a_long_run_has_the_hash_of_its_last_tick() {
     let bench = Bench::new();
     for (ticks, stride) in [(16_384, 1), (16_385, 2), (40_000, 3)] {
         let duration = format!("{}", (ticks - 1) as f64 / 1000.0);
-        let options = ["--clock=in-process", "--set", "accept={}", "--duration", &duration, "--out", "out"];
+        let options =
+            ["--clock=in-process", "--set", "accept={}", "--duration", &duration, "--out", "out", "--overwrite"];
         let summary = bench.summary("rigid-pair", &options);
         let (state, hashes) = (&summary["state"], checkpoints(&bench, "out"));
         assert_eq!((state["elapsed_ticks"].as_u64(), state["clean_ticks"].as_u64()), (Some(ticks), Some(ticks)));

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// Runs a shipped scenario in one thread with a recording.
 fn run(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
     let file = shipped(scenario);
-    let common = ["run", file.to_str().unwrap(), "--clock", "in-process", "--record", "--out", scenario];
+    let common = ["run", file.to_str().unwrap(), "--clock", "in-process", "--record", "--overwrite", "--out", scenario];
     let done = bench.run(&[&common, options].concat());
     assert!(matches!(done.code, Some(0 | 3)), "{done:?}");
     bench.path(scenario)
@@ -324,9 +324,14 @@ fn a_directory_holds_one_run_whose_files_name_it() {
     assert!(found.contains(&out.join("latency/controller.step.hgrm")), "{found:?}");
     std::fs::remove_file(verdict).unwrap();
     std::fs::write(out.join("latency/nobody.step.hgrm"), format!("# run {first}\n")).unwrap();
-    let again =
-        bench.run(&["run", out.join("scenario.toml").to_str().unwrap(), "--out", "out", "--set", "record=false"]);
+    let scenario = out.join("scenario.toml");
+    let again = ["run", scenario.to_str().unwrap(), "--out", "out", "--set", "record=false"];
+    let refused = bench.run(&again);
+    assert!(refused.code == Some(2) && refused.stderr.contains("run.mcap"), "{refused:?}");
+    assert_eq!(run_id(&out), first);
+    let again = bench.run(&[&again[..], &["--overwrite"]].concat());
     assert_eq!(again.code, Some(0), "{again:?}");
+    assert!(again.stderr.contains("run.mcap") && again.stderr.contains("report.html"), "{again:?}");
     let second = run_id(&out);
     assert_ne!(first, second);
     let found = names(&second);

@@ -237,7 +237,7 @@ fn start(bench: &Bench, file: &Path, arguments: &[&str]) -> (Running, PathBuf) {
 
 /// The same for any roles.
 fn start_without(bench: &Bench, file: &Path, roles: &[&str], arguments: &[&str]) -> (Running, PathBuf) {
-    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out"];
+    let common = ["run", file.to_str().unwrap(), "--json", "--out", "out", "--overwrite"];
     let external: Vec<&str> = roles.iter().flat_map(|role| ["--external", *role]).collect();
     let running = bench.start(&[&common[..], &external, arguments].concat());
     bench.await_role("leader");

@@ -42,7 +42,7 @@ fn cases() -> Vec<String> {
 }
 
 fn run(bench: &Bench, file: &str, clock: &str, further: &[&str]) -> Value {
-    let arguments = ["run", file, "--json", "--clock", clock, "--out", clock, "--set=duration_s=0.75"];
+    let arguments = ["run", file, "--json", "--clock", clock, "--out", clock, "--overwrite", "--set=duration_s=0.75"];
     let done = bench.run(&[&arguments[..], &["--set=accept={}", "--set=record=true"], further].concat());
     assert_eq!(done.code, Some(0), "{done:?}");
     let summary: Value = serde_json::from_str(&done.stdout).unwrap();

@@ -78,7 +78,7 @@ pub fn scenario(given: &str, kind: &str, overrides: &[String]) -> PyResult<Scena
 /// Runs a scenario; gives its summary as JSON and its directory. `tell` gets `("waiting", domain)` and `("running", tick)` now and
 /// then; what it raises ends the run in order, and is raised then.
 #[pyfunction]
-#[pyo3(signature = (given, kind, overrides, external, record, out, require_realtime, tell))]
+#[pyo3(signature = (given, kind, overrides, external, record, out, overwrite, require_realtime, tell))]
 #[allow(clippy::too_many_arguments, reason = "one call from one place")]
 pub fn run(
     py: Python<'_>,
@@ -88,6 +88,7 @@ pub fn run(
     external: Vec<String>,
     record: bool,
     out: Option<PathBuf>,
+    overwrite: bool,
     require_realtime: bool,
     tell: Option<Py<PyAny>>,
 ) -> PyResult<(String, PathBuf)> {
@@ -98,9 +99,7 @@ pub fn run(
         .try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
     let started = SystemTime::now();
     let directory = make_directory(out.as_deref(), &scenario.name, started).map_err(failed)?;
-    if out.is_some() {
-        claim(&directory).map_err(failed)?;
-    }
+    let _claim = claim(&directory, id, overwrite).map_err(failed)?;
     let signal = AtomicUsize::new(0);
     let mut raised: Option<PyErr> = None;
     let ended: Result<String, PyErr> = py.detach(|| {

@@ -59,8 +59,12 @@ pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>,
 /// The domain of the run that is meant by its domain, or by the directory that its results go to; none if there is no such run.
 #[pyfunction]
 pub fn domain_of(given: PathBuf) -> PyResult<Option<PathBuf>> {
-    let found = corotate::runtime::run_under_way(Some(&given)).map_err(failed)?;
-    Ok(found.filter(|domain| domain.join("scenario.toml").exists()))
+    use corotate::bus::domain::DomainError;
+    match corotate::runtime::run_under_way(Some(&given)) {
+        Ok(domain) => Ok(Some(domain).filter(|domain| domain.join("scenario.toml").exists())),
+        Err(DomainError::NoRun | DomainError::Over { .. } | DomainError::NotADomain { .. }) => Ok(None),
+        Err(error) => Err(failed(error)),
+    }
 }
 
 /// The samples of a tick as bytes without their stamps.

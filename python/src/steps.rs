@@ -2,7 +2,7 @@
 
 use crate::run::{failed, scenario};
 use crate::seat::{Seat, seat_of};
-use corotate::launch::{Summary, make_directory, make_latest, new_run, write_run};
+use corotate::launch::{Claim, Summary, claim, make_directory, make_latest, new_run, write_run};
 use corotate::sample::{FieldKind, Stamp, status};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
@@ -33,6 +33,8 @@ pub struct Steps {
     observation: Vec<f64>,
     over: bool,
     started: SystemTime,
+    /// Where the results go, if they are kept.
+    results: Option<(PathBuf, Claim)>,
 }
 
 impl Steps {
@@ -83,6 +85,7 @@ impl Steps {
             observation: vec![0.0; length],
             over: false,
             started: SystemTime::now(),
+            results: None,
         };
         this.observe()?;
         Ok(this)
@@ -172,23 +175,27 @@ impl Steps {
         self.scenario.rig.limits().into_iter().map(|limit| (limit.name, limit.value)).collect()
     }
 
-    /// Ends the run, and gives its summary as JSON; its results are written to a directory if that is asked for.
-    #[pyo3(signature = (write, out))]
-    fn finish(&mut self, write: bool, out: Option<PathBuf>) -> PyResult<(String, Option<PathBuf>)> {
+    /// Names the directory for the results, before the first tick.
+    fn claim(&mut self, out: Option<PathBuf>, overwrite: bool) -> PyResult<()> {
+        let directory = make_directory(out.as_deref(), &self.scenario.name, self.started).map_err(failed)?;
+        let run = self.scenario.run.ok_or_else(|| failed("the run has no identifier"))?;
+        let claim = claim(&directory, run, overwrite).map_err(failed)?;
+        self.results = Some((directory, claim));
+        Ok(())
+    }
+
+    /// Ends the run, and gives its summary as JSON; its results are written to the directory that was named.
+    fn finish(&mut self) -> PyResult<(String, Option<PathBuf>)> {
         let steps = self.steps.take().ok_or_else(|| failed("the run has been finished"))?;
         let outcome = steps.finish().map_err(failed)?;
         let summary = Summary::new(&self.scenario, &outcome, self.started);
-        let directory = match write {
-            true => {
-                let directory = make_directory(out.as_deref(), &self.scenario.name, self.started).map_err(failed)?;
-                if out.is_some() {
-                    corotate::launch::claim(&directory).map_err(failed)?;
-                }
+        let directory = match self.results.take() {
+            Some((directory, _claim)) => {
                 write_run(&directory, &self.scenario, &summary).map_err(failed)?;
                 let _ = make_latest(&directory);
                 Some(directory)
             }
-            false => None,
+            None => None,
         };
         Ok((serde_json::to_string(&summary).map_err(failed)?, directory))
     }

@@ -6,19 +6,19 @@
 //! under a prefix that nobody knows before the first of them is made.
 //!
 //! Knows files and locks, and of the transport only which of its files it would leave open to everybody. The lock says whether
-//! the run is alive; the kernel lets go of it when the launcher dies, however it dies. Must not touch a domain whose lock is
-//! held, nor what another user has put beside it.
+//! the run is alive; the kernel lets go of it when the launcher dies, however it dies. The launcher locks its directory in shared
+//! memory too: that lock is seen where the domain's directory is not, as from outside a container. Must not touch a domain whose
+//! lock is held, nor what another user has put beside it.
 
-use crate::files::{PrivacyError, require_private, user, user_name};
+use crate::files::{self, PrivacyError, require_private, user, user_name};
 use crate::system::{random_bits, remedy};
-use rustix::fs::{FlockOperation, OFlags, flock, fstat, statvfs};
-use rustix::io::Errno;
+use rustix::fs::{OFlags, statvfs};
 use std::ffi::OsStr;
-use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::fs::{self, DirBuilder, File, Metadata, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 /// Where the transport's shared memory appears as files.
 pub const SHARED_MEMORY: &str = "/dev/shm";
@@ -37,6 +37,11 @@ const NO_NODES: [u64; 2] = [10 << 16, 0];
 const DOMAINS_MAX: u32 = 3;
 /// The link in a domain's directory to that of its own files in shared memory.
 const OWN_SHARED: &str = "shared";
+/// The link in a domain's own shared memory to its directory.
+const OWN_ROOT: &str = "root";
+/// How old files in shared memory must be that are in no locked directory, before they count as left: a launcher makes its
+/// directory some microseconds after its first file.
+const BEGUN: Duration = Duration::from_secs(60);
 /// How often something is tried again that another process, or a signal, has come in the way of.
 const ATTEMPTS: u32 = 100;
 
@@ -51,6 +56,8 @@ pub struct Domain {
 pub struct OwnedDomain {
     domain: Domain,
     _lock: File,
+    /// The lock of its directory in shared memory.
+    _shared: Option<File>,
 }
 
 /// Why a domain could not be made or joined.
@@ -72,7 +79,7 @@ pub enum DomainError {
         source: io::Error,
     },
     /// A directory or file could not be made.
-    #[error("cannot make {}: {source}; set XDG_RUNTIME_DIR to a directory that you may write", path.display())]
+    #[error("cannot make {}: {source}; {}", path.display(), remedy_at(path, source))]
     Create {
         /// What could not be made.
         path: PathBuf,
@@ -117,12 +124,35 @@ pub enum DomainError {
         /// The path.
         path: PathBuf,
     },
+    /// No run is under way.
+    #[error("no run of this user is under way; start one with `corotate run`, or name its domain's directory")]
+    NoRun,
+    /// The directory has the results of a run that is over.
+    #[error("{} has the results of a run that is over; `corotate report {}` shows it", path.display(), path.display())]
+    Over {
+        /// The path as given.
+        path: PathBuf,
+    },
     /// The path is not a domain.
-    #[error("{} is not the domain of a run; the domains of your runs are in {}", path.display(), base().display())]
+    #[error("{} is not the domain of a run that is under way, nor where its results go; the domains of your runs are in {}", path.display(), base().display())]
     NotADomain {
         /// The path as given.
         path: PathBuf,
     },
+}
+
+/// What to do about an error at a path of a domain: it lies in shared memory, or in the directory of all domains.
+fn remedy_at(path: &Path, error: &io::Error) -> String {
+    if !path.starts_with(SHARED_MEMORY) {
+        return format!("{}, or set XDG_RUNTIME_DIR to another directory", remedy(error));
+    }
+    match error.raw_os_error() {
+        Some(libc::EROFS) => format!("`mount -o remount,rw {SHARED_MEMORY}` makes it writable"),
+        Some(libc::EACCES | libc::EPERM) => format!("let this user write there: `chmod 1777 {SHARED_MEMORY}`"),
+        Some(libc::ENOENT) => format!("mount a tmpfs at {SHARED_MEMORY}"),
+        Some(libc::ENOSPC) => format!("remove files there, or `mount -o remount,size=2g {SHARED_MEMORY}`"),
+        _ => remedy(error).to_owned(),
+    }
 }
 
 /// The directory that is to hold this user's domains.
@@ -167,12 +197,15 @@ impl OwnedDomain {
             // The lock comes first: a domain without a lock that is held counts as dead.
             let Some(lock) = lock(&lock_path(&root), Lock::New)? else { continue };
             // Removed again if it cannot be completed.
-            let owned = Self { domain: Domain { root }, _lock: lock };
+            let mut owned = Self { domain: Domain { root }, _lock: lock, _shared: None };
             let root = owned.domain.root();
             DirBuilder::new().mode(0o700).create(root).map_err(|error| create(root, error))?;
             match owned.domain.make_shared() {
                 Err(DomainError::Taken { .. }) if taken < DOMAINS_MAX => taken += 1,
-                made => return made.map(|()| owned),
+                made => {
+                    owned._shared = made?;
+                    return Ok(owned);
+                }
             }
         }
         Err(DomainError::Contended { path: base() })
@@ -205,8 +238,9 @@ impl Domain {
     }
 
     /// Makes what is the domain's in shared memory before anybody else does. The first file there tells the transport's prefix,
-    /// so it is the only one of its files that has a name which can be known beforehand.
-    fn make_shared(&self) -> Result<(), DomainError> {
+    /// so it is the only one of its files that has a name which can be known beforehand. Gives the lock of the domain's own directory
+    /// there; `None` where the file system has no locks.
+    fn make_shared(&self) -> Result<Option<File>, DomainError> {
         let failed = |path: &Path, source: io::Error| match source.kind() {
             io::ErrorKind::AlreadyExists => DomainError::Taken { path: path.to_owned() },
             _ => DomainError::Create { path: path.to_owned(), source },
@@ -218,7 +252,19 @@ impl Domain {
         let shared = Path::new(SHARED_MEMORY).join(format!("{}-{}", self.mark(), random_id()?));
         let link = self.root.join(OWN_SHARED);
         symlink(&shared, &link).map_err(|error| failed(&link, error))?;
-        DirBuilder::new().mode(0o700).create(&shared).map_err(|error| failed(&shared, error))
+        DirBuilder::new().mode(0o700).create(&shared).map_err(|error| failed(&shared, error))?;
+        // Before it is locked it may be taken for left over, and be removed.
+        let taken = || DomainError::Taken { path: shared.clone() };
+        let directory = open_directory(&shared).map_err(|_| taken())?;
+        let lock = match files::lock(&directory, &shared) {
+            Ok(true) => Some(directory),
+            Ok(false) => return Err(taken()),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Err(taken()),
+            Err(_) => None,
+        };
+        let root = shared.join(OWN_ROOT);
+        symlink(&self.root, &root).map_err(|error| failed(&root, error))?;
+        Ok(lock)
     }
 
     /// Its directory, open to this user alone.
@@ -282,11 +328,16 @@ impl Domain {
         Ok(())
     }
 
-    /// Removes every trace of the domain. What is gone already is no error.
-    fn remove(&self) {
+    /// Removes what is the domain's in shared memory.
+    fn remove_shared(&self) {
         self.in_shared_memory().for_each(|path| {
             let _ = fs::remove_file(&path).or_else(|_| fs::remove_dir_all(path));
         });
+    }
+
+    /// Removes every trace of the domain. What is gone already is no error.
+    fn remove(&self) {
+        self.remove_shared();
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
         let gone = matches!(self.root.try_exists(), Ok(false));
@@ -304,6 +355,102 @@ impl Domain {
 /// [`PrivacyError`].
 pub fn remove_dead_domains() -> Result<Vec<Domain>, PrivacyError> {
     Ok(private_base()?.map_or(Vec::new(), |base| remove_dead(&base)))
+}
+
+/// What a dead run has left in shared memory, while the directory of its domain is gone, as that of a container.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Abandoned {
+    /// Runs.
+    pub runs: usize,
+    /// Files of theirs.
+    pub files: usize,
+    /// Their size, bytes.
+    pub bytes: u64,
+}
+
+/// Finds what dead runs of this user have left in shared memory while the directories of their domains are gone, and removes it if
+/// `clean` says so.
+pub fn abandoned(clean: bool) -> Abandoned {
+    let mut ids: Vec<String> = entries(Path::new(SHARED_MEMORY)).filter_map(|path| id_of(&path)).collect();
+    ids.sort();
+    ids.dedup();
+    let mut all = Abandoned::default();
+    for id in ids {
+        let domain = Domain { root: base().join(id) };
+        // Held until all is removed: a launcher that is only beginning does not get these locks, and begins anew.
+        let Some(_locks) = domain.lock_abandoned() else { continue };
+        for path in domain.in_shared_memory() {
+            let within = entries(&path).chain([path]).filter_map(|path| fs::symlink_metadata(path).ok());
+            for file in within.filter(Metadata::is_file) {
+                all.files += 1;
+                all.bytes += file.len();
+            }
+        }
+        all.runs += 1;
+        if clean {
+            domain.remove_shared();
+        }
+    }
+    all
+}
+
+/// The domain that a path in shared memory belongs to, by its name.
+fn id_of(path: &Path) -> Option<String> {
+    let (id, rest) = path.file_name()?.to_str()?.strip_prefix(PREFIX)?.split_at_checked(ID_LENGTH)?;
+    (is_id(OsStr::new(id)) && rest.starts_with(['_', '-'])).then(|| id.to_owned())
+}
+
+fn entries(directory: &Path) -> impl Iterator<Item = PathBuf> + use<> {
+    fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path())
+}
+
+/// Opens a directory that is no link.
+fn open_directory(path: &Path) -> io::Result<File> {
+    let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)
+}
+
+impl Domain {
+    /// The locks of a domain whose launcher is dead and whose directory is gone; `None` if either may be there.
+    ///
+    /// The launcher locks the directory in shared memory, and every role its record there. Such a lock is seen from every PID
+    /// namespace, and the kernel releases it when its holder dies.
+    fn lock_abandoned(&self) -> Option<Vec<File>> {
+        let is_there = |root: &Path| !matches!(lock_path(root).try_exists(), Ok(false));
+        if is_there(&self.root) {
+            return None;
+        }
+        let mut locks = Vec::new();
+        for path in self.in_shared_memory() {
+            let about = fs::symlink_metadata(&path).ok()?;
+            if !about.is_dir() {
+                continue;
+            }
+            match fs::read_link(path.join(OWN_ROOT)) {
+                Ok(root) if is_there(&root) => return None,
+                // An older launcher holds no lock before its roles do.
+                Err(_) if !about.modified().ok()?.elapsed().is_ok_and(|age| age > BEGUN) => return None,
+                _ => {}
+            }
+            let directory = open_directory(&path).ok()?;
+            if !files::lock(&directory, &path).ok()? {
+                return None;
+            }
+            locks.push(directory);
+            for path in entries(&path).filter(|path| path.file_name().is_some_and(|name| name != OWN_ROOT)) {
+                let file = files::open_with(&path, OpenOptions::new().read(true), OFlags::NOFOLLOW).ok()?;
+                if !files::lock(&file, &path).ok()? {
+                    return None;
+                }
+                locks.push(file);
+            }
+        }
+        if locks.is_empty() {
+            let age = |path: PathBuf| fs::symlink_metadata(path).ok()?.modified().ok()?.elapsed().ok();
+            return self.in_shared_memory().all(|path| age(path).is_some_and(|age| age > BEGUN)).then_some(locks);
+        }
+        Some(locks)
+    }
 }
 
 /// A domain that was found, of a run or of what is left of one.
@@ -337,10 +484,13 @@ fn found(base: &Path) -> Vec<Found> {
     found
 }
 
-/// The lock files of all domains.
+/// The lock files of all domains. What is not a regular file is no lock, and neither is a file of another name.
 fn locks(base: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = fs::read_dir(base).into_iter().flatten().flatten();
-    entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
+    let regular = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
+    regular.map(|entry| entry.path()).filter(|path| {
+        path.extension().is_some_and(|extension| extension == "lock") && path.file_stem().is_some_and(is_id)
+    })
 }
 
 fn require_room(needed: u64) -> Result<(), DomainError> {
@@ -405,38 +555,23 @@ enum Lock {
 /// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
 fn lock(path: &Path, lock: Lock) -> Result<Option<File>, DomainError> {
     let mut options = OpenOptions::new();
-    options.write(true).create_new(lock == Lock::New).mode(0o600).custom_flags(OFlags::NOFOLLOW.bits() as i32);
-    let file = match options.open(path) {
+    options.write(true).create_new(lock == Lock::New).mode(0o600);
+    let file = match files::open_with(path, &mut options, OFlags::NOFOLLOW) {
         Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
             return Ok(None);
         }
         other => other.map_err(|source| DomainError::Create { path: path.to_owned(), source })?,
     };
-    match flock_now(&file) {
-        Ok(()) => {}
-        Err(Errno::WOULDBLOCK) => return Ok(None),
-        Err(error) => {
+    match files::lock(&file, path) {
+        Ok(named) => Ok(named.then_some(file)),
+        Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(None),
+        Err(source) => {
             if lock == Lock::New {
                 let _ = fs::remove_file(path);
             }
-            return Err(DomainError::Lock { path: path.to_owned(), source: error.into() });
+            Err(DomainError::Lock { path: path.to_owned(), source })
         }
     }
-    // Whoever cleans up takes the lock, removes the file, lets go: a lock on a removed file protects nothing.
-    let same = fs::metadata(path).is_ok_and(|at_path| fstat(&file).is_ok_and(|held| held.st_ino == at_path.ino()));
-    Ok(same.then_some(file))
-}
-
-/// Locks a file, or tells at once that another process has. A signal is no reason.
-fn flock_now(file: &File) -> Result<(), Errno> {
-    let mut locked = Err(Errno::INTR);
-    for _ in 0..ATTEMPTS {
-        locked = flock(file, FlockOperation::NonBlockingLockExclusive);
-        if locked != Err(Errno::INTR) {
-            break;
-        }
-    }
-    locked
 }
 
 fn random_id() -> Result<String, DomainError> {
@@ -463,6 +598,58 @@ mod tests {
         drop(owned);
         assert!(!transports.exists() && !own.exists() && !domain.root().exists() && !lock_path(domain.root()).exists());
         assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
+    }
+
+    /// As the shared memory of a container that was killed with the base directory: nothing but files, and locks that are released.
+    #[test]
+    fn what_a_dead_run_left_in_shared_memory_is_found_without_its_directory() {
+        let elsewhere = tempfile::tempdir().unwrap();
+        let domain = Domain { root: elsewhere.path().join(random_id().unwrap()) };
+        let left = || domain.in_shared_memory().count();
+        let lock = domain.make_shared().unwrap_err();
+        assert!(matches!(lock, DomainError::Create { .. }), "its directory is not there yet: {lock}");
+        domain.remove_shared();
+        fs::create_dir(domain.root()).unwrap();
+        let lock = domain.make_shared().unwrap();
+        let record = fs::canonicalize(domain.shared("")).unwrap().join("record");
+        fs::write(&record, b"x").unwrap();
+        assert!(domain.lock_abandoned().is_none(), "the launcher lives");
+        drop(lock);
+        let role = File::open(&record).unwrap();
+        assert!(files::lock(&role, &record).unwrap());
+        assert!(domain.lock_abandoned().is_none(), "a role lives");
+        drop(role);
+        fs::write(lock_path(domain.root()), b"").unwrap();
+        assert!(domain.lock_abandoned().is_none(), "its base is there");
+        fs::remove_file(lock_path(domain.root())).unwrap();
+        let found = abandoned(false);
+        assert!(found.runs >= 1 && found.files >= 2 && found.bytes > 0, "{found:?}");
+        assert_eq!(left(), 2);
+        abandoned(true);
+        assert_eq!(left(), 0);
+        // Without its directory a file may be a launcher's that is only beginning.
+        let young = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
+        fs::write(&young, b"x").unwrap();
+        assert!(domain.lock_abandoned().is_none());
+        let old = SystemTime::now() - 2 * BEGUN;
+        File::options().write(true).open(&young).unwrap().set_modified(old).unwrap();
+        assert!(domain.lock_abandoned().is_some());
+        domain.remove_shared();
+    }
+
+    #[test]
+    fn what_is_no_regular_file_is_no_lock() {
+        let base = tempfile::tempdir().unwrap();
+        let at = |name: &str| base.path().join(format!("{name:0>ID_LENGTH$}.lock"));
+        rustix::fs::mkfifoat(rustix::fs::CWD, at("1"), rustix::fs::Mode::RWXU).unwrap();
+        fs::create_dir(at("2")).unwrap();
+        symlink("/dev/zero", at("3")).unwrap();
+        let _socket = std::os::unix::net::UnixListener::bind(at("4")).unwrap();
+        assert!(found(base.path()).is_empty() && remove_dead(base.path()).is_empty());
+        for name in ["1", "2", "3", "4"] {
+            assert!(!matches!(lock(&at(name), Lock::Existing), Ok(Some(_))), "{name}");
+            assert!(fs::symlink_metadata(at(name)).is_ok());
+        }
     }
 
     #[test]

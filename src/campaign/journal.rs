@@ -4,12 +4,13 @@
 //! the journal ends before the first line that is not whole. Must not hold more of it than a line.
 
 use super::table::{MarginPoint, Row, Table};
+use crate::files;
 use crate::system::remedy;
+use rustix::fs::OFlags;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -147,7 +148,7 @@ impl Reader {
     pub fn open(directory: &Path) -> Result<Self, JournalError> {
         let path = directory.join(FILE);
         let refuse = |source| JournalError::Read { path: path.clone(), source };
-        let mut file = BufReader::new(File::open(&path).map_err(refuse)?);
+        let mut file = BufReader::new(files::open(&path).map_err(refuse)?);
         let mut line = Vec::new();
         file.read_until(b'\n', &mut line).map_err(refuse)?;
         let head = content::<Head>(&line).filter(|head| head.schema == SCHEMA);
@@ -195,7 +196,8 @@ impl Journal {
     ) -> Result<Self, JournalError> {
         let path = directory.join(FILE);
         let refuse = |source| JournalError::Write { path: path.clone(), source };
-        let file = OpenOptions::new().read(true).append(true).create(true).custom_flags(libc::O_NOFOLLOW).open(&path);
+        let mut options = OpenOptions::new();
+        let file = files::open_with(&path, options.read(true).append(true).create(true), OFlags::NOFOLLOW);
         let mut file = file.map_err(refuse)?;
         match file.try_lock() {
             Err(TryLockError::WouldBlock) => return Err(JournalError::Busy { path }),

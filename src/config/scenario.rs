@@ -37,6 +37,8 @@ pub struct Scenario {
     pub name: String,
     /// What drives the ticks.
     pub clock: ClockKind,
+    /// The rate that was asked for, Hz.
+    pub tick_hz: f64,
     /// The period h, ns.
     pub period_ns: u64,
     /// The last tick; the first is 0.
@@ -172,6 +174,7 @@ impl Scenario {
         Ok(Self {
             name: raw.name,
             clock: raw.clock,
+            tick_hz: raw.tick_hz,
             period_ns,
             last_tick,
             seed: raw.seed,
@@ -216,6 +219,17 @@ impl Scenario {
     /// How many ticks after its tick a role may still wait for what crosses hosts on the way to it.
     pub fn lag_ticks(&self, role: &str) -> u64 {
         self.hosts.lag_ticks(role, self.rig.bodies().iter().map(|body| (&*body.name, body.driven)))
+    }
+
+    /// What a reader of its results must know: of the tick, and of the rig.
+    pub fn notes(&self) -> Vec<String> {
+        let real_hz = 1e9 / self.period_ns as f64;
+        let part = real_hz / self.tick_hz - 1.0;
+        let rounded = (part.abs() > 1e-12).then(|| {
+            let period_ns = self.period_ns;
+            format!("tick_hz {}: a period is a whole number of ns, {period_ns}, so the rate is {real_hz:.9} Hz ({:+.2e} of it)", self.tick_hz, part)
+        });
+        rounded.into_iter().chain(self.rig.notes()).collect()
     }
 
     /// The period h, s.

@@ -13,7 +13,7 @@ mod trial;
 pub use machine::{Demand, Machine};
 pub use trial::Trial;
 
-use crate::bus::domain::{DomainError, Found};
+use crate::bus::domain::{Abandoned, DomainError, Found};
 use crate::telemetry::Host;
 use serde::Serialize;
 use std::fmt;
@@ -148,6 +148,17 @@ pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
             "`corotate doctor --clean` removes them; so does the next run",
         ),
     }
+}
+
+/// What dead runs have left in shared memory, of which there is nothing else; none if there is nothing.
+pub fn left_in_shared_memory(left: Abandoned) -> Option<Check> {
+    let Abandoned { runs, files, bytes } = left;
+    let found = format!(
+        "{files} files ({:.1} MiB) of {runs} dead runs whose directory is gone",
+        bytes as f64 / f64::from(1 << 20)
+    );
+    let remedy = "`corotate doctor --clean` removes them";
+    (runs > 0).then(|| Check::warn("leftover memory", found, remedy))
 }
 
 #[cfg(test)]

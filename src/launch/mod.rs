@@ -35,8 +35,8 @@ pub use outcome::{Outcome, Summary, write_run};
 #[cfg(feature = "hosts")]
 pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;
+pub use results::{Claim, LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
-pub use results::{LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub use score::{CertificateScore, MetricScore, Score, Scorer};
 pub(crate) use score::{lyapunov_floor, score_rig};
 pub use steps::{BodyState, Steps};

@@ -302,7 +302,7 @@ impl Summary {
             criteria,
             score: outcome.score.clone(),
             incidents: outcome.incidents.clone(),
-            notes: scenario.rig.notes().into_iter().chain(scenario.warnings.iter().cloned()).collect(),
+            notes: scenario.notes().into_iter().chain(scenario.warnings.iter().cloned()).collect(),
             limits: scenario.rig.limits(),
             watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),
             certificates: claims(scenario),

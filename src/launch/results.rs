@@ -1,25 +1,36 @@
-//! A run's directory: it holds the files of one run.
+//! A run's directory: it holds the files of one run, and is locked while that run writes them.
 //!
-//! What an older run of ours left there goes as a whole before anything new is written. Must not touch a file that is not
+//! The files of an earlier run are removed as a whole, and only where the caller asks for it. Must not touch a file that is not
 //! certainly one of ours.
 
 use crate::config::RunId;
 use crate::files;
 use crate::system::{random_bits, utc};
+use rustix::fs::OFlags;
 use serde::Deserialize;
-use std::fs::{self, File};
-use std::io::{self, ErrorKind, Read};
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// The files of a run.
-pub(crate) const SUMMARY: &str = "summary.json";
+pub(crate) use crate::runtime::SUMMARY;
 pub(crate) const SCENARIO: &str = "scenario.toml";
 pub(crate) const HASHES: &str = "hashes.txt";
 pub(crate) const RECORDING: &str = "run.mcap";
 pub(crate) const REPORT: &str = "report.html";
 pub(crate) const LATENCY: &str = "latency";
 pub(crate) const LATENCY_LOG: &str = "latency.hlog";
+/// The lock of a run that is under way, with its identifier and process.
+const LOCK: &str = "run.lock";
+/// How the lock's text begins.
+const LOCK_HEAD: &str = "corotate ";
+/// The most of the lock's text that is quoted, bytes.
+const LOCK_TEXT: u64 = 128;
+/// How often the lock is tried for again that another process removed meanwhile.
+const ATTEMPTS: u32 = 100;
+/// The files that a campaign's directory has from its first case on.
+const OF_CAMPAIGN: [&str; 2] = ["campaign.toml", "journal"];
 /// What a report's page begins its generator's name with.
 pub(crate) const GENERATOR: &str = "<meta name=\"generator\" content=\"corotate";
 /// How a recording begins: the magic bytes, the header's kind and length, and its texts with their lengths.
@@ -41,6 +52,28 @@ pub enum ResultsError {
     )]
     Foreign {
         /// The file.
+        path: PathBuf,
+    },
+    /// Another run writes to the directory.
+    #[error("{} takes the results of another run that is under way{holder}; wait for its end, or name another directory with --out", path.display())]
+    Busy {
+        /// The directory.
+        path: PathBuf,
+        /// The run and its process, as far as they are known.
+        holder: String,
+    },
+    /// The directory has the results of an earlier run.
+    #[error("{} has files of an earlier run: {}; name another directory with --out, or give --overwrite to remove them", path.display(), names(files))]
+    Finished {
+        /// The directory.
+        path: PathBuf,
+        /// The files.
+        files: Vec<PathBuf>,
+    },
+    /// The directory is a campaign's.
+    #[error("{} has the results of a campaign; name another directory with --out", path.display())]
+    Campaign {
+        /// The directory.
         path: PathBuf,
     },
     /// The directory cannot be made, looked at, or cleared.
@@ -110,20 +143,99 @@ pub fn new_run() -> io::Result<RunId> {
     Ok(RunId::from_bits(random_bits()?.to_ne_bytes()))
 }
 
-/// Makes a directory for a run's results. If it exists, the files of an older run of ours in it are removed.
+/// A directory that takes the results of one run, locked against others until this is dropped.
+#[derive(Debug)]
+#[must_use]
+pub struct Claim {
+    path: PathBuf,
+    _lock: File,
+    /// The files of an earlier run that were removed.
+    pub removed: Vec<PathBuf>,
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        // While it is still locked: a process that comes next makes a lock of its own.
+        let _ = fs::remove_file(self.path.join(LOCK));
+    }
+}
+
+/// Locks a directory for the results of a run, and makes it where it does not exist. Files of an earlier run of ours are removed
+/// if `overwrite` says so, and else are a reason to refuse the directory.
 ///
 /// # Errors
-/// [`ResultsError`]; nothing has been removed if a file is [`Foreign`](ResultsError::Foreign).
-pub fn claim(directory: &Path) -> Result<(), ResultsError> {
+/// [`ResultsError`]; nothing has been removed then, unless the system refused to remove one of several files.
+pub fn claim(directory: &Path, run: RunId, overwrite: bool) -> Result<Claim, ResultsError> {
     files::create_directories(directory).map_err(failed(directory))?;
+    if OF_CAMPAIGN.iter().all(|name| directory.join(name).is_file()) {
+        return Err(ResultsError::Campaign { path: directory.to_owned() });
+    }
+    let mut claim = Claim { path: directory.to_owned(), _lock: lock(directory, run)?, removed: Vec::new() };
     let older = older(directory)?;
-    older.iter().try_for_each(|path| fs::remove_file(path).map_err(failed(path)))?;
+    let (empty, written): (Vec<_>, Vec<_>) = older.into_iter().partition(|path| is_empty(path));
+    if !overwrite && !written.is_empty() {
+        return Err(ResultsError::Finished { path: directory.to_owned(), files: written });
+    }
+    empty.iter().chain(&written).try_for_each(|path| fs::remove_file(path).map_err(failed(path)))?;
+    claim.removed = written;
     // It stays if somebody else has put something there.
     match fs::remove_dir(directory.join(LATENCY)) {
         Err(error) if !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::DirectoryNotEmpty) => {
             Err(failed(&directory.join(LATENCY))(error))
         }
-        _ => Ok(()),
+        _ => Ok(claim),
+    }
+}
+
+/// Makes the lock file of a directory, or takes over that of a run that was killed, and writes down which run holds it.
+fn lock(directory: &Path, run: RunId) -> Result<File, ResultsError> {
+    let path = directory.join(LOCK);
+    let failed = |source| ResultsError::Directory { path: path.clone(), source };
+    for _ in 0..ATTEMPTS {
+        let mut options = OpenOptions::new();
+        let opened = files::open_with(&path, options.read(true).write(true).create(true), OFlags::NOFOLLOW);
+        let mut file = opened.map_err(failed)?;
+        let mut text = String::new();
+        // Text that is no text is not ours either.
+        let read = (&file).take(LOCK_TEXT).read_to_string(&mut text);
+        if read.is_err() || !(text.is_empty() || text.starts_with(LOCK_HEAD)) {
+            return Err(ResultsError::Foreign { path });
+        }
+        files::require_own(&file).map_err(failed)?;
+        match files::lock(&file, &path) {
+            Ok(true) => {}
+            Ok(false) => continue,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                let holder = text.strip_prefix(LOCK_HEAD).map_or(String::new(), |held| format!(" ({})", held.trim()));
+                return Err(ResultsError::Busy { path: directory.to_owned(), holder });
+            }
+            Err(error) => return Err(failed(error)),
+        }
+        let text = format!("{LOCK_HEAD}{}, process {}\n", run.comment(), std::process::id());
+        let written = file.set_len(0).and_then(|()| io::Seek::rewind(&mut file));
+        return written.and_then(|()| file.write_all(text.as_bytes())).map(|()| file).map_err(failed);
+    }
+    Err(failed(ErrorKind::WouldBlock.into()))
+}
+
+fn is_empty(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|file| file.len() == 0)
+}
+
+/// The names of files, for a message.
+fn names(files: &[PathBuf]) -> String {
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let (mut latency, names): (Vec<_>, Vec<_>) =
+        files.iter().partition(|path| path.parent().is_some_and(|parent| parent.ends_with(LATENCY)));
+    latency.truncate(1);
+    let latency = latency.iter().map(|_| format!("{LATENCY}/"));
+    names.into_iter().map(name).chain(latency).collect::<Vec<_>>().join(", ")
+}
+
+impl Claim {
+    /// The names of the files that were removed, for a message; `None` if there were none.
+    pub fn removed_names(&self) -> Option<String> {
+        (!self.removed.is_empty()).then(|| names(&self.removed))
     }
 }
 
@@ -172,7 +284,7 @@ fn known(path: PathBuf, limit: u64, is_ours: IsOurs) -> Result<Option<PathBuf>, 
         return Err(ResultsError::Foreign { path });
     }
     let mut head = Vec::new();
-    File::open(&path).and_then(|file| file.take(limit).read_to_end(&mut head)).map_err(failed(&path))?;
+    files::open(&path).and_then(|file| file.take(limit).read_to_end(&mut head)).map_err(failed(&path))?;
     // What was begun and never written holds nothing of anybody's.
     if head.is_empty() || is_ours(&head) { Ok(Some(path)) } else { Err(ResultsError::Foreign { path }) }
 }
@@ -222,13 +334,14 @@ mod tests {
             fs::write(&ours, format!("# {}", new_run().unwrap().comment())).unwrap();
             for content in ["name = \"mine\"\n", "{\"schema\":\"corotate/summary/v1\"}", "\u{89}MCAP0 of somebody"] {
                 fs::write(&path, content).unwrap();
-                let refused = claim(directory.path()).unwrap_err();
+                let refused = claim(directory.path(), new_run().unwrap(), true).unwrap_err();
                 assert!(matches!(&refused, ResultsError::Foreign { path: told } if *told == path), "{refused}");
                 assert!(path.exists() && ours.exists());
             }
             fs::remove_file(&path).unwrap();
             fs::create_dir(&path).unwrap();
-            assert!(matches!(claim(directory.path()), Err(ResultsError::Foreign { .. })), "{name} as a directory");
+            let refused = claim(directory.path(), new_run().unwrap(), true);
+            assert!(matches!(refused, Err(ResultsError::Foreign { .. })), "{name} as a directory");
         }
     }
 
@@ -242,8 +355,42 @@ mod tests {
         let gone = ["scenario.toml", "latency/latency.hlog"].map(at);
         gone.iter().for_each(|path| fs::write(path, format!("#[{}]", new_run().unwrap().comment())).unwrap());
         fs::write(at("run.mcap"), "").unwrap();
-        claim(directory.path()).unwrap();
+        let run = || new_run().unwrap();
+        assert!(matches!(claim(directory.path(), run(), false), Err(ResultsError::Finished { .. })));
+        assert!(gone.iter().all(|path| path.exists()));
+        let claimed = claim(directory.path(), run(), true).unwrap();
+        assert_eq!(claimed.removed, gone);
+        assert!(matches!(claim(directory.path(), run(), true), Err(ResultsError::Busy { .. })));
+        drop(claimed);
+        assert!(!at("run.lock").exists());
         assert!(kept.iter().all(|path| path.exists()) && !gone.iter().any(|path| path.exists()));
         assert!(!at("run.mcap").exists(), "it was begun and never written");
+    }
+    #[test]
+    fn a_lock_that_is_left_is_taken_over_and_a_foreign_one_is_not() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join(LOCK);
+        let claimed = || claim(directory.path(), new_run().unwrap(), false);
+        fs::write(&path, format!("{LOCK_HEAD}run 0, process 1\n")).unwrap();
+        drop(claimed().unwrap());
+        fs::write(&path, "mine").unwrap();
+        assert!(matches!(claimed(), Err(ResultsError::Foreign { .. })));
+        assert_eq!(fs::read(&path).unwrap(), b"mine");
+        fs::remove_file(&path).unwrap();
+        // Opened as a file is, it would wait for a writer.
+        rustix::fs::mkfifoat(rustix::fs::CWD, &path, rustix::fs::Mode::RWXU).unwrap();
+        assert!(matches!(claimed(), Err(ResultsError::Directory { .. })));
+    }
+
+    #[test]
+    fn of_many_at_once_one_gets_the_directory() {
+        let directory = tempfile::tempdir().unwrap();
+        let claims: Vec<_> = std::thread::scope(|scope| {
+            let threads: Vec<_> =
+                (0..16).map(|_| scope.spawn(|| claim(directory.path(), new_run().unwrap(), false))).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        assert_eq!(claims.iter().filter(|claim| claim.is_ok()).count(), 1);
+        assert!(claims.iter().flat_map(|claim| claim.as_ref().err()).all(|e| matches!(e, ResultsError::Busy { .. })));
     }
 }

@@ -2,7 +2,7 @@
 
 use super::qemu::Board;
 use super::role::{die_with, terminated_by_signals};
-use super::{Exit, fail, say};
+use super::{Exit, fail, runs, say};
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, RoleError, run_bridge};
 use crate::system::tell;
@@ -27,9 +27,9 @@ pub struct Arguments {
     /// The role whose seat the device takes: a driven body's name, observer, controller, or observer,controller
     #[arg(long, value_name = "NAME", value_delimiter = ',', required = true, alias = "body")]
     role: Vec<String>,
-    /// The run's domain, as `corotate run --external NAME` prints it
+    /// The run: its domain, as `corotate run --external NAME` prints it, or the directory that its results go to [default: the newest run of this user]
     #[arg(long, value_name = "DIR")]
-    domain: PathBuf,
+    domain: Option<PathBuf>,
     /// How long a device that is silent or gone is waited for, s
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     patience: f64,
@@ -64,12 +64,13 @@ pub fn bridge(arguments: &Arguments) -> Exit {
 fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
     arguments.parent.map_or(Ok(()), die_with)?;
     let terminated = terminated_by_signals()?;
+    let domain = runs::domain(arguments.domain.as_deref())?;
     let mut board = arguments.qemu.as_ref().map(|elf| Board::start(elf, &arguments.machine)).transpose();
     let board = board.as_mut().map_err(|error| fail(Exit::Usage, error))?.as_mut();
     let path =
         board.as_ref().map_or_else(|| arguments.serial.clone().unwrap_or_default(), |board| board.line().to_owned());
     let seat = DeviceSeat {
-        domain: arguments.domain.clone(),
+        domain,
         roles: arguments.role.clone(),
         path,
         baud: arguments.baud,

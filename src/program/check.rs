@@ -103,7 +103,7 @@ fn json(path: &Path, scenario: &Scenario) -> String {
         "scenario": scenario.name,
         "clock": scenario.clock.name(),
         "tick_hz": 1.0 / scenario.tick_s(),
-        "notes": scenario.rig.notes(),
+        "notes": scenario.notes(),
         "warnings": scenario.warnings,
         "limits": scenario.rig.limits(),
         "followers": claims(scenario),
@@ -113,7 +113,7 @@ fn json(path: &Path, scenario: &Scenario) -> String {
 
 fn tell_claims(scenario: &Scenario, text: &mut String) -> std::fmt::Result {
     scenario.warnings.iter().try_for_each(|warning| writeln!(text, "warning: {warning}"))?;
-    scenario.rig.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
+    scenario.notes().iter().try_for_each(|note| writeln!(text, "note: {note}"))?;
     for limit in scenario.rig.limits() {
         writeln!(text, "limit: {}: {}", limit.name, digits(limit.value))?;
     }

@@ -1,7 +1,7 @@
 //! `corotate diff`: two recordings beside each other.
 
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, latest, say};
+use super::{Exit, fail, harmless, remark, runs, say};
 use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -10,9 +10,9 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// A run's directory, or a recording
+    /// A run's directory, a recording, or latest
     a: PathBuf,
-    /// Another [default: runs/latest]
+    /// Another [default: the newest other recording in runs/]
     b: Option<PathBuf>,
     /// So much may numbers differ, in the field's own unit
     #[arg(long, value_name = "X", default_value_t = 0.0)]
@@ -49,8 +49,7 @@ pub fn diff(arguments: &Arguments) -> Exit {
     if let Some((name, value)) = bad {
         return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
     }
-    let files = latest::recording(Some(&arguments.a)).and_then(|a| Ok([a, latest::recording(arguments.b.as_deref())?]));
-    let files = match files {
+    let files = match files(arguments) {
         Ok(files) => files,
         Err(reason) => return fail(Exit::Usage, &reason),
     };
@@ -71,6 +70,17 @@ pub fn diff(arguments: &Arguments) -> Exit {
         },
         Err(error) => fail(exit_of(&error), &error),
     }
+}
+
+/// The two recordings. Without a second name it is the newest other recording in `runs/`.
+fn files(arguments: &Arguments) -> Result<[PathBuf; 2], String> {
+    let a = runs::recording(Some(&arguments.a))?;
+    if arguments.b.is_some() {
+        return Ok([a, runs::recording(arguments.b.as_deref())?]);
+    }
+    let b = runs::newest_recording(&a).ok_or("runs/ has no other run with a recording; name the second run")?;
+    remark(&format!("compared with {}", b.display()));
+    Ok([a, b])
 }
 
 /// All of it for programs. A number that is not finite is null.

@@ -4,8 +4,8 @@ use super::hosts::{self, KeyArguments};
 use super::run::catch_signals;
 use super::scenario::{Change, load};
 use super::{Exit, fail, say};
-use crate::bus::domain::{DomainError, domains, remove_dead_domains};
-use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, leftovers};
+use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
+use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, left_in_shared_memory, leftovers};
 use crate::hosts::Address;
 use crate::launch::{Launch, Progress, run};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -63,6 +63,10 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
     let mut checks = Machine::at(Path::new("/")).examine(&Demand::of(&scenario));
     checks.push(leftovers(cleared.and_then(|_| domains())));
+    if arguments.clean {
+        abandoned(true);
+    }
+    checks.extend(left_in_shared_memory(abandoned(false)));
     let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {
         Ok(trial) => trial,
         Err(Unmeasured::Exit(exit)) => return exit,

@@ -10,6 +10,7 @@ use crate::model::Inertia;
 use crate::record::RowGroups;
 use crate::report::{HiddenFacts, HiddenPage};
 use crate::sample::FieldKind;
+use crate::system::remedy;
 use nalgebra::{Matrix3, Vector3};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -142,7 +143,7 @@ pub fn estimate(arguments: &Arguments) -> Exit {
     }
     let unwritten = |path: &Option<PathBuf>, error: io::Error| {
         let path = path.as_deref().unwrap_or(Path::new("")).display();
-        fail(Exit::Failure, &format!("cannot write {path}: {error}; free some room, or name another file"))
+        fail(Exit::Failure, &format!("cannot write {path}: {error}; {}, or name another file", remedy(&error)))
     };
     let mut page = arguments.page.is_some().then(HiddenPage::default);
     let mut table = match arguments.table.as_deref().map(Table::begin).transpose() {

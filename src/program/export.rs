@@ -1,6 +1,6 @@
 //! `corotate export`: a recording as tables.
 
-use super::{Exit, fail, latest, record, say};
+use super::{Exit, fail, record, runs, say};
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES, group = clap::ArgGroup::new("forms").required(true).multiple(true))]
 pub struct Arguments {
-    /// A run's directory, or a recording [default: runs/latest]
+    /// A run's directory, a recording, or latest [default: runs/latest]
     run: Option<PathBuf>,
     /// Write one CSV file per signal into this directory
     #[arg(long, value_name = "DIR", group = "forms")]
@@ -45,7 +45,7 @@ pub fn export(arguments: &Arguments) -> Exit {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
         return fail(Exit::Usage, &REFUSAL);
     }
-    let file = match latest::recording(arguments.run.as_deref()) {
+    let file = match runs::recording(arguments.run.as_deref()) {
         Ok(file) => file,
         Err(reason) => return fail(Exit::Usage, &reason),
     };

@@ -60,6 +60,7 @@ fn serve(_: &Arguments) -> Exit {
 #[cfg(feature = "foxglove")]
 fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
     use super::role::{die_with, terminated_by_signals};
+    use super::runs;
     use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
     if let Some(Err(exit)) = parent.map(die_with) {
         return exit;
@@ -68,10 +69,14 @@ fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
         Ok(terminated) => terminated,
         Err(exit) => return exit,
     };
-    let seat = FoxgloveSeat { domain: domain.clone(), address: *address, tell: tell.clone() };
+    let domain = match runs::domain(domain.as_deref()) {
+        Ok(domain) => domain,
+        Err(exit) => return exit,
+    };
+    let seat = FoxgloveSeat { domain: Some(domain), address: *address, tell: tell.clone() };
     match run_foxglove(&seat, &terminated) {
         Ok(()) => Exit::Ok,
-        Err(error @ (FoxgloveError::NoRun | FoxgloveError::Run(_))) => fail(Exit::Usage, &error),
+        Err(error @ FoxgloveError::Run(_)) => fail(Exit::Usage, &error),
         Err(error) => fail(Exit::Failure, &error),
     }
 }

@@ -110,14 +110,16 @@ fn about_build() -> String {
     let features = [
         ("foxglove", cfg!(feature = "foxglove")),
         ("hooks", cfg!(feature = "hooks")),
+        ("hosts", cfg!(feature = "hosts")),
         ("parquet", cfg!(feature = "parquet")),
+        ("pdf", cfg!(feature = "pdf")),
     ];
     let built: Vec<&str> = features.iter().filter(|(_, built)| *built).map(|(name, _)| *name).collect();
     let host = Host::this();
     format!(
         "revision  {}\nfeatures  {}\niceoryx2  {}\ntarget    {}\nhost      {}, {}, {} cores",
         env!("COROTATE_REVISION"),
-        if built.is_empty() { "none of foxglove, parquet".to_owned() } else { built.join(", ") },
+        if built.is_empty() { "none of foxglove, hosts, parquet, pdf".to_owned() } else { built.join(", ") },
         env!("COROTATE_ICEORYX2"),
         env!("COROTATE_TARGET"),
         host.kernel,

@@ -21,7 +21,6 @@ mod help;
 mod hosts;
 mod identify;
 mod init;
-mod latest;
 mod new;
 mod qemu;
 mod record;
@@ -29,6 +28,7 @@ mod replay;
 mod report;
 mod role;
 mod run;
+mod runs;
 mod scenario;
 mod schema;
 mod seat;
@@ -38,6 +38,7 @@ mod watch;
 use crate::bench::Row;
 use crate::bus::domain::Domain;
 use crate::rig::{Rig, RigKind, register};
+use crate::system::remedy;
 use clap::{FromArgMatches, Parser, Subcommand};
 use color::When;
 use help::WIDTH;
@@ -193,13 +194,15 @@ fn harmless(text: &str) -> String {
     text.chars().map(shown).collect()
 }
 
-/// Prints to stdout, or says why not; a reader that has gone is an error, where `print!` would panic.
+/// Prints to stdout, or says why not. A reader that has had enough and is gone, as `head`, is no error.
 fn print(text: &str) -> Result<(), String> {
     let mut stdout = io::stdout().lock();
-    stdout
-        .write_all(text.as_bytes())
-        .and_then(|()| stdout.flush())
-        .map_err(|error| format!("cannot write to stdout: {error}; give it a reader"))
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            Err(format!("cannot write to stdout: {error}; {}", remedy(&error)))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Prints to stdout; where that fails, says so and gives the exit code.

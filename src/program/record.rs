@@ -1,10 +1,8 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
 use super::role::{die_with, terminated_by_signals};
-use super::{Exit, fail, remark, say};
+use super::{Exit, fail, remark, runs, say};
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
-use crate::runtime::run_under_way;
-use crate::watch::WatchError;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
@@ -18,6 +16,9 @@ pub struct Arguments {
     /// The file to write
     #[arg(long, value_name = "FILE", default_value = "run.mcap")]
     out: PathBuf,
+    /// Replace a recording that is there
+    #[arg(long)]
+    overwrite: bool,
     /// Die with this process (the launcher gives its own id)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
@@ -46,10 +47,14 @@ pub fn record(arguments: &Arguments) -> Exit {
         Ok(terminated) => terminated,
         Err(exit) => return exit,
     };
-    let domain = match run_under_way(arguments.domain.as_deref()) {
-        Ok(Some(domain)) => domain,
-        Ok(None) => return fail(Exit::Usage, &WatchError::NoRun),
-        Err(error) => return fail(Exit::Usage, &error),
+    let is_there = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
+    if arguments.parent.is_none() && !arguments.overwrite && is_there() {
+        let file = arguments.out.display();
+        return fail(Exit::Usage, &format!("{file} is there; name another file with --out, or give --overwrite"));
+    }
+    let domain = match runs::domain(arguments.domain.as_deref()) {
+        Ok(domain) => domain,
+        Err(exit) => return exit,
     };
     let seat = RecorderSeat { domain, file: arguments.out.clone() };
     match run_recorder(&seat, &terminated) {

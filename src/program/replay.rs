@@ -1,7 +1,7 @@
 //! `corotate replay`: a recording through the live roles.
 
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, latest, say};
+use super::{Exit, fail, harmless, runs, say};
 use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
@@ -13,7 +13,7 @@ use std::sync::atomic::Ordering;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// A run's directory, or a recording [default: runs/latest]
+    /// A run's directory, a recording, or latest [default: runs/latest]
     run: Option<PathBuf>,
     /// observer, controller, a body's name, or all
     #[arg(long, value_name = "ROLE", default_value = "all")]
@@ -44,7 +44,7 @@ Examples:
 
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Exit {
-    let file = match latest::recording(arguments.run.as_deref()) {
+    let file = match runs::recording(arguments.run.as_deref()) {
         Ok(file) => file,
         Err(reason) => return fail(Exit::Usage, &reason),
     };

@@ -1,7 +1,7 @@
 //! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
 
 use super::record;
-use super::{Exit, fail, latest, remark, say};
+use super::{Exit, fail, remark, runs, say};
 use crate::campaign::JournalError;
 use crate::report::{ReportError, report as compose, report_pair};
 use indicatif::ProgressBar;
@@ -57,7 +57,7 @@ Examples:
 
 /// Makes the page.
 pub fn report(arguments: &Arguments) -> Exit {
-    let source = match latest::run(arguments.run.as_deref()) {
+    let source = match runs::results(arguments.run.as_deref()) {
         Ok(source) => source,
         Err(reason) => return fail(Exit::Usage, &reason),
     };

@@ -1,7 +1,7 @@
 //! `corotate plant|observer|controller`: one role, as the launcher starts it.
 
 use super::run::not_caught;
-use super::{Exit, fail};
+use super::{Exit, fail, runs};
 use crate::runtime::{RoleError, RoleSeat, run_role};
 use crate::system::remedy;
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -13,9 +13,9 @@ use std::sync::atomic::AtomicBool;
 #[derive(clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
-    /// The run's domain, as `corotate run --external ROLE` prints it
+    /// The run: its domain, as `corotate run --external ROLE` prints it, or the directory that its results go to [default: the newest run of this user]
     #[arg(long, value_name = "DIR")]
-    domain: PathBuf,
+    domain: Option<PathBuf>,
     /// Die with this process (the launcher gives its own id)
     #[arg(long, value_name = "PID", hide = true)]
     parent: Option<i32>,
@@ -46,7 +46,11 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
         Ok(terminated) => terminated,
         Err(exit) => return exit,
     };
-    let seat = RoleSeat { domain: arguments.domain.clone(), role: name.to_owned() };
+    let domain = match runs::domain(arguments.domain.as_deref()) {
+        Ok(domain) => domain,
+        Err(exit) => return exit,
+    };
+    let seat = RoleSeat { domain, role: name.to_owned() };
     match run_role(&seat, &terminated) {
         Ok(()) => Exit::Ok,
         Err(error) => {

@@ -50,6 +50,9 @@ pub struct Arguments {
     /// Directory for the results [default: runs/<utc>-<name>]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Remove the files of an earlier run from the directory for the results
+    #[arg(long, requires = "out", hide_short_help = true)]
+    overwrite: bool,
     /// Do not run without every privilege that the scenario asks for
     #[arg(long, hide_short_help = true)]
     require_rt: bool,
@@ -245,11 +248,14 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
     let started = SystemTime::now();
     let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
         .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
-    if arguments.out.is_some() {
-        claim(&directory).map_err(|error| match error {
-            ResultsError::Foreign { .. } => Failure::new(Exit::Usage, error),
-            ResultsError::Directory { .. } => Failure::new(Exit::Failure, error),
-        })?;
+    let run = scenario.run.expect("it was given before");
+    // Kept to the end: no other run writes to the directory meanwhile.
+    let claim = claim(&directory, run, arguments.overwrite).map_err(|error| match error {
+        ResultsError::Directory { .. } => Failure::new(Exit::Failure, error),
+        _ => Failure::new(Exit::Usage, error),
+    })?;
+    if let Some(names) = claim.removed_names().filter(|_| !arguments.quiet) {
+        remark(&format!("removed from {}: {names}", directory.display()));
     }
     let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());

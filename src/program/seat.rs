@@ -1,7 +1,7 @@
 //! `corotate seat`: what a foreign program must know to take a role's seat.
 
 use super::scenario::{Change, load};
-use super::{Exit, fail, say};
+use super::{Exit, fail, runs, say};
 use crate::config::ClockKind;
 use crate::runtime::{RoleError, RoleId, describe_seat, join_run};
 use crate::system::tell;
@@ -22,7 +22,7 @@ pub struct Arguments {
     /// Override any key of the scenario
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// The domain of a run that waits for the role; SCENARIO is then DIR/scenario.toml
+    /// The run that waits for the role: its domain, the directory that its results go to, or latest; SCENARIO is then the domain's scenario.toml
     #[arg(long, value_name = "DIR")]
     domain: Option<PathBuf>,
 }
@@ -49,7 +49,8 @@ fn describe(arguments: &Arguments) -> Result<(), Exit> {
         fail(Exit::Usage, &RoleError::NoSuchRole { role, known })
     })?;
     scenario.check_external(&arguments.role).map_err(|reason| fail(Exit::Usage, &reason))?;
-    let domain = arguments.domain.as_deref().map(|root| join_run(&scenario, root)).transpose();
+    let root = arguments.domain.as_deref().map(|given| runs::domain(Some(given))).transpose()?;
+    let domain = root.map(|root| join_run(&scenario, &root)).transpose();
     let domain = domain.map_err(|error| fail(Exit::Usage, &error))?;
     if domain.is_none() {
         let name = &arguments.role;

@@ -125,6 +125,9 @@ fn put_together(given: &MergeArguments) -> Exit {
 fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
     let campaign = campaign::load(file, &arguments.set).map_err(|error| fail(Exit::Usage, &error))?;
     let directory = directory(arguments, &campaign)?;
+    if cfg!(debug_assertions) && !arguments.quiet {
+        remark(&"this is a debug build, about 50 times as slow as a release build: `cargo build --release`");
+    }
     let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
     let threads = arguments.threads.map(usize::from);
     let threads = threads.or_else(|| std::thread::available_parallelism().ok().map(usize::from)).unwrap_or(1);
@@ -324,7 +327,11 @@ fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -
     let scenario = campaign.scenario(case).map_err(|error| error.to_string())?;
     let run = new_run().map_err(|error| format!("no random numbers: {error}"))?;
     let scenario = Scenario { run: Some(run), record: true, ..scenario };
-    claim(path).map_err(|error| error.to_string())?;
+    // The samples of a case are the same whenever it runs.
+    let claim = claim(path, run, true).map_err(|error| error.to_string())?;
+    if let Some(names) = claim.removed_names() {
+        remark(&format!("removed from {}: {names}", path.display()));
+    }
     let (started, mut silent) = (SystemTime::now(), |_: &Progress<'_>| {});
     let mut launch = Launch { record: Some(path.join("run.mcap")), ..Launch::new(signal, &mut silent) };
     let outcome = crate::launch::run(&scenario, &mut launch).map_err(|error| error.to_string())?;

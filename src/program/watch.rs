@@ -1,12 +1,11 @@
 //! `corotate watch`: a screen on a running loop.
 
 use super::run::catch_signals;
-use super::{Exit, fail, say};
-use crate::launch::SUMMARY;
+use super::{Exit, fail, runs, say};
 use crate::sample::RoleState;
 use crate::watch::{Model, RoleLine, Session, WatchError, show, text};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Options of `corotate watch`.
@@ -47,26 +46,23 @@ Examples:
 
 /// Watches until it is enough.
 pub fn watch(arguments: &Arguments) -> Exit {
-    if let Some(run) = arguments.domain.as_deref().filter(|directory| directory.join(SUMMARY).exists()) {
-        let run = run.display();
-        return fail(
-            Exit::Usage,
-            &format!("{run} has the results of a run that is over; `corotate report {run}` shows it"),
-        );
-    }
     let signal = match catch_signals() {
         Ok(signal) => signal,
         Err(error) => return fail(Exit::Failure, &error),
     };
-    match attempt(arguments, &signal) {
+    let domain = match runs::domain(arguments.domain.as_deref()) {
+        Ok(domain) => domain,
+        Err(exit) => return exit,
+    };
+    match attempt(arguments, &domain, &signal) {
         Ok(exit) => exit,
         Err(error) => fail(exit_of(&error), &error),
     }
 }
 
-fn attempt(arguments: &Arguments, signal: &AtomicUsize) -> Result<Exit, WatchError> {
+fn attempt(arguments: &Arguments, domain: &Path, signal: &AtomicUsize) -> Result<Exit, WatchError> {
     let told = || signal.load(Ordering::Relaxed);
-    let mut session = match Session::open(arguments.domain.as_deref(), || told() != 0) {
+    let mut session = match Session::open(Some(domain), || told() != 0) {
         Err(_) if told() != 0 => return Ok(Exit::Signal(told())),
         opened => opened?,
     };
@@ -120,7 +116,7 @@ fn json(model: &Model) -> String {
 
 fn exit_of(error: &WatchError) -> Exit {
     match error {
-        WatchError::NoRun | WatchError::Domain(_) | WatchError::Run(_) | WatchError::Terminal { .. } => Exit::Usage,
+        WatchError::Domain(_) | WatchError::Run(_) | WatchError::Terminal { .. } => Exit::Usage,
         WatchError::Join { .. } | WatchError::Bus(_) => Exit::Failure,
     }
 }

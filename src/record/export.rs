@@ -15,6 +15,7 @@ use super::RecordError;
 use super::reader::{Recording, SignalInfo};
 use crate::files;
 use crate::sample::Stamp;
+use crate::system::remedy;
 use std::fs::Permissions;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
@@ -28,7 +29,7 @@ pub enum ExportError {
     #[error(transparent)]
     Recording(#[from] RecordError),
     /// A table, or the directory for it, cannot be written.
-    #[error("cannot write {}: {source}; free some room, or name another directory", path.display())]
+    #[error("cannot write {}: {source}; {}, or name another directory", path.display(), remedy(source))]
     Write {
         /// The table, or the directory.
         path: PathBuf,

@@ -9,13 +9,13 @@ use super::RecordError;
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, Scenario, ScriptedFault};
+use crate::files;
 use crate::sample::{CDR_HEADER, FieldKind, Layout, Stamp, VOID};
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError};
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, Read};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -568,7 +568,7 @@ fn scan(
     mut sample: impl FnMut(u16, u64, &[u8]),
 ) -> Result<Option<Flaw>, RecordError> {
     let failed = |source| RecordError::Read { path: path.to_owned(), source };
-    let mut file = File::open(path).map_err(failed)?;
+    let mut file = files::open(path).map_err(failed)?;
     let mut unread = file.metadata().map_err(failed)?.len();
     let mut last = [0; MAGIC.len()];
     // What has its end was not cut off, whatever lengths it tells.

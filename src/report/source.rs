@@ -6,10 +6,11 @@ use super::ReportError;
 use super::percentiles::{Curve, read_curve};
 use super::summary::Summary;
 use crate::config::{ClockKind, RunId, Scenario};
+use crate::files;
 use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY};
 use crate::record::Recording;
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 /// Everything that was found.
@@ -112,7 +113,7 @@ impl Source {
 
 /// The content of a file; none if there is no such file.
 fn text(path: &Path) -> Result<Option<String>, ReportError> {
-    match fs::read_to_string(path) {
+    match files::open(path).and_then(io::read_to_string) {
         Ok(text) => Ok(Some(text)),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(source) => Err(ReportError::Read { path: path.to_owned(), source }),

@@ -38,6 +38,7 @@ pub(crate) use privileges::{
     go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
+pub(crate) use process::SUMMARY;
 pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
 #[cfg(feature = "hosts")]
 pub(crate) use process::{clock_path, join};

@@ -161,23 +161,31 @@ pub fn results_path(root: &Path) -> PathBuf {
     root.join("results")
 }
 
-/// The domain of the run that is meant: of the newest that is under way; or of the one whose results go to the directory that is
-/// given; or that directory itself.
+/// The file of a run's results that is written once it is over.
+pub(crate) const SUMMARY: &str = "summary.json";
+
+/// The domain of a run that is under way: of the newest; or of the one whose results go to the directory that is given, or whose
+/// recording is the file that is given; or that directory itself.
 ///
 /// # Errors
-/// [`DomainError::Privacy`].
-pub fn run_under_way(given: Option<&Path>) -> Result<Option<PathBuf>, DomainError> {
-    // A domain that cannot be joined is told by whoever joins it.
+/// [`DomainError::NoRun`], [`DomainError::Over`], [`DomainError::NotADomain`], [`DomainError::Privacy`].
+pub fn run_under_way(given: Option<&Path>) -> Result<PathBuf, DomainError> {
+    // A domain that cannot be joined is told by the process that joins it.
     if let Some(given) = given.filter(|given| !matches!(Domain::join(given), Err(DomainError::NotADomain { .. }))) {
-        return Ok(Some(given.to_owned()));
+        return Ok(given.to_owned());
     }
     let mut running = domains()?.into_iter().filter(|found| found.alive).map(|found| found.root);
-    let Some(given) = given else { return Ok(running.next()) };
-    let directory = std::fs::canonicalize(given).unwrap_or_else(|_| given.to_owned());
+    let Some(given) = given else { return running.next().ok_or(DomainError::NoRun) };
+    let whole = std::fs::canonicalize(given).unwrap_or_else(|_| given.to_owned());
+    let directory = if whole.is_file() { whole.parent().unwrap_or(&whole) } else { &whole };
     let meant = |root: &PathBuf| {
-        std::fs::read(results_path(root)).is_ok_and(|results| results == directory.as_os_str().as_bytes())
+        files::read(&results_path(root)).is_ok_and(|results| results == directory.as_os_str().as_bytes())
     };
-    Ok(Some(running.find(meant).unwrap_or_else(|| given.to_owned())))
+    match running.find(meant) {
+        Some(root) => Ok(root),
+        None if directory.join(SUMMARY).exists() => Err(DomainError::Over { path: given.to_owned() }),
+        None => Err(DomainError::NotADomain { path: given.to_owned() }),
+    }
 }
 
 /// Takes a role's seat in a run and serves it to the end. `terminated` is set by a signal that asks the process to end.

@@ -6,6 +6,7 @@
 use super::handover;
 use crate::shared::SharedWords;
 use crate::state::Words;
+use crate::system::remedy;
 use rustix::fs::{FlockOperation, flock};
 use std::cell::{Cell, OnceCell};
 use std::io;
@@ -18,7 +19,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 #[derive(Debug, thiserror::Error)]
 pub enum LedgerError {
     /// The memory could not be had.
-    #[error("cannot keep the state in {}: {source}; is there room in /dev/shm?", path.display())]
+    #[error("cannot keep the state in {}: {source}; {}", path.display(), remedy(source))]
     Open {
         /// The file.
         path: PathBuf,

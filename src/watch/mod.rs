@@ -32,9 +32,6 @@ use std::io;
 /// Why there is nothing to watch.
 #[derive(Debug, thiserror::Error)]
 pub enum WatchError {
-    /// No run was found.
-    #[error("no run of this user is under way; start one with `corotate run`, or name its domain's directory")]
-    NoRun,
     /// The domain is none.
     #[error(transparent)]
     Domain(#[from] DomainError),

@@ -58,7 +58,7 @@ impl Session {
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>, stop: impl Fn() -> bool) -> Result<Self, WatchError> {
-        let root = run_under_way(directory)?.ok_or(WatchError::NoRun)?;
+        let root = run_under_way(directory)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let patient = || monotonic_ns() < end_ns && !stop();
         let (domain, scenario) = insist(patient, || join_whole(&root))?;

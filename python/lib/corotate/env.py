@@ -114,5 +114,5 @@ class Env(gymnasium.Env):
         if self._summary is None:
             if self._steps is None:
                 raise RuntimeError("there is no episode to sum up: call reset() first")
-            self._summary, self._steps = json.loads(self._steps.finish(False, None)[0]), None
+            self._summary, self._steps = json.loads(self._steps.finish()[0]), None
         return self._summary

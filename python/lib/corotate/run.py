@@ -88,7 +88,7 @@ class _Timeout:
 
 
 def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", record=False, out=None, timeout_s=None,
-        require_realtime=False):
+        require_realtime=False, overwrite=False):
     """Runs a scenario to its end.
 
     Parameters
@@ -111,6 +111,8 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
     timeout_s : float
         A run that takes longer is ended in order, and TimeoutError raised, also where a function hangs. In the clock `in-process`
         the function then runs in a thread. Python cannot end a thread that sleeps: it goes on until it executes Python again.
+    overwrite : bool
+        Whether the files of an earlier run in `out` are removed; a CorotateError otherwise.
 
     Returns
     -------
@@ -144,9 +146,9 @@ def run(scenario, *, clock="lockstep", set={}, roles={}, roles_in="thread", reco
             raise ValueError("in one thread a function can only be the controller; take clock='lockstep'")
         if record:
             raise ValueError("a run that is stepped is not recorded; take clock='lockstep'")
-        return _stepped(text, kind, set, roles["controller"], timeout, out)
+        return _stepped(text, kind, set, roles["controller"], timeout, out, overwrite)
     start = RoleThread if roles_in == "thread" else RoleProcess
-    arguments = text, kind, overrides({"clock": clock, **set}), list(roles), record, out and str(out), require_realtime
+    arguments = text, kind, overrides({"clock": clock, **set}), list(roles), record, out and str(out), overwrite, require_realtime
     return _launched(arguments, roles, start, timeout)
 
 
@@ -200,13 +202,14 @@ def _with_run(error, made, role=None):
     return error
 
 
-def _stepped(text, kind, changes, function, timeout, out):
+def _stepped(text, kind, changes, function, timeout, out, overwrite):
     """A run in one thread whose controller is a function. With a limit of time this thread watches another one."""
     __tracebackhide__ = True
     made, errors, left = [], [], threading.Event()
 
     def step():
         steps = _corotate.Steps(text, kind, overrides({**changes, "clock": "in-process"}))
+        steps.claim(out and str(out), overwrite)
         samples = Samples(*steps.seat())
         blank = samples.blank()
         while not steps.over() and not left.is_set():
@@ -214,7 +217,7 @@ def _stepped(text, kind, changes, function, timeout, out):
             function(steps.tick(), inputs, outputs)
             steps.act(outputs.close())
         if not left.is_set():
-            summary, directory = steps.finish(True, out and str(out))
+            summary, directory = steps.finish()
             made.append(Run(json.loads(summary), Path(directory)))
 
     def guarded():

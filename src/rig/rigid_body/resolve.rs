@@ -34,6 +34,7 @@ pub(super) fn resolve(
         let Some(playback) = &playback else { return Ok((None, table)) };
         raw.leader.initial_rate_rad_s = Some(playback.at(0.0).into());
     }
+    notes.extend(unmeasured(&raw.leader));
     let supplied_axis = config::hidden_axis(&raw, checks);
     let outages = resolve_outages(&raw, context.tick_s, checks);
     let inertia = checks.accept("leader.inertia_kg_m2", Inertia::new(raw.leader.inertia_kg_m2));
@@ -82,6 +83,17 @@ pub(super) fn resolve(
     }
     rig.check_tick(checks);
     Ok((Some(rig), table))
+}
+
+/// What is set of axes that the leader does not measure, and so has no effect.
+fn unmeasured(leader: &RawLeader) -> impl Iterator<Item = String> {
+    let of = |key: &'static str, values: [f64; 3]| {
+        let measured = &leader.measured_axes;
+        (1..=3).filter(move |axis| values[axis - 1] != 0.0 && !measured.contains(axis)).map(move |axis| {
+            format!("leader.{key} is set for axis {axis}, which is not measured: it has no effect there")
+        })
+    };
+    of("noise_rad_s", leader.noise_rad_s).chain(of("bias_rad_s", leader.bias_rad_s))
 }
 
 fn noise(context: Context, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
