@@ -89,6 +89,8 @@ pub mod hosts;
 #[cfg(feature = "runtime")]
 pub mod launch;
 #[cfg(feature = "runtime")]
+mod panics;
+#[cfg(feature = "runtime")]
 mod program;
 #[cfg(feature = "runtime")]
 pub mod record;

@@ -1,6 +1,6 @@
 //! A program of somebody else's, `examples/motor-pair`: with a rig that this crate does not know, everything works.
 
-use crate::common::{self, Bench, await_some};
+use crate::common::{self, Bench, Running, await_some};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -227,4 +227,118 @@ fn a_new_crate_is_the_example_under_its_name() {
         let refused = bench.run(&["new", name]);
         assert!(refused.code == Some(2) && refused.stderr.contains("cannot name"), "{name}: {refused:?}");
     }
+}
+
+/// The example with a law that panics at tick 500 as `PANIC` says, under another name.
+fn panicking() -> &'static Path {
+    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let example = root().join("examples/motor-pair");
+        let profile = Path::new(env!("CARGO_BIN_EXE_corotate")).parent().unwrap();
+        let directory = profile.join("motor-panics-crate");
+        std::fs::create_dir_all(directory.join("src")).unwrap();
+        let copy = |file: &str, change: &dyn Fn(String) -> String| {
+            let text = std::fs::read_to_string(example.join(file)).unwrap();
+            std::fs::write(directory.join(file), change(text)).unwrap();
+        };
+        let crate_path = format!("path = \"{}\"", root().display());
+        copy("Cargo.toml", &|text| text.replace("motor-pair", "motor-panics").replace("path = \"../..\"", &crate_path));
+        copy("Cargo.lock", &|text| text.replace("motor-pair", "motor-panics"));
+        copy("motor-pair.toml", &|text| text);
+        copy("src/main.rs", &|text| {
+            let law = "let rise = leader.rise_rad_s2";
+            assert!(text.contains(law));
+            text.replace(law, &format!("fail(own.stamp.tick);\n        {law}")) + PANICS
+        });
+        let mut command = Command::new(env!("CARGO"));
+        command.args(["build", "--manifest-path", directory.join("Cargo.toml").to_str().unwrap()]);
+        command.args(["--offline", "--target-dir", profile.parent().unwrap().to_str().unwrap()]);
+        command.args((!cfg!(debug_assertions)).then_some("--release"));
+        let built = command.output().unwrap();
+        assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+        profile.join("motor-panics")
+    })
+}
+
+const PANICS: &str = r#"
+struct Bomb;
+impl Drop for Bomb {
+    fn drop(&mut self) {
+        panic!("the second panic");
+    }
+}
+fn fail(tick: u64) {
+    if tick < 500 {
+        return;
+    }
+    match std::env::var("PANIC").as_deref() {
+        Ok("lines") => panic!("the rate is NaN\n  at tick {tick}"),
+        Ok("long") => panic!("the rate is NaN{}", "é".repeat(100_000)),
+        Ok("any") => std::panic::panic_any(tick),
+        Ok("nested") => {
+            let _bomb = Bomb;
+            panic!("the rate is NaN");
+        }
+        Ok("index") => {
+            let rates = vec![0.0; tick as usize - 500];
+            assert!(rates[tick as usize] > 0.0);
+        }
+        _ => {}
+    }
+}
+"#;
+
+/// The message and the place are the user's, they come first, and the same panic does not come again and again.
+#[test]
+fn a_law_that_panics_is_told_by_its_message_and_place() {
+    let bench = Bench::of(panicking());
+    for (kind, message, starts) in [
+        ("lines", "the rate is NaN\n  at tick 500", 2),
+        ("long", "the rate is NaNé", 2),
+        ("any", "a value that is no text", 2),
+        ("nested", "the rate is NaN", 2),
+        ("index", "index out of bounds: the len is 0 but the index is 500", 2),
+    ] {
+        let run = |line: &[&str], backtrace: &str| {
+            let mut command = bench.command();
+            Running::new(command.args(line).env("PANIC", kind).env("RUST_BACKTRACE", backtrace)).wait()
+        };
+        for (clock, starts) in [("lockstep", starts), ("in-process", 1), ("realtime", 3)] {
+            if clock == "realtime" && kind != "lines" {
+                continue;
+            }
+            let out = format!("{kind}-{clock}");
+            if clock == "in-process" && kind == "nested" {
+                // The panic in a panic ends the only process there is; its message comes first all the same.
+                let done = run(&["run", "--clock", clock, "--out", &out], "0");
+                assert!(done.stderr.contains("panicked at src/main.rs:") && done.stderr.contains(message), "{done:?}");
+                continue;
+            }
+            let line =
+                ["run", "--clock", clock, "--out", &out, "--set", "accept={}", "--set", "realtime.lock_memory=false"];
+            let done = run(&line, "1");
+            assert_eq!(done.code, Some(4), "{out}: {done:?}");
+            assert!(!done.stderr.contains("defect"), "{out}: {done:?}");
+            let first = done.stderr.lines().find(|line| line.contains("panicked at")).unwrap();
+            assert!(first.contains("src/main.rs:"), "{out}: {done:?}");
+            let told = summary(&bench, &out);
+            let incidents = told["incidents"].as_array().unwrap();
+            assert_eq!(incidents.len(), starts, "{out}: {incidents:#?}");
+            for (index, incident) in incidents.iter().enumerate() {
+                assert_eq!(incident["role"], "controller", "{out}");
+                let panic = &incident["panic"];
+                assert!(
+                    panic["message"].as_str().unwrap().starts_with(message) || clock == "realtime",
+                    "{out}: {panic}"
+                );
+                assert!(panic["place"].as_str().unwrap().starts_with("src/main.rs:"), "{out}: {panic}");
+                assert!(incident["cause"].as_str().unwrap().contains("src/main.rs:"), "{out}: {incident}");
+                assert_eq!(incident["last_words"], "", "{out}");
+                assert_eq!(incident["action"] == "stopped", index + 1 == starts, "{out}: {incident}");
+                assert!(clock == "realtime" || incident["tick"] == 500, "{out}: {incident}");
+            }
+            assert_eq!(told["books"]["balanced"], true, "{out}");
+        }
+    }
+    bench.assert_clean(&[]);
 }

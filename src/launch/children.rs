@@ -6,7 +6,8 @@ use super::LaunchError;
 use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
-use crate::runtime::RoleId;
+use crate::panics::Panic;
+use crate::runtime::{RoleId, panic_path};
 use crate::system::{tell, this_program};
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
@@ -14,6 +15,7 @@ use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -21,6 +23,8 @@ use std::time::Duration;
 
 /// How long a role may take to end once it has been told to.
 pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
+/// The exit code of a program of ours that failed.
+const FAILURE: i32 = 1;
 /// How much of a role's error output is kept.
 const LAST_LINES: usize = 8;
 
@@ -31,6 +35,8 @@ pub(super) struct RoleProcess {
     /// Readable once the process has ended; none on a kernel without.
     handle: Option<OwnedFd>,
     last_words: Arc<Mutex<VecDeque<String>>>,
+    /// Where it leaves its panic, if it does.
+    panic: Option<PathBuf>,
     listener: Option<JoinHandle<()>>,
 }
 
@@ -48,7 +54,10 @@ impl RoleProcess {
         if let RoleId::Plant(_) = role {
             command.arg("--body").arg(&name);
         }
-        Self::spawn(command, name)
+        let panic = panic_path(domain.root(), &name);
+        let mut process = Self::spawn(command, name)?;
+        process.panic = Some(panic);
+        Ok(process)
     }
 
     /// Starts what dies with this process and is listened to under a name.
@@ -62,7 +71,7 @@ impl RoleProcess {
         let handle = Pid::from_raw(child.id() as i32).and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
         let last_words = Arc::new(Mutex::new(VecDeque::new()));
         // Ended again if nobody can listen to it.
-        let mut process = Self { child, status: None, handle, last_words, listener: None };
+        let mut process = Self { child, status: None, handle, last_words, panic: None, listener: None };
         let listen = |stderr| listen(name.clone(), stderr, process.last_words.clone());
         process.listener = stderr.map(listen).transpose().map_err(failed)?;
         Ok(process)
@@ -81,20 +90,30 @@ impl RoleProcess {
         self.handle.as_ref().filter(|_| self.status.is_none())
     }
 
+    /// The panic that it has left, if it has.
+    pub fn panic(&self) -> Option<Failure> {
+        self.panic.as_deref().and_then(Panic::take).map(Failure::of)
+    }
+
     /// How a role failed that ended before its time.
     pub fn failure(&mut self, status: ExitStatus) -> Failure {
+        // A panic is caught by our own `main`, or ends the process by SIGABRT.
+        let panicked = status.code() == Some(FAILURE) || status.signal() == Some(libc::SIGABRT);
+        if let Some(failure) = self.panic().filter(|_| panicked) {
+            return failure;
+        }
         let cause = match (status.code(), status.signal()) {
             (Some(code), _) => format!("it exited with code {code}"),
             (None, Some(signal)) => format!("it was killed by {}", signal_name(signal)),
             (None, None) => "it ended".to_owned(),
         };
-        Failure { cause, last_words: self.last_words() }
+        Failure::new(cause, self.last_words())
     }
 
     /// An error if the process has ended before the ticks run.
     pub fn require_alive(&mut self, name: &str) -> Result<(), LaunchError> {
         let Some(status) = self.ended() else { return Ok(()) };
-        let Failure { cause, last_words } = self.failure(status);
+        let Failure { cause, last_words, .. } = self.failure(status);
         Err(LaunchError::Died { role: name.to_owned(), cause, last_words })
     }
 

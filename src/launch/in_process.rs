@@ -2,15 +2,17 @@
 //! files, no clock.
 
 use super::score;
+use super::supervision::Failure;
 use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
 use crate::config::{OnFailure, Scenario};
+use crate::panics;
 use crate::record::Recorder;
-use crate::runtime::{Ended, RoleId, build, depths, in_turn, private_ledger, report};
+use crate::runtime::{Ended, RoleId, build, depths, in_noted_turn, private_ledger, report};
 use crate::system::tell;
 use crate::telemetry::{Ledger, RoleReport};
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::sync::atomic::Ordering;
 
 /// Ticks between two looks at signals and progress.
@@ -18,9 +20,10 @@ const TURN_TICKS: u64 = 1024;
 
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
-    match scenario.rig.face().direct(scenario, launch) {
-        Some(outcome) => Ok(outcome),
-        None => run_nodes(scenario, launch),
+    // A panic comes again in the node of a role, which is told by name then.
+    match panics::catch_quietly(|| scenario.rig.face().direct(scenario, launch)) {
+        Ok(Some(outcome)) => Ok(outcome),
+        Ok(None) | Err(_) => run_nodes(scenario, launch),
     }
 }
 
@@ -53,7 +56,8 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         recorder.start(0, None)?;
     }
     let (mut failure, mut unrecorded) = (None, None);
-    let ended = in_turn(&mut nodes, scenario.last_tick, revive, |tick| {
+    let turn = Cell::new(None);
+    let after_tick = |tick| {
         let mut scorer = scorer.borrow_mut();
         if let (Some(recorder), None) = (&mut recorder, &unrecorded) {
             unrecorded = recorder.poll().err();
@@ -66,7 +70,22 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
                 false
             }
         }
-    })?;
+    };
+    let ended = match panics::catch(|| in_noted_turn(&mut nodes, scenario.last_tick, &turn, revive, after_tick)) {
+        Ok(ended) => ended?,
+        Err(panic) => {
+            let Some(index) = turn.get() else { return Err(LaunchError::Panicked { panic }) };
+            // All commit what they count. One that cannot even do that has panicked in its own turn.
+            for node in &mut nodes {
+                panics::catch(|| node.finish()).unwrap_or(Ok(()))?;
+            }
+            let (role, ledger) = &seats[index];
+            let incident = Incident::without_process(role.name(scenario), ledger, Failure::of(panic), Action::Stopped);
+            scorer.borrow_mut().incident(incident.tick);
+            incidents.push(incident);
+            Ended::Stopped
+        }
+    };
     if let Some(error) = failure {
         return Err(error.into());
     }
@@ -100,7 +119,8 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
 fn incident(scenario: &Scenario, (role, ledger): &(RoleId, Ledger)) -> Incident {
     let (name, supervision) = (role.name(scenario), &scenario.supervision);
     let again = supervision.of(name) == OnFailure::Restart && ledger.generation() <= supervision.restarts_max;
-    Incident::without_process(name, ledger, if again { Action::Restarted } else { Action::Stopped })
+    let killed = Failure::new("it was killed by the scenario".to_owned(), String::new());
+    Incident::without_process(name, ledger, killed, if again { Action::Restarted } else { Action::Stopped })
 }
 
 /// Now and then tells how far the run is; false if a signal asked for its end.

@@ -48,6 +48,7 @@ use crate::bus::BusError;
 use crate::bus::domain::DomainError;
 use crate::config::{ClockKind, Scenario};
 use crate::hosts::HostSeat;
+pub use crate::panics::Panic;
 use crate::record::RecordError;
 use crate::runtime::NodeError;
 use crate::system::remedy;
@@ -178,6 +179,12 @@ pub enum LaunchError {
         cause: String,
         /// The end of its error output.
         last_words: String,
+    },
+    /// The rig's score, or its other parts in the launcher, panicked.
+    #[error("the rig failed outside of its roles: {panic}")]
+    Panicked {
+        /// The panic.
+        panic: Panic,
     },
     /// Roles were not ready in time.
     #[error("not ready within {limit_s} s: {roles}; on a slow machine raise launch.startup_timeout_s")]

@@ -294,7 +294,7 @@ impl<'a> Supervisor<'a> {
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
             for member in &mut self.members {
-                if let Some(Failure { cause, last_words }) = member.failure(self.scenario, self.janitor) {
+                if let Some(Failure { cause, last_words, .. }) = member.failure(self.scenario, self.janitor) {
                     return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
                 }
             }
@@ -434,7 +434,7 @@ impl<'a> Supervisor<'a> {
             match waiting {
                 Waiting::Say(words) => (launch.progress)(&Progress::External(&words)),
                 Waiting::TooLong { member, tick, cause } => {
-                    let failure = Failure { cause, last_words: String::new() };
+                    let failure = Failure::new(cause, String::new());
                     let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
                     let incident = Incident { tick, ..incident };
                     tell(format_args!("corotate: {incident}"));

@@ -140,6 +140,8 @@ fn incident(role: String, with: Vec<String>, tick: u64, cause: String, last_word
         tick,
         cause,
         last_words,
+        panic: None,
+        repeated: false,
         begins_anew: false,
         action: Action::Stopped,
         outage_s: None,

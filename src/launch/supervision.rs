@@ -11,7 +11,8 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
-use crate::runtime::{RoleId, open_ledger, report_path, topic, words_path};
+use crate::panics::Panic;
+use crate::runtime::{RoleId, open_ledger, panic_path, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::Ledger;
 use serde::{Deserialize, Serialize};
@@ -26,6 +27,9 @@ const DISTRUSTED_NS: u64 = 1_000_000_000;
 
 /// An external role that is seen by its samples alone may be silent for at least so many periods.
 const SILENT_PERIODS: f64 = 10.0;
+
+/// So many starts in a row may end with the same panic: the second of them began without the state of the first.
+const PANICS_MAX: u64 = 2;
 
 /// A role that failed while the ticks ran, and what was done.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -45,6 +49,12 @@ pub struct Incident {
     pub cause: String,
     /// The end of its error output.
     pub last_words: String,
+    /// The panic that ended its process, if one did: its message as it was written, and its place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub panic: Option<Panic>,
+    /// True if it panicked as before, so that another start would not help.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub repeated: bool,
     /// Whether its successor begins with its counters alone: the state that it had itself inherited may be what it died of.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub begins_anew: bool,
@@ -80,6 +90,7 @@ impl fmt::Display for Incident {
         f.write_str(match self.action {
             Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
             Action::Restarted => "; it is started anew",
+            Action::Stopped if self.repeated => "; as before, so it is not started anew; the run ends",
             Action::Stopped => "; the run ends",
             Action::Noted => " after its last tick; its results are complete",
         })
@@ -87,16 +98,18 @@ impl fmt::Display for Incident {
 }
 
 impl Incident {
-    /// The scripted end of a role that has no process of its own: its successor is there at once.
-    pub(super) fn without_process(role: &str, ledger: &Ledger, action: Action) -> Self {
+    /// The end of a role that has no process of its own: after a scripted one its successor is there at once.
+    pub(super) fn without_process(role: &str, ledger: &Ledger, failure: Failure, action: Action) -> Self {
         Self {
             role: role.to_owned(),
             external: false,
             with: Vec::new(),
             generation: ledger.generation(),
             tick: crate::runtime::next_tick(ledger),
-            cause: "it was killed by the scenario".to_owned(),
-            last_words: String::new(),
+            cause: failure.cause,
+            last_words: failure.last_words,
+            panic: failure.panic,
+            repeated: false,
             begins_anew: false,
             action,
             outage_s: None,
@@ -109,6 +122,20 @@ impl Incident {
 pub(super) struct Failure {
     pub cause: String,
     pub last_words: String,
+    /// The panic that ended its process, if one did.
+    pub panic: Option<Panic>,
+}
+
+impl Failure {
+    /// A failure of a process that did not panic.
+    pub fn new(cause: String, last_words: String) -> Self {
+        Self { cause, last_words, panic: None }
+    }
+
+    /// A panic; its message is all that is told of the error output, which ends with a backtrace.
+    pub fn of(panic: Panic) -> Self {
+        Self { cause: panic.to_string(), last_words: String::new(), panic: Some(panic) }
+    }
 }
 
 /// One role, seen from the launcher, with what else is in its process.
@@ -141,6 +168,8 @@ pub(super) struct Member {
     restarts: u64,
     /// When the successor is due, and when the failure was noticed, ns.
     restart: Option<(u64, u64)>,
+    /// The panic that the last start ended with, at which tick, and how many starts in a row ended so.
+    panicked: Option<(Panic, u64, u64)>,
 }
 
 impl Member {
@@ -176,6 +205,7 @@ impl Member {
             started_ns: now_ns,
             restarts: 0,
             restart: None,
+            panicked: None,
         })
     }
 
@@ -284,12 +314,16 @@ impl Member {
             return None;
         }
         process.kill();
+        // A backtrace may take longer than the limit.
+        if let Some(failure) = process.panic() {
+            return Some(failure);
+        }
         let (said, limit) = match heard {
             true => ("said nothing", "supervision.heartbeat_timeout_s"),
             false => ("was not ready", "launch.startup_timeout_s"),
         };
         let cause = format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}");
-        Some(Failure { cause, last_words: process.last_words() })
+        Some(Failure::new(cause, process.last_words()))
     }
 
     /// Returns how an external role has failed: it left its last words, it is gone, or it is silent in real time. In lockstep a
@@ -300,12 +334,16 @@ impl Member {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let left = || "it left before its last tick".to_owned();
+        let panic = panic_path(janitor.root(), &self.name);
+        let fail = |cause: String, last_words: String| {
+            Some(Panic::take(&panic).map_or_else(|| Failure::new(cause, last_words), Failure::of))
+        };
         if state != RoleState::Done
             && let Ok(last_words) = std::fs::read_to_string(words_path(janitor.root(), &self.name))
         {
-            return Some(Failure { cause: left(), last_words });
+            return fail(left(), last_words);
         }
-        let fail = |cause: String| Some(Failure { cause, last_words: String::new() });
+        let fail = |cause: String| fail(cause, String::new());
         let timeout_s = match &self.host {
             Some(_) => scenario.hosts.network.silence_timeout_s,
             None => scenario.supervision.heartbeat_timeout_s,
@@ -352,7 +390,7 @@ impl Member {
                 process.kill();
                 let limit_s = END_LIMIT.as_secs();
                 let cause = format!("it did not end within {limit_s} s of being told to and was killed");
-                Some(Failure { cause, last_words: process.last_words() })
+                Some(Failure::new(cause, process.last_words()))
             }
         }
     }
@@ -383,6 +421,8 @@ impl Member {
             tick: if self.counts() { crate::runtime::next_tick(&self.ledger) } else { self.last.stamp.tick },
             cause: failure.cause,
             last_words: failure.last_words,
+            panic: failure.panic,
+            repeated: false,
             begins_anew: false,
             action,
             outage_s: None,
@@ -394,7 +434,9 @@ impl Member {
     pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
         let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
-        let again = !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max;
+        let repeated = self.panics_again(&failure, scenario.clock);
+        let again =
+            !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max && !repeated;
         // A state that kills must not be inherited for ever.
         let begins_anew = again && self.generation > 1 && now_ns.saturating_sub(self.started_ns) < DISTRUSTED_NS;
         if begins_anew {
@@ -402,7 +444,7 @@ impl Member {
         }
         let action = if again { Action::Restarted } else { Action::Stopped };
         self.lost = !again;
-        let incident = Incident { begins_anew, ..self.incident(failure, scenario, action) };
+        let incident = Incident { begins_anew, repeated, ..self.incident(failure, scenario, action) };
         // Reaped here, before anybody takes the seat.
         self.process = None;
         if again {
@@ -413,6 +455,19 @@ impl Member {
             self.restart = Some((earliest_ns.max(now_ns), now_ns));
         }
         incident
+    }
+
+    /// Takes note of a panic, and returns true if another start would only repeat it: at once in lockstep, where the same tick
+    /// has the same inputs; in real time after a start that began without the state of the one before.
+    fn panics_again(&mut self, failure: &Failure, clock: ClockKind) -> bool {
+        let tick = crate::runtime::next_tick(&self.ledger);
+        let alike = failure.panic.as_ref().map(|panic| match &self.panicked {
+            Some((before, at, starts)) if before.is_like(panic) => (panic.clone(), tick, starts + 1, *at == tick),
+            _ => (panic.clone(), tick, 1, false),
+        });
+        let same_tick = clock != ClockKind::Realtime && alike.as_ref().is_some_and(|(.., same_tick)| *same_tick);
+        self.panicked = alike.map(|(panic, tick, starts, _)| (panic, tick, starts));
+        same_tick || self.panicked.as_ref().is_some_and(|(.., starts)| *starts > PANICS_MAX)
     }
 
     /// Starts the successor if it is due.

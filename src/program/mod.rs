@@ -37,12 +37,12 @@ mod watch;
 
 use crate::bench::Row;
 use crate::bus::domain::Domain;
+use crate::panics;
 use crate::rig::{Rig, RigKind, register};
 use crate::system::remedy;
 use clap::{FromArgMatches, Parser, Subcommand};
 use color::When;
 use help::WIDTH;
-use std::backtrace::{Backtrace, BacktraceStatus};
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{self, Write};
@@ -283,9 +283,9 @@ impl Program {
         let arguments = Arguments::from_arg_matches_mut(&mut help::line().get_matches_from(words_given()));
         let Arguments { command, color } = arguments.unwrap_or_else(|error| error.exit());
         color::choose(color);
-        // iceoryx2 panics where the system does what it holds impossible. What this process holds is put away on the way here.
-        let exit = std::panic::catch_unwind(|| obey(command))
-            .unwrap_or_else(|_| fail(Exit::Failure, &"it cannot go on; run it again, and report the line above"));
+        // A user's rig may panic, and iceoryx2 does where the system does what it holds impossible; the hook has told it. What
+        // this process holds is put away on the way here.
+        let exit = std::panic::catch_unwind(|| obey(command)).unwrap_or(Exit::Failure);
         exit.code()
     }
 
@@ -306,7 +306,7 @@ impl Program {
         let _ = CAMPAIGNS.set(self.campaigns);
         // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
         let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
-        tell_defects();
+        panics::set_hook(remark);
     }
 }
 
@@ -345,21 +345,6 @@ fn name() -> &'static str {
         let file = words_given().first().map(Path::new).and_then(Path::file_name);
         file.map_or("corotate".into(), |name| name.to_string_lossy().into_owned())
     })
-}
-
-/// Tells a panic as any error is told, and with RUST_BACKTRACE where it came from.
-fn tell_defects() {
-    std::panic::set_hook(Box::new(|panic| {
-        let place = panic.location().map_or(String::new(), |at| format!(" at {}:{}", at.file(), at.line()));
-        let payload = panic.payload();
-        let words = payload.downcast_ref::<String>().map(String::as_str).or(payload.downcast_ref().copied());
-        let words = words.unwrap_or("no reason given").trim();
-        remark(&format!("a defect of this program or of iceoryx2{place}: {words}"));
-        let trace = Backtrace::capture();
-        if trace.status() == BacktraceStatus::Captured {
-            remark(&trace);
-        }
-    }));
 }
 
 /// Does what the command line asks for.

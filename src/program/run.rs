@@ -345,7 +345,12 @@ impl Verdict {
             return Self::new(exit, FAIL, "the counters do not balance");
         }
         if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
-            return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost", stopped.role));
+            // A run in one thread has told nobody yet.
+            if stopped.panic.is_some() && summary.clock == "in-process" {
+                remark(stopped);
+            }
+            let why = stopped.panic.as_ref().map_or(String::new(), |panic| format!(": {panic}"));
+            return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost{why}", stopped.role));
         }
         if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
             let exit = fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
@@ -414,6 +419,7 @@ pub fn exit_of(error: &LaunchError) -> Exit {
         | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)
         | LaunchError::Node(_)
+        | LaunchError::Panicked { .. }
         | LaunchError::Ledger(_)
         | LaunchError::Write { .. }
         | LaunchError::Record(_)

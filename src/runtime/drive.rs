@@ -8,6 +8,7 @@ use super::node::{Node, NodeError, Poll, ReadyNode, RoleId, RunCondition};
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How often a role looks at the schedule and says how it is, ns.
@@ -346,11 +347,23 @@ impl Backoff {
 pub fn in_turn(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
+    revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
+    after_tick: impl FnMut(u64) -> bool,
+) -> Result<Ended, NodeError> {
+    in_noted_turn(nodes, last_tick, &Cell::new(None), revive, after_tick)
+}
+
+/// The same; `turn` is the index of the node whose turn it is, none between ticks.
+pub(crate) fn in_noted_turn(
+    nodes: &mut Vec<ReadyNode>,
+    last_tick: u64,
+    turn: &Cell<Option<usize>>,
     mut revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
     mut after_tick: impl FnMut(u64) -> bool,
 ) -> Result<Ended, NodeError> {
     for tick in 0..=last_tick {
         for index in 0..nodes.len() {
+            turn.set(Some(index));
             if nodes[index].before_tick() {
                 // The seat is left before it is taken again, as between processes.
                 let mut left = nodes.remove(index);
@@ -364,6 +377,7 @@ pub fn in_turn(
                 node.finish_tick()?;
             }
         }
+        turn.set(None);
         if !after_tick(tick) {
             return leave(nodes, Ended::Stopped);
         }

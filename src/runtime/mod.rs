@@ -19,6 +19,7 @@ mod share;
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
 pub use compute::{Compute, ComputedTick};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
+pub(crate) use drive::in_noted_turn;
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]
@@ -42,7 +43,9 @@ pub(crate) use process::SUMMARY;
 pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
 #[cfg(feature = "hosts")]
 pub(crate) use process::{clock_path, join};
-pub(crate) use process::{join_whole, open_ledger, report_path, results_path, scenario_path, words_path, write_whole};
+pub(crate) use process::{
+    join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path, write_whole,
+};
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 
 use crate::bus::Depths;

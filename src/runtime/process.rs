@@ -15,6 +15,7 @@ use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{self, Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
 use crate::files;
+use crate::panics;
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
@@ -156,6 +157,11 @@ pub fn words_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.words"))
 }
 
+/// The file in a domain's directory that a role leaves its panic in, if it panicked.
+pub fn panic_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.panic.json"))
+}
+
 /// The file in a domain's directory that says where the run's results will be: a path, and nothing else.
 pub fn results_path(root: &Path) -> PathBuf {
     root.join("results")
@@ -196,6 +202,7 @@ pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleErro
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
     require_process(&scenario, role)?;
+    panics::keep_in(panic_path(domain.root(), &seat.role));
     let others = role.hosted(&scenario).into_iter().filter(|other| *other != role);
     let others = others.map(|other| Ok((other, take_ledger(&domain, &scenario, other)?)));
     let occupant = RoleImpl::Role(role, others.collect::<Result<_, LedgerError>>()?);
