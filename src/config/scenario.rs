@@ -232,6 +232,13 @@ impl Scenario {
         rounded.into_iter().chain(self.rig.notes()).collect()
     }
 
+    /// Returns how long another host may be silent, s. One that starts is loaded, and its session may have to be replaced: it has
+    /// as long as a role has to come up.
+    pub fn host_silence_s(&self, running: bool) -> f64 {
+        let limit_s = self.hosts.network.silence_timeout_s;
+        if running { limit_s } else { limit_s.max(self.startup_timeout_s) }
+    }
+
     /// The period h, s.
     pub fn tick_s(&self) -> f64 {
         self.period_ns as f64 / 1e9

@@ -11,7 +11,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// After so long without a word whoever had a host's part has left it, ns: somebody else may have it, as long as no ticks run.
-const GONE_NS: u64 = 3_000_000_000;
+pub(super) const GONE_NS: u64 = 3_000_000_000;
 
 /// What a host asks.
 #[derive(Debug, Serialize, Deserialize)]
@@ -195,6 +195,16 @@ impl Parts {
         *taken = Some(Taken { token: request.token, since_ns: now_ns });
         Ok(name.clone())
     }
+
+    /// Returns the hosts that joined and then were not heard for so long, ns. Only meaningful before ticks run.
+    pub fn lost(&self, now_ns: u64, silent_ns: u64, heard_ns: &[AtomicU64]) -> Vec<String> {
+        let Ok(parts) = self.parts.lock() else { return Vec::new() };
+        let heard_ns = heard_ns.iter().map(|heard_ns| heard_ns.load(Ordering::Relaxed));
+        let silent = |taken: &Taken, heard_ns: u64| now_ns.saturating_sub(taken.since_ns.max(heard_ns)) > silent_ns;
+        let lost =
+            parts.iter().zip(heard_ns).filter(|((_, taken), at_ns)| taken.is_some_and(|taken| silent(&taken, *at_ns)));
+        lost.map(|((name, _), _)| name.clone()).collect()
+    }
 }
 
 /// The part that a host was given.
@@ -297,6 +307,20 @@ mod tests {
         );
         assert!(ask(&parts, Some("b"), 2, GONE_NS + 1, true).is_err(), "ticks run");
         assert_eq!(ask(&parts, Some("b"), 2, GONE_NS + 1, false), Ok("b".to_owned()), "it was left");
+    }
+
+    #[test]
+    fn a_host_that_joined_and_is_not_heard_is_lost() {
+        let (parts, heard_ns) = (parts(""), heard());
+        assert!(parts.lost(1_000, 100, &heard_ns).is_empty(), "nobody has joined");
+        ask(&parts, Some("b"), 1, 1_000, false).unwrap();
+        assert!(parts.lost(1_100, 100, &heard_ns).is_empty());
+        assert_eq!(parts.lost(1_101, 100, &heard_ns), ["b"]);
+        heard_ns[1].store(1_050, Ordering::Relaxed);
+        assert!(parts.lost(1_101, 100, &heard_ns).is_empty(), "it was heard");
+        assert_eq!(parts.lost(1_151, 100, &heard_ns), ["b"]);
+        ask(&parts, Some("b"), 2, 1_151 + GONE_NS, false).unwrap();
+        assert!(parts.lost(1_152 + GONE_NS, 100, &heard_ns).is_empty(), "another process has its part");
     }
 
     #[test]

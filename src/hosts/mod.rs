@@ -30,7 +30,7 @@ mod wire;
 #[cfg(feature = "hosts")]
 pub use join::{JoinError, Part, Request};
 #[cfg(feature = "hosts")]
-pub use net::{Inquiry, NetError};
+pub use net::{Inquiry, NetError, ask_to_join};
 #[cfg(feature = "hosts")]
 pub use offset::{Estimate, Exchange, OffsetEstimator};
 #[cfg(feature = "hosts")]

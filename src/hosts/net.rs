@@ -9,10 +9,11 @@ use super::wire::{Message, What};
 use crate::clock::{raw_ns, tai_offset_ns};
 use serde_json::json;
 use std::path::Path;
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::{Duration, Instant};
 use zenoh::Wait;
-use zenoh::pubsub::{Publisher, Subscriber};
+use zenoh::key_expr::KeyExpr;
+use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Queryable;
 use zenoh::{Config, Session};
@@ -20,16 +21,29 @@ use zenoh::{Config, Session};
 /// Where the host that launches answers whoever wants to join, or asks for the time.
 const JOIN: &str = "corotate/join";
 const TIME: &str = "corotate/time";
-/// How long an answer may take.
+/// Time limit of one answer, and of one over UDP, where a lost datagram is only replaced by the next question.
 const ANSWER: Duration = Duration::from_secs(2);
-/// How long the first words of a connection may take, ms: what is lost of them is not sent again by itself.
+const ANSWER_UDP: Duration = Duration::from_millis(700);
+/// Questions in one session before a new session is opened.
+const QUESTIONS: usize = 3;
+/// Time limit of the handshake of a connection, ms. The engine does not repeat a lost datagram of it.
 const OPENING_MS: u64 = 1_500;
-/// After so long without a word the engine gives a connection up and looks for another, ms.
+/// Time limit of the first handshake over UDP, ms. It doubles at every second attempt, up to [`OPENING_MS`].
+const OPENING_UDP_MS: u64 = 400;
+/// After so long without a word the engine gives a connection up and looks for another, ms; over UDP, where nothing piles up on the
+/// way to a host that is gone, and a new connection is hard to get.
 const LEASE_MS: u64 = 2_000;
+const LEASE_UDP_MS: u64 = 10_000;
 /// Batches, of 64 KiB at the most, that may pile up of what is in no hurry: the most that the engine allows.
 const PILE: usize = 16;
 /// Between two tries to connect again, ms.
 const RETRY_MS: u64 = 200;
+const RETRY: Duration = Duration::from_millis(RETRY_MS);
+
+/// Returns how long the host that launches is looked for: longer where a handshake may be lost several times.
+pub fn patience(endpoint: &Endpoint) -> Duration {
+    Duration::from_secs(if endpoint.address.carrier == Carrier::Udp { 20 } else { 10 })
+}
 
 /// Why hosts cannot talk.
 #[derive(Debug, thiserror::Error)]
@@ -72,7 +86,7 @@ pub enum Side {
     Connects,
 }
 
-fn config(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Config, NetError> {
+fn config(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) -> Result<Config, NetError> {
     let mut config = Config::default();
     let mut set = |key: &str, value: serde_json::Value| {
         config.insert_json5(key, &value.to_string()).expect("these are keys of the engine's configuration");
@@ -90,9 +104,12 @@ fn config(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Config,
     set("scouting/gossip/enabled", json!(false));
     set("timestamping/enabled", json!(false));
     set("adminspace/enabled", json!(false));
-    set("transport/unicast/open_timeout", json!(OPENING_MS));
+    set("transport/unicast/open_timeout", json!(opening_ms));
     set("transport/unicast/accept_timeout", json!(OPENING_MS));
-    set("transport/link/tx/lease", json!(LEASE_MS));
+    set(
+        "transport/link/tx/lease",
+        json!(if endpoint.address.carrier == Carrier::Udp { LEASE_UDP_MS } else { LEASE_MS }),
+    );
     set("transport/link/tx/queue/size/data", json!(PILE));
     if let (Carrier::Quic, Some(Keys { ca, cert, key })) = (endpoint.address.carrier, &endpoint.keys) {
         [ca, cert, key].into_iter().try_for_each(|path| readable(path))?;
@@ -112,8 +129,26 @@ fn readable(path: &Path) -> Result<(), NetError> {
     std::fs::File::open(path).map(drop).map_err(failed)
 }
 
+/// Opens a session. One that connects is tried again until `patience` is over.
 fn open(endpoint: &Endpoint, side: Side, patience: Duration) -> Result<Session, NetError> {
-    zenoh::open(config(endpoint, side, patience)?).wait().map_err(|error| NetError::Open {
+    if (side, endpoint.address.carrier) != (Side::Connects, Carrier::Udp) {
+        return try_open(endpoint, side, patience, OPENING_MS);
+    }
+    // Each attempt is a session of its own: the router refuses a second connection of one whose handshake was half lost.
+    let end = Instant::now() + patience;
+    for attempt in 0.. {
+        let opening_ms = (OPENING_UDP_MS << (attempt / 2).min(8)).min(OPENING_MS);
+        let opened = try_open(endpoint, side, Duration::from_millis(opening_ms), opening_ms);
+        if !matches!(opened, Err(NetError::Open { .. })) || Instant::now() >= end {
+            return opened;
+        }
+        std::thread::sleep(RETRY);
+    }
+    unreachable!("the attempts end by the time")
+}
+
+fn try_open(endpoint: &Endpoint, side: Side, patience: Duration, opening_ms: u64) -> Result<Session, NetError> {
+    zenoh::open(config(endpoint, side, patience, opening_ms)?).wait().map_err(|error| NetError::Open {
         address: endpoint.address.to_string(),
         // Where in the engine it was found out is of no use to anybody here.
         reason: error.to_string().split(" at /").next().unwrap_or_default().to_owned(),
@@ -140,15 +175,10 @@ pub struct Arrived {
     pub bytes: Vec<u8>,
 }
 
-/// The ways to one host.
-struct Ways {
-    hurried: Publisher<'static>,
-    patient: Publisher<'static>,
-}
-
 /// The ways to all hosts of a run.
 pub struct Post {
-    ways: Vec<Ways>,
+    keys: Vec<KeyExpr<'static>>,
+    session: RwLock<Option<Session>>,
 }
 
 impl Post {
@@ -157,18 +187,31 @@ impl Post {
     /// # Errors
     /// [`NetError::Engine`].
     pub fn send(&self, to: u8, hurry: bool, message: &Message<'_>) -> Result<(), NetError> {
-        let ways = &self.ways[usize::from(to)];
-        let way = if hurry { &ways.hurried } else { &ways.patient };
-        way.put(message.encode()).wait().map_err(engine)
+        let session = self.session.read().unwrap_or_else(PoisonError::into_inner);
+        let Some(session) = &*session else { return Ok(()) };
+        let priority = if hurry { Priority::RealTime } else { Priority::Data };
+        // Not by a publisher: what that declares, and is told in return, may be lost, and then nothing is sent. Even what must
+        // not be lost is not waited for: it is sent again.
+        let put =
+            session.put(&self.keys[usize::from(to)], message.encode()).congestion_control(CongestionControl::Drop);
+        put.priority(priority).express(hurry).wait().map_err(engine)
     }
 }
 
 /// A host's part in the messages of a run; it ends when this is dropped.
 pub struct Net {
+    endpoint: Endpoint,
+    /// This host's number.
+    own: u8,
+    arrived: Arc<dyn Fn(Arrived) + Send + Sync>,
     post: Arc<Post>,
+    opened: Mutex<Option<Opened>>,
+}
+
+/// What ends with a session.
+struct Opened {
     _subscriber: Subscriber<()>,
     _answers: Vec<Queryable<()>>,
-    _session: Session,
 }
 
 /// What answers questions: the request's bytes in, the answer's out.
@@ -186,32 +229,47 @@ impl Net {
         (own, hosts): (u8, u8),
         arrived: impl Fn(Arrived) + Send + Sync + 'static,
         joins: Option<Answers>,
-        patience: Duration,
     ) -> Result<Self, NetError> {
-        let side = if joins.is_some() { Side::Listens } else { Side::Connects };
-        let session = open(endpoint, side, patience)?;
-        let key = |host: u8| format!("corotate/{run}/{host}");
-        let way = |host: u8, hurry: bool| {
-            let priority = if hurry { Priority::RealTime } else { Priority::Data };
-            // Even what must not be lost is not waited for: it is sent again.
-            let way = session.declare_publisher(key(host)).congestion_control(CongestionControl::Drop);
-            way.priority(priority).express(hurry).wait().map_err(engine)
+        let key = |host: u8| KeyExpr::try_from(format!("corotate/{run}/{host}")).map_err(engine);
+        let keys = (0..hosts).map(key).collect::<Result<_, NetError>>()?;
+        let net = Self {
+            endpoint: endpoint.clone(),
+            own,
+            arrived: Arc::new(arrived),
+            post: Arc::new(Post { keys, session: RwLock::default() }),
+            opened: Mutex::default(),
         };
-        let ways = |host: u8| Ok(Ways { hurried: way(host, true)?, patient: way(host, false)? });
-        let post = Arc::new(Post { ways: (0..hosts).map(ways).collect::<Result<_, NetError>>()? });
-        let (answers_to, last) = (post.clone(), hosts);
+        net.begin(joins, patience(endpoint))?;
+        Ok(net)
+    }
+
+    /// Replaces the session that goes to the host that launches. The engine connects again by itself, but what it declares then may
+    /// be lost: such a session looks open and carries nothing.
+    ///
+    /// # Errors
+    /// [`NetError`]; the old session is kept.
+    pub fn reopen(&self, patience: Duration) -> Result<(), NetError> {
+        self.begin(None, patience)
+    }
+
+    fn begin(&self, joins: Option<Answers>, patience: Duration) -> Result<(), NetError> {
+        let side = if joins.is_some() { Side::Listens } else { Side::Connects };
+        let session = open(&self.endpoint, side, patience)?;
+        let own = self.own;
+        let old = self.post.session.write().unwrap_or_else(PoisonError::into_inner).replace(session.clone());
+        let (hosts, answers_to, arrived) = (self.post.keys.len(), self.post.clone(), self.arrived.clone());
         let heard = move |sample: zenoh::sample::Sample| {
             let (at_ns, bytes) = (raw_ns(), sample.payload().to_bytes().into_owned());
-            match Message::decode(&bytes) {
-                Some(Message { from, what: What::Ping { sent_ns } }) if from < last => {
-                    let what = pong(sent_ns, at_ns);
-                    // A question that is not answered is asked again.
-                    let _ = answers_to.send(from, true, &Message { from: own, what });
-                }
-                _ => arrived(Arrived { at_ns, bytes }),
+            if let Some(Message { from, what: What::Ping { sent_ns } }) = Message::decode(&bytes)
+                && usize::from(from) < hosts
+            {
+                // A question that is not answered is asked again.
+                let _ = answers_to.send(from, true, &Message { from: own, what: pong(sent_ns, at_ns) });
             }
+            arrived(Arrived { at_ns, bytes });
         };
-        let subscriber = session.declare_subscriber(key(own)).callback(heard).wait().map_err(engine)?;
+        let subscriber =
+            session.declare_subscriber(&self.post.keys[usize::from(own)]).callback(heard).wait().map_err(engine)?;
         let answers = joins.map_or(Ok(Vec::new()), |joins| {
             let time: Answers = Box::new(move |request| {
                 let at_ns = raw_ns();
@@ -220,7 +278,9 @@ impl Net {
             });
             [(JOIN, joins), (TIME, time)].map(|(key, answers)| answer(&session, key, answers)).into_iter().collect()
         })?;
-        Ok(Self { post, _subscriber: subscriber, _answers: answers, _session: session })
+        let opened = Opened { _subscriber: subscriber, _answers: answers };
+        drop((self.opened.lock().unwrap_or_else(PoisonError::into_inner).replace(opened), old));
+        Ok(())
     }
 
     /// The ways to all hosts, for any thread.
@@ -242,10 +302,31 @@ fn answer(session: &Session, key: &'static str, answers: Answers) -> Result<Quer
     session.declare_queryable(key).callback(callback).wait().map_err(engine)
 }
 
+/// Asks the host that launches to join its run, until it answers or the time is over. One that listens may not answer yet, and
+/// a way that loses may lose the question, the answer, or the handshake.
+///
+/// # Errors
+/// [`NetError`].
+pub fn ask_to_join(endpoint: &Endpoint, request: &[u8]) -> Result<Vec<u8>, NetError> {
+    let end = Instant::now() + patience(endpoint);
+    loop {
+        let inquiry = Inquiry::open(endpoint, end.saturating_duration_since(Instant::now()))?;
+        for _ in 0..QUESTIONS {
+            let asked = Instant::now();
+            let answer = inquiry.ask(JOIN, request);
+            if !matches!(answer, Err(NetError::Silent { .. })) || Instant::now() >= end {
+                return answer;
+            }
+            std::thread::sleep(RETRY.saturating_sub(asked.elapsed()));
+        }
+    }
+}
+
 /// A way to ask the host that launches, before a run.
 pub struct Inquiry {
     session: Session,
     address: String,
+    limit: Duration,
 }
 
 impl Inquiry {
@@ -254,29 +335,22 @@ impl Inquiry {
     /// # Errors
     /// [`NetError`].
     pub fn open(endpoint: &Endpoint, patience: Duration) -> Result<Self, NetError> {
-        Ok(Self { session: open(endpoint, Side::Connects, patience)?, address: endpoint.address.to_string() })
-    }
-
-    /// Asks to join; gives the answer.
-    ///
-    /// # Errors
-    /// [`NetError::Silent`], [`NetError::Engine`].
-    pub fn join(&self, request: &[u8]) -> Result<Vec<u8>, NetError> {
-        self.ask(JOIN, request)
+        let limit = if endpoint.address.carrier == Carrier::Udp { ANSWER_UDP } else { ANSWER };
+        Ok(Self { session: open(endpoint, Side::Connects, patience)?, address: endpoint.address.to_string(), limit })
     }
 
     /// Asks for the time; gives the answer, a message.
     ///
     /// # Errors
-    /// As [`join`](Self::join).
+    /// [`NetError::Silent`], [`NetError::Engine`].
     pub fn time(&self) -> Result<Vec<u8>, NetError> {
         self.ask(TIME, &raw_ns().to_le_bytes())
     }
 
     fn ask(&self, key: &str, request: &[u8]) -> Result<Vec<u8>, NetError> {
         let silent = || NetError::Silent { address: self.address.clone() };
-        let replies = self.session.get(key).payload(request.to_vec()).timeout(ANSWER).wait().map_err(engine)?;
-        let reply = replies.recv_timeout(ANSWER).ok().flatten().ok_or_else(silent)?;
+        let replies = self.session.get(key).payload(request.to_vec()).timeout(self.limit).wait().map_err(engine)?;
+        let reply = replies.recv_timeout(self.limit).ok().flatten().ok_or_else(silent)?;
         let sample = reply.result().map_err(|_| silent())?;
         Ok(sample.payload().to_bytes().into_owned())
     }

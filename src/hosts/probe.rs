@@ -1,18 +1,15 @@
 //! What can be said of the way to a host before a run: how far its clock is, how long messages take, how evenly.
 
-use super::net::{Inquiry, NetError};
+use super::net::{Inquiry, NetError, patience};
 use super::offset::{Exchange, OffsetEstimator};
 use super::seat::Endpoint;
 use super::wire::{Message, What};
 use crate::clock::{monotonic_ns, raw_ns, sleep_until};
 use crate::telemetry::{Latency, Percentiles};
 use serde::Serialize;
-use std::time::Duration;
 
 /// Between two questions, ns.
 const ASK_NS: u64 = 20_000_000;
-/// How long the host is looked for.
-const PATIENCE: Duration = Duration::from_secs(10);
 
 /// What was found out about the way to a host.
 #[derive(Debug, Clone, Serialize)]
@@ -41,9 +38,9 @@ pub struct Probe {
 /// # Errors
 /// [`NetError`] if there is none.
 pub fn probe(endpoint: &Endpoint, seconds: f64) -> Result<Probe, NetError> {
-    let inquiry = Inquiry::open(endpoint, PATIENCE)?;
+    let inquiry = Inquiry::open(endpoint, patience(endpoint))?;
     let (mut estimator, mut round_trip) = (OffsetEstimator::default(), Latency::default());
-    let (mut answered, mut unanswered) = (0, 0);
+    let (mut answered, mut unanswered, mut failed) = (0, 0, None);
     let end_ns = raw_ns() + (seconds * 1e9) as u64;
     while raw_ns() < end_ns {
         let answer = inquiry.time();
@@ -54,12 +51,14 @@ pub fn probe(endpoint: &Endpoint, seconds: f64) -> Result<Probe, NetError> {
             round_trip.record(0, exchange.round_trip_ns().unwrap_or(0));
             estimator.take(exchange);
             answered += 1;
-        } else if let (0, Err(error)) = (answered, answer) {
-            return Err(error);
         } else {
             unanswered += 1;
+            failed = answer.err();
         }
         sleep_until(monotonic_ns() + ASK_NS);
+    }
+    if let Some(error) = failed.filter(|_| answered == 0) {
+        return Err(error);
     }
     let (estimate, figures) = (estimator.at(raw_ns()), round_trip.percentiles());
     Ok(Probe {

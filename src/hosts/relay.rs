@@ -5,8 +5,8 @@
 //! misses it. Must not be waited for by any role, nor know what a sample means.
 
 use super::carry::Carriers;
-use super::join::Parts;
-use super::net::{Arrived, Net, NetError, Post};
+use super::join::{GONE_NS, Parts};
+use super::net::{Arrived, Net, NetError, Post, patience};
 use super::offset::Exchange;
 use super::plan::Plan;
 use super::report::{HostReport, LinkEnd, Silence, far_end_path, ready_path, relay_report_path};
@@ -35,11 +35,16 @@ use std::time::Duration;
 const WORD_NS: u64 = 20_000_000;
 /// A host that is not heard for so long is silent, ns: it speaks every [`WORD_NS`].
 const SILENT_NS: u64 = 250_000_000;
-/// How long the way to the host that launched may take to be found; and to be known, each time that it is tried.
-const PATIENCE: Duration = Duration::from_secs(10);
-const TRY_NS: u64 = 3_000_000_000;
-/// So often it is tried: a way that loses may have lost the words by which it is opened.
-const TRIES: u64 = 5;
+/// How long the time of the host that launched is asked for in one session without any answer, ns: twice as long in every second
+/// session, up to the last of these. A way that loses may have lost what the session declared.
+const TRY_NS: u64 = 500_000_000;
+const TRY_MAX_NS: u64 = 4_000_000_000;
+/// How long it may take to be known well enough once there are answers, ns.
+const KNOW_NS: u64 = 5_000_000_000;
+/// A host that joined replaces its session after so long without an answer about the time, ns; that is asked for 20 times a second.
+const DEAF_NS: u64 = 1_500_000_000;
+/// Time limit of one attempt to replace it.
+const REOPEN: Duration = Duration::from_secs(3);
 /// How long a host that ends tries to tell how it ended, and the one that launched waits for it, ns: while nothing is heard of
 /// the other one, and in all.
 const LEAVE_NS: u64 = 4_000_000_000;
@@ -83,6 +88,16 @@ pub enum RelayError {
     /// The clock is of no use.
     #[error(transparent)]
     Clock(#[from] ClockRefused),
+    /// A host has joined and gone before any tick.
+    #[error(
+        "the host {host} joined, and nothing has been heard of it for {limit_s} s: look at what its `join` printed, and start both again"
+    )]
+    Lost {
+        /// The host.
+        host: String,
+        /// The limit, s.
+        limit_s: f64,
+    },
     /// A link failed.
     #[error(transparent)]
     Bus(#[from] BusError),
@@ -125,47 +140,42 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
         heard_ns: plan.hosts.iter().map(|_| AtomicU64::new(raw_ns())).collect(),
     });
     let (arrives, inbox) = mpsc::channel();
-    let joins: Option<super::net::Answers> = if plan.own == plan.hub {
+    let parts = if plan.own == plan.hub {
         let path = scenario_path(&domain);
         let text = std::fs::read_to_string(&path).map_err(|source| RelayError::Write { path, source })?;
-        let (parts, shared) = (Parts::new(&scenario, text, &run, own), shared.clone());
-        Some(Box::new(move |request| {
-            parts.answer(request, raw_ns(), shared.begun.load(Ordering::Relaxed), &shared.heard_ns)
-        }))
+        Some(Arc::new(Parts::new(&scenario, text, &run, own)))
     } else {
         None
     };
+    let joins = parts.clone().map(|parts| {
+        let shared = shared.clone();
+        let answers = move |request: &[u8]| {
+            parts.answer(request, raw_ns(), shared.begun.load(Ordering::Relaxed), &shared.heard_ns)
+        };
+        Box::new(answers) as super::net::Answers
+    });
     let heard = shared.clone();
-    let arrived = Arc::new(move |arrived: Arrived| {
+    let arrived = move |arrived: Arrived| {
         // Noted here: a host is heard even if this one has no time for what it says.
         if let Some(heard_ns) = arrived.bytes.first().and_then(|from| heard.heard_ns.get(usize::from(*from))) {
             heard_ns.store(arrived.at_ns, Ordering::Relaxed);
         }
         let _ = arrives.send(arrived);
-    });
-    let numbers = (plan.own, plan.hosts.len() as u8);
-    let open = |joins| {
-        let arrived = arrived.clone();
-        Net::open(&seat.seat.endpoint, &run, numbers, move |message| arrived(message), joins, PATIENCE)
     };
-    let (net, timing) = if joins.is_some() {
-        (open(joins)?, None)
-    } else {
-        let found = (0..TRIES).find_map(|_| {
-            let net = match open(None) {
-                Ok(net) => net,
-                Err(error) => return Some(Err(error.into())),
-            };
-            let found = find_time(&domain, &scenario, &plan, &net, &inbox, terminated).transpose()?;
-            Some(found.map(|timing| (net, Some(timing))))
-        });
-        found.unwrap_or(Err(RelayError::NoTime(TRIES * TRY_NS / 1_000_000_000)))?
+    let numbers = (plan.own, plan.hosts.len() as u8);
+    let net = Arc::new(Net::open(&seat.seat.endpoint, &run, numbers, arrived, joins)?);
+    let timing = match &parts {
+        Some(_) => None,
+        None => {
+            let patience = patience(&seat.seat.endpoint);
+            Some(know_time((&domain, &scenario), &plan, (&net, patience), &inbox, terminated)?)
+        }
     };
     let bus = IoxBus::enter(&domain, RELAY, depths(&scenario))?;
     let mut relay = Relay::open(&domain, &scenario, &plan, &net.post(), shared, timing, &bus)?;
     let carriers = Carriers::start(&domain, &scenario, &plan, &net.post())?;
     write(&ready_path(domain.root()), seat.seat.endpoint.address.to_string().as_bytes())?;
-    let served = relay.serve(&inbox, &carriers, terminated);
+    let served = relay.serve(&inbox, &carriers, (&net, parts.as_deref()), terminated);
     let links = carriers.end();
     let report = relay.report(&links);
     let written = served.and_then(|()| {
@@ -177,32 +187,44 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
     written
 }
 
-/// Asks the host that launched for the time until it is known well enough; nothing if no answer comes.
-fn find_time(
-    domain: &Domain,
-    scenario: &Scenario,
+/// Asks the host that launched for the time until it is known well enough, in one session after the other while none answers.
+fn know_time(
+    (domain, scenario): (&Domain, &Scenario),
     plan: &Plan,
-    net: &Net,
+    (net, patience): (&Net, Duration),
     inbox: &mpsc::Receiver<Arrived>,
     terminated: &AtomicBool,
-) -> Result<Option<Timing>, RelayError> {
+) -> Result<Timing, RelayError> {
     let path = clock_path(domain);
     let clock = RunClock::open(&path).map_err(|source| RelayError::Write { path, source })?;
     let (mut timing, post) = (Timing::new(scenario, plan.name(plan.own), clock), net.post());
-    let end_ns = raw_ns() + TRY_NS;
+    let (begun_ns, limit_ns) = (raw_ns(), patience.as_nanos() as u64);
+    let (mut sessions, mut try_ns, mut deaf_ns, mut answered_ns) = (1, TRY_NS, raw_ns(), None);
     while !timing.ready(raw_ns())? {
-        if raw_ns() > end_ns || terminated.load(Ordering::Relaxed) {
-            return Ok(None);
+        let now_ns = raw_ns();
+        let late = match answered_ns {
+            Some(answered_ns) => now_ns - answered_ns > KNOW_NS,
+            None => now_ns - begun_ns > limit_ns,
+        };
+        if late || terminated.load(Ordering::Relaxed) {
+            return Err(RelayError::NoTime((now_ns - begun_ns) / 1_000_000_000));
+        }
+        if answered_ns.is_none() && now_ns - deaf_ns > try_ns {
+            // If that fails, the session before may still do.
+            let _ = net.reopen(REOPEN);
+            (sessions, deaf_ns) = (sessions + 1, raw_ns());
+            try_ns = if sessions % 2 == 1 { (2 * try_ns).min(TRY_MAX_NS) } else { try_ns };
         }
         ask(&mut timing, plan, &post);
         let Ok(Arrived { at_ns, bytes }) = inbox.recv_timeout(PAUSE) else { continue };
-        if let Some(Message { from, what }) = Message::decode(&bytes)
+        if let Some(Message { from, what: what @ What::Pong { .. } }) = Message::decode(&bytes)
             && from == plan.hub
         {
+            answered_ns.get_or_insert(at_ns);
             answered(&mut timing, &what, at_ns);
         }
     }
-    Ok(Some(timing))
+    Ok(timing)
 }
 
 /// Asks for the time, if that is due.
@@ -217,6 +239,28 @@ fn ask(timing: &mut Timing, plan: &Plan, post: &Post) {
 fn answered(timing: &mut Timing, what: &What<'_>, returned_ns: u64) {
     if let What::Pong { sent_ns, received_ns, answered_ns, tai_offset_ns } = *what {
         timing.take(Exchange { sent_ns, received_ns, answered_ns, returned_ns }, tai_offset_ns as i64);
+    }
+}
+
+/// Replaces a host's session once that has become deaf; the engine waits, so a thread of its own does it.
+struct Ear {
+    /// When the host that launched answered last, ns.
+    answered_ns: u64,
+    replaces: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Ear {
+    fn look(&mut self, net: &Arc<Net>, now_ns: u64) {
+        if self.replaces.as_ref().is_some_and(std::thread::JoinHandle::is_finished) {
+            // It has as long to answer as the one before had.
+            (self.replaces, self.answered_ns) = (None, now_ns);
+        }
+        if self.replaces.is_none() && now_ns.saturating_sub(self.answered_ns) > DEAF_NS {
+            let net = net.clone();
+            // A failed attempt is followed by the next.
+            let replace = move || drop(net.reopen(REOPEN));
+            self.replaces = std::thread::Builder::new().name("reopen".to_owned()).spawn(replace).ok();
+        }
     }
 }
 
@@ -253,6 +297,9 @@ struct Relay<'a> {
     post: Arc<Post>,
     shared: Arc<Shared>,
     timing: Option<Timing>,
+    ear: Ear,
+    /// Hosts that joined and are not heard, before any tick.
+    lost: Vec<String>,
     streams: Vec<(Sender, Receiver)>,
     incoming: Vec<Incoming>,
     taps: Vec<Tap>,
@@ -328,6 +375,8 @@ impl<'a> Relay<'a> {
             post: post.clone(),
             shared,
             timing,
+            ear: Ear { answered_ns: raw_ns(), replaces: None },
+            lost: Vec::new(),
             streams: plan.hosts.iter().map(|_| (Sender::new(capacity), Receiver::default())).collect(),
             incoming,
             taps,
@@ -354,6 +403,7 @@ impl<'a> Relay<'a> {
         &mut self,
         inbox: &mpsc::Receiver<Arrived>,
         carriers: &Carriers,
+        (net, parts): (&Arc<Net>, Option<&Parts>),
         terminated: &AtomicBool,
     ) -> Result<(), RelayError> {
         let (mut idle, mut leaving_ns, mut next_look_ns) = (0_u32, None, 0);
@@ -374,6 +424,10 @@ impl<'a> Relay<'a> {
             if now_ns >= next_look_ns || leaving_ns.is_some() {
                 next_look_ns = now_ns + WORD_NS;
                 self.listen_for_silence(now_ns);
+                match parts {
+                    Some(parts) => self.listen_for_lost(parts, now_ns)?,
+                    None => self.ear.look(net, now_ns),
+                }
                 if terminated.load(Ordering::Relaxed) || !self.domain.exists() {
                     return Ok(());
                 }
@@ -427,10 +481,12 @@ impl<'a> Relay<'a> {
             }
             pong @ What::Pong { .. } => {
                 if let Some(timing) = self.timing.as_mut().filter(|_| from_hub) {
+                    self.ear.answered_ns = arrived.at_ns;
                     answered(timing, &pong, arrived.at_ns);
                 }
             }
-            What::Ping { .. } => self.malformed += 1,
+            // Answered where it arrived.
+            What::Ping { .. } => {}
         }
         Ok(())
     }
@@ -608,6 +664,26 @@ impl<'a> Relay<'a> {
                 tell(format_args!("corotate: nothing is heard of the host {}", self.plan.name(host)));
             }
         }
+    }
+
+    /// Notes hosts that joined and are not heard before any tick; such a part is free for another process.
+    ///
+    /// # Errors
+    /// [`RelayError::Lost`] once one is not heard for as long as roles may take to come up.
+    fn listen_for_lost(&mut self, parts: &Parts, now_ns: u64) -> Result<(), RelayError> {
+        if self.shared.begun.load(Ordering::Relaxed) {
+            return Ok(());
+        }
+        let limit_s = self.scenario.startup_timeout_s;
+        let lost = parts.lost(now_ns, GONE_NS, &self.shared.heard_ns);
+        for host in lost.iter().filter(|host| !self.lost.contains(host)) {
+            tell(format_args!(
+                "corotate: the host {host} joined and is not heard any more; waiting {limit_s} s for it, or for another `join`"
+            ));
+        }
+        self.lost = lost;
+        let host = parts.lost(now_ns, (limit_s * 1e9) as u64, &self.shared.heard_ns).into_iter().next();
+        host.map_or(Ok(()), |host| Err(RelayError::Lost { host, limit_s }))
     }
 
     /// A host was heard.

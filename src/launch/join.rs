@@ -143,7 +143,6 @@ impl Follower<'_> {
         supervisor: &mut Supervisor<'_>,
         launch: &mut Launch<'_>,
     ) -> Result<Option<String>, LaunchError> {
-        let limit_s = self.scenario.hosts.network.silence_timeout_s;
         let lull_ns = if self.scenario.clock == ClockKind::Realtime { LULL_NS } else { LOCKSTEP_LULL_NS };
         let (mut next_look_ns, mut told_ns) = (0, raw_ns());
         loop {
@@ -164,6 +163,7 @@ impl Follower<'_> {
                 if looked_ns - std::mem::replace(&mut told_ns, looked_ns) > 20 * LOOK_NS {
                     self.heard_ns = looked_ns;
                 }
+                let limit_s = self.scenario.host_silence_s(supervisor.phase() >= Phase::Run);
                 if (looked_ns.saturating_sub(self.heard_ns)) as f64 > limit_s * 1e9 {
                     return Ok(Some(format!("nothing was heard of the host {} for {limit_s} s", self.hub)));
                 }

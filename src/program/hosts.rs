@@ -147,18 +147,12 @@ mod with_hosts {
 mod with_hosts {
     use super::*;
     use crate::config::Scenario;
-    use crate::hosts::{HostSeat, Inquiry, JoinError, NetError, Part, RelayError, RelaySeat, Request, run_relay};
+    use crate::hosts::{HostSeat, JoinError, NetError, Part, RelayError, RelaySeat, Request, ask_to_join, run_relay};
     use crate::launch::{FarOutcome, Launch, new_domain};
     use crate::program::role::terminated_by_signals;
     use crate::program::run::{catch_signals, exit_of};
     use crate::program::say;
     use crate::system::{random_bits, tell};
-    use std::time::Duration;
-
-    /// So often it is asked, if it is there and does not answer.
-    const TRIES: usize = 4;
-    /// How long the host that launches is looked for.
-    const PATIENCE: Duration = Duration::from_secs(10);
 
     pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Exit {
         let terminated = match terminated_by_signals() {
@@ -222,10 +216,7 @@ mod with_hosts {
     fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Part, Exit> {
         let token = random_bits().map_err(|error| fail(Exit::Failure, &error))? as u64;
         let request = Request::new(arguments.host.as_deref(), token).encode();
-        // A way that loses may lose the question, or the words by which it is opened.
-        let tries = (0..TRIES).map(|_| Inquiry::open(endpoint, PATIENCE).and_then(|inquiry| inquiry.join(&request)));
-        let mut tries = tries.skip_while(|answer| matches!(answer, Err(NetError::Silent { .. })));
-        let answer = tries.next().unwrap_or_else(|| Err(NetError::Silent { address: endpoint.address.to_string() }));
+        let answer = ask_to_join(endpoint, &request);
         let answer = answer.map_err(|error| {
             let usage = matches!(error, NetError::Key { .. });
             fail(if usage { Exit::Usage } else { Exit::Failure }, &error)

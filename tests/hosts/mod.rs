@@ -68,11 +68,16 @@ impl Run {
 
     /// Joins with the site of this number, by another port on the way if that is given.
     fn join(&self, number: usize, carrier: &str, by: Option<u16>) -> common::Running {
+        self.await_listening();
+        self.join_at_once(number, carrier, by)
+    }
+
+    /// The same, whether somebody listens there or not.
+    fn join_at_once(&self, number: usize, carrier: &str, by: Option<u16>) -> common::Running {
         let address = match by {
             Some(port) => format!("{carrier}/127.0.0.1:{port}"),
             None => format!("{carrier}/{}:{}", self.sites[number].hub(), self.port),
         };
-        self.await_listening();
         self.sites[number].start(&["join", &address, "--host", self.hosts[number], "--insecure"])
     }
 
@@ -100,8 +105,12 @@ impl Run {
     }
 
     fn proxy(&self, number: usize, impairment: Impairment) -> Proxy {
+        self.proxy_by(number, impairment, 1 + number as u64)
+    }
+
+    fn proxy_by(&self, number: usize, impairment: Impairment, seed: u64) -> Proxy {
         let to = format!("{}:{}", self.sites[number].hub(), self.port).parse().unwrap();
-        Proxy::start(&self.sites[number], to, impairment, 1 + number as u64)
+        Proxy::start(&self.sites[number], to, impairment, seed)
     }
 
     /// Nothing is left on any site.
@@ -180,6 +189,75 @@ fn lockstep_loses_nothing_on_a_bad_way() {
     assert_eq!(run_of(&over), run_of(&run.alone(&arguments)));
     assert!(proxy.ill.iter().all(|count| count.load(std::sync::atomic::Ordering::Relaxed) > 0));
     assert!(over["hosts"]["hosts"][0]["repeated_frames"].as_u64().unwrap() > 0, "{}", over["hosts"]);
+    run.assert_clean();
+}
+
+/// What running survives, starting survives: the handshake, the question, the answer, and what is declared may all be lost.
+#[test]
+fn every_start_on_a_bad_way_succeeds() {
+    const STARTS: usize = 8;
+    let arguments = [&["--tick-hz", "200", "--duration", "0.5"][..], &UNJUDGED].concat();
+    let mut alone = None;
+    for start in 0..STARTS {
+        let run = Run::new(&TWO, KEYS, "");
+        let bad = Impairment { delay_us: 200, jitter_us: 300, lost: 200, doubled: 100, late: 200 };
+        let proxy = run.proxy_by(1, bad, 7 + start as u64);
+        let launched = run.launch("udp", &[&arguments[..], &["--clock", "lockstep"]].concat());
+        let joined = run.join(1, "udp", Some(proxy.port));
+        let (done, over) = finish(launched, joined);
+        assert_eq!(done.code, Some(0), "start {start}: {done:?}");
+        let alone = alone.get_or_insert_with(|| run.alone(&arguments));
+        assert_eq!(run_of(&over), run_of(alone), "start {start}");
+        assert!(proxy.ill.iter().all(|count| count.load(std::sync::atomic::Ordering::Relaxed) > 0));
+        run.assert_clean();
+    }
+}
+
+/// Whoever is there first waits for the other.
+#[test]
+fn hosts_may_start_in_any_order() {
+    let arguments = [&["--tick-hz", "200", "--duration", "0.5", "--clock", "lockstep"][..], &UNJUDGED].concat();
+    let pause = std::time::Duration::from_secs(2);
+    for carrier in ["tcp", "udp"] {
+        for order in ["join first", "at once", "launcher first"] {
+            let run = Run::new(&TWO, KEYS, "");
+            let joins = |before: std::time::Duration| {
+                std::thread::sleep(before);
+                run.join_at_once(1, carrier, None)
+            };
+            let (launched, joined) = match order {
+                "join first" => {
+                    let joined = joins(std::time::Duration::ZERO);
+                    std::thread::sleep(pause);
+                    (run.launch(carrier, &arguments), joined)
+                }
+                "at once" => (run.launch(carrier, &arguments), joins(std::time::Duration::ZERO)),
+                _ => (run.launch(carrier, &arguments), joins(pause)),
+            };
+            let (done, _) = finish(launched, joined);
+            assert_eq!(done.code, Some(0), "{carrier}, {order}: {done:?}");
+            run.assert_clean();
+        }
+    }
+}
+
+/// A host that joined and is gone before the ticks does not keep the others waiting: they say so, and end.
+#[test]
+fn a_host_that_joined_and_left_before_the_ticks_ends_the_run() {
+    let run = Run::new(&THREE, "actuation_delay_ticks = 3", "[network]\nsilence_timeout_s = 1.5\n");
+    let bounded = ["--set", "launch.startup_timeout_s=4", "--clock", "lockstep", UNJUDGED[0], UNJUDGED[1]];
+    let launched = run.launch("tcp", &bounded);
+    let joined = run.join(1, "tcp", None);
+    await_some(|| (!run.sites[1].bench.domains().is_empty()).then_some(()));
+    run.sites[1].cut_power();
+    assert_eq!(joined.wait().signal, Some(libc::SIGKILL));
+    let done = launched.wait();
+    assert_eq!(done.code, Some(4), "{done:?}");
+    assert!(done.stderr.contains("the host sky") && done.stderr.contains("for 4 s"), "{done:?}");
+    // The next run there removes what a power cut leaves.
+    let next = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "0.1", UNJUDGED[0], UNJUDGED[1]];
+    let next = run.sites[1].bench.run(&next);
+    assert_eq!(next.code, Some(0), "{next:?}");
     run.assert_clean();
 }
 
