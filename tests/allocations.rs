@@ -217,9 +217,16 @@ fn live<S: Seat>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
 /// The link to that device, greeted.
 fn linked(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
     let names = roles.iter().map(|role| role.name(scenario).to_owned()).collect();
-    let seat = DeviceSeat { domain: PathBuf::new(), roles: names, path: path.to_owned(), baud: None, patience_s: 60.0 };
+    let seat = DeviceSeat {
+        domain: PathBuf::new(),
+        roles: names,
+        path: path.to_owned(),
+        baud: None,
+        patience_s: 60.0,
+        other_device: false,
+    };
     let mut link = DeviceLink::open(&seat, scenario, roles, 1).unwrap();
-    assert!(link.greet(&AtomicBool::new(false)).unwrap().is_some());
+    assert!(link.greet(None, &AtomicBool::new(false)).unwrap().is_some());
     let (last, others) = roles.split_last().unwrap();
     let others = others.iter().map(|other| (*other, private_ledger(scenario, *other))).collect();
     RoleImpl::Device(*last, others, Box::new(link))

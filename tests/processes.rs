@@ -179,6 +179,47 @@ fn a_role_can_be_started_by_hand() {
     bench.assert_clean(&[domain]);
 }
 
+/// Every program that takes a seat in the midst of a run is told, by its process and the tick of its first sample.
+#[test]
+fn a_role_by_hand_that_is_replaced_is_told_each_time() {
+    const LIVES: usize = 4;
+    for clock in ["realtime", "lockstep"] {
+        let bench = Bench::new();
+        let file = shipped("rigid-pair");
+        let endless = ["--tick-hz", "200", "--duration", "100000", "--out", "out", "--set", "accept={}"];
+        // A role may be away for long on a loaded machine.
+        let patient = ["--set", "supervision.heartbeat_timeout_s=60", "--external", "follower", "--json"];
+        let run = bench.start(&[&["run", file.to_str().unwrap(), "--clock", clock], &endless[..], &patient].concat());
+        let domain = await_some(|| bench.domains().pop());
+        let (mut pids, mut last) = (Vec::new(), None);
+        for _ in 0..LIVES {
+            if let Some(before) = last.take() {
+                let before: Running = before;
+                before.signal(SIGKILL);
+                before.wait();
+            }
+            let follower = bench.start(&["plant", "--body", "follower", "--domain", domain.to_str().unwrap()]);
+            pids.push(u64::from(follower.pid()));
+            bench.await_commits("follower", bench.commits("follower") + 100);
+            last = Some(follower);
+        }
+        run.signal(SIGTERM);
+        let (run, _) = (run.wait(), last.map(Running::wait));
+        assert_eq!(run.code, Some(128 + SIGTERM), "{clock}: {run:?}");
+        let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+        let incidents = summary["incidents"].as_array().unwrap();
+        let by: Vec<_> = incidents.iter().map(|one| one["replaced_by"]["pid"].as_u64().unwrap()).collect();
+        assert_eq!(by, pids[1..], "{clock}: {incidents:?}");
+        for incident in incidents {
+            let [left, back] = [&incident["tick"], &incident["replaced_by"]["tick"]].map(|tick| tick.as_u64().unwrap());
+            assert_eq!((&incident["role"], &incident["action"]), (&"follower".into(), &"continued".into()));
+            assert!(left > 0 && back >= left && incident["time_s"] == left as f64 / 200.0, "{incident}");
+            assert!(incident["outage_s"].as_f64().unwrap() > 0.0, "{incident}");
+        }
+        bench.assert_clean(&[domain]);
+    }
+}
+
 /// A core that no machine has cannot be granted, whoever asks.
 const UNGRANTABLE: [&str; 2] = ["--set", "realtime.cores=[1023]"];
 

@@ -17,7 +17,7 @@ use self::opening::{Connections, Refusal};
 use self::single::{Current, Lane, NO_KEY};
 use super::domain::Domain;
 use super::notifier::{NOTIFIERS_BYTES, Notifiers};
-use super::{Bus, BusError, Depths, Reader, Signal, Topic};
+use super::{Bus, BusError, Depths, Reader, Signal, Topic, WriterProcess};
 use crate::sample::{FleetLayout, Sample};
 use crate::system::remedy;
 use iceoryx2::config::Config;
@@ -262,6 +262,17 @@ pub fn clear_dead(domain: &Domain) -> Result<(), BusError> {
 /// Whether a service has a writer. One that was killed is one until its remains are cleared.
 fn is_written<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> bool {
     service.dynamic_config().number_of_publishers() > 0
+}
+
+/// The process that has a service's writing end open, dead or alive.
+fn writer<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> Option<WriterProcess> {
+    let mut found = None;
+    service.dynamic_config().list_publishers(|details| {
+        let node = details.node_id;
+        found = node.pid::<Ipc>().ok().map(|pid| WriterProcess { pid: pid.value() as u32, unique: node.value() });
+        CallbackProgression::Continue
+    });
+    found
 }
 
 /// The transport's configuration by which a process enters a domain, whose directory is at `root`.

@@ -182,6 +182,15 @@ pub trait Write<S: ?Sized> {
     fn refresh(&mut self) -> Result<(), BusError>;
 }
 
+/// The process that has a writing end open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WriterProcess {
+    /// Its number, as it knows it itself: in a container another one than outside.
+    pub pid: u32,
+    /// Tells it from every other process of that number.
+    pub unique: u128,
+}
+
 /// The reading end of a link.
 pub trait Read<S: ?Sized> {
     /// Moves on to the next sample; false, and nothing changed, if there is none. Never waits.
@@ -195,6 +204,10 @@ pub trait Read<S: ?Sized> {
     /// is always open.
     fn written(&self) -> bool {
         true
+    }
+    /// The process that has the writing end open; none within one thread.
+    fn writer(&self) -> Option<WriterProcess> {
+        None
     }
     /// Sleeps until there may be a next sample, at most until `until_ns` on the monotonic clock. Where nobody else could
     /// bring one meanwhile it does not sleep.

@@ -5,7 +5,7 @@
 
 use super::iox::IoxBus;
 use super::memory::MemoryBus;
-use super::{BusError, Carried, Read, Reader, Topic, Write};
+use super::{BusError, Carried, Read, Reader, Topic, Write, WriterProcess};
 use std::marker::PhantomData;
 
 /// A bus, whichever it is.
@@ -38,6 +38,8 @@ pub trait ReadWords {
     fn next(&mut self) -> Result<Option<&[u64]>, BusError>;
     /// Whether somebody has the writing end open, as [`Read::written`].
     fn written(&self) -> bool;
+    /// The process that has it open, as [`Read::writer`].
+    fn writer(&self) -> Option<WriterProcess>;
     /// Sleeps until there may be a next sample, at most until `until_ns`, as [`Read::sleep`].
     ///
     /// # Errors
@@ -124,6 +126,10 @@ impl<T: Read<S>, S: Carried + ?Sized> ReadWords for End<T, S> {
 
     fn written(&self) -> bool {
         self.0.written()
+    }
+
+    fn writer(&self) -> Option<WriterProcess> {
+        self.0.writer()
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

@@ -116,7 +116,17 @@ mod tests {
             reason: String::new(),
         });
         let (written, read, stages) = (Vec::new(), Vec::new(), Vec::new());
-        RoleReport { role, ticks, written, read, watchdog: None, stages, grants: vec![grant(false)], line: None }
+        RoleReport {
+            role,
+            ticks,
+            written,
+            read,
+            watchdog: None,
+            stages,
+            grants: vec![grant(false)],
+            line: None,
+            outages: Vec::new(),
+        }
     }
 
     #[test]

@@ -220,6 +220,7 @@ impl<'a, R: Rig> Run<'a, R> {
             stages: Vec::new(),
             grants: Vec::new(),
             line: None,
+            outages: Vec::new(),
         }
     }
 

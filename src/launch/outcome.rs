@@ -266,6 +266,12 @@ impl Judged {
     }
 }
 
+/// Incidents with the times of their ticks.
+fn timed(scenario: &Scenario, incidents: &[Incident]) -> Vec<Incident> {
+    let timed = |incident: &Incident| Incident { time_s: scenario.time_s(incident.tick), ..incident.clone() };
+    incidents.iter().map(timed).collect()
+}
+
 /// The hash over everything that was published, as a summary has it.
 pub(crate) fn state_hash(reports: &[RoleReport]) -> String {
     format!("{:016x}", combine(hashes(reports).iter().map(|(_, hash)| hash.last)))
@@ -301,7 +307,7 @@ impl Summary {
             verdict,
             criteria,
             score: outcome.score.clone(),
-            incidents: outcome.incidents.clone(),
+            incidents: timed(scenario, &outcome.incidents),
             notes: scenario.notes().into_iter().chain(scenario.warnings.iter().cloned()).collect(),
             limits: scenario.rig.limits(),
             watchdog: outcome.reports.iter().find_map(|report| report.watchdog.clone()),

@@ -27,7 +27,7 @@ use crate::runtime::{
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::system::tell;
-use crate::telemetry::{Grant, Ledger, RoleReport};
+use crate::telemetry::{Grant, Ledger, Outage, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::fmt;
@@ -75,12 +75,23 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let mut scorer = score::open(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
     let mut shutdown = supervisor.shut_down(if signal == 0 { END_LIMIT } else { SIGNALLED_END_LIMIT });
+    let of = |report: &RoleReport| {
+        let role = report.role.clone();
+        report.outages.clone().into_iter().map(move |outage| (role.clone(), outage))
+    };
+    let outages: Vec<(String, Outage)> = shutdown.reports.iter().flat_map(of).collect();
     shutdown.leave_out_partial(|role| is_external(scenario, launch, role));
     let ShutdownReport { reports, unbooked, mut problems } = shutdown;
     let (hosts, told, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
     problems.extend(told);
     elsewhere.iter().for_each(|incident| scorer.incident(incident.tick));
     supervisor.incidents.extend(elsewhere);
+    for (role, outage) in outages {
+        let incident = Incident::of_device(&role, &outage);
+        tell(format_args!("corotate: {incident}"));
+        scorer.incident(incident.tick);
+        supervisor.incidents.push(incident);
+    }
     let score = scorer.finish()?;
     let (incidents, recorder) = supervisor.incidents(&score.recoveries_s);
     let recording = recorder.finish(domain, &reports, HostsSummary::of(&hosts).as_ref());
@@ -413,6 +424,11 @@ impl<'a> Supervisor<'a> {
                 self.janitor.clear_dead();
                 note(incident.tick);
                 go_on &= incident.action != Action::Stopped;
+                self.incidents.push(incident);
+            }
+            if let Some(incident) = member.replaced() {
+                tell(format_args!("corotate: {incident}"));
+                note(incident.tick);
                 self.incidents.push(incident);
             }
             // A successor finds its links free once the remains of its predecessor are put away.

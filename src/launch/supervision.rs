@@ -8,13 +8,13 @@ use super::janitor::Janitor;
 use super::trace::Trace;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
-use crate::bus::{Bus, BusError, Read, Reader, Signal};
+use crate::bus::{Bus, BusError, Read, Reader, Signal, WriterProcess};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::panics::Panic;
 use crate::runtime::{RoleId, open_ledger, panic_path, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
-use crate::telemetry::Ledger;
+use crate::telemetry::{Ledger, Outage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -45,6 +45,9 @@ pub struct Incident {
     pub generation: u64,
     /// The tick that it had not finished.
     pub tick: u64,
+    /// When that was, s from the first tick.
+    #[serde(default)]
+    pub time_s: f64,
     /// How it failed.
     pub cause: String,
     /// The end of its error output.
@@ -58,6 +61,9 @@ pub struct Incident {
     /// Whether its successor begins with its counters alone: the state that it had itself inherited may be what it died of.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub begins_anew: bool,
+    /// The program that took its seat, if one did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub replaced_by: Option<Replacement>,
     /// What was done.
     pub action: Action,
     /// From when it was noticed until its successor ran, s.
@@ -65,6 +71,15 @@ pub struct Incident {
     /// From `tick` on until every metric with a limit was within it and stayed there, s. None if that did not happen, or if
     /// there is no limit.
     pub recovery_s: Option<f64>,
+}
+
+/// A program that took the seat of another one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Replacement {
+    /// Its process, by the number that it knows itself by.
+    pub pid: u32,
+    /// The tick of its first sample.
+    pub tick: u64,
 }
 
 /// What is done about a role that failed.
@@ -77,12 +92,18 @@ pub enum Action {
     Stopped,
     /// Nothing: it died after its last tick, and its results are complete.
     Noted,
+    /// Nothing: the run went on without it, and with it again once it was back.
+    Continued,
 }
 
 impl fmt::Display for Incident {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let with: String = self.with.iter().map(|role| format!(", and {role} with it,")).collect();
-        let failed = if self.external { "failed" } else { "died" };
+        let failed = match (self.action, self.external) {
+            (Action::Continued, _) => "was absent",
+            (_, true) => "failed",
+            (_, false) => "died",
+        };
         write!(f, "{}{with} {failed} at tick {}: {}", self.role, self.tick, self.cause)?;
         if !self.last_words.is_empty() {
             write!(f, "; it said: {}", self.last_words)?;
@@ -93,11 +114,33 @@ impl fmt::Display for Incident {
             Action::Stopped if self.repeated => "; as before, so it is not started anew; the run ends",
             Action::Stopped => "; the run ends",
             Action::Noted => " after its last tick; its results are complete",
+            Action::Continued => "; the run goes on",
         })
     }
 }
 
 impl Incident {
+    /// An absence of the device in a role's seat.
+    pub(super) fn of_device(role: &str, outage: &Outage) -> Self {
+        Self {
+            role: role.to_owned(),
+            external: true,
+            with: Vec::new(),
+            generation: 1,
+            tick: outage.tick,
+            time_s: 0.0,
+            cause: outage.cause.clone(),
+            last_words: String::new(),
+            panic: None,
+            repeated: false,
+            begins_anew: false,
+            replaced_by: None,
+            action: Action::Continued,
+            outage_s: outage.back_at_tick.map(|_| outage.seconds),
+            recovery_s: None,
+        }
+    }
+
     /// The end of a role that has no process of its own: after a scripted one its successor is there at once.
     pub(super) fn without_process(role: &str, ledger: &Ledger, failure: Failure, action: Action) -> Self {
         Self {
@@ -110,7 +153,9 @@ impl Incident {
             last_words: failure.last_words,
             panic: failure.panic,
             repeated: false,
+            time_s: 0.0,
             begins_anew: false,
+            replaced_by: None,
             action,
             outage_s: None,
             recovery_s: None,
@@ -138,6 +183,52 @@ impl Failure {
     }
 }
 
+/// The program in the seat of an external role, by what it sends.
+#[derive(Default)]
+struct Occupant {
+    writer: Option<WriterProcess>,
+    /// When it sent its last sample, ns.
+    sent_ns: u64,
+    last_tick: Option<u64>,
+    /// The program that left the seat, until its successor sends; then with the tick of that sample and how long the seat was empty, s.
+    left: Option<Left>,
+    back: Option<(u64, f64)>,
+}
+
+/// A program that left its seat, and the tick that it had not sent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Left {
+    pid: u32,
+    tick: u64,
+}
+
+impl Occupant {
+    /// Looks who writes. `next_tick` is that after the last sample before this look, `run` the first and the last tick of the newest
+    /// samples without a gap.
+    fn look(&mut self, writer: Option<WriterProcess>, next_tick: u64, run: Option<(u64, u64)>, now_ns: u64) {
+        let before = self.writer;
+        self.writer = writer.or(before);
+        if let Some(before) =
+            before.filter(|before| next_tick > 0 && self.left.is_none() && self.writer != Some(*before))
+        {
+            self.left = Some(Left { pid: before.pid, tick: next_tick });
+        }
+        if let (Some((first, last)), None) = (run.filter(|(_, last)| Some(*last) > self.last_tick), self.back) {
+            if let Some(left) = self.left.filter(|left| last >= left.tick) {
+                self.back = Some((first.max(left.tick), now_ns.saturating_sub(self.sent_ns) as f64 / 1e9));
+            }
+            (self.last_tick, self.sent_ns) = (Some(last), now_ns);
+        }
+    }
+
+    /// Returns the program that left, the process that took its seat, the tick of its first sample, and for how long nobody sent, s:
+    /// once.
+    fn replaced(&mut self) -> Option<(Left, u32, u64, f64)> {
+        let (tick, outage_s) = self.back.take()?;
+        Some((self.left.take()?, self.writer?.pid, tick, outage_s))
+    }
+}
+
 /// One role, seen from the launcher, with what else is in its process.
 pub(super) struct Member {
     pub name: String,
@@ -153,6 +244,8 @@ pub(super) struct Member {
     hosted: Vec<(RoleId, Ledger)>,
     /// What an external role sends; all there is to go by where it says nothing of itself.
     trace: Option<Trace>,
+    /// Who sends that.
+    occupant: Occupant,
     health: <IoxBus as Bus>::Reader<Health>,
     /// Health of an earlier generation is a dead role's.
     generation: u64,
@@ -190,6 +283,7 @@ impl Member {
             health: bus.reader(&topic(scenario, &name, Signal::Health), Reader::Role)?,
             ledger: open_ledger(domain, scenario, role)?,
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
+            occupant: Occupant::default(),
             name,
             role,
             process: None,
@@ -253,7 +347,12 @@ impl Member {
             }
         }
         if let Some(trace) = &mut self.trace {
+            let (before, _) = trace.newest();
             let told = trace.look()?;
+            // A host's relay sends for all processes there.
+            if self.host.is_none() {
+                self.occupant.look(trace.writer(), before, trace.newest().1, now_ns);
+            }
             if !self.health.written() && told != self.last && self.state() < RoleState::Done {
                 self.last = told;
                 self.silent_ns = 0;
@@ -276,6 +375,28 @@ impl Member {
     /// and none is due.
     pub fn spent(&self) -> bool {
         self.over && self.trace.is_some() && !self.health.written()
+    }
+
+    /// Returns the incident of an external role whose program has been replaced by another: once, when that sends.
+    pub fn replaced(&mut self) -> Option<Incident> {
+        let (left, pid, tick, outage_s) = self.occupant.replaced()?;
+        Some(Incident {
+            role: self.name.clone(),
+            external: true,
+            with: Vec::new(),
+            generation: self.generation,
+            tick: left.tick,
+            time_s: 0.0,
+            cause: format!("its program, process {}, left; process {pid} took its seat at tick {tick}", left.pid),
+            last_words: String::new(),
+            panic: None,
+            repeated: false,
+            begins_anew: false,
+            replaced_by: Some(Replacement { pid, tick }),
+            action: Action::Continued,
+            outage_s: Some(outage_s),
+            recovery_s: None,
+        })
     }
 
     /// What it sends, if it is external.
@@ -345,7 +466,7 @@ impl Member {
         }
         let fail = |cause: String| fail(cause, String::new());
         let timeout_s = match &self.host {
-            Some(_) => scenario.hosts.network.silence_timeout_s,
+            Some(_) => scenario.host_silence_s(state >= RoleState::Running),
             None => scenario.supervision.heartbeat_timeout_s,
         };
         let limit_s = if tells { timeout_s } else { timeout_s.max(SILENT_PERIODS * scenario.tick_s()) };
@@ -423,7 +544,9 @@ impl Member {
             last_words: failure.last_words,
             panic: failure.panic,
             repeated: false,
+            time_s: 0.0,
             begins_anew: false,
+            replaced_by: None,
             action,
             outage_s: None,
             recovery_s: None,
@@ -483,5 +606,48 @@ impl Member {
         let (_, noticed_ns) = self.restart.filter(|_| self.state() >= RoleState::Running)?;
         self.restart = None;
         Some(now_ns - noticed_ns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn process(pid: u32, unique: u128) -> Option<WriterProcess> {
+        Some(WriterProcess { pid, unique })
+    }
+
+    #[test]
+    fn a_program_that_takes_a_seat_in_the_midst_is_told_once() {
+        let mut occupant = Occupant::default();
+        occupant.look(process(1, 1), 0, None, 0);
+        occupant.look(process(1, 1), 0, Some((0, 99)), 1_000_000_000);
+        assert_eq!(occupant.replaced(), None);
+        // Its remains are put away, then another one is there, which sends later.
+        occupant.look(None, 100, Some((0, 99)), 1_500_000_000);
+        occupant.look(process(1, 2), 100, Some((0, 99)), 2_000_000_000);
+        assert_eq!(occupant.replaced(), None);
+        occupant.look(process(1, 2), 100, Some((180, 185)), 3_000_000_000);
+        assert_eq!(
+            occupant.replaced(),
+            Some((Left { pid: 1, tick: 100 }, 1, 180, 2.0)),
+            "the same number in another container"
+        );
+        occupant.look(process(1, 2), 186, Some((180, 190)), 3_100_000_000);
+        assert_eq!(occupant.replaced(), None);
+        occupant.look(process(7, 3), 191, Some((180, 191)), 3_200_000_000);
+        assert!(
+            matches!(occupant.replaced(), Some((Left { pid: 1, tick: 191 }, 7, 191, _))),
+            "in lockstep no tick is lost"
+        );
+    }
+
+    #[test]
+    fn a_seat_that_changes_hands_before_the_run_is_no_incident() {
+        let mut occupant = Occupant::default();
+        occupant.look(process(1, 1), 0, None, 0);
+        occupant.look(process(2, 2), 0, None, 10);
+        occupant.look(process(2, 2), 0, Some((0, 5)), 20);
+        assert_eq!(occupant.replaced(), None);
     }
 }

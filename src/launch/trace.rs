@@ -5,7 +5,7 @@
 //! tells which sample of any external role is missing, and what came instead. Must not judge a role that reports its health.
 
 use crate::bus::iox::IoxBus;
-use crate::bus::{BusError, Reader, Signal, Topic, WordReader};
+use crate::bus::{BusError, Reader, Signal, Topic, WordReader, WriterProcess};
 use crate::config::Scenario;
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Health, RoleState, Stamp, VOID};
@@ -90,6 +90,16 @@ impl Trace {
             Ok(Traced { signal, end, seen: Seen::default(), readers })
         });
         Ok(Self { signals: signals.collect::<Result<_, BusError>>()?, last_tick: scenario.last_tick })
+    }
+
+    /// The process that writes the first signal.
+    pub fn writer(&self) -> Option<WriterProcess> {
+        self.signals.first()?.end.writer()
+    }
+
+    /// The tick after the newest sample of that signal, and the first and the last tick of its newest samples without a gap.
+    pub fn newest(&self) -> (u64, Option<(u64, u64)>) {
+        self.signals.first().map_or((0, None), |traced| (traced.seen.next_tick, traced.seen.run))
     }
 
     /// Whether all signals have a writer.

@@ -4,7 +4,7 @@ use super::qemu::Board;
 use super::role::{die_with, terminated_by_signals};
 use super::{Exit, fail, runs, say};
 use crate::launch::line_words;
-use crate::runtime::{DeviceError, DeviceSeat, RoleError, run_bridge};
+use crate::runtime::{DeviceError, DeviceSeat, NodeError, RoleError, Served, run_bridge};
 use crate::system::tell;
 use std::path::PathBuf;
 
@@ -33,6 +33,9 @@ pub struct Arguments {
     /// How long a device that is silent or gone is waited for, s
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     patience: f64,
+    /// Go on if a device of another name answers in the midst of the run
+    #[arg(long)]
+    allow_other_device: bool,
     /// Print the line's counters at the end as one JSON object (corotate/bridge/v1)
     #[arg(long)]
     json: bool,
@@ -75,23 +78,23 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
         path,
         baud: arguments.baud,
         patience_s: arguments.patience,
+        other_device: arguments.allow_other_device,
     };
     let role = seat.roles.join(",");
     let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
     let served = run_bridge(&seat, &terminated, welcomed);
-    let counters = served.map_err(|error| match board.and_then(Board::ended) {
+    let served = served.map_err(|error| match board.and_then(Board::ended) {
         Some(ended) => fail(exit_of(&error), &format!("{ended}: {error}")),
         None => fail(exit_of(&error), &error),
     })?;
-    match counters {
-        Some(counters) if arguments.json => {
-            let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters });
-            say(&format!("{object}\n"))?;
-        }
-        Some(counters) => tell(line_words(&role, &counters)),
-        None => {}
+    let Some(Served { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
+    if arguments.json {
+        let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });
+        say(&format!("{object}\n"))?;
+    } else {
+        tell(line_words(&role, &counters));
     }
-    Ok(Exit::Ok)
+    Ok(lost.map_or(Exit::Ok, |lost| fail(Exit::ProcessLost, &format!("{role}: {lost}"))))
 }
 
 fn exit_of(error: &RoleError) -> Exit {
@@ -102,6 +105,8 @@ fn exit_of(error: &RoleError) -> Exit {
         // A device that should be there and does not answer is a failure; one that is not what was asked for is usage.
         RoleError::Device(DeviceError::Silent { .. }) => Exit::Failure,
         RoleError::Device(_) => Exit::Usage,
+        // It took part in the run, and is lost to it.
+        RoleError::Node(NodeError::Device(_)) => Exit::ProcessLost,
         _ => Exit::Failure,
     }
 }

@@ -112,7 +112,6 @@ fn about_build() -> String {
         ("hooks", cfg!(feature = "hooks")),
         ("hosts", cfg!(feature = "hosts")),
         ("parquet", cfg!(feature = "parquet")),
-        ("pdf", cfg!(feature = "pdf")),
     ];
     let built: Vec<&str> = features.iter().filter(|(_, built)| *built).map(|(name, _)| *name).collect();
     let host = Host::this();

@@ -3,18 +3,20 @@
 //! A silent device is waited for, asked again, greeted anew, and its line opened again, for a bounded time. Must not know
 //! what its samples mean.
 
+use super::absence::Absences;
 use super::line::{Line, LineError};
-use super::node::{RoleId, RoleImpl, ports};
-use super::process::{RoleError, find_role, in_domain, join, require_process, take_ledger};
+use super::node::{NodeError, RoleId, RoleImpl, ports};
+use super::process::{RoleError, find_role, in_domain, join, require_process, take_ledger, words_path, write_whole};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, Scenario};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
     Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse, Samples, Terms,
-    VERSION, fits_version_1,
+    VERSION, Welcome, fits_version_1,
 };
-use std::path::PathBuf;
+use crate::telemetry::Outage;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Between two tries to open a line again, ns.
@@ -44,6 +46,19 @@ pub struct DeviceSeat {
     pub baud: Option<u32>,
     /// How long a silent device, or one that is gone, is waited for, s.
     pub patience_s: f64,
+    /// Go on with a device of another name that answers in the midst of a run.
+    pub other_device: bool,
+}
+
+/// What is told of a device once its run is over.
+#[derive(Debug, Clone)]
+pub struct Served {
+    /// The line's counters.
+    pub counters: LineCounters,
+    /// When the device was absent.
+    pub outages: Vec<Outage>,
+    /// Why the device was lost to the run, if it was: at the end, or in real time for longer than commands last.
+    pub lost: Option<String>,
 }
 
 /// Why there is no device, or none any more.
@@ -97,6 +112,20 @@ pub enum DeviceError {
         path: PathBuf,
         /// The device's version.
         theirs: u8,
+    },
+    /// Another device answers in its place.
+    #[error(
+        "on {} the device `{found}` answers in the place of `{expected}`; connect that one again, or give \
+         --allow-other-device",
+        path.display()
+    )]
+    Other {
+        /// The line.
+        path: PathBuf,
+        /// The name of the device that the run began with.
+        expected: String,
+        /// The name of the other one.
+        found: String,
     },
     /// What it would have to say is too much for a message.
     #[error(
@@ -220,6 +249,10 @@ pub struct DeviceLink {
     inputs: Vec<usize>,
     patience_ns: u64,
     reopen_ns: u64,
+    /// The name of the device that has the seat, once it has said it.
+    device: Option<String>,
+    other_device: bool,
+    absences: Absences,
 }
 
 impl DeviceLink {
@@ -262,7 +295,17 @@ impl DeviceLink {
         };
         let patience_ns = (seat.patience_s * 1e9) as u64;
         let line = Line::open(&seat.path, seat.baud)?;
-        Ok(Self { line, host: Host::new(terms), greeting, inputs, patience_ns, reopen_ns: 0 })
+        Ok(Self {
+            line,
+            host: Host::new(terms),
+            greeting,
+            inputs,
+            patience_ns,
+            reopen_ns: 0,
+            device: None,
+            other_device: seat.other_device,
+            absences: Absences::new(terms.period_ns, scenario.command_timeout_ticks),
+        })
     }
 
     /// Bytes of each sample that the device reads, in order.
@@ -275,24 +318,26 @@ impl DeviceLink {
         self.host.terms().outputs.iter().map(|length| usize::from(*length)).take_while(|length| *length > 0).collect()
     }
 
-    /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first.
+    /// Returns what a reader must know of the device's samples, to stand behind its name.
+    fn remark(&self) -> &'static str {
+        match self.greeting.bare_since_ns.is_some() || self.host.version() < VERSION {
+            true => " (states no layouts: its samples are trusted by their type names)",
+            false => "",
+        }
+    }
+
+    /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first. The device `before` is the one
+    /// that an earlier bridge had in this run.
     ///
     /// # Errors
     /// [`DeviceError`] if it refuses, or stays silent for too long.
-    pub fn greet(&mut self, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
-        let mut name = None;
+    pub fn greet(&mut self, before: Option<String>, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
+        self.device = before;
         while !terminated.load(Ordering::Relaxed) {
-            self.exchange(monotonic_ns(), |heard| {
-                if let Heard::Welcome(welcome) = heard {
-                    name = Some(printable(welcome.device));
-                }
-            })?;
-            if let Some(mut name) = name {
-                if self.greeting.bare_since_ns.is_some() || self.host.version() < VERSION {
-                    name.push_str(" (states no layouts: its samples are trusted by their type names)");
-                }
+            self.exchange(monotonic_ns(), |_| {})?;
+            if self.host.greeted() {
                 self.host.wait_anew();
-                return Ok(Some(name));
+                return Ok(self.device.clone());
             }
             sleep_until(monotonic_ns() + LOOK_NS);
         }
@@ -303,6 +348,7 @@ impl DeviceLink {
     #[inline]
     pub fn request(&mut self, tick: u64, samples: Samples<'_>, now_ns: u64) {
         self.host.request(tick, samples, now_ns);
+        self.absences.asked(tick, now_ns);
     }
 
     /// Asks no more for the tick at hand.
@@ -315,22 +361,19 @@ impl DeviceLink {
     /// # Errors
     /// [`DeviceError`] if the device has been away for too long, or will not take part any more.
     #[inline]
-    pub fn turn(&mut self, now_ns: u64, mut answer: impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
-        self.exchange(now_ns, |heard| {
-            if let Heard::Answer(heard) = heard {
-                answer(heard);
-            }
-        })
+    pub fn turn(&mut self, now_ns: u64, answer: impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
+        self.exchange(now_ns, answer)
     }
 
-    fn exchange(&mut self, now_ns: u64, mut hear: impl FnMut(&Heard<'_>)) -> Result<(), DeviceError> {
+    fn exchange(&mut self, now_ns: u64, mut answer: impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
+        self.absences.look(now_ns, self.line.is_open());
         if self.host.silent_ns(now_ns) > self.patience_ns {
             return Err(self.silent(now_ns));
         }
         if !self.line.is_open() && !self.open_again(now_ns) {
             return Ok(());
         }
-        self.take_in(now_ns, &mut hear)?;
+        self.take_in(now_ns, &mut answer)?;
         let Self { line, host, greeting, .. } = self;
         let hello = greeting.hello();
         while let Some(frame) = host.due(now_ns, &hello) {
@@ -345,19 +388,27 @@ impl DeviceLink {
         Ok(())
     }
 
-    fn take_in(&mut self, now_ns: u64, hear: &mut impl FnMut(&Heard<'_>)) -> Result<(), DeviceError> {
+    fn take_in(&mut self, now_ns: u64, answer: &mut impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
         let mut bytes = [0; CHUNK];
+        let Self { line, host, greeting, device, other_device, absences, .. } = self;
         for _ in 0..CHUNKS {
-            let count = self.line.read(&mut bytes);
+            let count = line.read(&mut bytes);
             for &byte in &bytes[..count] {
-                match self.host.push(byte, now_ns) {
+                match host.push(byte, now_ns) {
                     None => {}
-                    Some(Heard::Refused(refuse)) if self.greeting.drop_hashes(&refuse, now_ns) => {}
-                    Some(Heard::Refused(refuse)) => return Err(refused(&self.line, &self.greeting, &refuse)),
+                    Some(Heard::Refused(refuse)) if greeting.drop_hashes(&refuse, now_ns) => {}
+                    Some(Heard::Refused(refuse)) => return Err(refused(line, greeting, &refuse)),
                     Some(Heard::OtherVersion(theirs)) => {
-                        return Err(DeviceError::Version { path: self.line.path().to_owned(), theirs });
+                        return Err(DeviceError::Version { path: line.path().to_owned(), theirs });
                     }
-                    Some(heard) => hear(&heard),
+                    Some(Heard::Answer(heard)) => {
+                        absences.answered(heard.tick);
+                        answer(&heard);
+                    }
+                    Some(Heard::Welcome(welcome)) => {
+                        let renamed = welcomed(line, &welcome, device, *other_device)?;
+                        absences.greeted(welcome.next_tick, renamed.then_some(device.as_deref()).flatten());
+                    }
                 }
             }
             if count < CHUNK {
@@ -402,6 +453,29 @@ impl DeviceLink {
     pub fn counters(&self) -> LineCounters {
         self.host.counters()
     }
+
+    /// When the device was absent.
+    pub fn outages(&self) -> Vec<Outage> {
+        self.absences.outages()
+    }
+}
+
+/// Keeps the name that a device says; returns true if it is another than before, and that is allowed.
+fn welcomed(
+    line: &Line,
+    welcome: &Welcome<'_>,
+    device: &mut Option<String>,
+    other_device: bool,
+) -> Result<bool, DeviceError> {
+    let found = printable(welcome.device);
+    let expected = device.get_or_insert_with(|| found.clone());
+    let renamed = *expected != found;
+    if renamed && !other_device {
+        let path = line.path().to_owned();
+        return Err(DeviceError::Other { path, expected: expected.clone(), found });
+    }
+    *expected = found;
+    Ok(renamed)
 }
 
 impl Drop for DeviceLink {
@@ -465,8 +539,13 @@ fn roles(scenario: &Scenario, names: &[String]) -> Result<Vec<RoleId>, RoleError
     Err(RoleError::NoDevice { roles: names.join(","), driven })
 }
 
+/// The file in a domain's directory with the name of the device that has a seat, for a bridge that is started again.
+fn device_path(root: &Path, roles: &str) -> PathBuf {
+    root.join(format!("{roles}.device"))
+}
+
 /// Puts a device into a role's seat and serves it to the end of the run. `welcomed` is told the device's name.
-/// Gives the line's counters, if a run was served.
+/// Gives an account of it, if a run was served.
 ///
 /// # Errors
 /// [`RoleError`].
@@ -474,19 +553,47 @@ pub fn run_bridge(
     seat: &DeviceSeat,
     terminated: &AtomicBool,
     welcomed: impl FnOnce(&str),
-) -> Result<Option<LineCounters>, RoleError> {
+) -> Result<Option<Served>, RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let roles = roles(&scenario, &seat.roles)?;
     roles.iter().try_for_each(|role| require_process(&scenario, *role))?;
     // A bridge that is started again in the same run finds a device that knows it.
     let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
     let mut link = DeviceLink::open(seat, &scenario, &roles, run)?;
-    let Some(name) = link.greet(terminated)? else { return Ok(None) };
-    welcomed(&name);
+    let known = device_path(domain.root(), &link.greeting.role);
+    let before = std::fs::read_to_string(&known).ok();
+    let Some(name) = link.greet(before, terminated)? else { return Ok(None) };
+    welcomed(&format!("{name}{}", link.remark()));
+    write_whole(&known, name.as_bytes()).map_err(|source| RoleError::Report { path: known.clone(), source })?;
     let (last, others) = roles.split_last().expect("a seat has a role");
     let others = others.iter().map(|other| Ok((*other, take_ledger(&domain, &scenario, *other)?)));
     let others = others.collect::<Result<_, RoleError>>()?;
-    let (mut counters, occupant) = (None, RoleImpl::Device(*last, others, Box::new(link)));
-    in_domain(&domain, &scenario, occupant, terminated, |report| counters = counters.or(report.line))?;
-    Ok(counters)
+    let (mut served, occupant) = (None, RoleImpl::Device(*last, others, Box::new(link)));
+    let done = in_domain(&domain, &scenario, occupant, terminated, |report| {
+        if let Some(counters) = report.line {
+            let lost = report.outages.iter().rev().find_map(|outage| lost(outage, &scenario));
+            served = Some(Served { counters, outages: report.outages.clone(), lost });
+        }
+    });
+    if let Err(RoleError::Node(NodeError::Device(error))) = &done {
+        // For the launcher, which has no line to it. If the run is gone, the caller is told all the same.
+        for role in &roles {
+            let _ = write_whole(&words_path(domain.root(), role.name(&scenario)), error.to_string().as_bytes());
+        }
+    }
+    done.map(|()| served)
+}
+
+/// Returns why an outage has cost the run its device, if it has.
+fn lost(outage: &Outage, scenario: &Scenario) -> Option<String> {
+    let timeout_s = scenario.command_timeout_ticks as f64 * scenario.tick_s();
+    let Outage { tick, cause, .. } = outage;
+    let at_s = scenario.time_s(*tick);
+    match outage.back_at_tick {
+        None => Some(format!("at tick {tick} ({at_s:.3} s) {cause}, to the end of the run")),
+        Some(back) if scenario.clock == ClockKind::Realtime && outage.seconds > timeout_s => {
+            Some(format!("at tick {tick} ({at_s:.3} s) {cause}; it answered again at tick {back}"))
+        }
+        Some(_) => None,
+    }
 }

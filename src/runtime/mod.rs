@@ -3,6 +3,7 @@
 //! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
+mod absence;
 mod bridge;
 mod compute;
 mod disturb;
@@ -16,7 +17,7 @@ mod process;
 mod seat;
 mod share;
 
-pub use bridge::{DeviceError, DeviceLink, DeviceSeat, run_bridge};
+pub use bridge::{DeviceError, DeviceLink, DeviceSeat, Served, run_bridge};
 pub use compute::{Compute, ComputedTick};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub(crate) use drive::in_noted_turn;

@@ -31,7 +31,7 @@ use crate::role::Guard;
 use crate::serial::LineCounters;
 use crate::state::{Count, Persist, Restore, Words};
 use crate::telemetry::{
-    Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, Ticks, WatchReport,
+    Grant, Ledger, LedgerError, Outage, ReadCounters, RoleReport, StageReport, TickCounters, Ticks, WatchReport,
 };
 use missed::MissedTicks;
 use plant::PlantNode;
@@ -161,6 +161,10 @@ pub trait Node {
     /// The counters of its device's serial line, if it has one.
     fn line(&self) -> Option<LineCounters> {
         None
+    }
+    /// When that device was absent.
+    fn outages(&self) -> Vec<Outage> {
+        Vec::new()
     }
 }
 
@@ -451,6 +455,7 @@ pub fn report(
         stages,
         grants,
         line: None,
+        outages: Vec::new(),
     }
 }
 

@@ -390,7 +390,8 @@ pub fn serve<B: Bus + 'static>(
         let grants = if *of == role { privileges.grants.clone() } else { Vec::new() };
         let node = node.of(*of).unwrap_or(&*node);
         stages.extend(node.stages());
-        deliver(&RoleReport { line: node.line(), ..report(scenario, *of, ledger, stages, grants) })?;
+        let (line, outages) = (node.line(), node.outages());
+        deliver(&RoleReport { line, outages, ..report(scenario, *of, ledger, stages, grants) })?;
     }
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {

@@ -10,7 +10,7 @@ use super::node::NodeError;
 use crate::clock::{Grid, monotonic_ns};
 use crate::sample::Stamp;
 use crate::serial::{Answer, LineCounters, MAX_CONTENT, Samples};
-use crate::telemetry::Latency;
+use crate::telemetry::{Latency, Outage};
 use std::cell::RefCell;
 use std::rc::Rc;
 
@@ -119,6 +119,14 @@ impl Computer {
     pub fn restarted(&self) -> bool {
         let Self::Device(share) = self else { return false };
         share.exchange.borrow().link.counters().restarts > 0
+    }
+
+    /// When the device was absent, for the role that tells it.
+    pub fn outages(&self) -> Vec<Outage> {
+        match self {
+            Self::Device(share) if share.part != Part::Controller => share.exchange.borrow().link.outages(),
+            _ => Vec::new(),
+        }
     }
 
     /// The counters of the line and its round trips, for the role that tells them.

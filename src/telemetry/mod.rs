@@ -23,4 +23,4 @@ pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
-pub use report::{Grant, LinkRead, LinkWritten, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};
+pub use report::{Grant, LinkRead, LinkWritten, Outage, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

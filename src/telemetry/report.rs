@@ -27,6 +27,22 @@ pub struct RoleReport {
     pub grants: Vec<Grant>,
     /// The counters of its device's serial line, if a device has the seat.
     pub line: Option<LineCounters>,
+    /// When that device was absent.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub outages: Vec<Outage>,
+}
+
+/// A time in which a device did not answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Outage {
+    /// The first tick that it did not answer in time.
+    pub tick: u64,
+    /// The tick that it answered next; none if it was absent at the end.
+    pub back_at_tick: Option<u64>,
+    /// How long it was waited for, s.
+    pub seconds: f64,
+    /// What happened, in words.
+    pub cause: String,
 }
 
 /// What a watchdog saw.

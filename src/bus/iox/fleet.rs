@@ -2,7 +2,7 @@
 
 use super::{Connections, IoxBus, Ipc, buffer_size, cause};
 use crate::bus::notifier::Notifier;
-use crate::bus::{BusError, Read, Reader, Topic, Write};
+use crate::bus::{BusError, Read, Reader, Topic, Write, WriterProcess};
 use crate::sample::{FleetLayout, FleetSample};
 use bytemuck::TransparentWrapper;
 use core::marker::PhantomData;
@@ -160,6 +160,10 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
 
     fn written(&self) -> bool {
         super::is_written(&self.service)
+    }
+
+    fn writer(&self) -> Option<WriterProcess> {
+        super::writer(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

@@ -3,7 +3,7 @@
 use super::latest::{LatestReader, LatestWriter};
 use super::{Ipc, Wire, cause, is_written};
 use crate::bus::notifier::Notifier;
-use crate::bus::{BusError, Read, Topic, Write};
+use crate::bus::{BusError, Read, Topic, Write, WriterProcess};
 use crate::sample::{Sample, VOID};
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher;
@@ -228,6 +228,10 @@ impl<S: Sample> Read<S> for IoxReader<S> {
 
     fn written(&self) -> bool {
         is_written(&self.service)
+    }
+
+    fn writer(&self) -> Option<WriterProcess> {
+        super::writer(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

@@ -16,7 +16,7 @@ use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// A device with its links and counters.
 pub struct BridgeNode<R: Rig, B: Bus> {
@@ -334,6 +334,10 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn line(&self) -> Option<LineCounters> {
         Some(self.link.counters())
+    }
+
+    fn outages(&self) -> Vec<Outage> {
+        self.link.outages()
     }
 }
 

@@ -16,7 +16,7 @@ use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// What drives the bodies of a rig one by one.
 type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
@@ -571,6 +571,10 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn line(&self) -> Option<LineCounters> {
         self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
+    }
+
+    fn outages(&self) -> Vec<Outage> {
+        self.computing.as_ref().map_or_else(Vec::new, Computer::outages)
     }
 }
 

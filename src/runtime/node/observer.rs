@@ -14,7 +14,7 @@ use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
-use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
+use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
 /// The instants of one executed tick, ns.
 #[derive(Debug, Clone, Copy, Default)]
@@ -257,6 +257,10 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn line(&self) -> Option<LineCounters> {
         self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
+    }
+
+    fn outages(&self) -> Vec<Outage> {
+        self.computing.as_ref().map_or_else(Vec::new, Computer::outages)
     }
 }
 
