@@ -161,7 +161,7 @@ pub(crate) fn require_own(file: &File) -> io::Result<()> {
 /// Opens a regular file, and refuses anything else. It never waits for another process, as opening a FIFO does.
 ///
 /// # Errors
-/// Those of the system; [`InvalidInput`](io::ErrorKind::InvalidInput) for what is not a regular file.
+/// Errors of the system; [`InvalidInput`](io::ErrorKind::InvalidInput) for a file that is not regular.
 pub fn open_with(path: &Path, options: &mut OpenOptions, flags: OFlags) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY | flags;
     let irregular = || io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file");
@@ -194,7 +194,7 @@ pub fn read(path: &Path) -> io::Result<Vec<u8>> {
 /// the process that held the lock has removed the file, and a lock on it protects nothing.
 ///
 /// # Errors
-/// Those of the system; [`WouldBlock`](io::ErrorKind::WouldBlock) if another process holds the lock.
+/// Errors of the system; [`WouldBlock`](io::ErrorKind::WouldBlock) if another process holds the lock.
 pub fn lock(file: &File, path: &Path) -> io::Result<bool> {
     lock_now(file)?;
     let held = file.metadata()?;

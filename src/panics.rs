@@ -1,7 +1,7 @@
 //! Panics: what they say, where they are, and whose code that is.
 //!
 //! A user's law may panic: its message and place come first, and nothing calls it a defect of this crate. Must not end the
-//! process; whoever catches a panic decides.
+//! process; the caller that catches a panic decides.
 
 use crate::files;
 use serde::{Deserialize, Serialize};
@@ -94,11 +94,11 @@ static KEPT: OnceLock<PathBuf> = OnceLock::new();
 static KEPT_ONE: AtomicBool = AtomicBool::new(false);
 
 thread_local! {
-    /// While this thread catches panics: whether nobody is told of them, and the one that was caught.
+    /// While this thread catches panics: whether they are silent, and the one that was caught.
     static CAUGHT: RefCell<Option<(bool, Option<Panic>)>> = const { RefCell::new(None) };
 }
 
-/// Keeps the first panic of this process in a file, for whoever asks why the process ended.
+/// Keeps the first panic of this process in a file, from which the launcher reads why the process ended.
 pub fn keep_in(path: PathBuf) {
     let _ = KEPT.set(path);
 }
@@ -147,7 +147,7 @@ pub fn catch<T>(call: impl FnOnce() -> T) -> Result<T, Panic> {
     catch_as(false, call)
 }
 
-/// The same without telling it.
+/// Catches a panic without printing it.
 ///
 /// # Errors
 /// The panic.

@@ -192,7 +192,7 @@ fn a_function_that_is_slow_is_waited_for_in_lockstep() {
             served.unwrap();
             assert_eq!(summary["incidents"], serde_json::json!([]));
         } else {
-            // It may be back before the run is gone; nobody killed its launcher.
+            // It may be back before the run is gone; its launcher was not killed.
             assert!(matches!(served, Ok(()) | Err(RoleError::Late)), "{served:?}");
             assert_eq!(summary["incidents"][0]["tick"], 50, "{summary:#}");
         }

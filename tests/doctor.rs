@@ -40,7 +40,7 @@ fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
     }
     let remedied = |check: &Value| check["verdict"] == "ok" || check["remedy"].is_string();
     assert!(report["checks"].as_array().unwrap().iter().all(remedied), "{report}");
-    // What is judged is what ran: every role's ticks, and no others.
+    // Every role's ticks are judged, and no others.
     let trial = &report["trial"];
     let number = |value: &Value| value.as_u64().unwrap();
     let roles = trial["roles"].as_object().unwrap();

@@ -338,7 +338,7 @@ fn the_follower_synchronises_in_real_time_with_a_component_that_nobody_measures(
 }
 
 /// Every tick has an entry in every stage, also those that a controller which stands still for 20 ms misses, and those that a
-/// follower spends with an old command: nothing is omitted because nobody was there.
+/// follower spends with an old command: nothing is omitted because a role was absent.
 #[test]
 fn every_stage_counts_every_tick() {
     let bench = Bench::new();

@@ -566,7 +566,7 @@ fn two_runs_are_shown_over_each_other() {
     let words = text(section(&page, "differences"));
     assert!((4000..4010).contains(&first) && words.contains(&format!("at tick {first} ")), "{first}: {words}");
     assert!(html.contains("first difference</text>") && html.contains("leader, A") && html.contains("leader, B"));
-    // What was changed, key by key, and nothing else.
+    // The comparison names each key that was changed, and nothing else.
     let differing = rows(section(&page, "scenarios"));
     let keys: Vec<&str> = differing[1..].iter().map(|row| row[0].as_str()).collect();
     assert_eq!(keys, ["from_tick", "kind", "probability", "role", "ticks"].map(|key| format!("fault[0].{key}")));
@@ -625,7 +625,7 @@ const back = [...document.querySelectorAll("svg.plot")].every((plot) => plot.get
 document.title = [told, ticks, !other.startsWith("64 ") && back, svg.querySelectorAll("g.ticks text").length].join("|");
 </script></body>"#;
 
-/// What a browser makes of a page once its scripts have run; none where there is no browser.
+/// Returns a page as a browser has it once its scripts have run; none where there is no browser.
 fn in_browser(bench: &Bench, html: &str) -> Option<String> {
     let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
         std::process::Command::new(name).arg("--version").output().is_ok_and(|output| output.status.success())
@@ -678,7 +678,7 @@ fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
     let estimate = ["estimate", "log.csv", "--hidden", "z", "--inertia", "1,2,2.5", "--page", "log.html"];
     assert_eq!(bench.run(&estimate).code, Some(0));
     let log = std::fs::read_to_string(bench.path("log.html")).unwrap();
-    // What was read, what was done, what came of it: three paragraphs of whole sentences, and no verdict.
+    // Input, method, result: three paragraphs of whole sentences, and no verdict.
     let paragraphs = section(&parse(&log), "result").children().filter(|node| node.has_tag_name("p")).count();
     assert!(paragraphs == 3 && !log.contains("class=\"verdict"), "{paragraphs}");
     let pages = [

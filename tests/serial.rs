@@ -763,7 +763,7 @@ fn answered(message: Message<'_>) -> Vec<u8> {
 }
 
 const COMMAND: &str = "corotate/rigid-body/command/v2";
-/// The same type name over other fields.
+/// Another layout under the same type name.
 const SWAPPED: &str = "corotate/rigid-body/command/v2#00000000";
 
 #[test]

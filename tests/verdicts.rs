@@ -90,7 +90,7 @@ fn a_run_whose_external_controller_is_killed_is_not_accepted() {
     bench.assert_clean(&[domain]);
 }
 
-/// What the scorer had no room for while its process stood still may have been the worst.
+/// Ticks that the scorer had no room for while its process stood still may have been the worst.
 #[test]
 fn ticks_that_were_not_scored_leave_a_peak_unjudged() {
     let bench = Bench::new();
@@ -120,7 +120,7 @@ fn a_run_that_ends_before_it_is_judged_runs_and_says_so() {
         let scenario = Scenario::parse(text, name, &["duration_s=0.3".to_owned()]).unwrap();
         assert!(scenario.warnings[0].starts_with("accept.settled_by_s: "), "{name}: {:?}", scenario.warnings);
     }
-    // What may be claimed of the others takes a debug build a while.
+    // Claims of the other scenarios take a debug build a while.
     for name in ["rigid-pair", "faults", "inertia"] {
         let short = ["run", name, "--clock=in-process", "--duration=0.3", "--json", "--out=out", "--junit=v.xml"];
         let done = bench.run(&short);

@@ -88,7 +88,7 @@ fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
 }
 
 /// Serves a seat to the end of the run with a function of tick, inputs and blank outputs, all as bytes, that returns the outputs.
-/// What the function raises is raised.
+/// Raises the function's own exception.
 #[pyfunction]
 pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
     let raised = Arc::new(Mutex::new(None));

@@ -13,7 +13,7 @@ use std::time::SystemTime;
 /// Words of a stamp.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
-/// What a step gives: the command that acts, how many commands were rejected and missed, and how a body's motion has ended.
+/// The result of a step: the command that acts, the numbers of rejected and missed commands, and how a body's motion has ended.
 type Acted<'py> = (Bound<'py, PyArray1<f64>>, u32, u32, Option<String>);
 type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<Acted<'py>>);
 

@@ -53,7 +53,7 @@ def test_a_function_that_raises_ends_the_run_with_its_own_exception(tmp_path, cl
 @pytest.mark.parametrize("where", ["thread", "process"])
 @pytest.mark.parametrize("how, raises", [("interrupt", KeyboardInterrupt), ("leave", SystemExit), ("unpicklable", Unpicklable)])
 def test_whatever_it_is_that_a_function_raises(tmp_path, where, how, raises):
-    # What cannot travel is told by its text.
+    # An exception that cannot be pickled travels as text.
     raises = corotate.CorotateError if (where, how) == ("process", "unpicklable") else raises
     with pytest.raises(raises) as caught:
         run(tmp_path, "lockstep", where, Fails(how, 5))

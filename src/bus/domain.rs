@@ -39,7 +39,7 @@ const DOMAINS_MAX: u32 = 3;
 const OWN_SHARED: &str = "shared";
 /// The link in a domain's own shared memory to its directory.
 const OWN_ROOT: &str = "root";
-/// How old files in shared memory must be that are in no locked directory, before they count as left: a launcher makes its
+/// The age from which files in shared memory that are in no locked directory count as left: a launcher makes its
 /// directory some microseconds after its first file.
 const BEGUN: Duration = Duration::from_secs(60);
 /// How often something is tried again that another process, or a signal, has come in the way of.
@@ -141,7 +141,7 @@ pub enum DomainError {
     },
 }
 
-/// What to do about an error at a path of a domain: it lies in shared memory, or in the directory of all domains.
+/// Returns the remedy for an error at a path of a domain, which lies in shared memory or in the directory of all domains.
 fn remedy_at(path: &Path, error: &io::Error) -> String {
     if !path.starts_with(SHARED_MEMORY) {
         return format!("{}, or set XDG_RUNTIME_DIR to another directory", remedy(error));
@@ -357,7 +357,7 @@ pub fn remove_dead_domains() -> Result<Vec<Domain>, PrivacyError> {
     Ok(private_base()?.map_or(Vec::new(), |base| remove_dead(&base)))
 }
 
-/// What a dead run has left in shared memory, while the directory of its domain is gone, as that of a container.
+/// Files of a dead run in shared memory whose domain directory is gone, as that of a container.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Abandoned {
     /// Runs.

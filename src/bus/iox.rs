@@ -475,7 +475,7 @@ mod tests {
     }
 
     crate::sample! {
-        /// The same after two fields were swapped, under the same name.
+        /// `Ordered` with two fields swapped, under the same name.
         Swapped = "test/Sample/v1" {
             /// Another.
             current_a: f64,

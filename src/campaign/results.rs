@@ -42,7 +42,7 @@ pub struct Counts {
     pub not_judged: u64,
     /// How many cases ended how; only what occurred.
     pub exits: BTreeMap<&'static str, u64>,
-    /// How many cases of each verdict (accepted, not accepted, not judged) did not simply run to their last tick, by how they ended.
+    /// The cases of each verdict (accepted, not accepted, not judged) that did not run to their last tick, by how they ended.
     #[serde(skip)]
     pub otherwise: [BTreeMap<&'static str, u64>; 3],
     /// Points of margins.

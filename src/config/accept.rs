@@ -85,7 +85,7 @@ pub(super) fn is_common(key: &str) -> bool {
     keys_of::<Raw>().contains(&key)
 }
 
-/// What criteria are checked against. Without a rig, `metrics` are not known and nothing is said of criteria that may be theirs.
+/// The scenario around the criteria. Without a rig, `metrics` are unknown, and keys that may be metrics are not checked.
 pub(super) struct Setting<'a> {
     pub duration_s: f64,
     pub metrics: Option<&'a [&'a str]>,

@@ -75,7 +75,7 @@ impl ConfigError {
         }
     }
 
-    /// The same mistake; a top-level key that is one of the keys of tables, or like one, is told as that key.
+    /// Returns the mistake with a suggestion: a top-level key that belongs into a table is named with that table.
     pub(super) fn within(self, nested: &[String]) -> Self {
         match self {
             Self::UnknownKey { place, key, remedy } => {
@@ -127,7 +127,7 @@ impl ConfigError {
     }
 }
 
-/// What is said of a key that is not known.
+/// The message for an unknown key.
 const UNKNOWN: &str = "unknown key";
 
 /// "did you mean" for the key of a table whose last part is a top-level key's name, or much like it.

@@ -79,7 +79,7 @@ pub struct Scenario {
     pub resolved: toml::Table,
     /// Files that it names: key and path.
     pub files: Vec<(String, PathBuf)>,
-    /// What has no effect in a run of this length, by key.
+    /// Settings without effect in a run of this length, by key.
     pub warnings: Vec<String>,
     /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
     pub run: Option<RunId>,
@@ -221,7 +221,7 @@ impl Scenario {
         self.hosts.lag_ticks(role, self.rig.bodies().iter().map(|body| (&*body.name, body.driven)))
     }
 
-    /// What a reader of its results must know: of the tick, and of the rig.
+    /// Returns notes for readers of the results: on the tick, and on the rig.
     pub fn notes(&self) -> Vec<String> {
         let real_hz = 1e9 / self.period_ns as f64;
         let part = real_hz / self.tick_hz - 1.0;

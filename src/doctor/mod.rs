@@ -80,11 +80,11 @@ pub struct Diagnosis {
     host: Host,
     /// The scenario whose demands the machine is held to.
     pub scenario: String,
-    /// Whether the scenario was run and no line is bad; none if no line is bad and it was not run.
+    /// True if the scenario was run and no line is bad; none if no line is bad and it was not run.
     pub fit: Option<bool>,
     /// The lines.
     pub checks: Vec<Check>,
-    /// What the run came to, if there was one.
+    /// The result of the run, if there was one.
     pub trial: Option<Trial>,
 }
 
@@ -150,7 +150,7 @@ pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
     }
 }
 
-/// What dead runs have left in shared memory, of which there is nothing else; none if there is nothing.
+/// Returns the line on leftovers of dead runs in shared memory; none if there are none.
 pub fn left_in_shared_memory(left: Abandoned) -> Option<Check> {
     let Abandoned { runs, files, bytes } = left;
     let found = format!(

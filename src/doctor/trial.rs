@@ -1,4 +1,4 @@
-//! What a machine makes of a scenario: the scenario itself, run in real time for some seconds, and the ticks that were missed.
+//! The trial run: the scenario itself, in real time for some seconds, and the ticks that were missed.
 //!
 //! Must not start the run; and must not judge anything but what ran.
 
@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 /// From this share of its ticks on, a role that missed or starved makes the machine unfit.
 const SHARE_MAX: f64 = 1e-3;
 
-/// What the roles reported.
+/// The reports of the roles.
 #[derive(Debug, Clone, Serialize)]
 pub struct Trial {
     /// Ticks per second.
@@ -19,7 +19,7 @@ pub struct Trial {
     pub ticks: u64,
     /// The role with the most ticks missed or starved.
     pub worst_role: String,
-    /// How many these are.
+    /// The number of these ticks.
     pub missed: u64,
     /// Their share of its ticks.
     pub missed_share: f64,
@@ -27,7 +27,7 @@ pub struct Trial {
     pub roles: BTreeMap<String, Ticks>,
     /// Wake − due of all bodies.
     pub lateness: Percentiles,
-    /// What was asked of the machine, and what it granted.
+    /// The privileges that were asked for, and whether the machine granted them.
     pub grants: Vec<Grant>,
 }
 
@@ -59,7 +59,7 @@ impl Trial {
         }
     }
 
-    /// How many ticks would be missed, in words.
+    /// Returns the missed ticks in words.
     pub fn words(&self) -> String {
         let Self { tick_hz, ticks, missed, .. } = self;
         let share = if *missed > 0 { format!(" ({:.2} %)", 1e2 * self.missed_share) } else { String::new() };

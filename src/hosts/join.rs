@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn a_host_that_joined_and_is_not_heard_is_lost() {
         let (parts, heard_ns) = (parts(""), heard());
-        assert!(parts.lost(1_000, 100, &heard_ns).is_empty(), "nobody has joined");
+        assert!(parts.lost(1_000, 100, &heard_ns).is_empty(), "no host has joined");
         ask(&parts, Some("b"), 1, 1_000, false).unwrap();
         assert!(parts.lost(1_100, 100, &heard_ns).is_empty());
         assert_eq!(parts.lost(1_101, 100, &heard_ns), ["b"]);

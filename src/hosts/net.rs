@@ -208,7 +208,7 @@ pub struct Net {
     opened: Mutex<Option<Opened>>,
 }
 
-/// What ends with a session.
+/// The parts of a session that end with it.
 struct Opened {
     _subscriber: Subscriber<()>,
     _answers: Vec<Queryable<()>>,

@@ -35,11 +35,11 @@ use std::time::Duration;
 const WORD_NS: u64 = 20_000_000;
 /// A host that is not heard for so long is silent, ns: it speaks every [`WORD_NS`].
 const SILENT_NS: u64 = 250_000_000;
-/// How long the time of the host that launched is asked for in one session without any answer, ns: twice as long in every second
+/// The time for which one session asks the launching host for its time without any answer, ns: twice as long in every second
 /// session, up to the last of these. A way that loses may have lost what the session declared.
 const TRY_NS: u64 = 500_000_000;
 const TRY_MAX_NS: u64 = 4_000_000_000;
-/// How long it may take to be known well enough once there are answers, ns.
+/// The time limit for knowing it well enough once there are answers, ns.
 const KNOW_NS: u64 = 5_000_000_000;
 /// A host that joined replaces its session after so long without an answer about the time, ns; that is asked for 20 times a second.
 const DEAF_NS: u64 = 1_500_000_000;

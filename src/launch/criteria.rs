@@ -12,7 +12,7 @@ use std::fmt;
 
 /// The part of a role's ticks that may be missed, and starved, where a scenario states no limit.
 const DEFAULT_SHARE: TickAmount = TickAmount::Share(0.01);
-/// How long it may take until the death of a role is noticed, s.
+/// The time limit for noticing the death of a role, s.
 const NOTICED_S: f64 = 0.1;
 
 /// A criterion and its verdict.
@@ -84,7 +84,7 @@ impl Criterion {
         format!("{}{}{role}", self.name, if self.default { " (default)" } else { "" })
     }
 
-    /// The same, not judged for a reason. A limit that is exceeded is exceeded all the same.
+    /// Returns the criterion as not judged for a reason. A limit that is exceeded stays exceeded.
     fn unless(mut self, reason: Option<Unjudged>) -> Self {
         let exceeded = self.value.is_some_and(|value| value > self.limit);
         if reason.is_some() && !exceeded {
@@ -173,7 +173,7 @@ impl Judge<'_> {
         if self.interrupted {
             return value.is_none().then_some(Unjudged::Stopped);
         }
-        // What was never measured does not hold.
+        // A metric that was never measured does not hold.
         value?;
         let ticks = self.ticks_from(from_tick);
         let blank = self.unscored(from_tick, blank);
@@ -187,12 +187,12 @@ impl Judge<'_> {
         (blank > allowed).then_some(Unjudged::Unscored(blank, ticks, from_s))
     }
 
-    /// How many ticks there are from one on.
+    /// Returns the number of ticks from one on.
     fn ticks_from(&self, from_tick: u64) -> u64 {
         self.scenario.last_tick + 1 - from_tick
     }
 
-    /// How many ticks from one on are without a score: those that the scorer passed over, and those that it did not come to.
+    /// Returns the number of ticks from one on without a score: those that the scorer passed over, and those that it did not come to.
     fn unscored(&self, from_tick: u64, passed_over: u64) -> u64 {
         let score = &self.outcome.score;
         let end = score.scored_ticks + score.unscored_ticks;
@@ -200,7 +200,7 @@ impl Judge<'_> {
         passed_over + rest
     }
 
-    /// How many samples were sent to the scorer and did not reach it; none if no writer keeps counters.
+    /// Returns the number of samples that were sent to the scorer and did not reach it; none if no writer keeps counters.
     fn lost_samples(&self) -> Option<u64> {
         let written = || self.outcome.reports.iter().flat_map(|report| &report.written);
         let received = self.outcome.score.received.iter();
@@ -276,7 +276,7 @@ impl Judge<'_> {
         booked.chain(unbooked).collect()
     }
 
-    /// How many ticks the run came to.
+    /// Returns the number of ticks that elapsed.
     fn elapsed(&self) -> u64 {
         let booked = self.books.roles.values().map(|ticks| ticks.elapsed).max();
         booked.unwrap_or(if self.interrupted { 0 } else { self.scenario.last_tick + 1 })
@@ -299,7 +299,7 @@ impl Judge<'_> {
         self.books.unbooked.iter().filter(absent).map(String::as_str).collect()
     }
 
-    /// How many ticks scripted faults may have cost any one role.
+    /// Returns the number of ticks that scripted faults may have cost any one role.
     fn scripted_ticks(&self) -> u64 {
         let (scenario, period_ns) = (self.scenario, self.scenario.period_ns);
         let stall_ticks = scenario.faults.iter().map(|fault| match fault.fault.action {
@@ -323,7 +323,7 @@ impl Judge<'_> {
     }
 }
 
-/// The criterion of the role that is closest to its limit, or furthest beyond; none if nobody counts such ticks.
+/// Returns the criterion of the role that is closest to its limit, or furthest beyond; none if no role counts such ticks.
 fn worst(
     name: &str,
     roles: &[Counted<'_>],
@@ -336,13 +336,13 @@ fn worst(
     Some(Criterion { role, ..Criterion::new(name, limit as f64, Some(ticks as f64)) })
 }
 
-/// Whether a run is accepted, by what is said of its criteria; none if nothing was judged, if the run was `interrupted` before
+/// Returns true if a run is accepted by its criteria; none if nothing was judged, if the run was `interrupted` before
 /// anything failed, or if something could not be judged that the run should have shown.
 pub(super) fn accepted(criteria: &[Criterion], interrupted: bool) -> Option<bool> {
     if criteria.iter().any(|criterion| criterion.holds == Some(false)) {
         return Some(false);
     }
-    // What holds by default alone is no test.
+    // Criteria that hold by default alone do not make a run accepted.
     let judged = criteria.iter().any(|criterion| criterion.holds.is_some() && !criterion.default);
     (judged && !interrupted && first_open(criteria).is_none()).then_some(true)
 }

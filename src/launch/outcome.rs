@@ -141,7 +141,7 @@ pub struct Accounting {
     pub missed_ticks: u64,
     /// Samples received and not believed, all links together.
     pub rejected_samples: u64,
-    /// The same by reason.
+    /// Samples received and rejected, by reason.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched, and stalls.
@@ -171,7 +171,7 @@ pub struct LinkCounters {
     pub stale: u64,
     /// Samples received and not believed.
     pub rejected: u64,
-    /// The same by reason.
+    /// Samples received and rejected, by reason.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched on the writing end.

@@ -51,7 +51,7 @@ const DESCRIPTORS_PER_ROLE: u64 = 24;
 /// Upper bounds on the files that a run makes in shared memory, and beside it: signals, connections, tags of processes.
 const FILES: u64 = 32;
 const FILES_PER_ROLE: u64 = 32;
-/// How long an external role of this host may take to leave a run that a signal ends: it may hang.
+/// The time that an external role of this host has to leave a run that a signal ends: it may hang.
 const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
 /// Without any progress for so long the run counts as hung, ns, and periods.
 const HUNG_NS: u64 = 30_000_000_000;

@@ -23,11 +23,11 @@ pub(crate) const LATENCY: &str = "latency";
 pub(crate) const LATENCY_LOG: &str = "latency.hlog";
 /// The lock of a run that is under way, with its identifier and process.
 const LOCK: &str = "run.lock";
-/// How the lock's text begins.
+/// The beginning of the lock's text.
 const LOCK_HEAD: &str = "corotate ";
 /// The most of the lock's text that is quoted, bytes.
 const LOCK_TEXT: u64 = 128;
-/// How often the lock is tried for again that another process removed meanwhile.
+/// The number of attempts at a lock that another process has removed meanwhile.
 const ATTEMPTS: u32 = 100;
 /// The files that a campaign's directory has from its first case on.
 const OF_CAMPAIGN: [&str; 2] = ["campaign.toml", "journal"];

@@ -208,7 +208,7 @@ impl<R: Rig, B: Bus> TruthInput<R, B> {
         }
     }
 
-    /// How many samples were received.
+    /// Returns the number of samples received.
     fn samples(&mut self) -> u64 {
         match self {
             Self::One(input) => input.counters().samples(),

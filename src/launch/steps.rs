@@ -62,7 +62,7 @@ pub struct BodyState {
     pub status: u64,
     /// The command that acts, as numbers.
     pub applied: Vec<f64>,
-    /// How its motion has ended, as a verb with its object, if it has.
+    /// The end of its motion, as a verb with its object, if it has ended.
     pub loss: Option<&'static str>,
 }
 

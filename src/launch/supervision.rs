@@ -221,7 +221,7 @@ impl Occupant {
         }
     }
 
-    /// Returns the program that left, the process that took its seat, the tick of its first sample, and for how long nobody sent, s:
+    /// Returns the program that left, the process that took its seat, the tick of its first sample, and how long the seat was empty, s:
     /// once.
     fn replaced(&mut self) -> Option<(Left, u32, u64, f64)> {
         let (tick, outage_s) = self.back.take()?;
@@ -244,7 +244,7 @@ pub(super) struct Member {
     hosted: Vec<(RoleId, Ledger)>,
     /// What an external role sends; all there is to go by where it says nothing of itself.
     trace: Option<Trace>,
-    /// Who sends that.
+    /// The program that sends its samples.
     occupant: Occupant,
     health: <IoxBus as Bus>::Reader<Health>,
     /// Health of an earlier generation is a dead role's.

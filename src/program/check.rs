@@ -83,7 +83,7 @@ fn campaign_json(path: &Path, campaign: &Campaign) -> String {
     format!("{value}\n")
 }
 
-/// What is told as comments, then the file that resolves to itself: the whole is a file of the same kind.
+/// Returns the text as comments, then the resolved file: together a file of the same kind.
 fn resolved(told: &str, file: &str) -> String {
     let comments: String = told.lines().map(|line| format!("# {line}\n")).collect();
     format!("{comments}{file}\n")

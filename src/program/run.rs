@@ -345,7 +345,7 @@ impl Verdict {
             return Self::new(exit, FAIL, "the counters do not balance");
         }
         if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
-            // A run in one thread has told nobody yet.
+            // A run in one thread has printed nothing yet.
             if stopped.panic.is_some() && summary.clock == "in-process" {
                 remark(stopped);
             }

@@ -187,7 +187,7 @@ fn newest(campaign: &Campaign) -> Option<PathBuf> {
     found.pop()
 }
 
-/// What a campaign's pieces of work are.
+/// The noun for a campaign's pieces of work.
 fn pieces(campaign: &Campaign) -> &'static str {
     if campaign.table().margins.is_empty() { "cases" } else { "cases and margin points" }
 }

@@ -19,7 +19,7 @@ pub(super) fn finite(measurement: &RateMeasurement) -> bool {
     nothing(&measurement.omega_rad_s) + nothing(&measurement.applied_rad_s2) == 0.0
 }
 
-/// What a measurement tells the relations. Components that are not valid are 0.
+/// Returns the measurement as the relations use it. Components that are not valid are 0.
 #[inline]
 pub(crate) fn seen(measurement: &RateMeasurement) -> RateSample {
     RateSample { rate_rad_s: measurement.omega_rad_s.into(), torque_rad_s2: measurement.applied_rad_s2.into() }
@@ -72,7 +72,7 @@ impl HiddenObserver {
         (self.last, self.rate) = (regressor, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
     }
 
-    /// What the last step did: bits of [`status`].
+    /// Returns the status of the last step: bits of [`status`].
     pub(crate) fn status(&self) -> u64 {
         self.status
     }
@@ -169,7 +169,7 @@ impl Persist for HiddenObserver {
     }
 }
 
-/// What coefficients say of a body. Where they are known it is computed once.
+/// A body known by its coefficients. Where they are known, its relation is computed once.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Knowledge {
     pub(super) coefficients: Vector3<f64>,
@@ -178,7 +178,7 @@ pub(crate) struct Knowledge {
 }
 
 impl Knowledge {
-    /// What these coefficients say.
+    /// Returns the knowledge of a body with these coefficients.
     pub fn new(coefficients: Vector3<f64>) -> Self {
         let closure = closure(&coefficients);
         let ratios = InertiaRatios::new(&coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);

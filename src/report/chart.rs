@@ -37,7 +37,7 @@ pub struct Line {
 pub struct Picture {
     /// The SVG.
     pub svg: String,
-    /// The same for a screen on which a picture as wide as the page has no room.
+    /// Draws it for a screen on which a picture as wide as the page has no room.
     pub narrow: Option<String>,
     /// What it is called.
     pub title: String,

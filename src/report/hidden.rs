@@ -48,7 +48,7 @@ pub struct HiddenFacts<'a> {
     pub title: String,
     /// The letter of the hidden axis.
     pub axis: &'a str,
-    /// What was done.
+    /// The method.
     pub paragraphs: Vec<String>,
     /// Names and scores of all segments, in their order.
     pub segments: &'a [(String, SegmentScore)],

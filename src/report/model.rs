@@ -19,7 +19,7 @@ pub struct Model {
     pub run: Option<RunId>,
     /// When and how that was made.
     pub subtitle: String,
-    /// The verdict in a word, and whether it is a good one; none where nobody judged. Empty where there is nothing to judge.
+    /// The verdict in a word, and whether it is a good one; none where nothing was judged. Empty where there is nothing to judge.
     pub verdict: (String, Option<bool>),
     /// What a reader must know before all else.
     pub remarks: Vec<String>,

@@ -53,7 +53,7 @@ impl Wait {
 }
 
 impl Absences {
-    /// Those of a device in a run; with a `period_ns` where ticks follow the clock.
+    /// Absences of a device in a run; with a `period_ns` where ticks follow the clock.
     pub fn new(period_ns: Option<u64>, timeout_ticks: u64) -> Self {
         let limit_ns = period_ns.map_or(u64::MAX, |period_ns| SILENT_NS.max(timeout_ticks.saturating_mul(period_ns)));
         let look_max_ns = period_ns.map_or(LOOK_MAX_NS, |period_ns| LOOK_PERIODS.saturating_mul(period_ns));

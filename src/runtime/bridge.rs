@@ -50,7 +50,7 @@ pub struct DeviceSeat {
     pub other_device: bool,
 }
 
-/// What is told of a device once its run is over.
+/// The result of a device's run.
 #[derive(Debug, Clone)]
 pub struct Served {
     /// The line's counters.

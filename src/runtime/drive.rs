@@ -353,7 +353,7 @@ pub fn in_turn(
     in_noted_turn(nodes, last_tick, &Cell::new(None), revive, after_tick)
 }
 
-/// The same; `turn` is the index of the node whose turn it is, none between ticks.
+/// Runs the nodes in turn; `turn` is the index of the node whose turn it is, none between ticks.
 pub(crate) fn in_noted_turn(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,

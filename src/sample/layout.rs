@@ -1,4 +1,4 @@
-//! What tells the layouts of two samples apart: the type name with a hash of the fields.
+//! The name of a sample's layout: the type name with a hash of the fields.
 //!
 //! A layout that is changed without a new version in its type name has another hash, so ends that were built from different
 //! sources do not meet. Computed by the compiler. Must not depend on how a sample travels.

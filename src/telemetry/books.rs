@@ -192,7 +192,7 @@ pub struct ReadCounters {
 persist_fields!(ReadCounters, taken, received, gaps, stale, covered, void, rejected);
 
 impl ReadCounters {
-    /// How many samples were received, rejected ones too.
+    /// Returns the number of samples received, rejected ones too.
     pub fn samples(&self) -> u64 {
         self.received
     }

@@ -15,7 +15,7 @@ pub struct Latency {
     tallies: Tallies,
 }
 
-/// What is counted beside the values.
+/// Counts beside the values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct Tallies {
@@ -36,7 +36,7 @@ pub struct Percentiles {
     pub count: u64,
     /// How many of them were longer than the histogram holds.
     pub clipped: u64,
-    /// How many of them are of ticks that were missed, or lacked an input.
+    /// The values among them of ticks that were missed, or lacked an input.
     #[serde(default)]
     pub missed: u64,
     /// Differences that were negative. If there is one, the two stamps are not of one clock: all figures below are NaN (null).

@@ -39,9 +39,9 @@ pub struct Outage {
     pub tick: u64,
     /// The tick that it answered next; none if it was absent at the end.
     pub back_at_tick: Option<u64>,
-    /// How long it was waited for, s.
+    /// The time without an answer, s.
     pub seconds: f64,
-    /// What happened, in words.
+    /// The cause in words.
     pub cause: String,
 }
 
@@ -141,7 +141,7 @@ pub struct LinkRead {
     /// Samples that were received and not believed; they count as received where they were of the tick that was due.
     #[serde(default)]
     pub rejected: u64,
-    /// The same by reason, by the names of [`Refusal`](crate::role::Refusal); reasons that there was none of are left out.
+    /// Samples rejected by reason, by the names of [`Refusal`](crate::role::Refusal); only reasons that occurred.
     #[serde(default)]
     pub rejected_by: BTreeMap<String, u64>,
     /// The tick of the last sample.
@@ -149,7 +149,7 @@ pub struct LinkRead {
 }
 
 impl LinkWritten {
-    /// How many ticks are counted.
+    /// Returns the number of ticks that are counted.
     pub fn covered(&self) -> u64 {
         self.last_tick.map_or(0, |tick| tick + 1)
     }
@@ -161,7 +161,7 @@ impl LinkWritten {
 }
 
 impl LinkRead {
-    /// How many ticks are counted.
+    /// Returns the number of ticks that are counted.
     pub fn covered(&self) -> u64 {
         self.last_tick.map_or(0, |tick| tick + 1)
     }
@@ -189,7 +189,7 @@ pub struct StageReport {
     pub stage: String,
     /// HdrHistogram V2 encoding, ns.
     pub histogram: Vec<u8>,
-    /// What is counted beside it.
+    /// Counts beside the histogram.
     #[serde(flatten)]
     pub tallies: Tallies,
 }

@@ -130,7 +130,7 @@ impl Window {
         self.values.push_back(to_ns.wrapping_sub(from_ns) as i64);
     }
 
-    /// How far the stamp that should be the earlier one lies ahead at the most, µs; none if it never does.
+    /// The most by which the stamp that should be the earlier one lies ahead, µs; none if it never does.
     pub fn ahead_us(&self) -> Option<f64> {
         self.values.iter().min().filter(|ns| **ns < 0).map(|ns| ns.unsigned_abs() as f64 / 1e3)
     }

@@ -290,7 +290,7 @@ mod tests {
         }
     }
 
-    /// What a high screen has more of are events, and no line between the sections is empty while there are more.
+    /// A high screen shows more events, and no line between the sections is empty while there are more.
     #[test]
     fn events_have_the_height_that_there_is() {
         let mut model = model();

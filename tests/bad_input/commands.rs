@@ -236,7 +236,7 @@ fn what_check_prints_is_the_scenario_it_checked() {
         let path = shipped(name);
         let done = bench.run(&["check", "--resolved", path.to_str().unwrap()]);
         assert_eq!((done.code, done.stderr.as_str()), (Some(0), ""), "{name}");
-        // What is claimed comes first, here as comments, and without the option alone.
+        // The claims come first: here as comments, without the option alone.
         let claims: String = done.stdout.lines().map_while(|line| Some(format!("{}\n", line.strip_prefix("# ")?))).collect();
         assert_eq!(bench.run(&["check", path.to_str().unwrap()]).stdout, claims);
         assert!(claims.contains("the loop that runs") || claims.contains("no body is driven"), "{claims}");

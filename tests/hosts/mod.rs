@@ -72,7 +72,7 @@ impl Run {
         self.join_at_once(number, carrier, by)
     }
 
-    /// The same, whether somebody listens there or not.
+    /// Starts a launcher, whether or not a host listens there.
     fn join_at_once(&self, number: usize, carrier: &str, by: Option<u16>) -> common::Running {
         let address = match by {
             Some(port) => format!("{carrier}/127.0.0.1:{port}"),
@@ -192,7 +192,7 @@ fn lockstep_loses_nothing_on_a_bad_way() {
     run.assert_clean();
 }
 
-/// What running survives, starting survives: the handshake, the question, the answer, and what is declared may all be lost.
+/// A start survives what a run survives: the handshake, the question, the answer and declarations may be lost.
 #[test]
 fn every_start_on_a_bad_way_succeeds() {
     const STARTS: usize = 8;
@@ -213,7 +213,7 @@ fn every_start_on_a_bad_way_succeeds() {
     }
 }
 
-/// Whoever is there first waits for the other.
+/// The host that is first waits for the other.
 #[test]
 fn hosts_may_start_in_any_order() {
     let arguments = [&["--tick-hz", "200", "--duration", "0.5", "--clock", "lockstep"][..], &UNJUDGED].concat();

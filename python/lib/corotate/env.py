@@ -9,7 +9,7 @@ from . import _corotate
 from .scenario import given, overrides, seed_of
 from .seat import Samples
 
-# What the guards bound, by the beginning of a field's name: of measurements, of estimates, of commands that act.
+# Limits from the guards, by the beginning of a field's name: of measurements, of estimates, of commands that act.
 RATES, APPLIED = ("omega_", "velocity_"), "applied_"
 
 

@@ -1,4 +1,4 @@
-//! What a table of a recording is, whatever its format.
+//! A table of a recording, in any format.
 
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::{FieldKind, Layout};
@@ -7,7 +7,7 @@ use std::io;
 
 /// A table in the making.
 pub trait Table: Sized {
-    /// How its file's name ends.
+    /// The extension of its file.
     const EXTENSION: &'static str;
 
     /// Begins the table of a signal.

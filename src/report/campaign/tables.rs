@@ -30,7 +30,7 @@ pub fn result(facts: &Facts<'_>) -> Section {
     ];
     for (name, verdict) in [("accepted", Some(true)), ("not accepted", Some(false)), ("not judged", None)] {
         let of: Vec<&Row> = rows.iter().filter(|row| row.accepted == verdict).collect();
-        // What did not occur is not told, but for the first four.
+        // Causes without a case are left out, but for the first four.
         told.extend((verdict.is_some() || !of.is_empty()).then_some((name, of.len() as u64)));
         let ended = ends.map(|(name, end)| (name, of.iter().filter(|row| row.exit == end).count() as u64));
         told.extend(ended.into_iter().filter(|(_, count)| *count > 0));

@@ -85,7 +85,7 @@ pub(super) fn resolve(
     Ok((Some(rig), table))
 }
 
-/// What is set of axes that the leader does not measure, and so has no effect.
+/// Settings of axes that the leader does not measure, and so without effect.
 fn unmeasured(leader: &RawLeader) -> impl Iterator<Item = String> {
     let of = |key: &'static str, values: [f64; 3]| {
         let measured = &leader.measured_axes;

@@ -19,7 +19,7 @@ use std::rc::Rc;
 /// A tick of the schedule, s: long, so that a tick does not become due while the test runs.
 const PERIOD_NS: u64 = 1_000_000_000;
 
-/// What the reader does where a schedule lets it look.
+/// An action of the reader where a schedule lets it look.
 #[derive(Debug, Clone, Copy)]
 enum Look {
     /// Nothing.
@@ -34,7 +34,7 @@ enum Look {
     Restart,
 }
 
-/// What the writer does at a tick.
+/// An action of the writer at a tick.
 #[derive(Debug, Clone, Copy)]
 enum Turn {
     /// It misses the tick.

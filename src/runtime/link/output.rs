@@ -280,7 +280,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             let late =
                 self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
             let (sample, kept): (&S, _) = (self.sample.borrow(), self.kept.as_ref());
-            // What a successor sends first, its predecessor may have sent: its readers have to look at what is kept, or do not
+            // The predecessor may have sent the successor's first sample: its readers have to look at what is kept, or do not
             // count it if it is late.
             let (first, generation) = (std::mem::take(&mut self.succeeds), self.generation);
             self.port.fill(|slot| {

@@ -28,7 +28,7 @@ impl MissedTicks {
         self.grid.into_iter().flat_map(move |grid| ticks.clone().map(move |tick| grid.due_ns(tick)))
     }
 
-    /// The same at the end of the run, of which `tick` would be next; with the time until which they are missed, ns.
+    /// Returns the missed ticks at the end of the run, of which `tick` would be next; with the time until which they are missed, ns.
     pub fn rest(&mut self, tick: u64) -> (impl Iterator<Item = u64> + use<>, u64) {
         let end_ns = self.grid.map_or(0, |grid| grid.due_ns(tick).max(monotonic_ns()));
         (self.before(tick), end_ns)

@@ -16,7 +16,7 @@ pub struct Port {
     pub topic: Topic,
     /// Name and version of the layout.
     pub type_name: &'static str,
-    /// The same with a hash of the fields, by which services and devices know it.
+    /// The type name with a hash of the fields, by which services and devices know it.
     pub layout: &'static str,
     /// The length of a sample, bytes.
     pub size: usize,
