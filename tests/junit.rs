@@ -93,7 +93,7 @@ fn a_run_without_an_end_is_an_error() {
         (&["--set", "tick_herz=1"][..], 2, "did you mean"),
         (&["--external", "nosuch"], 2, "no such role"),
         (&["--clock", "in-process", "--out", "/dev/null/x"], 1, "name another directory with --out"),
-        (&["--require-rt", "--set", "realtime.cores=[1023]"], 5, "core 1023"),
+        (&["--clock", "realtime", "--set", "realtime.cores=[1023]"], 2, "core 1023"),
     ] {
         let done = run(&bench, arguments);
         assert_eq!(done.code, Some(code), "{done:?}");

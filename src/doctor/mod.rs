@@ -14,9 +14,11 @@ pub use machine::{Demand, Machine};
 pub use trial::Trial;
 
 use crate::bus::domain::{Abandoned, DomainError, Found};
+use crate::runtime::{priority_remedy, refused_priority};
 use crate::telemetry::Host;
 use serde::Serialize;
 use std::fmt;
+use std::path::Path;
 
 /// Layout version of the report.
 const SCHEMA: &str = "corotate/doctor/v1";
@@ -159,6 +161,12 @@ pub fn left_in_shared_memory(left: Abandoned) -> Option<Check> {
     );
     let remedy = "`corotate doctor --clean` removes them";
     (runs > 0).then(|| Check::warn("leftover memory", found, remedy))
+}
+
+/// Returns the line on a real-time priority that the limits allow and the kernel refuses; none if it is granted.
+pub fn refused(priority: i32) -> Option<Check> {
+    let error = (priority > 0).then(|| refused_priority(priority)).flatten()?;
+    Some(Check::bad("SCHED_FIFO", format!("{priority} is refused: {error}"), priority_remedy(Path::new("/"))))
 }
 
 #[cfg(test)]

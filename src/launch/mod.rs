@@ -50,7 +50,7 @@ use crate::config::{ClockKind, Scenario};
 use crate::hosts::HostSeat;
 pub use crate::panics::Panic;
 use crate::record::RecordError;
-use crate::runtime::NodeError;
+use crate::runtime::{NodeError, unavailable_cores};
 use crate::system::remedy;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;
@@ -133,6 +133,12 @@ pub enum LaunchError {
     NotStepped {
         /// Why.
         reason: &'static str,
+    },
+    /// The scenario names cores that this process cannot be bound to.
+    #[error("realtime.cores: this run cannot be bound to {}: not online, or not in its cpuset; name other cores, or \"auto\"", cores.iter().map(|core| format!("core {core}")).collect::<Vec<_>>().join(", "))]
+    Cores {
+        /// The cores.
+        cores: Vec<usize>,
     },
     /// The domain could not be made.
     #[error(transparent)]
@@ -218,8 +224,19 @@ pub enum LaunchError {
 /// # Errors
 /// [`LaunchError`] if the run could not be started, or a role failed.
 pub fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
+    check_cores(scenario)?;
     match scenario.clock {
         ClockKind::InProcess => in_process::run(scenario, launch),
         ClockKind::Realtime | ClockKind::Lockstep => processes::run(scenario, launch),
     }
+}
+
+/// Refuses cores that no process of a run in real time can be bound to.
+///
+/// # Errors
+/// [`LaunchError::Cores`].
+pub fn check_cores(scenario: &Scenario) -> Result<(), LaunchError> {
+    let realtime = scenario.clock == ClockKind::Realtime;
+    let cores = if realtime { unavailable_cores(&scenario.realtime) } else { Vec::new() };
+    if cores.is_empty() { Ok(()) } else { Err(LaunchError::Cores { cores }) }
 }

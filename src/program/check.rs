@@ -6,6 +6,7 @@ use super::{Exit, fail, say};
 use crate::analysis::{Claim, apart, claims, digits};
 use crate::campaign::Campaign;
 use crate::config::Scenario;
+use crate::launch::check_cores;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -63,6 +64,7 @@ fn checked(arguments: &Arguments, path: &Path) -> Result<String, String> {
         return Ok(if arguments.resolved { resolved(&told, campaign.to_toml()) } else { told });
     }
     let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
+    check_cores(&scenario).map_err(|error| format!("{}: {error}", path.display()))?;
     if arguments.json {
         return Ok(json(path, &scenario));
     }

@@ -5,7 +5,7 @@ use super::run::catch_signals;
 use super::scenario::{Change, load};
 use super::{Exit, fail, say};
 use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
-use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, left_in_shared_memory, leftovers};
+use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict, left_in_shared_memory, leftovers, refused};
 use crate::hosts::Address;
 use crate::launch::{Launch, Progress, run};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -61,7 +61,12 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     };
     // If it cannot be done, the line on what is left says why.
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
-    let mut checks = Machine::at(Path::new("/")).examine(&Demand::of(&scenario));
+    let demand = Demand::of(&scenario);
+    let mut checks = Machine::at(Path::new("/")).examine(&demand);
+    // The line on the limit tells it where the limit forbids it.
+    if !checks.iter().any(|check| check.name == "rtprio limit" && check.verdict == Verdict::Bad) {
+        checks.extend(refused(demand.priority));
+    }
     checks.push(leftovers(cleared.and_then(|_| domains())));
     if arguments.clean {
         abandoned(true);

@@ -10,10 +10,10 @@ use crate::doctor::Machine;
 use crate::files;
 use crate::hosts::{Address, HostSeat};
 use crate::launch::{
-    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, claim, junit, make_directory, make_latest,
-    new_run, table, tick_words, write_run,
+    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, check_cores, claim, junit, make_directory,
+    make_latest, new_run, table, tick_words, write_run,
 };
-use crate::runtime::seat_path;
+use crate::runtime::{priority_remedy, refused_priority, seat_path};
 use crate::system::{remedy, tell};
 use indicatif::{ProgressBar, ProgressStyle};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -140,6 +140,7 @@ impl Arguments {
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
             .and_then(|()| self.check_host(&scenario))
+            .and_then(|()| check_cores(&scenario).map_err(|error| error.to_string()))
             .map_err(|reason| Failure { exit: Exit::Usage, reason })?;
         Ok(scenario)
     }
@@ -299,6 +300,11 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
 fn tell_ungranted(scenario: &Scenario) {
     if let Some((lacking, command)) = Machine::at(Path::new("/")).ungranted(&scenario.realtime) {
         remark(&format!("not granted: {lacking}; this shell is granted it by `{command}`"));
+    } else if scenario.realtime.priority > 0
+        && let Some(error) = refused_priority(scenario.realtime.priority)
+    {
+        let (priority, remedy) = (scenario.realtime.priority, priority_remedy(Path::new("/")));
+        remark(&format!("not granted: SCHED_FIFO {priority}: {error}; {remedy}"));
     }
 }
 
@@ -414,7 +420,7 @@ pub fn exit_of(error: &LaunchError) -> Exit {
     match error {
         LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
         LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
-        LaunchError::NotStepped { .. } => Exit::Usage,
+        LaunchError::NotStepped { .. } | LaunchError::Cores { .. } => Exit::Usage,
         LaunchError::Domain(_)
         | LaunchError::Descriptors { .. }
         | LaunchError::Bus(_)

@@ -5,6 +5,7 @@
 
 mod absence;
 mod bridge;
+mod budget;
 mod compute;
 mod disturb;
 mod drive;
@@ -18,6 +19,7 @@ mod seat;
 mod share;
 
 pub use bridge::{DeviceError, DeviceLink, DeviceSeat, Served, run_bridge};
+pub use budget::{empty_budgets, grant_budgets};
 pub use compute::{Compute, ComputedTick};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub(crate) use drive::in_noted_turn;
@@ -35,7 +37,7 @@ pub use node::{
 pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_bytes};
 #[cfg(feature = "hosts")]
 pub(crate) use privileges::go_before_roles;
-pub use privileges::{Privileges, hold_low_latency_idle};
+pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
 pub(crate) use privileges::{
     go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,

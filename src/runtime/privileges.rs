@@ -2,9 +2,11 @@
 //!
 //! Must not fail a run: whether a missing privilege matters is decided by `--require-rt`.
 
+use super::budget::{empty_budgets, grant_budgets};
 use super::node::RoleId;
 use crate::config::{Cores, NamedCores, Realtime, Scenario};
 use crate::telemetry::Grant;
+use rustix::io::Errno;
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::process::{Resource, getrlimit, nice};
 use rustix::thread::{
@@ -13,6 +15,7 @@ use rustix::thread::{
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::num::NonZero;
+use std::path::Path;
 
 const FIFO: &str = "SCHED_FIFO";
 /// What a limit on locked memory must allow a role, bytes. Its own need is far below.
@@ -56,8 +59,8 @@ pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
         grants.push(grant("locked memory", "all".to_owned(), lock_memory(), remedy));
     }
     if settings.priority > 0 {
-        let remedy = "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE";
-        grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), remedy));
+        let remedy = priority_remedy(Path::new("/"));
+        grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), &remedy));
     }
     let has_realtime = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
     // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
@@ -74,6 +77,39 @@ pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
     Privileges { grants, has_realtime, co_located }
+}
+
+/// Returns what grants a real-time priority that is refused, on the machine whose files lie below `root`.
+pub fn priority_remedy(root: &Path) -> String {
+    let empty = empty_budgets(root);
+    if let Some(file) = empty.last() {
+        return format!("{} is 0: `{}`, or start it in another cgroup", file.display(), grant_budgets(&empty));
+    }
+    if capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::SYS_NICE)) {
+        return "a sandbox, or a cgroup without real-time budget, may forbid it: start it outside of that".to_owned();
+    }
+    "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE".to_owned()
+}
+
+/// Asks for a real-time priority in a thread that ends at once, and returns the refusal; none if it is granted.
+pub fn refused_priority(priority: i32) -> Option<io::Error> {
+    std::thread::spawn(move || set_fifo(priority).err()).join().ok().flatten()
+}
+
+/// Returns the cores that the scenario names and this process cannot be bound to: they are not online, or not in its cpuset.
+pub fn unavailable_cores(settings: &Realtime) -> Vec<usize> {
+    let Cores::List(cores) = &settings.cores else { return Vec::new() };
+    let mut cores = cores.clone();
+    // In a thread that ends at once, and its binding with it. Any other refusal is told by the roles.
+    let bind = move || {
+        cores.retain(|core| {
+            let mut set = CpuSet::new();
+            set.set(*core);
+            sched_setaffinity(None, &set) == Err(Errno::INVAL)
+        });
+        cores
+    };
+    std::thread::spawn(bind).join().unwrap_or_default()
 }
 
 /// Opens `/dev/cpu_dma_latency` and asks for 0 µs. The request lasts as long as the file is open.
@@ -252,6 +288,17 @@ mod tests {
     fn nobody_is_bound_to_a_core_without_being_served_first_there() {
         assert!(cores(&Realtime::default(), false).is_empty());
         assert!(!cores(&Realtime::default(), true).is_empty());
+    }
+
+    #[test]
+    fn a_core_that_no_machine_has_is_found_before_a_run() {
+        let cores =
+            |list: &str| unavailable_cores(&shipped("rigid-pair", &[&format!("realtime.cores={list}")]).realtime);
+        let allowed = sched_getaffinity(None).unwrap();
+        let first = (0..CpuSet::MAX_CPU).find(|core| allowed.is_set(*core)).unwrap();
+        assert_eq!(cores(&format!("[{first},1023]")), [1023]);
+        assert!(cores("\"auto\"").is_empty());
+        assert_eq!(sched_getaffinity(None).unwrap(), allowed, "this thread is not bound by it");
     }
 
     #[test]
