@@ -43,6 +43,7 @@ pub fn utc(time: SystemTime) -> String {
 pub fn remedy(error: &io::Error) -> &'static str {
     match error.raw_os_error() {
         Some(libc::ENOSPC | libc::EDQUOT) => "free some room there",
+        Some(libc::EFBIG) => "raise the limit on the size of files with `ulimit -f`",
         Some(libc::EMFILE) => "raise the limit on open files with `ulimit -n`",
         Some(libc::ENFILE) => "the machine has too many open files: end some programs",
         Some(libc::EAGAIN) => "raise the limit on processes and threads with `ulimit -u`, or end some",

@@ -150,6 +150,7 @@ impl Page {
             "limits={}",
             "--out",
             "beside",
+            "--overwrite",
         ]);
         self.bench.await_ticks("controller");
         run

@@ -505,8 +505,7 @@ fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
         std::fs::write(bench.path("silence.toml"), text + fault).unwrap();
         let timeout_key = format!("actuator.command_timeout_ticks={timeout}");
         for clock in ["in-process", "lockstep"] {
-            let done =
-                bench.run(&["run", "silence.toml", "--json", "--out=out", "--clock", clock, "--set", &timeout_key]);
+            let done = bench.run(&["run", "silence.toml", "--json", "--clock", clock, "--set", &timeout_key]);
             assert_eq!(done.code, Some(0), "{done:?}");
             let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
             let follower = &summary["books"]["roles"]["follower"];

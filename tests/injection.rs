@@ -411,17 +411,20 @@ fn every_failed_system_call_is_told_and_leaves_nothing() {
     assert!(failures.is_empty(), "{} of {} cells:\n{}", failures.len(), cells.len(), failures.join("\n"));
 }
 
-/// A file system without locks: whoever cannot lock says so, once, and leaves no lock file.
+/// A file system without locks, for the results or for the domain: the run is refused with the path, and leaves no lock file.
 #[test]
-fn a_domain_that_cannot_be_locked_is_an_error() {
-    let bench = Bench::new();
-    let scenario = Target::Run.scenario(&bench);
-    let scenario: Vec<&str> = scenario.iter().map(String::as_str).collect();
-    let options = ["-o", "/dev/null", "-e", "inject=flock:error=ENOLCK", PROGRAM];
-    let done = bench.start_program(Path::new("strace"), &[&options, &scenario[..]].concat()).wait();
-    told_clearly(&done, &[1]).unwrap();
-    assert!(done.stderr.contains("cannot lock"), "{done:?}");
-    bench.assert_clean(&[]);
+fn what_cannot_be_locked_is_an_error() {
+    for (calls, file) in [("1+", "out/run.lock"), ("2+", ".lock")] {
+        let bench = Bench::new();
+        let scenario = Target::Run.scenario(&bench);
+        let scenario: Vec<&str> = scenario.iter().map(String::as_str).collect();
+        let inject = format!("inject=flock:error=ENOLCK:when={calls}");
+        let options = ["-o", "/dev/null", "-e", &inject, PROGRAM];
+        let done = bench.start_program(Path::new("strace"), &[&options, &scenario[..]].concat()).wait();
+        told_clearly(&done, &[1]).unwrap();
+        assert!(done.stderr.contains(file), "{done:?}");
+        bench.assert_clean(&[]);
+    }
 }
 
 /// A watcher puts away what it made anew in a run that is gone; a run that it cannot look at is not gone.
@@ -433,8 +436,8 @@ fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
     bench.await_role("controller");
     let domains = bench.domains();
     let (domain, lock) = (domains[0].to_str().unwrap(), domains[0].with_extension("lock"));
-    // It looks twice as it joins.
-    let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=3+"];
+    // It looks three times: as it finds the run, and twice as it joins.
+    let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=4+"];
     let done =
         bench.start_program(Path::new("strace"), &[&fails[..], &[PROGRAM, "watch", domain, "--once", "1"]].concat());
     let done = done.wait();

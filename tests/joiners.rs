@@ -190,7 +190,7 @@ fn foxglove_may_die_anywhere() {
 /// A run that waits for the foreign follower, and the seat.
 fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
     let scenario = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/pair.toml");
-    let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}", "--out=out"];
+    let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}"];
     let running = bench.start(&run);
     let is_seat =
         |domain: PathBuf| Some((domain.join("follower.seat.json"), domain)).filter(|(seat, _)| seat.is_file());

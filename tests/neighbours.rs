@@ -14,13 +14,13 @@ const LEADER: &str = "corotate/rigid-pair/leader/measurement";
 /// The size of a rate measurement, and its name on the wire.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("corotate/rigid-body/measurement/v1")]
+#[type_name("corotate/rigid-body/measurement/v1#bcfd8b41")]
 struct Measurement([u64; 12]);
 
 /// The same name and another size.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("corotate/rigid-body/measurement/v1")]
+#[type_name("corotate/rigid-body/measurement/v1#bcfd8b41")]
 struct Short([u64; 11]);
 
 /// The same size and another version.

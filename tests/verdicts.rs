@@ -122,7 +122,16 @@ fn a_run_that_ends_before_it_is_judged_runs_and_says_so() {
     }
     // Claims of the other scenarios take a debug build a while.
     for name in ["rigid-pair", "faults", "inertia"] {
-        let short = ["run", name, "--clock=in-process", "--duration=0.3", "--json", "--out=out", "--junit=v.xml"];
+        let short = [
+            "run",
+            name,
+            "--clock=in-process",
+            "--duration=0.3",
+            "--json",
+            "--overwrite",
+            "--out=out",
+            "--junit=v.xml",
+        ];
         let done = bench.run(&short);
         assert_eq!(done.code, Some(0), "{name}: {done:?}");
         let summary = summary(&done);

@@ -12,7 +12,7 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, WriterProcess};
 use crate::clock::monotonic_ns;
 use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::panics::Panic;
-use crate::runtime::{RoleId, open_ledger, panic_path, report_path, topic, words_path};
+use crate::runtime::{RoleId, device_words_path, open_ledger, panic_path, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
 use crate::telemetry::{Ledger, Outage};
 use serde::{Deserialize, Serialize};
@@ -464,7 +464,8 @@ impl Member {
         {
             return fail(left(), last_words);
         }
-        let fail = |cause: String| fail(cause, String::new());
+        let words = device_words_path(janitor.root(), &self.name);
+        let fail = |cause: String| fail(cause, std::fs::read_to_string(&words).unwrap_or_default());
         let timeout_s = match &self.host {
             Some(_) => scenario.host_silence_s(state >= RoleState::Running),
             None => scenario.supervision.heartbeat_timeout_s,

@@ -47,7 +47,8 @@ pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_unde
 #[cfg(feature = "hosts")]
 pub(crate) use process::{clock_path, join};
 pub(crate) use process::{
-    join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path, write_whole,
+    device_words_path, join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path,
+    write_whole,
 };
 pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
 

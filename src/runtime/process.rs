@@ -157,6 +157,12 @@ pub fn words_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.words"))
 }
 
+/// The file in a domain's directory that a bridge in real time leaves its last words in: another one may take its seat, so they end
+/// nothing by themselves.
+pub fn device_words_path(root: &Path, role: &str) -> PathBuf {
+    root.join(format!("{role}.device.words"))
+}
+
 /// The file in a domain's directory that a role leaves its panic in, if it panicked.
 pub fn panic_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.panic.json"))

@@ -300,7 +300,14 @@ fn real_time_is_the_same_until_a_tick_is_missed() {
 /// Of 20 samples one is lost, others are doubled and late: the books of both ends tell, and the declared bound holds.
 #[test]
 fn losses_are_counted_and_the_bound_holds() {
-    let accept = ["--set", "accept={sync_error_rad_s_peak=0.05,peak_from_s=3}", "--tick-hz", "200", "--duration", "6"];
+    let accept = [
+        "--set",
+        "accept={sync_error_rad_s_peak=0.05,peak_from_s=3,missed_ticks_max={},starved_ticks_max={},safe_ticks_max={},unscored_ticks_max=\"50 %\"}",
+        "--tick-hz",
+        "200",
+        "--duration",
+        "6",
+    ];
     let run = Run::new(&TWO, "actuation_delay_ticks = 4", "[network]\nbudget_ticks = 2\n");
     let bad = Impairment { delay_us: 300, jitter_us: 300, lost: 50, doubled: 20, late: 20 };
     let proxy = run.proxy(1, bad);
