@@ -66,11 +66,11 @@ fn in_lockstep_a_killed_role_costs_nothing() {
 }
 
 #[test]
-fn in_lockstep_a_role_that_stands_still_is_killed_and_brought_back() {
+fn in_lockstep_a_role_that_hangs_is_killed_and_brought_back() {
     for role in ROLES {
         let bench = Bench::new();
         let more = ["--clock", "lockstep", "--set", "supervision.heartbeat_timeout_s=0.5"];
-        let done = start(&bench, role, "sent 902", "STOP", &more).wait();
+        let done = start(&bench, role, "sent 902", "HANG", &more).wait();
         assert_survived(&bench, &done, role, role);
         assert!(done.stderr.contains("it said nothing for 0.5 s and was killed"), "{done:?}");
     }
@@ -105,10 +105,10 @@ fn in_real_time_a_killed_or_stopped_role_is_back_and_the_follower_is_bounded_mea
 fn a_role_that_fails_before_it_is_ready_ends_the_run() {
     for role in ROLES {
         for place in ["opening 1", "ready 1"] {
-            for (signal, clock) in [("KILL", "realtime"), ("KILL", "lockstep"), ("STOP", "lockstep")] {
+            for (signal, clock) in [("KILL", "realtime"), ("KILL", "lockstep"), ("HANG", "lockstep")] {
                 let bench = Bench::new();
-                // Who stands still is only found by a limit, which the others must keep on a loaded machine.
-                let limit_s = if signal == "STOP" { 4 } else { 30 };
+                // A hang is only found by a limit, which the others must keep on a loaded machine.
+                let limit_s = if signal == "HANG" { 4 } else { 30 };
                 let limits =
                     ["launch.startup", "supervision.heartbeat"].map(|key| format!("--set={key}_timeout_s={limit_s}"));
                 let limits = limits.each_ref().map(String::as_str);

@@ -18,6 +18,7 @@ mod contest;
 #[allow(dead_code, reason = "its command line is not used")]
 mod contestants;
 mod damage;
+mod debugging;
 mod directories;
 mod doctor;
 mod documents;

@@ -1,6 +1,8 @@
 """Functions in the seats of roles that raise, hang, die or are slow: what their caller gets, and when."""
 
+import io
 import os
+import pdb
 import subprocess
 import sys
 import textwrap
@@ -92,6 +94,20 @@ def test_a_function_that_hangs_is_left_in_time(tmp_path, clock, where, how):
     assert done.returncode == 0, done.stderr
     # Within a second where nothing else runs; a loaded machine takes its time to end processes, though not an hour.
     assert float(done.stdout) >= 5, done
+
+
+def test_a_function_in_pdb_is_waited_for_in_lockstep(tmp_path):
+    class Typed(io.StringIO):
+        def readline(self):
+            time.sleep(3)
+            return "continue\n"
+
+    def debugged(tick, inputs, outputs):
+        if tick == 5:
+            pdb.Pdb(stdin=Typed(), stdout=io.StringIO(), nosigint=True).set_trace()
+
+    made = run(tmp_path, "lockstep", "thread", debugged, set={"supervision.heartbeat_timeout_s": 0.5, "duration_s": 0.5})
+    assert made.summary["incidents"] == [] and made.summary["books"]["roles"]["controller"]["executed"] == 51
 
 
 def test_a_function_that_is_slow_once_is_waited_for_in_lockstep(tmp_path):

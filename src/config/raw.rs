@@ -179,11 +179,14 @@ pub(super) struct Launch {
     pub processes: Vec<Vec<String>>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub external: Vec<String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub debug: Vec<String>,
 }
 
 impl Default for Launch {
     fn default() -> Self {
-        Self { startup_timeout_s: 30.0, external_timeout_s: None, processes: Vec::new(), external: Vec::new() }
+        let (processes, external, debug) = (Vec::new(), Vec::new(), Vec::new());
+        Self { startup_timeout_s: 30.0, external_timeout_s: None, processes, external, debug }
     }
 }
 

@@ -63,6 +63,8 @@ pub struct Scenario {
     pub processes: Vec<Vec<String>>,
     /// Roles that somebody else starts: hardware, or a foreign program.
     pub external: Vec<String>,
+    /// Roles that wait for a debugger before the first tick.
+    pub debug: Vec<String>,
     /// What the launcher does about roles that fail.
     pub supervision: Supervision,
     /// The computers, if there are several, and what holds between them.
@@ -187,6 +189,7 @@ impl Scenario {
             external_timeout_s: raw.launch.external_timeout_s,
             processes: raw.launch.processes,
             external: raw.launch.external,
+            debug: raw.launch.debug,
             supervision: raw.supervision,
             hosts,
             faults,
@@ -211,6 +214,9 @@ impl Scenario {
         }
         if !roles.contains(&role) {
             return Err(format!("there is no such role; this scenario has: {}", roles.join(", ")));
+        }
+        if self.debug.iter().any(|debugged| debugged == role) {
+            return Err(debugged_and_external(role));
         }
         let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
         if shared { Err(shared_with_external(role)) } else { Ok(()) }
@@ -420,19 +426,27 @@ fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
 
 /// Without a rig, its roles are not known and nothing is said of them.
 fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) {
-    let external = &raw.launch.external;
+    let Launch { external, debug, .. } = &raw.launch;
     checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", || {
         "one process has no room for another's role; give clock = \"realtime\" or \"lockstep\", or leave it empty"
             .to_owned()
     });
+    checks.require(debug.is_empty() || raw.clock != ClockKind::InProcess, "launch.debug", || {
+        "one process has all roles: debug it, as `gdb --args corotate run …`, or give clock = \"lockstep\"".to_owned()
+    });
+    for (index, role) in debug.iter().enumerate().filter(|(_, role)| external.contains(role)) {
+        checks.refuse(&format!("launch.debug[{index}]"), debugged_and_external(role));
+    }
     let Some(roles) = roles else { return };
     check_processes(&raw.launch, &roles, checks);
-    for (index, role) in external.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
-        let known = roles.join(", ");
-        checks.refuse(
-            &format!("launch.external[{index}]"),
-            format!("there is no role `{role}`; this scenario has: {known}"),
-        );
+    for (key, names) in [("external", external), ("debug", debug)] {
+        for (index, role) in names.iter().enumerate().filter(|(_, role)| !roles.contains(&role.as_str())) {
+            let known = roles.join(", ");
+            checks.refuse(
+                &format!("launch.{key}[{index}]"),
+                format!("there is no role `{role}`; this scenario has: {known}"),
+            );
+        }
     }
 }
 
@@ -457,6 +471,13 @@ fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
             taken.push(name);
         }
     }
+}
+
+/// Why a run cannot wait for a debugger of a role that another program takes.
+fn debugged_and_external(role: &str) -> String {
+    format!(
+        "another program takes the {role}: start that in a debugger, as `gdb --args …`, and take it out of launch.debug"
+    )
 }
 
 /// Why a role that shares a process of ours cannot be somebody else's.

@@ -3,13 +3,14 @@
 //! A role dies with its launcher by the kernel's hand (parent-death signal). Must not leave a zombie.
 
 use super::LaunchError;
+use super::standstill::is_dead;
 use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::panics::Panic;
 use crate::runtime::{RoleId, panic_path};
 use crate::system::{tell, this_program};
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Read};
@@ -23,6 +24,8 @@ use std::time::Duration;
 
 /// How long a role may take to end once it has been told to.
 pub(super) const END_LIMIT: Duration = Duration::from_secs(5);
+/// Between two looks whether a killed process has ended.
+const KILL_LOOK: Duration = Duration::from_micros(200);
 /// The exit code of a program of ours that failed.
 const FAILURE: i32 = 1;
 /// How much of a role's error output is kept.
@@ -75,6 +78,18 @@ impl RoleProcess {
         let listen = |stderr| listen(name.clone(), stderr, process.last_words.clone());
         process.listener = stderr.map(listen).transpose().map_err(failed)?;
         Ok(process)
+    }
+
+    /// The process's identifier.
+    pub fn pid(&self) -> i32 {
+        self.child.id() as i32
+    }
+
+    /// Undoes a stop by a signal.
+    pub fn resume(&mut self) {
+        if let (None, Some(pid)) = (self.ended(), Pid::from_raw(self.pid())) {
+            let _ = kill_process(pid, Signal::CONT);
+        }
     }
 
     /// How the process ended, if it has.
@@ -132,7 +147,14 @@ impl RoleProcess {
             (0..CpuSet::MAX_CPU).for_each(|core| any.set(core));
             let _ = sched_setaffinity(Pid::from_raw(self.child.id() as i32), &any);
             let _ = self.child.kill();
-            self.status = self.child.wait().ok();
+            while self.ended().is_none() {
+                // A debugger that holds it has its status, and may keep that for ever.
+                if is_dead(self.pid()) {
+                    self.status = self.ended().or(Some(ExitStatus::from_raw(libc::SIGKILL)));
+                } else {
+                    std::thread::sleep(KILL_LOOK);
+                }
+            }
         }
     }
 

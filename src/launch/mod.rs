@@ -19,6 +19,7 @@ mod relay;
 mod replay;
 mod results;
 mod score;
+mod standstill;
 mod steps;
 mod supervision;
 mod table;
@@ -112,7 +113,7 @@ pub enum Progress<'a> {
         /// The domain's directory; it holds a file with the seat of each external role.
         domain: PathBuf,
     },
-    /// An external role keeps the run waiting: who, since when, for what. Told now and then.
+    /// A role keeps the run waiting, or goes on: a line to print, now and then.
     External(&'a str),
     /// Ticks run.
     Running {

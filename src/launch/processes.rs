@@ -12,6 +12,7 @@ use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
 use super::score::{self, Scorer};
+use super::standstill::attach_remedy;
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::domain::{Domain, OwnedDomain, require_files};
@@ -51,6 +52,10 @@ const DESCRIPTORS_PER_ROLE: u64 = 24;
 /// Upper bounds on the files that a run makes in shared memory, and beside it: signals, connections, tags of processes.
 const FILES: u64 = 32;
 const FILES_PER_ROLE: u64 = 32;
+/// A role runs in its debugger for so long before the ticks begin, ns: between attaching and stopping it runs for a moment.
+const DEBUGGED_NS: u64 = 500_000_000;
+/// Between two looks whether a role that is to end is stopped, ns.
+const RELEASE_NS: u64 = 50_000_000;
 /// The time that an external role of this host has to leave a run that a signal ends: it may hang.
 const SIGNALLED_END_LIMIT: Duration = Duration::from_millis(300);
 /// Without any progress for so long the run counts as hung, ns, and periods.
@@ -279,6 +284,9 @@ impl<'a> Supervisor<'a> {
         {
             return Err(self.denied(grants));
         }
+        if !self.await_debuggers(scorer, launch)? {
+            return Ok(launch.signal.load(Ordering::Relaxed));
+        }
         self.word.phase = Phase::Run as u64;
         if self.scenario.clock == ClockKind::Realtime {
             let lead_ns = if launch.host.is_some() { EPOCH_LEAD_HOSTS_NS } else { EPOCH_LEAD_NS };
@@ -287,6 +295,58 @@ impl<'a> Supervisor<'a> {
         }
         self.announce()?;
         self.follow(scorer, launch)
+    }
+
+    /// Waits until each role of `launch.debug` runs in a debugger; false if a signal came first.
+    fn await_debuggers(&mut self, scorer: &mut dyn Scorer, launch: &mut Launch<'_>) -> Result<bool, LaunchError> {
+        let scenario = self.scenario;
+        let named = |role: RoleId| scenario.debug.iter().any(|name| name == role.name(scenario));
+        let debugged = |member: &&mut Member| member.process.is_some() && member.books().any(|(role, _)| named(role));
+        for member in self.members.iter_mut().filter(debugged) {
+            member.set_patient(true);
+            let (name, pid) = (&member.name, member.pid().unwrap_or_default());
+            let remedy = attach_remedy().map_or(String::new(), |remedy| format!("\n  {remedy}"));
+            (launch.progress)(&Progress::External(&format!(
+                "the {name} waits for a debugger: attach it, set breakpoints, and continue\n  gdb -p {pid}\n  lldb -p {pid}{remedy}"
+            )));
+        }
+        let mut alone_ns = monotonic_ns();
+        while !scenario.debug.is_empty() && monotonic_ns() - alone_ns < DEBUGGED_NS {
+            self.announce()?;
+            self.listen()?;
+            scorer.poll(u64::MAX)?;
+            self.look_at_standstills(launch);
+            self.require_well()?;
+            if launch.signal.load(Ordering::Relaxed) != 0 {
+                return Ok(false);
+            }
+            if self.members.iter_mut().filter(debugged).any(|member| !member.runs_in_debugger()) {
+                alone_ns = monotonic_ns();
+            }
+            self.pause(monotonic_ns() + SCORE_NS);
+        }
+        let patient = scenario.clock != ClockKind::Realtime;
+        self.members.iter_mut().for_each(|member| member.set_patient(patient));
+        Ok(true)
+    }
+
+    /// Tells of roles that are stopped or go on; true while the run waits for one.
+    fn look_at_standstills(&mut self, launch: &mut Launch<'_>) -> bool {
+        let now_ns = monotonic_ns();
+        for line in self.members.iter_mut().filter_map(|member| member.look_at_standstill(now_ns)) {
+            (launch.progress)(&Progress::External(&line));
+        }
+        self.members.iter().any(Member::is_stopped)
+    }
+
+    /// An error if a role has failed before the ticks run.
+    fn require_well(&mut self) -> Result<(), LaunchError> {
+        for member in &mut self.members {
+            if let Some(Failure { cause, last_words, .. }) = member.failure(self.scenario, self.janitor) {
+                return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
+            }
+        }
+        Ok(())
     }
 
     /// Waits until every role has reached a state; false if a signal came first. A role that fails on the way will not do
@@ -298,17 +358,18 @@ impl<'a> Supervisor<'a> {
         launch: &mut Launch<'_>,
     ) -> Result<bool, LaunchError> {
         let limit_s = self.scenario.startup_timeout_s;
-        let end_ns = monotonic_ns() + (limit_s * 1e9) as u64;
+        let mut looked_ns = monotonic_ns();
+        let mut end_ns = looked_ns + (limit_s * 1e9) as u64;
         loop {
             self.announce()?;
             self.listen()?;
+            // Time in which a role is stopped does not count.
+            let stopped = self.look_at_standstills(launch);
+            end_ns += if stopped { monotonic_ns() - looked_ns } else { 0 };
+            looked_ns = monotonic_ns();
             // Its links take part in the warm-up.
             scorer.poll(u64::MAX)?;
-            for member in &mut self.members {
-                if let Some(Failure { cause, last_words, .. }) = member.failure(self.scenario, self.janitor) {
-                    return Err(LaunchError::Died { role: member.name.clone(), cause, last_words });
-                }
-            }
+            self.require_well()?;
             let waiting = self.externals.before_ticks(self.scenario, &self.members, state, monotonic_ns());
             if !self.tell(waiting, scorer, launch) {
                 return Ok(false);
@@ -377,12 +438,17 @@ impl<'a> Supervisor<'a> {
                 if !self.supervise(&mut |tick| scorer.incident(tick), tick, now_ns)? {
                     return Ok(0);
                 }
-                let waiting = self.externals.in_ticks(self.scenario, &self.members, scorer.next_tick(), now_ns);
+                let stopped = self.look_at_standstills(launch);
+                // No other role is blamed for what a stopped one keeps waiting.
+                let waiting = match stopped {
+                    true => Vec::new(),
+                    false => self.externals.in_ticks(self.scenario, &self.members, scorer.next_tick(), now_ns),
+                };
                 if !self.tell(waiting, scorer, launch) {
                     return Ok(0);
                 }
                 // An external role that is waited for has its own limit.
-                stall.look(&self.members, now_ns, lockstep && self.externals.waits())?;
+                stall.look(&self.members, now_ns, stopped || lockstep && self.externals.waits())?;
                 let signal = launch.signal.load(Ordering::Relaxed);
                 if signal != 0 {
                     return Ok(signal);
@@ -513,7 +579,12 @@ impl<'a> Supervisor<'a> {
         // are put away.
         let _ = self.announce();
         self.janitor.clear_dead();
+        let mut release_ns = monotonic_ns() + RELEASE_NS;
         while self.members.iter_mut().any(lingers) {
+            if monotonic_ns() >= release_ns {
+                self.members.iter_mut().for_each(Member::release);
+                release_ns = monotonic_ns() + RELEASE_NS;
+            }
             let _ = self.janitor.is_busy();
             // Again and again: who is only just coming up has not heard it yet. A link that fails now changes nothing:
             // whoever does not end by itself is ended.

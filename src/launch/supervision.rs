@@ -5,6 +5,7 @@
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
 use super::janitor::Janitor;
+use super::standstill::{Standstill, standstill};
 use super::trace::Trace;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -14,6 +15,7 @@ use crate::config::{ClockKind, OnFailure, Scenario};
 use crate::panics::Panic;
 use crate::runtime::{RoleId, device_words_path, open_ledger, panic_path, report_path, topic, words_path};
 use crate::sample::{Health, RoleState};
+use crate::system::tell;
 use crate::telemetry::{Ledger, Outage};
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -21,6 +23,10 @@ use std::fmt;
 /// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
 /// clock of silence too: a role is only judged for the time in which it was listened to.
 const LOOK_MAX_NS: u64 = 100_000_000;
+
+/// After so long a silence `/proc` is asked whether a role is stopped, ns, and so often again.
+const STANDSTILL_NS: u64 = 250_000_000;
+const STANDSTILL_LOOK_NS: u64 = 50_000_000;
 
 /// A successor that fails sooner than this may have died of the state that it inherited, ns.
 const DISTRUSTED_NS: u64 = 1_000_000_000;
@@ -247,6 +253,13 @@ pub(super) struct Member {
     /// The program that sends its samples.
     occupant: Occupant,
     health: <IoxBus as Bus>::Reader<Health>,
+    /// True if a stop by a signal or a debugger is waited for without limit, as in lockstep.
+    patient: bool,
+    /// Since when it is stopped, ns, and when that was looked at last.
+    stopped_ns: Option<u64>,
+    stop_looked_ns: u64,
+    /// True if it was killed because a debugger held it when the run ended.
+    released: bool,
     /// Health of an earlier generation is a dead role's.
     generation: u64,
     silent_ns: u64,
@@ -284,6 +297,10 @@ impl Member {
             ledger: open_ledger(domain, scenario, role)?,
             trace: external.then(|| Trace::open(scenario, role, bus)).transpose()?,
             occupant: Occupant::default(),
+            patient: scenario.clock != ClockKind::Realtime,
+            stopped_ns: None,
+            stop_looked_ns: 0,
+            released: false,
             name,
             role,
             process: None,
@@ -361,6 +378,72 @@ impl Member {
         Ok(())
     }
 
+    /// Sets whether a stop is waited for without limit.
+    pub fn set_patient(&mut self, patient: bool) {
+        self.patient = patient;
+    }
+
+    /// The process that has this seat, if it is one of this host.
+    pub fn pid(&self) -> Option<i32> {
+        let external = || self.occupant.writer.filter(|_| self.external_here()).map(|writer| writer.pid as i32);
+        self.process.as_ref().map(RoleProcess::pid).or_else(external)
+    }
+
+    /// Returns what keeps its process from running.
+    fn standstill(&self) -> Option<Standstill> {
+        standstill(self.pid()?)
+    }
+
+    /// Returns true while the run waits for a stopped role.
+    pub fn is_stopped(&self) -> bool {
+        self.stopped_ns.is_some()
+    }
+
+    /// Returns true if a debugger is attached to it, and it runs and is heard.
+    pub fn runs_in_debugger(&self) -> bool {
+        let attached = |held: Standstill| held.debugger.is_some() && !held.stopped;
+        self.silent_ns < STANDSTILL_NS && self.standstill().is_some_and(attached)
+    }
+
+    /// Looks whether a silent role is stopped where that is waited for. Returns the line to print once it is, and once it goes on.
+    pub fn look_at_standstill(&mut self, now_ns: u64) -> Option<String> {
+        let silent = self.silent_ns >= STANDSTILL_NS;
+        if !self.patient || !(silent || self.is_stopped()) || now_ns < self.stop_looked_ns + STANDSTILL_LOOK_NS {
+            return None;
+        }
+        self.stop_looked_ns = now_ns;
+        match (self.standstill().filter(|_| silent), self.stopped_ns) {
+            (Some(held), None) => {
+                self.stopped_ns = Some(now_ns);
+                Some(format!("the {} is {held}; the run waits for it", self.name))
+            }
+            (None, Some(since_ns)) => {
+                // From here on it has its usual time to speak.
+                (self.stopped_ns, self.silent_ns) = (None, 0);
+                let stopped_s = now_ns.saturating_sub(since_ns) as f64 / 1e9;
+                Some(format!("the {} goes on after {stopped_s:.1} s", self.name))
+            }
+            _ => None,
+        }
+    }
+
+    /// Lets a stopped process end with the run: undoes a signal's stop, and kills what a debugger holds.
+    pub fn release(&mut self) {
+        let Some(process) = self.process.as_mut() else { return };
+        if process.ended().is_some() {
+            return;
+        }
+        match standstill(process.pid()) {
+            Some(Standstill { debugger: None, .. }) => process.resume(),
+            Some(held) if held.stopped => {
+                tell(format_args!("corotate: the {} is {held}; it is killed, as the run ends", self.name));
+                process.kill();
+                self.released = true;
+            }
+            _ => {}
+        }
+    }
+
     /// Notes that the ticks run, and whether no more tick will be due.
     pub fn in_ticks(&mut self, over: bool) {
         (self.in_ticks, self.over) = (true, over);
@@ -434,6 +517,11 @@ impl Member {
         if self.silent_ns as f64 <= limit_s * 1e9 {
             return None;
         }
+        let held = standstill(process.pid());
+        // One that has just gone on is heard before it is judged.
+        if self.patient && (held.is_some() || self.stopped_ns.is_some()) {
+            return None;
+        }
         process.kill();
         // A backtrace may take longer than the limit.
         if let Some(failure) = process.panic() {
@@ -443,7 +531,10 @@ impl Member {
             true => ("said nothing", "supervision.heartbeat_timeout_s"),
             false => ("was not ready", "launch.startup_timeout_s"),
         };
-        let cause = format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}");
+        let cause = match held {
+            Some(held) => format!("it was {held}, {said} for {limit_s} s and was killed; in lockstep it is waited for"),
+            None => format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}"),
+        };
         Some(Failure::new(cause, process.last_words()))
     }
 
@@ -485,11 +576,12 @@ impl Member {
         if let (true, Some(host)) = (tells, &self.host) {
             return fail(format!("nothing was heard of it and the host {host} for {limit_s} s"));
         }
+        let held = || self.standstill().map_or(String::new(), |held| format!(" and was {held}"));
         match (tells, state, scenario.clock) {
             (true, _, ClockKind::Realtime) => {
                 let limit_s = scenario.external_timeout_s.map_or(limit_s, |external_s| external_s.max(limit_s));
                 let silent = self.silent_ns as f64 > limit_s * 1e9;
-                silent.then(|| fail(format!("it said nothing for {limit_s} s"))).flatten()
+                silent.then(|| fail(format!("it said nothing for {limit_s} s{}", held()))).flatten()
             }
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
@@ -497,16 +589,18 @@ impl Member {
                 }
                 None
             }
-            (false, RoleState::Running, ClockKind::Realtime) => fail(format!("it sent nothing for {limit_s} s")),
+            (false, RoleState::Running, ClockKind::Realtime) => {
+                fail(format!("it sent nothing for {limit_s} s{}", held()))
+            }
             _ => None,
         }
     }
 
-    /// How the role failed to end in order, if so.
+    /// How the role failed to end in order, if so. A debugger that held it is no failure.
     pub fn bad_end(&mut self, reported: bool) -> Option<Failure> {
         let process = self.process.as_mut()?;
         match process.ended() {
-            Some(status) if status.success() && reported => None,
+            Some(status) if status.success() && reported || self.released => None,
             Some(status) => Some(process.failure(status)),
             None => {
                 process.kill();

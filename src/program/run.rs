@@ -59,6 +59,9 @@ pub struct Arguments {
     /// Do not start this role: wait for somebody else to
     #[arg(long, value_name = "ROLE")]
     external: Vec<String>,
+    /// Print this role's process before the first tick, and wait for a debugger that continues it (several: a,b)
+    #[arg(long, value_name = "ROLE", value_parser = role_list, hide_short_help = true)]
+    debug: Option<String>,
     /// Write the verdict as JUnit XML, one test case per criterion
     #[arg(long, value_name = "FILE", hide_short_help = true)]
     junit: Option<PathBuf>,
@@ -120,6 +123,7 @@ impl Arguments {
             ("--clock", "clock", &self.clock),
             ("--duration", "duration_s", &self.duration),
             ("--tick-hz", "tick_hz", &self.tick_hz),
+            ("--debug", "launch.debug", &self.debug),
         ];
         let named = named
             .into_iter()
@@ -176,6 +180,11 @@ impl Arguments {
                 "--external: somebody else's role has no part in a run over several hosts; leave out --host {host}, or it"
             ));
         }
+        if let Some(role) = scenario.debug.iter().find(|role| scenario.hosts.of(role) != Some(&host)) {
+            return Err(format!(
+                "--host {host}: the {role} of launch.debug is on another host; debug the roles of this one"
+            ));
+        }
         match names.contains(&host.as_str()) {
             true => Ok(()),
             false if names.is_empty() => {
@@ -190,6 +199,12 @@ impl Arguments {
             |role: &String| scenario.check_external(role).map_err(|reason| format!("--external {role}: {reason}"));
         self.external.iter().try_for_each(check)
     }
+}
+
+/// Returns names that commas separate as a list of a scenario file.
+fn role_list(names: &str) -> Result<String, std::convert::Infallible> {
+    let names: Vec<String> = names.split(',').map(|name| format!("{:?}", name.trim())).collect();
+    Ok(format!("[{}]", names.join(", ")))
 }
 
 /// Why a run has no verdict.

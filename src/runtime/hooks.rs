@@ -2,7 +2,7 @@
 //! is for tests alone.
 //!
 //! `COROTATE_HOOK="observer sent 1500 KILL"`: the observer, the 1500th time that it has just sent a sample, gets SIGKILL
-//! from itself, once in a run. Must not do anything else to a role.
+//! from itself, once in a run. `STOP` is SIGSTOP, `HANG` an endless sleep. Must not do anything else to a role.
 
 /// A place in a role's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,7 +54,8 @@ mod on {
     struct Hook {
         place: Failpoint,
         left: AtomicU64,
-        signal: Signal,
+        /// None for a hang.
+        signal: Option<Signal>,
     }
 
     static HOOK: OnceLock<Option<Hook>> = OnceLock::new();
@@ -82,8 +83,9 @@ mod on {
         };
         let left = AtomicU64::new(words.next()?.parse().ok()?);
         let signal = match words.next()? {
-            "KILL" => Signal::KILL,
-            "STOP" => Signal::STOP,
+            "KILL" => Some(Signal::KILL),
+            "STOP" => Some(Signal::STOP),
+            "HANG" => None,
             _ => return None,
         };
         Some(Hook { place, left, signal })
@@ -96,7 +98,12 @@ mod on {
             && hook.place == place
             && hook.left.fetch_sub(1, Ordering::Relaxed) == 1
         {
-            let _ = kill_process(getpid(), hook.signal);
+            match hook.signal {
+                Some(signal) => _ = kill_process(getpid(), signal),
+                None => loop {
+                    std::thread::park();
+                },
+            }
         }
     }
 }

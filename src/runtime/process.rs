@@ -33,7 +33,9 @@ pub(super) const WARM_UP_PAUSE_NS: u64 = 50_000;
 /// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
 const BASELINE_WAKES: usize = 100;
 const BASELINE_PERIOD_NS: u64 = 300_000;
-/// How long a role that is done waits for the launcher's leave, ns: longer than any machine keeps a launcher waiting.
+/// The most that one look adds to the launcher's silence, ns.
+const LOOK_MAX_NS: u64 = 100_000_000;
+/// How long a role that is done waits for a launcher that says nothing, ns: longer than any machine keeps a launcher waiting.
 const LEAVE_NS: u64 = 120_000_000_000;
 
 /// Which role to take, where.
@@ -290,6 +292,10 @@ pub(super) fn in_domain(
     let privileges = if takes { privileges::take(scenario, role) } else { Privileges::default() };
     let ledger = take_ledger(domain, scenario, role)?;
     let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
+    if roles.iter().any(|role| scenario.debug.iter().any(|name| name == role)) {
+        // Yama restricts debuggers to a process's parent; without it there is nothing to allow.
+        let _ = rustix::process::set_ptracer(rustix::process::PTracer::Any);
+    }
     hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Failpoint::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
@@ -401,14 +407,38 @@ pub fn serve<B: Bus + 'static>(
     }
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
-        let leave_ns = monotonic_ns() + LEAVE_NS;
-        while monotonic_ns() < leave_ns && !control.stopped()? {
+        let mut patience = Patience::new(LEAVE_NS);
+        while patience.lasts(control.schedule()?.stamp.tick) && !control.stopped()? {
             control.announce(RoleState::Done, &*node)?;
             node.refresh()?;
             sleep_until(monotonic_ns() + LOOK_NS);
         }
     }
     Ok(())
+}
+
+/// How long a role waits for its launcher, which announces again and again while it lives. Time in which this process is
+/// stopped does not count.
+struct Patience {
+    limit_ns: u64,
+    silent_ns: u64,
+    looked_ns: u64,
+    heard: Option<u64>,
+}
+
+impl Patience {
+    fn new(limit_ns: u64) -> Self {
+        Self { limit_ns, silent_ns: 0, looked_ns: monotonic_ns(), heard: None }
+    }
+
+    /// Returns true while the launcher's last word, by its number, is recent.
+    fn lasts(&mut self, word: u64) -> bool {
+        let now_ns = monotonic_ns();
+        let news = self.heard.replace(word) != Some(word);
+        self.silent_ns = if news { 0 } else { self.silent_ns + (now_ns - self.looked_ns).min(LOOK_MAX_NS) };
+        self.looked_ns = now_ns;
+        self.silent_ns < self.limit_ns
+    }
 }
 
 /// From open links to the word to run. The links of a successor carry samples already. Whoever has the leader measures the
@@ -456,18 +486,14 @@ fn await_phase<B: Bus>(
     phase: Phase,
 ) -> Result<Option<Schedule>, RoleError> {
     let waited_s = 2.0 * scenario.startup_timeout_s;
-    let limit_ns = (waited_s * 1e9) as u64;
-    let (mut end_ns, mut heard) = (monotonic_ns() + limit_ns, None);
-    while monotonic_ns() < end_ns {
+    let mut patience = Patience::new((waited_s * 1e9) as u64);
+    let mut schedule = control.schedule()?;
+    while patience.lasts(schedule.stamp.tick) {
         control.announce(state, &**node)?;
         if control.stopped()? {
             return Ok(None);
         }
-        let schedule = control.schedule()?;
-        // A launcher that waits for somebody announces again and again: it is alive.
-        if heard.replace(schedule.stamp.tick) != Some(schedule.stamp.tick) {
-            end_ns = monotonic_ns() + limit_ns;
-        }
+        schedule = control.schedule()?;
         if Phase::from_number(schedule.phase) >= phase {
             return Ok(Some(schedule));
         }
