@@ -11,6 +11,7 @@ use rustix::io::Errno;
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, OpenOptions};
 use std::io::{self, Read};
+use std::ops::Deref;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
@@ -297,7 +298,46 @@ fn locate(path: &Path) -> io::Result<Place> {
 ///
 /// # Errors
 /// Those of the system.
-pub fn create(path: &Path) -> io::Result<File> {
+pub fn create(path: &Path) -> io::Result<Created> {
+    open_anew(path).map(Created)
+}
+
+/// A file that is being written anew, and that no other process may open so until it is dropped.
+#[derive(Debug)]
+pub struct Created(File);
+
+impl From<File> for Created {
+    fn from(file: File) -> Self {
+        Self(file)
+    }
+}
+
+impl Deref for Created {
+    type Target = File;
+
+    fn deref(&self) -> &File {
+        &self.0
+    }
+}
+
+impl io::Write for Created {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Drop for Created {
+    fn drop(&mut self) {
+        // Closing it is not enough: a process that another thread has just forked has it too until it executes its program.
+        let _ = self.0.unlock();
+    }
+}
+
+fn open_anew(path: &Path) -> io::Result<File> {
     const WRITE: OFlags = OFlags::WRONLY.union(OFlags::NOCTTY).union(OFlags::CLOEXEC);
     for _ in 0..ATTEMPTS {
         let Place { directory, name, is_open } = locate(path)?;
@@ -536,5 +576,17 @@ mod tests {
         assert!(create_directories(&at("to-nothing")).is_err() && Directory::open(&at("to-directory")).is_err());
         assert_eq!(fs::read(at("own/secret")).unwrap(), b"kept");
         assert_eq!(fs::read_dir(at("own")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_may_be_written_anew_as_soon_as_its_writer_is_dropped() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        let first = create(&path).unwrap();
+        assert!(create(&path).is_err(), "it is being written");
+        // As a process has it that was just forked.
+        let _copy = first.try_clone().unwrap();
+        drop(first);
+        create(&path).unwrap();
     }
 }

@@ -98,7 +98,7 @@ impl<A: Atomic> Shared<A> {
         Ok(Self { map: MmapRaw::map_raw(&file)?, file, width: PhantomData })
     }
 
-    /// The file.
+    /// The file. A lock on it ends with this value.
     pub fn file(&self) -> &File {
         &self.file
     }
@@ -110,6 +110,13 @@ impl<A: Atomic> Shared<A> {
         // process of a run shortens it), and lives as long as `self`; any bytes are an `A`, by `Atomic`; every access to
         // them, in any process, is atomic and of this width.
         unsafe { std::slice::from_raw_parts(self.map.as_ptr().cast::<A>(), self.map.len() / size_of::<A>()) }
+    }
+}
+
+impl<A> Drop for Shared<A> {
+    fn drop(&mut self) {
+        // Closing it is not enough: a process that was forked meanwhile has the file too.
+        let _ = self.file.unlock();
     }
 }
 

@@ -97,8 +97,9 @@ fn rests(pid: u32) -> Option<bool> {
 fn await_left(joiner: &Joiner, mut running: Running) -> Done {
     if joiner.stays {
         let children = format!("/proc/{0}/task/{0}/children", running.pid());
-        // Before the joiner, strace has children of its own, by which it learns what this machine can trace.
-        let is_joiner = |pid: &u32| status_of(*pid, "Name") != "strace";
+        // Before the joiner, strace has children of its own, by which it learns what this machine can trace; one that has just
+        // ended has no name.
+        let is_joiner = |pid: &u32| status_of(*pid, "Name") == "corotate";
         let child = await_some(|| {
             let text = std::fs::read_to_string(&children).unwrap_or_default();
             let found = text.split_whitespace().flat_map(str::parse).find(is_joiner).map(Some);

@@ -544,7 +544,8 @@ fn in_real_time_a_device_synchronises() {
     assert!(error < limit, "{error:e}: {summary:#}");
     let serial = summary["latencies"].as_array().unwrap().iter().find(|stage| stage["stage"] == "serial").unwrap();
     println!("round trip {serial}");
-    assert_eq!((&serial["role"], number(&serial["count"])), (&Value::from("follower"), number(&ticks["executed"])));
+    let told = number(&serial["count"]) - number(&serial["missed"]);
+    assert_eq!((&serial["role"], told), (&Value::from("follower"), number(&ticks["executed"])));
     assert!(bench.path("out/latency/follower.serial.hgrm").is_file());
 }
 
@@ -675,7 +676,7 @@ fn a_controller_whose_line_stays_cut_is_an_incident_with_tick_and_time() {
     let absent = incidents(&summary, "continued");
     let last = absent.last().unwrap_or_else(|| panic!("{summary:#}"));
     assert_eq!((&last["role"], &last["outage_s"]), (&Value::from("controller"), &Value::Null), "{last}");
-    assert_eq!(last["time_s"].as_f64().unwrap(), number(&last["tick"]) as f64 / 100.0);
+    assert!((last["time_s"].as_f64().unwrap() - number(&last["tick"]) as f64 / 100.0).abs() < 1e-9, "{last}");
     let outage = told["outages"].as_array().unwrap().last().unwrap();
     assert_eq!((&outage["tick"], &outage["back_at_tick"]), (&last["tick"], &Value::Null));
     assert!(outage["seconds"].as_f64().unwrap() > 0.5, "{outage}");

@@ -185,6 +185,13 @@ pub(super) struct Journal {
     end: u64,
 }
 
+impl Drop for Journal {
+    fn drop(&mut self) {
+        // Closing it is not enough: a process that was forked meanwhile has the file too.
+        let _ = self.file.unlock();
+    }
+}
+
 impl Journal {
     /// Begins a journal, or goes on with one that the same campaign began. `pieces` tells how many lines there will be, `place` which
     /// of them an entry is.

@@ -10,7 +10,7 @@ use crate::files;
 use serde::Serialize;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
@@ -146,7 +146,7 @@ pub(super) fn write(
 /// Writes a file beside its place and puts it there when it is whole.
 pub(super) fn write_file(
     path: &Path,
-    content: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+    content: impl FnOnce(&mut BufWriter<files::Created>) -> io::Result<()>,
 ) -> Result<(), SweepError> {
     let part = path.with_extension("part");
     let attempt = || {

@@ -21,7 +21,6 @@ use crate::telemetry::{
 };
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -561,7 +560,7 @@ pub fn write_run(directory: &Path, scenario: &Scenario, summary: &Summary) -> io
     })
 }
 
-fn write(path: &Path, content: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
+fn write(path: &Path, content: impl FnOnce(&mut BufWriter<files::Created>) -> io::Result<()>) -> io::Result<()> {
     let attempt = || {
         let mut out = BufWriter::new(files::create(path)?);
         content(&mut out)?;

@@ -253,7 +253,7 @@ const COLUMNS: [(&str, FieldKind); 7] = [
 
 /// Every row with its estimate.
 enum Table {
-    Csv(BufWriter<std::fs::File>),
+    Csv(BufWriter<files::Created>),
     #[cfg(feature = "parquet")]
     Parquet(Box<RowGroups>),
 }

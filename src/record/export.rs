@@ -116,7 +116,7 @@ impl<T: Table> Part<T> {
             tempfile::Builder::new().prefix(&name).suffix(".part").permissions(permissions).tempfile_in(place.path());
         let begun = made.and_then(|made| {
             let (file, part) = made.into_parts();
-            Ok((part, T::begin(file, recording, signal)?))
+            Ok((part, T::begin(file.into(), recording, signal)?))
         });
         match begun {
             Ok((file, table)) => Ok(Self { path, file, table }),

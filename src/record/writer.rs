@@ -51,7 +51,7 @@ const CHANNEL_INDEX_BYTES: u64 = 32;
 pub struct Writer {
     mcap: Option<mcap::Writer<BufWriter<Sink>>>,
     /// The same file, for what its writer cannot do.
-    file: File,
+    file: files::Created,
     path: PathBuf,
     channels: u64,
     chunks: u64,
@@ -115,7 +115,7 @@ impl Writer {
         self.attempt(mcap::Writer::flush)?;
         (self.pending, self.began_ns) = (0, None);
         self.chunks += 1;
-        self.whole = (&self.file).stream_position().map_err(|source| self.failed(source))?;
+        self.whole = (&*self.file).stream_position().map_err(|source| self.failed(source))?;
         Ok(())
     }
 
@@ -143,7 +143,7 @@ impl Writer {
         if let Some(mcap) = self.mcap.take() {
             mcap.into_inner().into_inner().map_err(|error| self.failed(error.into_error()))?;
         }
-        let length = (&self.file).stream_position().map_err(|source| self.failed(source))?;
+        let length = (&*self.file).stream_position().map_err(|source| self.failed(source))?;
         // Gives back the room that was not used.
         self.file.set_len(length).and_then(|()| self.file.sync_data()).map_err(|source| self.failed(source))?;
         Ok(length)

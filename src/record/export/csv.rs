@@ -1,20 +1,20 @@
 //! A table as CSV. Numbers are written so that the very bits are read back from them; of what is no number only that is kept.
 
 use super::table::{Table, columns};
+use crate::files::Created;
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
-use std::fs::File;
 use std::io::{self, BufWriter, Write};
 
 pub struct Csv {
-    out: BufWriter<File>,
+    out: BufWriter<Created>,
     kinds: Vec<FieldKind>,
 }
 
 impl Table for Csv {
     const EXTENSION: &'static str = "csv";
 
-    fn begin(file: File, _: &Recording, signal: &SignalInfo) -> io::Result<Self> {
+    fn begin(file: Created, _: &Recording, signal: &SignalInfo) -> io::Result<Self> {
         let (names, kinds): (Vec<_>, Vec<_>) = columns(&signal.layout).into_iter().unzip();
         let mut out = BufWriter::new(file);
         writeln!(out, "{}", names.join(","))?;

@@ -3,6 +3,7 @@
 //! Every bit is kept, of what is no number too. Must not hold more than the rows of one group.
 
 use super::table::{Table, columns};
+use crate::files::Created;
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
@@ -12,7 +13,6 @@ use parquet::file::metadata::KeyValue;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterVersion};
 use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::types::{Type, TypePtr};
-use std::fs::File;
 use std::io;
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ pub struct Parquet(RowGroups);
 impl Table for Parquet {
     const EXTENSION: &'static str = "parquet";
 
-    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
+    fn begin(file: Created, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
         let (name, about) = (&signal.layout.type_name, about(recording, signal));
         RowGroups::begin(file, name, None, columns(&signal.layout), about, rows_per_group(recording)).map(Self)
     }
@@ -44,7 +44,7 @@ impl Table for Parquet {
 
 /// Rows of numbers, and of a text before them where that is asked for, written a group at a time.
 pub struct RowGroups {
-    writer: SerializedFileWriter<File>,
+    writer: SerializedFileWriter<Created>,
     texts: Option<Vec<ByteArray>>,
     columns: Vec<Waiting>,
     rows_per_group: usize,
@@ -59,7 +59,7 @@ struct Waiting {
 impl RowGroups {
     /// A file of these columns, `text` the first if there is one, with what is to be known `about` it.
     pub fn begin(
-        file: File,
+        file: Created,
         name: &str,
         text: Option<&str>,
         columns: Vec<(String, FieldKind)>,

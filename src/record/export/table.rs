@@ -1,8 +1,8 @@
 //! A table of a recording, in any format.
 
+use crate::files::Created;
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::{FieldKind, Layout};
-use std::fs::File;
 use std::io;
 
 /// A table in the making.
@@ -11,7 +11,7 @@ pub trait Table: Sized {
     const EXTENSION: &'static str;
 
     /// Begins the table of a signal.
-    fn begin(file: File, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
+    fn begin(file: Created, recording: &Recording, signal: &SignalInfo) -> io::Result<Self>;
 
     /// Adds a row: the bits of every column.
     fn row(&mut self, bits: &[u64]) -> io::Result<()>;
