@@ -40,7 +40,7 @@ const SILENT_NS: u64 = 250_000_000;
 const TRY_NS: u64 = 500_000_000;
 const TRY_MAX_NS: u64 = 4_000_000_000;
 /// The time limit for knowing it well enough once there are answers, ns.
-const KNOW_NS: u64 = 5_000_000_000;
+const KNOW_NS: u64 = 15_000_000_000;
 /// A host that joined replaces its session after so long without an answer about the time, ns; that is asked for 20 times a second.
 const DEAF_NS: u64 = 1_500_000_000;
 /// Time limit of one attempt to replace it.

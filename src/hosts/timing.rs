@@ -12,6 +12,8 @@ const FIRST_ASK_NS: u64 = 4_000_000;
 const ASK_NS: u64 = 50_000_000;
 /// How long it asks before the first answer is believed, ns.
 const FIRST_NS: u64 = 600_000_000;
+/// How long a way that takes too long may get better before the host is refused, ns: machines are busy while a run starts.
+const REFUSED_NS: u64 = 10_000_000_000;
 /// Between two corrections, and how long one takes to act, ns.
 const CORRECT_NS: u64 = 100_000_000;
 const CATCH_UP_NS: f64 = 5e8;
@@ -124,6 +126,9 @@ impl Timing {
         };
         let (way_ns, error_ns) = (estimate.round_trip_ns as f64 / 2.0, estimate.error_ns);
         if self.realtime && way_ns + error_ns > self.part_ns {
+            if now_ns < began_ns + REFUSED_NS {
+                return Ok(false);
+            }
             return Err(ClockRefused::Budget {
                 way_us: way_ns / 1e3,
                 error_us: error_ns / 1e3,
@@ -240,12 +245,18 @@ mod tests {
         let scenario = Scenario::parse(SHIPPED[0].1, "x", &["tick_hz=1000".to_owned()]).unwrap();
         let mut timing = Timing::new(&scenario, "flight", RunClock::open(&directory.path().join("clock")).unwrap());
         assert!(!timing.ready(0).unwrap());
-        for sent_ns in (0..FIRST_NS).step_by(10_000_000) {
+        let take = |timing: &mut Timing, sent_ns: u64, round_trip_ns: u64| {
             let exchange =
-                Exchange { sent_ns, received_ns: sent_ns, answered_ns: sent_ns, returned_ns: sent_ns + 2_000_000 };
+                Exchange { sent_ns, received_ns: sent_ns, answered_ns: sent_ns, returned_ns: sent_ns + round_trip_ns };
             timing.take(exchange, 0);
+        };
+        for sent_ns in (0..FIRST_NS).step_by(10_000_000) {
+            take(&mut timing, sent_ns, 2_000_000);
         }
-        let refused = timing.ready(FIRST_NS).unwrap_err().to_string();
+        assert!(!timing.ready(FIRST_NS).unwrap(), "it may get better");
+        let refused = timing.ready(REFUSED_NS).unwrap_err().to_string();
         assert!(refused.contains("takes 1000 us") && refused.contains("raise the budget"), "{refused}");
+        take(&mut timing, REFUSED_NS, 200_000);
+        assert!(timing.ready(REFUSED_NS + 200_000).unwrap(), "it got better");
     }
 }
