@@ -1,6 +1,6 @@
 //! Roles that stand still because a signal or a debugger has stopped them.
 
-use crate::common::{self, Bench, await_some, send_signal};
+use crate::common::{self, Bench, Done, await_some, send_signal};
 use serde_json::Value;
 use std::process::{Child, Stdio};
 use std::time::Duration;
@@ -26,6 +26,13 @@ fn json(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
 }
 
+/// Returns the summary of a run that ended with an exit code, without an incident.
+fn undisturbed(done: &Done, code: i32) -> Value {
+    let told = json(&done.stdout);
+    assert_eq!((done.code, &told["incidents"]), (Some(code), &serde_json::json!([])), "{}", done.stderr);
+    told
+}
+
 /// Without an incident, and with the bits of a run that nobody stopped.
 #[test]
 fn a_stopped_role_is_waited_for_in_lockstep() {
@@ -38,8 +45,7 @@ fn a_stopped_role_is_waited_for_in_lockstep() {
         std::thread::sleep(STOPPED);
         send_signal(pid, CONT);
         let done = run.wait();
-        let told = json(&done.stdout);
-        assert_eq!((done.code, &told["incidents"]), (Some(0), &serde_json::json!([])), "{}", done.stderr);
+        let told = undisturbed(&done, 0);
         assert_eq!(told["state"]["hash"], json(&plain.stdout)["state"]["hash"]);
         let lines = |words: &str| done.stderr.lines().filter(|line| line.contains(words)).count();
         assert_eq!((lines("stopped by a signal"), lines("goes on after")), (1, 1), "{}", done.stderr);
@@ -73,9 +79,7 @@ fn ctrl_c_ends_a_run_with_a_stopped_role_in_order() {
     std::thread::sleep(STOPPED);
     run.signal(2);
     let done = run.wait();
-    let told = json(&done.stdout);
-    assert_eq!((done.code, &told["incidents"]), (Some(130), &serde_json::json!([])), "{}", done.stderr);
-    assert_eq!(told["books"]["balanced"], true);
+    assert_eq!(undisturbed(&done, 130)["books"]["balanced"], true);
     bench.assert_clean(&[]);
 }
 
@@ -114,7 +118,7 @@ fn a_role_is_debugged_from_before_the_first_tick() {
     // Attached, stopped for longer than silence may last, let go on.
     let gdb = Gdb::attach(&bench, pid, &["shell sleep 1.5", "continue"]);
     let done = run.wait();
-    assert_eq!((done.code, &json(&done.stdout)["incidents"]), (Some(0), &serde_json::json!([])), "{}", done.stderr);
+    undisturbed(&done, 0);
     assert!(done.stderr.contains(&format!("gdb -p {pid}")), "{}", done.stderr);
     drop(gdb);
     bench.assert_clean(&[]);
@@ -131,8 +135,7 @@ fn a_role_that_a_debugger_holds_is_waited_for_and_ctrl_c_ends_the_run() {
     assert_eq!(bench.role("controller"), Some(pid), "it is not killed");
     run.signal(2);
     let done = run.wait();
-    let told = json(&done.stdout);
-    assert_eq!((done.code, &told["incidents"]), (Some(130), &serde_json::json!([])), "{}", done.stderr);
+    undisturbed(&done, 130);
     assert!(done.stderr.contains("stopped by a debugger"), "{}", done.stderr);
     drop(gdb);
     bench.assert_clean(&[]);

@@ -10,8 +10,9 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 
 /// A command by its first words, and where else it is run or why it cannot be.
-const ELSEWHERE: [(&str, &str); 29] = [
+const ELSEWHERE: [(&str, &str); 30] = [
     ("corotate run pair.toml --host", "it waits for another host; tests/hosts"),
+    ("corotate run pair.toml --clock lockstep --debug", "it waits for a debugger; tests/debugging.rs"),
     ("corotate join", "it needs a run to join; tests/hosts"),
     ("corotate doctor --link", "it needs a run that waits; tests/hosts"),
     ("cargo run --release", "tests/run builds it so; `run` without arguments is run here"),
@@ -227,6 +228,7 @@ pages! {
     concepts: "docs/concepts.md",
     campaigns: "docs/campaigns.md",
     commands_page: "docs/commands.md",
+    debugging: "docs/debugging.md",
     foreign_role: "docs/foreign-role.md",
     hosts: "docs/hosts.md",
     formats: "docs/formats.md",

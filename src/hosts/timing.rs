@@ -12,7 +12,7 @@ const FIRST_ASK_NS: u64 = 4_000_000;
 const ASK_NS: u64 = 50_000_000;
 /// How long it asks before the first answer is believed, ns.
 const FIRST_NS: u64 = 600_000_000;
-/// How long a way that takes too long may get better before the host is refused, ns: machines are busy while a run starts.
+/// Time for which a way that takes too long is measured again before the host is refused, ns: a machine is busy at first.
 const REFUSED_NS: u64 = 10_000_000_000;
 /// Between two corrections, and how long one takes to act, ns.
 const CORRECT_NS: u64 = 100_000_000;

@@ -3,7 +3,7 @@
 //! A role dies with its launcher by the kernel's hand (parent-death signal). Must not leave a zombie.
 
 use super::LaunchError;
-use super::standstill::is_dead;
+use super::standstill::is_zombie;
 use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
@@ -149,7 +149,7 @@ impl RoleProcess {
             let _ = self.child.kill();
             while self.ended().is_none() {
                 // A debugger that holds it has its status, and may keep that for ever.
-                if is_dead(self.pid()) {
+                if is_zombie(self.pid()) {
                     self.status = self.ended().or(Some(ExitStatus::from_raw(libc::SIGKILL)));
                 } else {
                     std::thread::sleep(KILL_LOOK);

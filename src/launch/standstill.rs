@@ -6,7 +6,7 @@ use std::fmt;
 use std::fs;
 use std::path::PathBuf;
 
-/// What keeps a process from running.
+/// A process that a signal or a debugger keeps from running.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Standstill {
     /// True if a thread is stopped. A debugger that has let all of them go on may still be why the process is silent.
@@ -38,7 +38,7 @@ impl Thread {
     }
 }
 
-/// Returns what keeps a process from running: `None` for one that runs freely, has ended, or cannot be looked at.
+/// Looks for a stop or a debugger: `None` for a process that runs freely, has ended, or cannot be looked at.
 pub(super) fn standstill(pid: i32) -> Option<Standstill> {
     let threads = threads(pid);
     if threads.iter().all(|thread| thread.dead()) {
@@ -53,12 +53,13 @@ pub(super) fn standstill(pid: i32) -> Option<Standstill> {
     (stopped || debugger.is_some()).then_some(Standstill { stopped, debugger })
 }
 
-/// Returns true if a process has ended, although a debugger may still keep its entry.
-pub(super) fn is_dead(pid: i32) -> bool {
-    threads(pid).iter().all(|thread| thread.dead())
+/// Returns true if a process has ended and nobody has reaped it yet: a debugger that traced it may keep it so for ever.
+pub(super) fn is_zombie(pid: i32) -> bool {
+    let threads = threads(pid);
+    !threads.is_empty() && threads.iter().all(|thread| thread.dead())
 }
 
-/// Why this user's debuggers cannot attach to a process that is not theirs, with what to do.
+/// Returns the remedy where this user's debuggers cannot attach to a process that is not their child.
 pub(super) fn attach_remedy() -> Option<&'static str> {
     let scope = fs::read_to_string("/proc/sys/kernel/yama/ptrace_scope").unwrap_or_default();
     remedy_of(scope.trim(), rustix::process::geteuid().is_root())
@@ -67,7 +68,7 @@ pub(super) fn attach_remedy() -> Option<&'static str> {
 fn remedy_of(ptrace_scope: &str, root: bool) -> Option<&'static str> {
     match (ptrace_scope, root) {
         ("2", false) => Some("only root may attach here (kernel.yama.ptrace_scope = 2): put sudo in front"),
-        ("3", _) => Some("nobody may attach here until the next boot (kernel.yama.ptrace_scope = 3)"),
+        ("3", _) => Some("attaching is disabled until the next boot (kernel.yama.ptrace_scope = 3)"),
         _ => None,
     }
 }
@@ -88,7 +89,7 @@ fn state_of(stat: &str) -> Option<char> {
     stat.rsplit_once(')')?.1.trim_start().chars().next()
 }
 
-/// The tracer in the text of `status`, 0 if there is none.
+/// The process of the tracer in the text of `status`; 0 without a tracer, `None` if the text has no such line.
 fn tracer_in(status: &str) -> Option<i32> {
     status.lines().find_map(|line| line.strip_prefix("TracerPid:"))?.trim().parse().ok()
 }
@@ -146,15 +147,15 @@ mod tests {
         awaited(None);
         send(rustix::process::Signal::STOP);
         awaited(Some(Standstill { stopped: true, debugger: None }));
-        assert!(!is_dead(pid));
+        assert!(!is_zombie(pid));
         send(rustix::process::Signal::CONT);
         awaited(None);
         child.kill().unwrap();
-        while !is_dead(pid) {
+        while !is_zombie(pid) {
             std::thread::yield_now();
         }
-        assert_eq!(standstill(pid), None, "nobody has waited for it");
+        assert_eq!(standstill(pid), None, "a zombie is not stopped");
         child.wait().unwrap();
-        assert!(is_dead(pid) && standstill(pid).is_none());
+        assert!(!is_zombie(pid) && standstill(pid).is_none());
     }
 }

@@ -389,7 +389,7 @@ impl Member {
         self.process.as_ref().map(RoleProcess::pid).or_else(external)
     }
 
-    /// Returns what keeps its process from running.
+    /// Looks for a stop of its process, or a debugger.
     fn standstill(&self) -> Option<Standstill> {
         standstill(self.pid()?)
     }
@@ -596,7 +596,7 @@ impl Member {
         }
     }
 
-    /// How the role failed to end in order, if so. A debugger that held it is no failure.
+    /// Returns the failure of a role that did not end in order. One that was killed because a debugger held it has none.
     pub fn bad_end(&mut self, reported: bool) -> Option<Failure> {
         let process = self.process.as_mut()?;
         match process.ended() {
