@@ -109,16 +109,19 @@ fn overview(line: &clap::Command) -> String {
 fn about_build() -> String {
     let features = [
         ("foxglove", cfg!(feature = "foxglove")),
-        ("hooks", cfg!(feature = "hooks")),
         ("hosts", cfg!(feature = "hosts")),
         ("parquet", cfg!(feature = "parquet")),
+        ("hooks", cfg!(feature = "hooks")),
     ];
-    let built: Vec<&str> = features.iter().filter(|(_, built)| *built).map(|(name, _)| *name).collect();
+    let names = |is_built| features.iter().filter(move |(_, built)| *built == is_built).map(|(name, _)| *name);
+    let built: Vec<&str> = names(true).collect();
+    // The hooks are for tests alone.
+    let absent: Vec<&str> = names(false).filter(|name| *name != "hooks").collect();
     let host = Host::this();
     format!(
         "revision  {}\nfeatures  {}\niceoryx2  {}\ntarget    {}\nhost      {}, {}, {} cores",
         env!("COROTATE_REVISION"),
-        if built.is_empty() { "none of foxglove, hosts, parquet, pdf".to_owned() } else { built.join(", ") },
+        if built.is_empty() { format!("none of {}", absent.join(", ")) } else { built.join(", ") },
         env!("COROTATE_ICEORYX2"),
         env!("COROTATE_TARGET"),
         host.kernel,
