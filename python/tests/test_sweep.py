@@ -67,6 +67,41 @@ def test_a_pool_whose_worker_is_killed_costs_no_case(local, tmp_path):
     assert the_same(swept, local)
 
 
+class Loses(concurrent.futures.ThreadPoolExecutor):
+    """Loses the result of the first task, as Dask may with the worker that had it: the future fails, and not by the work."""
+
+    lost = 0
+
+    def submit(self, task, *arguments):
+        future = super().submit(task, *arguments)
+        if not self.lost:
+            self.lost += 1
+            future.result()
+            future = concurrent.futures.Future()
+            future.set_exception(ValueError("not enough values to unpack (expected 3, got 1)"))
+        return future
+
+
+def test_a_lost_result_is_made_again(local, tmp_path):
+    with Loses(2) as executor:
+        swept = corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=3)
+    assert executor.lost == 1 and the_same(swept, local)
+
+
+class Fails(concurrent.futures.ThreadPoolExecutor):
+    tries = 0
+
+    def submit(self, task, *arguments):
+        self.tries += 1
+        return super().submit(lambda: 1 / 0)
+
+
+def test_work_that_fails_again_is_an_error(tmp_path):
+    with Fails(1) as executor, pytest.raises(ZeroDivisionError):
+        corotate.sweep(CAMPAIGN, out=tmp_path, executor=executor, chunk=1000)
+    assert executor.tries == 2
+
+
 def test_dask_gives_the_same_table_also_when_a_worker_is_killed(local, tmp_path):
     cluster = distributed.LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address=None, local_directory=str(tmp_path / "dask"))
     with cluster, distributed.Client(cluster) as client:

@@ -77,15 +77,32 @@ def _elsewhere(cases, directory, executor, chunk, progress):
     results = cases.collect(str(directory))
     left, every = results.left(), cases.pieces()
     task = functools.partial(_work, cases.text(), cases.identity(), _corotate.build)
-    done, futures = every - len(left), []
+    done, futures = every - len(left), {}
+
+    def submit(pieces, again):
+        futures[executor.submit(task, pieces)] = pieces, again
+
     try:
-        futures += [executor.submit(task, left[at:at + chunk]) for at in range(0, len(left), chunk)]
-        for future in concurrent.futures.as_completed(futures):
-            for entry in future.result():
-                results.add(entry)
-                done += 1
-            if progress is not None:
-                progress(done, every)
+        for at in range(0, len(left), chunk):
+            submit(left[at:at + chunk], True)
+        while futures:
+            for future in concurrent.futures.wait(futures, return_when=concurrent.futures.FIRST_COMPLETED).done:
+                pieces, again = futures.pop(future)
+                try:
+                    entries = future.result()
+                except concurrent.futures.BrokenExecutor:
+                    raise
+                except Exception:
+                    # A scheduler that lost a worker may lose its results too; what the work itself says, it says twice.
+                    if not again:
+                        raise
+                    submit(pieces, False)
+                    continue
+                for entry in entries:
+                    results.add(entry)
+                    done += 1
+                if progress is not None:
+                    progress(done, every)
         results.finish()
         return True
     except concurrent.futures.BrokenExecutor as error:
