@@ -3,10 +3,11 @@
 //! From when the leader's tick was due until the controller has sent its command. The follower looks at it when the next
 //! tick is due, by definition, so the hop to it is never waited for.
 
+use super::board::Board;
 use super::exchange::{Mechanism, Opening, Sender, Station, Wake};
 use super::hop::send_paced;
 use super::peer::Peer;
-use super::{Bench, BenchError, Board};
+use super::session::{Bench, BenchError};
 use crate::bus::domain::OwnedDomain;
 use crate::clock::{Grid, monotonic_ns};
 use crate::launch::Outcome;

@@ -2,8 +2,8 @@
 //!
 //! Every way carries the same words and is used as a plain, careful program would use it. Must not know what is measured.
 
-use super::BenchError;
 use super::page::Page;
+use super::session::BenchError;
 use crate::bus::domain::Domain;
 use crate::bus::iox::{IoxBus, IoxReader, IoxWriter};
 use crate::bus::raw::{RawBoardReader, RawBoardWriter, RawListener, RawNode, RawNotifier, RawPublisher, RawSubscriber};

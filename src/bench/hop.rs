@@ -3,9 +3,10 @@
 //! The sender is this process in the leader's place, the receiver a peer in the controller's. Must not favour
 //! anyone: same cores, same privileges, same samples, same waits.
 
+use super::board::Board;
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
 use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns};
-use super::{Bench, BenchError, Board};
+use super::session::{Bench, BenchError};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use crate::telemetry::{Grant, Latency};

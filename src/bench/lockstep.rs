@@ -1,9 +1,10 @@
 //! Ticks per second where nobody waits for the time: as processes in lockstep, and in one thread; beside the hops and the
 //! arithmetic that they cannot do without.
 
+use super::board::Board;
 use super::exchange::{Mechanism, Wake};
 use super::hop::Pair;
-use super::{Bench, BenchError, Board, resolve};
+use super::session::{Bench, BenchError, resolve};
 use crate::bus::domain::OwnedDomain;
 use crate::config::Scenario;
 use crate::launch::Progress;

@@ -16,6 +16,7 @@ mod peer;
 mod processor;
 mod report;
 mod run;
+mod session;
 mod targets;
 mod tick;
 mod watch;
@@ -24,36 +25,10 @@ pub use board::{Beside, Board, Figure};
 pub(crate) use lockstep::arithmetic_alone;
 pub use peer::serve_peer;
 pub use report::{Results, table, write_results};
+pub use session::{Bench, BenchError, Measure, Row, row};
 pub use targets::{Bound, Of, Target, Verdict, target};
 
-use crate::bus::BusError;
-use crate::bus::domain::DomainError;
-use crate::config::{ConfigError, SHIPPED, Scenario};
-use crate::launch::{self, Launch, LaunchError, Outcome, Progress};
-use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
 use crate::telemetry::Grant;
-use rustix::thread::{sched_getaffinity, sched_setaffinity};
-use std::io;
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-/// A row of a benchmark.
-#[derive(Debug, Clone, Copy)]
-pub struct Row {
-    /// Its name.
-    pub name: &'static str,
-    title: &'static str,
-    /// What its figures are held against.
-    pub targets: &'static [Target],
-    measure: Measure,
-}
-
-/// Measures a row and puts its figures on the board.
-pub type Measure = fn(&mut Bench<'_>, &mut Board) -> Result<(), BenchError>;
-
-/// A row by its name, what it is in words, what its figures are held against, and what measures it.
-pub const fn row(name: &'static str, title: &'static str, targets: &'static [Target], measure: Measure) -> Row {
-    Row { name, title, targets, measure }
-}
 
 /// What a user measures on a machine.
 pub const ROWS: &[Row] = &[
@@ -70,60 +45,6 @@ pub const ROWS: &[Row] = &[
     ),
     row("processor", "processor time per tick of every role, by how roles wait", &[], processor::measure),
 ];
-
-/// What a benchmark run is to do.
-pub struct Bench<'a> {
-    /// The rows, in the order of the table.
-    pub rows: Vec<Row>,
-    /// A smoke run: every row, a second each, figures that mean nothing.
-    pub quick: bool,
-    /// Its scenarios, name and text; whole runs are of the first.
-    pub scenarios: &'a [(&'a str, &'a str)],
-    /// The signal that asked the run to end; 0 while none has.
-    pub signal: &'a AtomicUsize,
-    /// Told what is being measured.
-    pub progress: &'a mut dyn FnMut(&str),
-}
-
-/// Why a benchmark run failed. Whatever had been started is gone.
-#[derive(Debug, thiserror::Error)]
-pub enum BenchError {
-    /// A signal asked for the end.
-    #[error("ended by signal {0} before everything was measured")]
-    Interrupted(usize),
-    /// There is nothing to measure.
-    #[error("this program has no scenario of its own to measure; add one with `Program::scenario`")]
-    NoScenario,
-    /// A scenario cannot be run as a row has to run it.
-    #[error(transparent)]
-    Scenario(#[from] ConfigError),
-    /// A domain could not be made.
-    #[error(transparent)]
-    Domain(#[from] DomainError),
-    /// A link failed.
-    #[error(transparent)]
-    Bus(#[from] BusError),
-    /// A run of the product failed.
-    #[error(transparent)]
-    Launch(#[from] LaunchError),
-    /// A peer process could not be started, or left.
-    #[error("the measuring peer failed: {0}; its own error is above")]
-    Peer(String),
-    /// The operating system refused something.
-    #[error("cannot {what}: {source}")]
-    System {
-        /// What was asked for.
-        what: &'static str,
-        /// Its reason.
-        source: io::Error,
-    },
-}
-
-impl BenchError {
-    fn system(what: &'static str) -> impl FnOnce(io::Error) -> Self {
-        move |source| Self::System { what, source }
-    }
-}
 
 /// Measures the rows. One that this program's scenario does not go with is a remark on the board.
 ///
@@ -143,102 +64,12 @@ pub fn run(bench: &mut Bench<'_>) -> Result<(Board, Vec<Grant>), BenchError> {
     Ok((board, [grants, taken].concat()))
 }
 
-/// A scenario with these overrides, whatever its run is judged by.
-fn resolve((name, text): (&str, &str), overrides: &[&str]) -> Result<Scenario, BenchError> {
-    let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
-    Ok(Scenario::parse(text, &format!("{name}.toml"), &overrides)?)
-}
-
-impl Bench<'_> {
-    /// The scenario that is measured: without faults, unwatched, and with every role started by the launcher.
-    ///
-    /// # Errors
-    /// [`BenchError::NoScenario`], [`BenchError::Scenario`].
-    pub fn scenario(&self, overrides: &[&str]) -> Result<Scenario, BenchError> {
-        let first = self.scenarios.first().ok_or(BenchError::NoScenario)?;
-        resolve(*first, &[overrides, &["fault=[]", "watchdog={}", "launch.external=[]"]].concat())
-    }
-
-    /// Whether the scenario is the one whose figures have targets.
-    fn has_targets(&self) -> bool {
-        self.scenarios.first() == SHIPPED.first()
-    }
-
-    /// Why no target is judged; nothing if all are.
-    pub fn unjudged(&self) -> Vec<String> {
-        let mut reasons = Vec::new();
-        if self.quick {
-            reasons.push("a smoke run: everything is exercised, no figure means anything".to_owned());
-        }
-        if cfg!(debug_assertions) {
-            reasons.push("a debug build: its figures are not those of the product; build with --release".to_owned());
-        }
-        if !self.has_targets() {
-            let (of, this) = (SHIPPED[0].0, self.scenarios.first().map_or("none", |(name, _)| *name));
-            reasons.push(format!("the targets are those of corotate's scenario {of}, and this is {this}"));
-        }
-        reasons
-    }
-
-    /// Runs a scenario by this program, until `signal` is one.
-    fn launch(
-        &self,
-        scenario: &Scenario,
-        signal: &AtomicUsize,
-        progress: &mut dyn FnMut(&Progress<'_>),
-    ) -> Result<Outcome, BenchError> {
-        let mut launch = Launch::new(signal, progress);
-        let outcome = launch::run(scenario, &mut launch)?;
-        self.interrupted()?;
-        Ok(outcome)
-    }
-
-    /// Says what comes next.
-    ///
-    /// # Errors
-    /// [`BenchError::Interrupted`] if the run is to end.
-    pub fn next(&mut self, what: &str) -> Result<(), BenchError> {
-        self.interrupted()?;
-        (self.progress)(what);
-        Ok(())
-    }
-
-    /// An error if the run is to end.
-    fn interrupted(&self) -> Result<(), BenchError> {
-        match self.signal.load(Ordering::Relaxed) {
-            0 => Ok(()),
-            signal => Err(BenchError::Interrupted(signal)),
-        }
-    }
-
-    /// One of two sizes: of a run that counts, and of a smoke run.
-    pub fn size<T>(&self, full: T, quick: T) -> T {
-        if self.quick { quick } else { full }
-    }
-
-    /// Does something with what the leader asks for, and gives it back; told what was granted.
-    ///
-    /// # Errors
-    /// Those of the work, and [`BenchError`] if there is no scenario.
-    pub fn in_the_leaders_place<T>(
-        &self,
-        board: &mut Board,
-        work: impl FnOnce(&Privileges) -> Result<T, BenchError>,
-    ) -> Result<T, BenchError> {
-        let cores = sched_getaffinity(None).ok();
-        let place = take_privileges(&self.scenario(&[])?, RoleId::Plant(0));
-        board.granted(place.grants.clone());
-        let done = work(&place);
-        release_priority();
-        // Where it cannot be had back the rest of the suite stays on the leader's core.
-        let _ = cores.map(|cores| sched_setaffinity(None, &cores));
-        done
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::session::resolve;
     use super::*;
+    use crate::config::SHIPPED;
+    use std::sync::atomic::AtomicUsize;
 
     fn with<T>(name: &str, scenarios: &[(&str, &str)], act: impl FnOnce(&mut Bench<'_>) -> T) -> T {
         act(&mut Bench {

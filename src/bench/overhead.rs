@@ -3,8 +3,9 @@
 //!
 //! Counts that do not disturb each other are taken in one run; whoever watches system calls gets a run of its own.
 
+use super::board::Board;
+use super::session::{Bench, BenchError};
 use super::watch::{Process, Watch, status_word};
-use super::{Bench, BenchError, Board};
 use crate::runtime::{RoleId, ports};
 use std::ffi::OsString;
 use std::fs;

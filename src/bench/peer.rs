@@ -3,8 +3,8 @@
 //! Asks for the same privileges as the role whose place it has. Takes its orders as lines of JSON on standard input and
 //! answers on standard output, never while it measures. Dies with its parent.
 
-use super::BenchError;
 use super::exchange::{Opening, Receiver, Sender, Station, Wake, system};
+use super::session::BenchError;
 use crate::bus::domain::Domain;
 use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::config::Scenario;

@@ -3,8 +3,9 @@
 //!
 //! The kernel's own account of each process. Must not ask a process of the run for anything.
 
+use super::board::Board;
+use super::session::{Bench, BenchError};
 use super::watch::{Process, Watch};
-use super::{Bench, BenchError, Board};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use rustix::time::{ClockId, clock_gettime};
 use std::fs;

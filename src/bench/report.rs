@@ -2,7 +2,9 @@
 //!
 //! Must not compute a figure: what is not on the board is not told.
 
-use super::{Bench, Board, Figure, Row, Target, Verdict};
+use super::board::{Board, Figure};
+use super::session::{Bench, Row};
+use super::targets::{Target, Verdict};
 use crate::files;
 use crate::launch::plain;
 use crate::system::utc;

@@ -1,7 +1,8 @@
 //! What a whole run takes: to start, to stop, of memory; beside a bare process and a bare node.
 
+use super::board::Board;
+use super::session::{Bench, BenchError};
 use super::watch::Watch;
-use super::{Bench, BenchError, Board};
 use crate::bus::domain::OwnedDomain;
 use crate::bus::raw::RawNode;
 use crate::system::this_program;

@@ -2,7 +2,7 @@
 //!
 //! Must not measure anything. A target that could not be measured is neither met nor missed, and says so.
 
-use super::Board;
+use super::board::Board;
 use crate::telemetry::Percentiles;
 
 /// Which number of a figure counts.

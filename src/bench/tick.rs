@@ -1,8 +1,9 @@
 //! How late a tick begins: in a run, bare, and by cyclictest, in turn, at the same priority and period on the same core.
 
+use super::board::Board;
 use super::chain::{APART, run_live, stages};
+use super::session::{Bench, BenchError};
 use super::watch::Watch;
-use super::{Bench, BenchError, Board};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::runtime::RoleId;
 use crate::telemetry::{Grant, Latency};

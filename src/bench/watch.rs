@@ -4,7 +4,7 @@
 //! Looks at /proc and at the run's own signals, as any program may. Must not disturb what it watches more than a reader of
 //! these signals does.
 
-use super::{Bench, BenchError};
+use super::session::{Bench, BenchError};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{IoxBus, IoxReader};
 use crate::bus::{Bus, Read, Reader, Signal, WordReader};

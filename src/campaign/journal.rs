@@ -291,6 +291,41 @@ impl Lines<'_> {
     }
 }
 
+impl Table {
+    /// Whether a directory holds the results of a campaign.
+    pub fn is_in(directory: &Path) -> bool {
+        directory.join(FILE).is_file()
+    }
+
+    /// Reads the results of a campaign from its directory, all of them or as many as there are.
+    ///
+    /// # Errors
+    /// [`JournalError`].
+    pub fn read(directory: &Path) -> Result<Self, JournalError> {
+        let mut opened = Reader::open(directory)?;
+        let mut table = opened.head().table.clone();
+        while let Some(entry) = opened.next()? {
+            table.add(entry);
+        }
+        table.rows.sort_by_key(|row| row.case);
+        table.rows.dedup_by_key(|row| row.case);
+        for margin in &mut table.margins {
+            margin.points.sort_by_key(|point| point.case);
+            margin.points.dedup_by_key(|point| point.case);
+        }
+        Ok(table)
+    }
+
+    fn add(&mut self, entry: Entry) {
+        match entry {
+            Entry::Row(row) => self.rows.push(row),
+            Entry::Margin { margin, point } => {
+                self.margins.get_mut(margin).into_iter().for_each(|margin| margin.points.push(point.clone()));
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

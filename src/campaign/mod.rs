@@ -7,6 +7,7 @@ mod apply;
 mod axis;
 mod case;
 mod draw;
+mod error;
 mod file;
 mod journal;
 mod margin;
@@ -18,12 +19,13 @@ mod table;
 #[cfg(test)]
 mod tests;
 
+pub use error::SweepError;
 pub(crate) use file::is_campaign;
 pub use file::{Campaign, Case, Shipped};
 pub use journal::{Entry, JournalError};
 pub(crate) use results::CAMPAIGN;
 pub use results::{Counts, worst};
-pub use sweep::{Collection, NoShard, Shard, Sweep, SweepError, Swept, merge};
+pub use sweep::{Collection, NoShard, Shard, Sweep, Swept, merge};
 pub use table::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic, Table};
 
 /// Version and revision: the results of one campaign come from one build.

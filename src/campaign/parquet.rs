@@ -2,8 +2,7 @@
 //!
 //! A column has the type of its values, and what a row does not have is null. Must not hold more than the rows of one group.
 
-use super::results::{Kind, columns};
-use super::table::{Parameter, Row, Table};
+use super::table::{Kind, Parameter, Row, Table, columns};
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
 use parquet::column::writer::ColumnWriter;
 use parquet::data_type::ByteArray;

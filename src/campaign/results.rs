@@ -2,10 +2,10 @@
 //!
 //! Must not hold the rows: they pass from the journal to the files.
 
+use super::error::SweepError;
 use super::file::Campaign;
 use super::journal::{Entry, Journal};
-use super::sweep::SweepError;
-use super::table::{End, Parameter, Row, Table};
+use super::table::{End, Kind, Parameter, Row, Table, columns};
 use crate::files;
 use serde::Serialize;
 use std::cmp::Reverse;
@@ -24,11 +24,6 @@ const CASES_PARQUET: &str = "cases.parquet";
 const SUMMARY: &str = "summary.json";
 /// Layout version of the summary.
 const SCHEMA: &str = "corotate/sweep/v1";
-/// Columns before the parameters, between them and the metrics, and after these.
-const FIRST: [&str; 2] = ["case", "seed"];
-const VERDICT: [&str; 5] = ["accepted", "verdict", "exit", "reason", "settled_at_s"];
-const LAST: [&str; 8] = ["executed", "missed", "starved", "safe", "lost", "injected", "hash", "predicted_rate_per_s"];
-
 /// What the rows come to.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct Counts {
@@ -159,14 +154,6 @@ pub(super) fn write_file(
     attempt().map_err(|source| SweepError::Write { path: path.to_owned(), source })
 }
 
-/// The names of all columns, in the order of both tables.
-pub(super) fn columns(table: &Table) -> Vec<String> {
-    let owned = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
-    let axes = table.axes.iter().map(|axis| axis.key.clone()).collect();
-    let metrics = table.metrics.iter().map(|metric| metric.name.clone()).collect();
-    [owned(&FIRST), axes, owned(&VERDICT), metrics, owned(&LAST)].concat()
-}
-
 fn record(row: &Row) -> Vec<String> {
     let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
     let mut record = vec![row.case.to_string(), row.seed.to_string()];
@@ -180,35 +167,6 @@ fn record(row: &Row) -> Vec<String> {
     );
     record.extend([row.hash.clone(), number(row.predicted_rate_per_s)]);
     record
-}
-
-/// What the values of an axis have in common.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    Flag,
-    Whole,
-    Number,
-    Word,
-}
-
-impl Kind {
-    fn of(parameter: &Parameter) -> Self {
-        match parameter {
-            Parameter::Flag(_) => Self::Flag,
-            Parameter::Whole(_) => Self::Whole,
-            Parameter::Number(_) => Self::Number,
-            Parameter::Word(_) => Self::Word,
-        }
-    }
-
-    fn with(self, other: Option<Self>) -> Self {
-        match (self, other) {
-            (kind, None) => kind,
-            (kind, Some(other)) if kind == other => kind,
-            (Self::Whole | Self::Number, Some(Self::Whole | Self::Number)) => Self::Number,
-            _ => Self::Word,
-        }
-    }
 }
 
 /// The cases that fared worst and could be run, the worst first: lost or stopped, then not accepted, then those with the largest

@@ -3,13 +3,13 @@
 //! What is done is in the journal before it is counted. Memory follows from the cores and not from the cases, but for eight bytes per
 //! case. Must not do a piece of work twice, nor let the result depend on who did it.
 
+use super::error::SweepError;
 use super::file::Campaign;
-use super::journal::{Entry, FILE, Head, Journal, JournalError, Reader};
+use super::journal::{Entry, FILE, Head, Journal, Reader};
 use super::results::{self, CAMPAIGN, Counts};
 use super::table::{MarginPoint, Row};
-use crate::config::{ClockKind, ConfigError};
+use crate::config::ClockKind;
 use crate::files;
-use crate::system::remedy;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -67,59 +67,6 @@ pub struct Swept {
     pub all: u64,
     /// What is in the tables; none where the sweep was interrupted and they are not written.
     pub counts: Option<Counts>,
-}
-
-/// Why a campaign has no results, or cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum SweepError {
-    /// The journal.
-    #[error(transparent)]
-    Journal(#[from] JournalError),
-    /// The campaign in a directory.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// The directory holds something else.
-    #[error("{} is not empty, and no campaign's; name another directory with --out", path.display())]
-    Foreign {
-        /// The directory.
-        path: PathBuf,
-    },
-    /// A file cannot be written.
-    #[error("{}: {source}; {}", path.display(), remedy(source))]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// Directories that are to be merged are not of one campaign.
-    #[error("{} holds another campaign than {}, or another build's; merge what belongs together", other.display(), first.display())]
-    Mixed {
-        /// The first.
-        first: PathBuf,
-        /// The one that does not belong to it.
-        other: PathBuf,
-    },
-    /// Pieces of work are missing.
-    #[error(
-        "{count} of {all} cases and points of margins are missing, number {first} first; run the shards to their end, and name them all"
-    )]
-    Missing {
-        /// How many.
-        count: u64,
-        /// Of how many.
-        all: u64,
-        /// The first, of the cases and then of the points of margins.
-        first: u64,
-    },
-    /// Two directories tell different things of one case.
-    #[error("{}: its case {case} is another than that of a directory before it; do both machines have the same processor?", path.display())]
-    Disagree {
-        /// The directory.
-        path: PathBuf,
-        /// The case.
-        case: u64,
-    },
 }
 
 impl Shard {

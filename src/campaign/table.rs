@@ -2,10 +2,8 @@
 //!
 //! Plain data, the same in memory, as JSON and in the journal. Must not compute anything.
 
-use super::journal::{self, JournalError};
 use serde::{Deserialize, Serialize};
 use std::fmt;
-use std::path::Path;
 
 /// What came of a campaign, or of as much of it as has been run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -249,43 +247,9 @@ pub struct MarginPoint {
     pub runs: u64,
 }
 
-impl Table {
-    /// Whether a directory holds the results of a campaign.
-    pub fn is_in(directory: &Path) -> bool {
-        directory.join(journal::FILE).is_file()
-    }
-
-    /// Reads the results of a campaign from its directory, all of them or as many as there are.
-    ///
-    /// # Errors
-    /// [`JournalError`].
-    pub fn read(directory: &Path) -> Result<Self, JournalError> {
-        let mut opened = journal::Reader::open(directory)?;
-        let mut table = opened.head().table.clone();
-        while let Some(entry) = opened.next()? {
-            table.add(entry);
-        }
-        table.rows.sort_by_key(|row| row.case);
-        table.rows.dedup_by_key(|row| row.case);
-        for margin in &mut table.margins {
-            margin.points.sort_by_key(|point| point.case);
-            margin.points.dedup_by_key(|point| point.case);
-        }
-        Ok(table)
-    }
-
-    fn add(&mut self, entry: journal::Entry) {
-        match entry {
-            journal::Entry::Row(row) => self.rows.push(row),
-            journal::Entry::Margin { margin, point } => {
-                self.margins.get_mut(margin).into_iter().for_each(|margin| margin.points.push(point.clone()));
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::journal;
     use super::*;
 
     /// A table with something of everything.
@@ -364,5 +328,49 @@ pub(super) mod tests {
         std::fs::write(directory.path().join(journal::FILE), format!("{text}0123456789abcdef {{\"row\"")).unwrap();
         let read = Table::read(directory.path()).unwrap();
         assert_eq!(read, Table { rows: vec![other, table.rows[0].clone()], ..table });
+    }
+}
+
+/// Columns before the parameters, between them and the metrics, and after these.
+const FIRST: [&str; 2] = ["case", "seed"];
+
+const VERDICT: [&str; 5] = ["accepted", "verdict", "exit", "reason", "settled_at_s"];
+
+const LAST: [&str; 8] = ["executed", "missed", "starved", "safe", "lost", "injected", "hash", "predicted_rate_per_s"];
+
+/// The names of all columns, in the order of both tables.
+pub(super) fn columns(table: &Table) -> Vec<String> {
+    let owned = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    let axes = table.axes.iter().map(|axis| axis.key.clone()).collect();
+    let metrics = table.metrics.iter().map(|metric| metric.name.clone()).collect();
+    [owned(&FIRST), axes, owned(&VERDICT), metrics, owned(&LAST)].concat()
+}
+
+/// What the values of an axis have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Flag,
+    Whole,
+    Number,
+    Word,
+}
+
+impl Kind {
+    pub fn of(parameter: &Parameter) -> Self {
+        match parameter {
+            Parameter::Flag(_) => Self::Flag,
+            Parameter::Whole(_) => Self::Whole,
+            Parameter::Number(_) => Self::Number,
+            Parameter::Word(_) => Self::Word,
+        }
+    }
+
+    pub fn with(self, other: Option<Self>) -> Self {
+        match (self, other) {
+            (kind, None) => kind,
+            (kind, Some(other)) if kind == other => kind,
+            (Self::Whole | Self::Number, Some(Self::Whole | Self::Number)) => Self::Number,
+            _ => Self::Word,
+        }
     }
 }

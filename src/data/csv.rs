@@ -1,7 +1,8 @@
 //! Rows of a CSV file, or of what looks like one. Must not hold more of it than a line.
 
 use super::columns::{self, Places};
-use super::{DataError, Meaning, Options, Row, Rows, Stamp};
+use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::stamp::Stamp;
 use csv::{ByteRecord, ErrorKind, Reader, ReaderBuilder, Trim};
 use std::io::{self, Cursor, Read};
 use std::path::{Path, PathBuf};

@@ -2,8 +2,9 @@
 //!
 //! So many samples are read ahead as a rate is chosen from; beyond that, memory grows with the number of segments only.
 
+use super::form::{DataError, Options};
 use super::identification::{LogAccount, sample};
-use super::{DataError, Entry, Log, Options};
+use super::log::{Entry, Log};
 use crate::estimate::{
     FilterKind, RateChoice, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup, Survey,
 };

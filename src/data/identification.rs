@@ -1,6 +1,7 @@
 //! Logs identified: every way of [`identify`](crate::identify) along the rows of files, in bounded memory.
 
-use super::{Counts, DataError, Entry, Log, Meaning, Options};
+use super::form::{DataError, Meaning, Options};
+use super::log::{Counts, Entry, Log};
 use crate::identify::{
     Account, AxesFit, Finding, Motion, Recursive, RecursiveAxisymmetric, RecursiveFit, Sample, TensorFit, findings,
 };

@@ -2,8 +2,9 @@
 //!
 //! Read from its beginning to its end, a record at a time. Must not believe a length that a message tells beyond its bytes.
 
-use super::columns::{RateUnit, TimeUnit};
-use super::{DataError, Meaning, Options, Row, Rows, Stamp};
+use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::stamp::Stamp;
+use super::unit::{RateUnit, TimeUnit};
 use crate::sample::Layout;
 use crate::sample::{FieldKind, VOID};
 use mcap::McapError;

@@ -1,7 +1,9 @@
 //! Rows of a Parquet file: numbers in plain columns, nothing nested. Must not hold more of it than a batch of rows.
 
-use super::columns::{self, Places, TimeUnit};
-use super::{DataError, Meaning, Options, Row, Rows, Stamp};
+use super::columns::{self, Places};
+use super::form::{DataError, Meaning, Options, Row, Rows};
+use super::stamp::Stamp;
+use super::unit::TimeUnit;
 use parquet::basic::{LogicalType, TimeUnit as Unit};
 use parquet::column::reader::ColumnReader;
 use parquet::errors::ParquetError;

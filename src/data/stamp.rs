@@ -1,6 +1,6 @@
 //! Time stamps as files have them. Nanoseconds since 1970 do not fit a 64-bit float: whole part and fraction are kept apart.
 
-use super::TimeUnit;
+use super::unit::TimeUnit;
 
 /// A stamp, in the unit of its column.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,6 +1,6 @@
 use super::*;
 use proptest::prelude::*;
-use std::io::Cursor;
+use std::io::{self, Cursor, Read};
 
 fn log(text: &str, options: &Options) -> Result<Log, DataError> {
     Log::from_csv(Cursor::new(text.as_bytes().to_vec()), "log.csv".as_ref(), options)

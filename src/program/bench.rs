@@ -1,9 +1,10 @@
 //! `corotate bench`: the benchmark, from the rows asked for to a table, JSON and histograms.
 
-use super::role::die_with;
-use super::run::catch_signals;
+use super::output::{Exit, fail, print};
 use super::scenario::load;
-use super::{Exit, fail, print, scenarios};
+use super::shipped::scenarios;
+use super::signals::catch_signals;
+use super::signals::die_with;
 use crate::bench::{Bench, BenchError, Results, Row, run, serve_peer, table, write_results};
 use crate::launch::make_directory;
 use indicatif::ProgressBar;

@@ -1,8 +1,9 @@
 //! `corotate bridge`: a device behind a serial line, in a role's seat.
 
+use super::output::{Exit, fail, say};
 use super::qemu::Board;
-use super::role::{die_with, terminated_by_signals};
-use super::{Exit, fail, runs, say};
+use super::runs;
+use super::signals::{die_with, terminated_by_signals};
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, NodeError, RoleError, Served, run_bridge};
 use crate::system::tell;

@@ -3,7 +3,7 @@
 //! Must not judge what it reads: [`crate::campaign`] does.
 
 use super::scenario::{quoting, text, unknown};
-use super::{campaigns, scenarios};
+use super::shipped::{campaigns, scenarios};
 use crate::campaign::{Campaign, is_campaign};
 use crate::config::{Document, is_name, nearest};
 use std::borrow::Cow;

@@ -1,8 +1,8 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
 use super::campaign;
+use super::output::{Exit, fail, say};
 use super::scenario::{Change, load};
-use super::{Exit, fail, say};
 use crate::analysis::{Claim, apart, claims, digits};
 use crate::campaign::Campaign;
 use crate::config::Scenario;

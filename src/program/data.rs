@@ -1,6 +1,6 @@
 //! What `identify` and `estimate` share: how a log is named, read and told of.
 
-use super::Exit;
+use super::output::Exit;
 use crate::data::{DataError, LogAccount, Options, RateUnit, TimeUnit};
 use std::fmt::Write;
 

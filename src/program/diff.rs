@@ -1,7 +1,8 @@
 //! `corotate diff`: two recordings beside each other.
 
+use super::output::{Exit, fail, harmless, remark, say};
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, remark, runs, say};
+use super::runs;
 use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
 use std::fmt::Write;
 use std::path::PathBuf;

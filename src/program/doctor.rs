@@ -1,9 +1,9 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
 use super::hosts::{self, KeyArguments};
-use super::run::catch_signals;
+use super::output::{Exit, fail, say};
 use super::scenario::{Change, load};
-use super::{Exit, fail, say};
+use super::signals::catch_signals;
 use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
 use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict, left_in_shared_memory, leftovers, refused};
 use crate::hosts::Address;

@@ -1,7 +1,7 @@
 //! `corotate estimate`: the rate about one axis of a body from a log of the other two.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, tell_log};
-use super::{Exit, fail, harmless, say};
+use super::output::{Exit, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
 use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;

@@ -1,6 +1,7 @@
 //! `corotate export`: a recording as tables.
 
-use super::{Exit, fail, record, runs, say};
+use super::output::{Exit, fail, say};
+use super::{record, runs};
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 

@@ -1,6 +1,6 @@
 //! `corotate foxglove`: a running loop on a Foxglove WebSocket, as `corotate run --foxglove` starts it or by hand.
 
-use super::{Exit, fail};
+use super::output::{Exit, fail};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -59,8 +59,8 @@ fn serve(_: &Arguments) -> Exit {
 
 #[cfg(feature = "foxglove")]
 fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
-    use super::role::{die_with, terminated_by_signals};
     use super::runs;
+    use super::signals::{die_with, terminated_by_signals};
     use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
     if let Some(Err(exit)) = parent.map(die_with) {
         return exit;

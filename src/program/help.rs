@@ -3,10 +3,11 @@
 //! Must not describe a command twice: everything is made of the definition by which the command line is read.
 
 use super::color::When;
-use super::{Arguments, Exit, fail, name, say, scenarios};
+use super::output::{Exit, fail, say};
+use super::shipped::{name, scenarios, words_given};
 use crate::files;
 use crate::telemetry::Host;
-use clap::{ColorChoice, CommandFactory, ValueEnum};
+use clap::{ColorChoice, ValueEnum};
 use clap_complete::Shell;
 use std::fmt::Write;
 use std::io;
@@ -51,18 +52,18 @@ const MAN: &str = "\
 Example:
   corotate man ~/.local/share/man/man1 && man corotate-run";
 
-/// The definition of the command line, as it is read.
-pub fn line() -> clap::Command {
-    let line = definition();
+/// Returns the definition of the command line with its help, as it is read.
+pub fn line(definition: clap::Command) -> clap::Command {
+    let line = named(definition);
     let version = format!("{}\n{}", version(), about_build());
     let overview = overview(&line) + OPTIONS;
     // For the rest of the process, which reads its command line once.
     line.long_version(&*version.leak()).help_template(TEMPLATE).after_help(overview).color(asked_color())
 }
 
-/// What of it is the same on every machine.
-fn definition() -> clap::Command {
-    Arguments::command().name(name()).version(version())
+/// Returns the definition with the program's name and version: what of it is the same on every machine.
+fn named(definition: clap::Command) -> clap::Command {
+    definition.name(name()).version(version())
 }
 
 fn version() -> &'static str {
@@ -72,7 +73,7 @@ fn version() -> &'static str {
 
 /// What `--color` asks for. Help is printed while the line is read, so it cannot wait for the result.
 fn asked_color() -> ColorChoice {
-    let words: Vec<String> = super::words_given().iter().map(|word| word.to_string_lossy().into_owned()).collect();
+    let words: Vec<String> = words_given().iter().map(|word| word.to_string_lossy().into_owned()).collect();
     let beside = words.windows(2).find(|pair| pair[0] == "--color").map(|pair| pair[1].as_str());
     let within = || words.iter().find_map(|word| word.strip_prefix("--color="));
     match beside.or_else(within).and_then(|word| When::from_str(word, false).ok()) {
@@ -131,8 +132,8 @@ fn about_build() -> String {
 }
 
 /// Prints the completions for a shell.
-pub fn completions(arguments: &CompletionsArguments) -> Exit {
-    let (all, mut text) = (definition(), Vec::new());
+pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) -> Exit {
+    let (all, mut text) = (named(definition), Vec::new());
     // What help does not tell of is not offered either.
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
     let mut line = clap::Command::new(name()).version(version());
@@ -142,20 +143,20 @@ pub fn completions(arguments: &CompletionsArguments) -> Exit {
 }
 
 /// Writes the manual pages.
-pub fn man(arguments: &ManArguments) -> Exit {
-    match write_pages(arguments) {
+pub fn man(arguments: &ManArguments, definition: clap::Command) -> Exit {
+    match write_pages(arguments, definition) {
         Ok(written) => say(&written).map_or_else(|exit| exit, |()| Exit::Ok),
         Err(error) => fail(Exit::Failure, &format!("{error}; name another directory")),
     }
 }
 
-fn write_pages(ManArguments { directory }: &ManArguments) -> Result<String, String> {
+fn write_pages(ManArguments { directory }: &ManArguments, definition: clap::Command) -> Result<String, String> {
     let failed = |path: &Path| {
         let path = path.display().to_string();
         move |error: io::Error| format!("{path}: {error}")
     };
     files::create_directories(directory).map_err(failed(directory))?;
-    let mut root = definition().disable_help_subcommand(true).after_long_help(OPTIONS);
+    let mut root = named(definition).disable_help_subcommand(true).after_long_help(OPTIONS);
     root.build();
     let commands = root.get_subcommands().filter(|command| !command.is_hide_set());
     let mut written = String::new();

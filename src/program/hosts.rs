@@ -1,7 +1,7 @@
 //! `corotate join`, the relay that it and `corotate run --listen` start, and the options by which hosts find one another.
 
-use super::role::die_with;
-use super::{Exit, fail};
+use super::output::{Exit, fail};
+use super::signals::die_with;
 use crate::hosts::{Address, Endpoint, Keys};
 use std::path::PathBuf;
 
@@ -149,9 +149,10 @@ mod with_hosts {
     use crate::config::Scenario;
     use crate::hosts::{HostSeat, JoinError, NetError, Part, RelayError, RelaySeat, Request, ask_to_join, run_relay};
     use crate::launch::{FarOutcome, Launch, new_domain};
-    use crate::program::role::terminated_by_signals;
-    use crate::program::run::{catch_signals, exit_of};
-    use crate::program::say;
+    use crate::program::output::exit_of;
+    use crate::program::output::say;
+    use crate::program::signals::catch_signals;
+    use crate::program::signals::terminated_by_signals;
     use crate::system::{random_bits, tell};
 
     pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Exit {

@@ -1,7 +1,7 @@
 //! `corotate identify`: a body's inertia from logs of its angular velocity.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
-use super::{Exit, fail, harmless, say};
+use super::output::{Exit, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;

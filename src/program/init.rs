@@ -1,7 +1,8 @@
 //! `corotate init`: print a shipped scenario or campaign, or the list of them.
 
+use super::output::{Exit, fail, say};
 use super::scenario::{title, unknown};
-use super::{Exit, campaigns, fail, say, scenarios};
+use super::shipped::{campaigns, scenarios};
 
 /// Layout version of the list.
 const SCHEMA: &str = "corotate/scenarios/v1";

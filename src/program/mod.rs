@@ -22,6 +22,7 @@ mod hosts;
 mod identify;
 mod init;
 mod new;
+mod output;
 mod qemu;
 mod record;
 mod replay;
@@ -32,6 +33,8 @@ mod runs;
 mod scenario;
 mod schema;
 mod seat;
+mod shipped;
+mod signals;
 mod sweep;
 mod watch;
 
@@ -39,17 +42,18 @@ use crate::bench::Row;
 use crate::bus::domain::Domain;
 use crate::panics;
 use crate::rig::{Rig, RigKind, register};
-use crate::system::remedy;
-use clap::{FromArgMatches, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use color::When;
 use help::WIDTH;
+use output::{Exit, fail, remark};
+use shipped::{CAMPAIGNS, SCENARIOS, WORDS, words_given};
 use std::ffi::OsString;
 use std::fs::File;
-use std::io::{self, Write};
+use std::io;
 use std::os::fd::AsFd;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Bodies move together although not everything about them can be measured.
@@ -140,76 +144,6 @@ struct JanitorArguments {
     limit_s: f64,
 }
 
-/// What the process says to its parent.
-#[derive(Clone, Copy)]
-enum Exit {
-    Ok,
-    Failure,
-    Usage,
-    NotAccepted,
-    ProcessLost,
-    PrivilegeMissing,
-    Signal(usize),
-}
-
-impl Exit {
-    fn code(self) -> u8 {
-        match self {
-            Self::Ok => 0,
-            Self::Failure => 1,
-            Self::Usage => 2,
-            Self::NotAccepted => 3,
-            Self::ProcessLost => 4,
-            Self::PrivilegeMissing => 5,
-            Self::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
-        }
-    }
-}
-
-/// Prints an error, one paragraph per line of it, and gives the exit code.
-fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
-    remark(error);
-    exit
-}
-
-/// Prints what there is to be said beside the results.
-fn remark(text: &dyn std::fmt::Display) {
-    for line in harmless(&text.to_string()).lines() {
-        // Without a stderr the exit code is all there is to say.
-        let _ = writeln!(io::stderr(), "corotate: {line}");
-    }
-}
-
-/// A text that may come from a file, as it may stand on a terminal: what would command it, or turn the order of letters, is
-/// shown by its number.
-fn harmless(text: &str) -> String {
-    let shown = |letter: char| match letter {
-        '\n' => letter.to_string(),
-        '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
-            letter.escape_unicode().to_string()
-        }
-        _ if letter.is_control() => letter.escape_unicode().to_string(),
-        _ => letter.to_string(),
-    };
-    text.chars().map(shown).collect()
-}
-
-/// Prints to stdout, or says why not. A reader that has had enough and is gone, as `head`, is no error.
-fn print(text: &str) -> Result<(), String> {
-    let mut stdout = io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-            Err(format!("cannot write to stdout: {error}; {}", remedy(&error)))
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Prints to stdout; where that fails, says so and gives the exit code.
-fn say(text: &str) -> Result<(), Exit> {
-    print(text).map_err(|reason| fail(Exit::Failure, &reason))
-}
-
 /// A program that runs rigs: its launcher, its roles and its tools.
 ///
 /// ```no_run
@@ -280,7 +214,8 @@ impl Program {
     pub fn obey(self, words: Vec<OsString>) -> u8 {
         let _ = WORDS.set(words);
         self.begin();
-        let arguments = Arguments::from_arg_matches_mut(&mut help::line().get_matches_from(words_given()));
+        let arguments =
+            Arguments::from_arg_matches_mut(&mut help::line(Arguments::command()).get_matches_from(words_given()));
         let Arguments { command, color } = arguments.unwrap_or_else(|error| error.exit());
         color::choose(color);
         // A user's rig may panic, and iceoryx2 does where the system does what it holds impossible; the hook has told it. What
@@ -317,36 +252,6 @@ struct BenchArguments {
     bench: bench::Arguments,
 }
 
-static SCENARIOS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
-
-/// The scenarios that ship with this program.
-fn scenarios() -> &'static [(&'static str, &'static str)] {
-    SCENARIOS.get().map_or(&[], Vec::as_slice)
-}
-
-static CAMPAIGNS: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
-
-/// The campaigns that ship with this program.
-fn campaigns() -> &'static [(&'static str, &'static str)] {
-    CAMPAIGNS.get().map_or(&[], Vec::as_slice)
-}
-
-/// What the program was called with.
-static WORDS: OnceLock<Vec<OsString>> = OnceLock::new();
-
-fn words_given() -> &'static [OsString] {
-    WORDS.get().map_or(&[], Vec::as_slice)
-}
-
-/// How this program is called.
-fn name() -> &'static str {
-    static NAME: OnceLock<String> = OnceLock::new();
-    NAME.get_or_init(|| {
-        let file = words_given().first().map(Path::new).and_then(Path::file_name);
-        file.map_or("corotate".into(), |name| name.to_string_lossy().into_owned())
-    })
-}
-
 /// Does what the command line asks for.
 fn obey(command: Option<Command>) -> Exit {
     match command {
@@ -375,8 +280,8 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
         Some(Command::Bench(arguments)) => bench::bench(&arguments, crate::bench::ROWS),
         Some(Command::Schema(arguments)) => schema::schema(&arguments),
-        Some(Command::Completions(arguments)) => help::completions(&arguments),
-        Some(Command::Man(arguments)) => help::man(&arguments),
+        Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
+        Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
         Some(Command::Emulate(arguments)) => qemu::emulate(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),

@@ -1,6 +1,6 @@
 //! `corotate new`: a crate of one's own to start from, the one of `examples/motor-pair` under another name.
 
-use super::{Exit, fail, say};
+use super::output::{Exit, fail, say};
 use crate::files::{create_directories, write};
 use std::io;
 use std::path::{Path, PathBuf};

@@ -2,8 +2,8 @@
 //!
 //! Must not know the protocol; `bridge` opens the pty like any other line.
 
-use super::role::die_with;
-use super::{Exit, fail};
+use super::output::{Exit, fail};
+use super::signals::die_with;
 use crate::system::this_program;
 use std::io::{self, BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt;

@@ -1,7 +1,8 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
-use super::role::{die_with, terminated_by_signals};
-use super::{Exit, fail, remark, runs, say};
+use super::output::{Exit, fail, remark, say};
+use super::runs;
+use super::signals::{die_with, terminated_by_signals};
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};

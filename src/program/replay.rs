@@ -1,7 +1,8 @@
 //! `corotate replay`: a recording through the live roles.
 
+use super::output::{Exit, fail, harmless, say};
 use super::record::{exit_of, exit_with, open};
-use super::{Exit, fail, harmless, runs, say};
+use super::runs;
 use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
@@ -63,7 +64,7 @@ pub fn replay(arguments: &Arguments) -> Exit {
             }
         }
         Err(LaunchError::Record(error)) => fail(exit_of(&error), &error),
-        Err(error) => fail(super::run::exit_of(&error), &error),
+        Err(error) => fail(super::output::exit_of(&error), &error),
     }
 }
 
@@ -78,7 +79,7 @@ fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleRepla
             .collect::<Result<_, _>>()?);
     }
     let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
-    let signal = super::run::catch_signals().map_err(spawn)?;
+    let signal = super::signals::catch_signals().map_err(spawn)?;
     let mut replays = Vec::new();
     for role in roles {
         replays.push(replay_as_process(recording, &scenario, role, &signal)?);

@@ -1,7 +1,8 @@
 //! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
 
+use super::output::{Exit, fail, remark, say};
 use super::record;
-use super::{Exit, fail, remark, runs, say};
+use super::runs;
 use crate::campaign::JournalError;
 use crate::report::{ReportError, report as compose, report_pair};
 use indicatif::ProgressBar;

@@ -1,13 +1,10 @@
 //! `corotate plant|observer|controller`: one role, as the launcher starts it.
 
-use super::run::not_caught;
-use super::{Exit, fail, runs};
+use super::output::{Exit, fail};
+use super::runs;
+use super::signals::{die_with, terminated_by_signals};
 use crate::runtime::{RoleError, RoleSeat, run_role};
-use crate::system::remedy;
-use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 /// Options of every role.
 #[derive(clap::Args)]
@@ -60,29 +57,5 @@ pub fn role(name: &str, arguments: &Arguments) -> Exit {
             );
             fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
         }
-    }
-}
-
-/// A flag that the signals which ask a process to end set.
-pub fn terminated_by_signals() -> Result<Arc<AtomicBool>, Exit> {
-    let terminated = Arc::new(AtomicBool::new(false));
-    for signal in [SIGTERM, SIGINT] {
-        signal_hook::flag::register(signal, terminated.clone())
-            .map_err(|error| fail(Exit::Failure, &not_caught(error)))?;
-    }
-    Ok(terminated)
-}
-
-/// Asks the kernel to kill this process when its parent dies.
-pub fn die_with(parent: i32) -> Result<(), Exit> {
-    use rustix::process::{Signal, getppid, set_parent_process_death_signal};
-    set_parent_process_death_signal(Some(Signal::KILL)).map_err(|error| {
-        let error = std::io::Error::from(error);
-        fail(Exit::Failure, &format!("cannot be bound to the launcher's life: {error}; {}", remedy(&error)))
-    })?;
-    // The parent may have died before the request.
-    match getppid() {
-        Some(pid) if pid.as_raw_nonzero().get() == parent => Ok(()),
-        _ => Err(fail(Exit::Failure, &"the launcher is gone; start the run again")),
     }
 }

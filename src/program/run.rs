@@ -2,27 +2,27 @@
 
 use super::campaign;
 use super::color::{Color, paint};
+use super::foxglove;
 use super::hosts::{self, KeyArguments};
+use super::output::{Exit, exit_of, fail, print, remark};
 use super::scenario::{Change, changed, load, stem};
-use super::{Exit, fail, foxglove, name, print, remark};
+use super::shipped::name;
+use super::signals::catch_signals;
 use crate::config::{ClockKind, RunId, Scenario};
 use crate::doctor::Machine;
 use crate::files;
 use crate::hosts::{Address, HostSeat};
 use crate::launch::{
-    Action, Launch, LaunchError, Outcome, Progress, ResultsError, Summary, check_cores, claim, junit, make_directory,
-    make_latest, new_run, table, tick_words, write_run,
+    Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, junit, make_directory, make_latest,
+    new_run, table, tick_words, write_run,
 };
 use crate::runtime::{priority_remedy, refused_priority, seat_path};
-use crate::system::{remedy, tell};
+use crate::system::tell;
 use indicatif::{ProgressBar, ProgressStyle};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::collections::BTreeMap;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::AtomicUsize;
 use std::time::SystemTime;
 
 /// Options of `corotate run`.
@@ -428,38 +428,6 @@ const NOT_JUDGED: (&str, Color) = ("NOT JUDGED", Color::Yellow);
 fn counted(count: usize, one: &str, many: &str) -> String {
     let text = if count == 1 { format!("1 criterion {one}") } else { format!("{count} criteria {many}") };
     text.trim_end().to_owned()
-}
-
-/// The exit code of a run, or a replay, that failed.
-pub fn exit_of(error: &LaunchError) -> Exit {
-    match error {
-        LaunchError::Died { .. } | LaunchError::StartUp { .. } | LaunchError::Hung { .. } => Exit::ProcessLost,
-        LaunchError::Privileges { .. } => Exit::PrivilegeMissing,
-        LaunchError::NotStepped { .. } | LaunchError::Cores { .. } => Exit::Usage,
-        LaunchError::Domain(_)
-        | LaunchError::Descriptors { .. }
-        | LaunchError::Bus(_)
-        | LaunchError::Node(_)
-        | LaunchError::Panicked { .. }
-        | LaunchError::Ledger(_)
-        | LaunchError::Write { .. }
-        | LaunchError::Record(_)
-        | LaunchError::Spawn { .. } => Exit::Failure,
-    }
-}
-
-/// A signal cannot be caught: the system's error with what to do.
-pub fn not_caught(error: io::Error) -> io::Error {
-    io::Error::new(error.kind(), format!("cannot catch signals: {error}; {}", remedy(&error)))
-}
-
-/// The number of the signal that asked for the end, once one has.
-pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
-    let signal = Arc::new(AtomicUsize::new(0));
-    for number in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
-    }
-    Ok(signal)
 }
 
 /// Tells programs of one thing that happened: a line of JSON.

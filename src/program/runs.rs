@@ -2,7 +2,8 @@
 //!
 //! Must not follow a link of another user.
 
-use super::{Exit, fail, name};
+use super::output::{Exit, fail};
+use super::shipped::name;
 use crate::bus::domain::Domain;
 use crate::files::{self, Directory};
 use crate::launch::{LATEST, RECORDING, RUNS};

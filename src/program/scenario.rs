@@ -2,7 +2,7 @@
 //!
 //! Must not judge what it reads: [`crate::config`] does.
 
-use super::{campaigns, name, scenarios};
+use super::shipped::{campaigns, name, scenarios};
 use crate::campaign::{Shipped, is_campaign};
 use crate::config::{ConfigError, Document, Scenario, is_name, nearest, read_text};
 use std::borrow::Cow;

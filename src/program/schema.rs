@@ -1,6 +1,7 @@
 //! `corotate schema`: what a scenario may say, for editors.
 
-use super::{Exit, name, say, scenarios};
+use super::output::{Exit, say};
+use super::shipped::{name, scenarios};
 
 /// Options of `corotate schema`.
 #[derive(clap::Args)]

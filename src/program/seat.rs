@@ -1,7 +1,8 @@
 //! `corotate seat`: what a foreign program must know to take a role's seat.
 
+use super::output::{Exit, fail, say};
+use super::runs;
 use super::scenario::{Change, load};
-use super::{Exit, fail, runs, say};
 use crate::config::ClockKind;
 use crate::runtime::{RoleError, RoleId, describe_seat, join_run};
 use crate::system::tell;

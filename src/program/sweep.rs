@@ -1,8 +1,8 @@
 //! `corotate sweep`: a campaign from file to table.
 
 use super::campaign;
-use super::run::catch_signals;
-use super::{Exit, fail, print, remark};
+use super::output::{Exit, fail, print, remark};
+use super::signals::catch_signals;
 use crate::campaign::{
     Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
 };

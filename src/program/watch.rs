@@ -1,7 +1,8 @@
 //! `corotate watch`: a screen on a running loop.
 
-use super::run::catch_signals;
-use super::{Exit, fail, runs, say};
+use super::output::{Exit, fail, say};
+use super::runs;
+use super::signals::catch_signals;
 use crate::sample::RoleState;
 use crate::watch::{Model, RoleLine, Session, WatchError, show, text};
 use std::collections::BTreeMap;

@@ -4,8 +4,8 @@
 //! alone, and every value that reaches it has gone through [`Columns`].
 
 use super::axis::Axis;
-use super::columns::{Column, Columns, Corners, Extremes};
-use super::frame::{BOTTOM, Frame, HEIGHT, LEFT, RIGHT, TOP, WIDE, WIDTH};
+use super::columns::{Column, Columns, Extremes};
+use super::frame::{BOTTOM, Frame, HEIGHT, LEFT, Line, RIGHT, TOP, WIDE, WIDTH};
 use super::html::escape;
 use std::fmt::Write;
 
@@ -18,19 +18,6 @@ const LETTER: f64 = 5.6;
 const SQUARE: f64 = 420.0;
 /// The darkest shade of a strip; 0 is the lightest.
 pub const SHADES: usize = 8;
-
-/// A line of a picture.
-#[derive(Debug, Clone)]
-pub struct Line {
-    /// Its classes: a colour and a dash pattern, see the page's style.
-    pub class: &'static str,
-    /// What it is, for the legend.
-    pub label: String,
-    /// Its parts, in the units of the axes.
-    pub parts: Vec<Vec<(f64, f64)>>,
-    /// Where it begins is marked by a dot.
-    pub dot: bool,
-}
 
 /// A picture with what its legend says.
 #[derive(Debug, Clone)]
@@ -87,40 +74,6 @@ pub struct Marks {
     pub missing: Vec<(f64, f64)>,
     /// From when to when an estimate lacked something.
     pub unseen: Vec<(f64, f64)>,
-}
-
-impl Line {
-    /// A signal's extremes over time: within a column it goes from one to the other.
-    pub fn of(class: &'static str, label: &str, columns: &Columns<Extremes>, tick_s: f64) -> Self {
-        let (mut parts, mut part, mut before) = (Vec::new(), Vec::new(), f64::NAN);
-        for (tick, extremes) in columns.iter() {
-            if extremes.is_empty() {
-                parts.extend((!part.is_empty()).then(|| std::mem::take(&mut part)));
-                continue;
-            }
-            let time = (tick as f64 + 0.5 * (columns.stride() - 1) as f64) * tick_s;
-            let mut ends = [extremes.min, extremes.max];
-            // The nearer end first, so that a line is no thicker than the signal.
-            if (before - extremes.max).abs() < (before - extremes.min).abs() {
-                ends.reverse();
-            }
-            part.extend(ends.map(|value| (time, value)));
-            before = ends[1];
-        }
-        parts.extend((!part.is_empty()).then_some(part));
-        Self { class, label: label.to_owned(), parts, dot: false }
-    }
-
-    /// A path in a plane.
-    pub fn path(class: &'static str, label: &str, columns: &Columns<Corners>) -> Self {
-        let points = columns.iter().flat_map(|(_, corners)| corners.points()).collect();
-        Self { class, label: label.to_owned(), parts: vec![points], dot: true }
-    }
-
-    /// A line through some points.
-    pub fn through(class: &'static str, label: &str, points: Vec<(f64, f64)>) -> Self {
-        Self { class, label: label.to_owned(), parts: vec![points], dot: false }
-    }
 }
 
 /// Least and greatest of all values of some columns; only positive ones if `positive`.

@@ -2,7 +2,7 @@
 //!
 //! It is computed here, in one thread. Must not be told as if it had been measured.
 
-use super::ReportError;
+use super::error::ReportError;
 use super::traces::{Traces, trace};
 use crate::config::Scenario;
 use crate::launch::{Launch, run};

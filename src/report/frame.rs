@@ -3,7 +3,7 @@
 //! Must not know what a picture is of.
 
 use super::axis::Axis;
-use super::chart::Line;
+use super::columns::{Columns, Corners, Extremes};
 use super::html::escape;
 use std::fmt::Write;
 
@@ -156,5 +156,52 @@ impl Frame {
             let (at_x, at_y, class) = (self.x(x, first.0), self.y(y, first.1), line.class);
             let _ = write!(svg, "<circle class=\"dot {class}\" cx=\"{at_x:.1}\" cy=\"{at_y:.1}\" r=\"4\"/>");
         }
+    }
+}
+
+/// A line of a picture.
+#[derive(Debug, Clone)]
+pub struct Line {
+    /// Its classes: a colour and a dash pattern, see the page's style.
+    pub class: &'static str,
+    /// What it is, for the legend.
+    pub label: String,
+    /// Its parts, in the units of the axes.
+    pub parts: Vec<Vec<(f64, f64)>>,
+    /// Where it begins is marked by a dot.
+    pub dot: bool,
+}
+
+impl Line {
+    /// A signal's extremes over time: within a column it goes from one to the other.
+    pub fn of(class: &'static str, label: &str, columns: &Columns<Extremes>, tick_s: f64) -> Self {
+        let (mut parts, mut part, mut before) = (Vec::new(), Vec::new(), f64::NAN);
+        for (tick, extremes) in columns.iter() {
+            if extremes.is_empty() {
+                parts.extend((!part.is_empty()).then(|| std::mem::take(&mut part)));
+                continue;
+            }
+            let time = (tick as f64 + 0.5 * (columns.stride() - 1) as f64) * tick_s;
+            let mut ends = [extremes.min, extremes.max];
+            // The nearer end first, so that a line is no thicker than the signal.
+            if (before - extremes.max).abs() < (before - extremes.min).abs() {
+                ends.reverse();
+            }
+            part.extend(ends.map(|value| (time, value)));
+            before = ends[1];
+        }
+        parts.extend((!part.is_empty()).then_some(part));
+        Self { class, label: label.to_owned(), parts, dot: false }
+    }
+
+    /// A path in a plane.
+    pub fn path(class: &'static str, label: &str, columns: &Columns<Corners>) -> Self {
+        let points = columns.iter().flat_map(|(_, corners)| corners.points()).collect();
+        Self { class, label: label.to_owned(), parts: vec![points], dot: true }
+    }
+
+    /// A line through some points.
+    pub fn through(class: &'static str, label: &str, points: Vec<(f64, f64)>) -> Self {
+        Self { class, label: label.to_owned(), parts: vec![points], dot: false }
     }
 }

@@ -3,7 +3,8 @@
 //! Of every segment a bounded number of points is kept, and of a log a bounded number of segments. Must not hide which.
 
 use super::axis::Axis;
-use super::chart::{Line, Picture, plain};
+use super::chart::{Picture, plain};
+use super::frame::Line;
 use super::model::{Block, Model, Section};
 use super::page::page;
 use crate::estimate::SegmentScore;

@@ -9,7 +9,8 @@
 //! | `hidden` | another page: the hidden component of a log |
 //! | `counterpart` | the run that an orbit's is compared with |
 //! | `percentiles` | latency distributions as curves |
-//! | `model` | what is shown, in which order |
+//! | `model` | what a page is made of: sections of facts, tables and figures |
+//! | `single` | what is shown of a run, in which order |
 //! | `pair` | the same for two runs over each other |
 //! | `pictures` | which pictures the samples give |
 //! | `tables` | the tables of the summary |
@@ -24,6 +25,7 @@ mod campaign;
 mod chart;
 mod columns;
 mod counterpart;
+mod error;
 mod frame;
 mod hidden;
 mod html;
@@ -32,115 +34,18 @@ mod page;
 mod pair;
 mod percentiles;
 mod pictures;
+mod single;
 mod source;
 mod summary;
 mod tables;
 mod traces;
 
+pub use error::ReportError;
 pub use hidden::{HiddenFacts, HiddenPage};
 
-use crate::campaign::{JournalError, Table};
-use crate::config::{ConfigError, RunId};
-use crate::record::RecordError;
+use crate::campaign::Table;
 use source::Source;
-use std::io;
-use std::path::{Path, PathBuf};
-
-/// Why there is no report.
-#[derive(Debug, thiserror::Error)]
-pub enum ReportError {
-    /// There is no such file or directory.
-    #[error("{} does not exist; give the directory of a run, or its run.mcap", path.display())]
-    Nothing {
-        /// What was given.
-        path: PathBuf,
-    },
-    /// The directory is no run's.
-    #[error(
-        "{} has neither summary.json nor run.mcap; give the directory that `corotate run` named at its end",
-        path.display()
-    )]
-    NoRun {
-        /// The directory.
-        path: PathBuf,
-    },
-    /// A file cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The summary is none of this version's.
-    #[error("{} is no summary that can be shown: {reason}; use the version that wrote it", path.display())]
-    Summary {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// A latency distribution is none.
-    #[error("{} is no percentile distribution: {reason}; remove it, or run again", path.display())]
-    Latency {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The directory holds files of two runs.
-    #[error(
-        "{} is of {} and {} of {}: a page shows one run; remove the files of one, or give its run.mcap alone",
-        files[0].0.display(), named(files[0].1), files[1].0.display(), named(files[1].1)
-    )]
-    TwoRuns {
-        /// Two of them, each with its run.
-        files: Box<[(PathBuf, Option<RunId>); 2]>,
-    },
-    /// The scenario is refused.
-    #[error("the run's scenario is refused by this version: {0}")]
-    Scenario(#[from] ConfigError),
-    /// The recording cannot be used.
-    #[error(transparent)]
-    Record(#[from] RecordError),
-    /// The results of a campaign cannot be read.
-    #[error(transparent)]
-    Campaign(#[from] JournalError),
-    /// A campaign has a page of its own.
-    #[error("{} holds a campaign, which is shown alone and has no fields; give it without {with}", path.display())]
-    CampaignWith {
-        /// The directory.
-        path: PathBuf,
-        /// What it was given with.
-        with: &'static str,
-    },
-    /// There is no such field.
-    #[error("the recording shows no field `{name}`; it has: {known}")]
-    Field {
-        /// As given.
-        name: String,
-        /// Those there are.
-        known: String,
-    },
-    /// The run to compare with failed.
-    #[error("the same motion with full state, for comparison, failed: {reason}")]
-    Counterpart {
-        /// Why.
-        reason: String,
-    },
-    /// The page cannot be written.
-    #[error("cannot write {}: {source}; name another file with --out", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-}
-
-fn named(run: Option<RunId>) -> String {
-    run.map_or("a run without an identifier".to_owned(), |run| format!("run {run}"))
-}
+use std::path::Path;
 
 /// A page.
 #[derive(Debug)]
@@ -208,7 +113,7 @@ pub fn report(path: &Path, shown: &[String]) -> Result<Report, ReportError> {
         return campaign(path, shown);
     }
     let source = Source::open(path)?;
-    let model = model::model(&source, shown)?;
+    let model = single::model(&source, shown)?;
     let damaged = source.recording.as_ref().is_some_and(|recording| recording.damage().is_some());
     Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged })
 }

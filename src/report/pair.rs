@@ -2,10 +2,11 @@
 //!
 //! Must not judge which of them is better.
 
-use super::ReportError;
 use super::axis::Axis;
-use super::chart::{Line, Marks, Picture, Size, marks, over_time, over_time_in, plane, range};
+use super::chart::{Marks, Picture, Size, marks, over_time, over_time_in, plane, range};
 use super::columns::{Columns, Extremes};
+use super::error::ReportError;
+use super::frame::Line;
 use super::model::{Block, Model, Section, latency_section};
 use super::percentiles::{Curve, pictures};
 use super::pictures::{by_unit, error_axis};

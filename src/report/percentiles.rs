@@ -1,7 +1,8 @@
 //! Latency distributions as curves over 1/(1 − p), from HdrHistogram's text form, and their pictures.
 
 use super::axis::Axis;
-use super::chart::{Line, Picture, plain};
+use super::chart::{Picture, plain};
+use super::frame::Line;
 use crate::config::RunId;
 
 /// The stages in the order in which they are shown, and what each is.

@@ -1,9 +1,10 @@
 //! Which pictures the samples of a run give: motion, errors, V, and how late what was sent.
 
-use super::ReportError;
 use super::axis::Axis;
-use super::chart::{Line, Picture, SHADES, Size, over_time, over_time_in, plain_in, plane, range, strip};
+use super::chart::{Picture, SHADES, Size, over_time, over_time_in, plain_in, plane, range, strip};
 use super::columns::{Columns, Extremes};
+use super::error::ReportError;
+use super::frame::Line;
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces};

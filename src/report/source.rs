@@ -2,7 +2,7 @@
 //!
 //! Must not guess: a file that is there and cannot be read is an error.
 
-use super::ReportError;
+use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
 use super::summary::Summary;
 use crate::config::{ClockKind, RunId, Scenario};

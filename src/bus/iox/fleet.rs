@@ -1,6 +1,8 @@
 //! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
 
-use super::{Connections, IoxBus, Ipc, buffer_size, cause};
+use super::cause;
+use super::opening::{Connections, IoxBus};
+use super::service::{Ipc, buffer_size, is_written, writer};
 use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Reader, Topic, Write, WriterProcess};
 use crate::sample::{FleetLayout, FleetSample};
@@ -159,11 +161,11 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     }
 
     fn written(&self) -> bool {
-        super::is_written(&self.service)
+        is_written(&self.service)
     }
 
     fn writer(&self) -> Option<WriterProcess> {
-        super::writer(&self.service)
+        writer(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

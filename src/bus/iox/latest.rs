@@ -5,7 +5,9 @@
 //! blackboard that its writer died on cannot be written again while anybody reads it, so each generation of a writer has
 //! one of its own.
 
-use super::{Ipc, MAX_NODES, MAX_READERS, Refusal, Topic, Wire};
+use super::opening::Refusal;
+use super::service::{Ipc, MAX_NODES, MAX_READERS, Wire};
+use crate::bus::Topic;
 use crate::sample::Sample;
 use iceoryx2::node::Node;
 use iceoryx2::port::reader::{BlackboardValue, EntryHandle};

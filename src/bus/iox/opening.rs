@@ -1,11 +1,15 @@
-//! What keeps an end from being opened, and whether it may pass.
+//! A node in a run's domain, what keeps an end of a signal from being opened there, and whether that may pass.
 //!
 //! Must not wait longer than it is told to, nor clean up after anybody.
 
-use super::{IoxBus, Ipc, cause, config};
-use crate::bus::{BusError, Topic};
+use super::cause;
+use super::service::{Ipc, config};
+use crate::bus::domain::Domain;
+use crate::bus::notifier::Notifiers;
+use crate::bus::{BusError, Depths, Topic};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::type_name_of;
+use iceoryx2::node::Node;
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
@@ -17,6 +21,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 use iceoryx2::service::messaging_pattern::MessagingPattern;
 use iceoryx2::service::static_config::messaging_pattern::MessagingPattern as PatternDetails;
 use std::fmt;
+use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -24,6 +29,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const VACATE_NS: u64 = 2_000_000_000;
 /// Between two attempts at an opening, ns.
 const RETRY_NS: u64 = 20_000_000;
+
+/// A node in a run's domain.
+pub struct IoxBus {
+    pub(super) node: Rc<Node<Ipc>>,
+    pub(super) notifiers: Notifiers,
+    pub(super) depths: Depths,
+    /// Whether a signal that nobody has opened yet is made.
+    pub(super) makes: bool,
+    pub(super) domain: Domain,
+    /// For how long an opening tries again, ns.
+    pub(super) opening_ns: u64,
+}
 
 impl IoxBus {
     /// Opens something, again and again while what is in the way may pass. A signal to this process only breaks off an

@@ -1,7 +1,8 @@
 //! The links of single bodies over shared memory: samples of one size, by a queue, and the newest by its lane too.
 
+use super::cause;
 use super::latest::{LatestReader, LatestWriter};
-use super::{Ipc, Wire, cause, is_written};
+use super::service::{Ipc, Wire, is_written, writer};
 use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Topic, Write, WriterProcess};
 use crate::sample::{Sample, VOID};
@@ -231,7 +232,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn writer(&self) -> Option<WriterProcess> {
-        super::writer(&self.service)
+        writer(&self.service)
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {

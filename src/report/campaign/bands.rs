@@ -10,8 +10,8 @@ use super::shades::{by_factors, range};
 use super::spread::Cells;
 use crate::campaign::Row;
 use crate::report::axis::Axis;
-use crate::report::chart::{Line, Picture};
-use crate::report::frame::{Frame, LEFT, RIGHT, TOP, WIDE, WIDTH};
+use crate::report::chart::Picture;
+use crate::report::frame::{Frame, LEFT, Line, RIGHT, TOP, WIDE, WIDTH};
 use crate::report::html::escape;
 use std::fmt::Write;
 

@@ -2,7 +2,8 @@
 //!
 //! A border lies between two cells, never within one. Must not smooth or fill in: a cell without a case is empty.
 
-use super::facts::{Facts, claimed_share, few, quantile, share};
+use super::facts::{Facts, claimed_share, quantile, share};
+use super::number::few;
 use super::shades::Shades;
 use super::spread::{Cells, Spread};
 use crate::campaign::Row;

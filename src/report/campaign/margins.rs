@@ -7,8 +7,8 @@ use super::shades::{by_factors, range};
 use crate::analysis::digits;
 use crate::campaign::{Find, Margin, MarginPoint};
 use crate::report::axis::Axis;
-use crate::report::chart::{Line, Picture};
-use crate::report::frame::{Frame, LEFT, RIGHT, TOP, WIDTH};
+use crate::report::chart::Picture;
+use crate::report::frame::{Frame, LEFT, Line, RIGHT, TOP, WIDTH};
 use crate::report::model::{Block, Section};
 use std::fmt::Write;
 

@@ -6,6 +6,7 @@
 //! | `spread` | how the values of an axis lie, and its cells |
 //! | `shades` | classes of values, and their scale |
 //! | `map`, `scatter`, `bands` | two axes, cases as points, one axis |
+//! | `number` | numbers in few digits |
 //! | `margins`, `tables` | margins; everything in rows |
 //!
 //! Must not judge a case: verdicts are those of its row. Must not show a number that no row has, but for counts of rows.
@@ -14,6 +15,7 @@ mod bands;
 mod facts;
 mod map;
 mod margins;
+mod number;
 mod scatter;
 mod shades;
 mod spread;
@@ -144,7 +146,7 @@ fn maps(facts: &Facts<'_>, map: &Map<'_>, over: &str) -> Vec<(super::chart::Pict
     let cases = if map.most() > 1 { format!("; a cell has up to {} cases{over}", map.most()) } else { String::new() };
     let limit = facts
         .limit
-        .map_or(String::new(), |limit| format!("; the bar across the scale is the limit, {}", facts::few(limit)));
+        .map_or(String::new(), |limit| format!("; the bar across the scale is the limit, {}", number::few(limit)));
     let values: Vec<f64> = map.values().collect();
     let shares = Shades::of_shares();
     // Without a finite value there is still what was lost.

@@ -2,7 +2,8 @@
 //!
 //! Must not leave out a case silently: of more cases than can be told apart there are maps instead.
 
-use super::facts::{Facts, few};
+use super::facts::Facts;
+use super::number::few;
 use super::shades::Shades;
 use crate::campaign::Row;
 use crate::report::chart::Picture;

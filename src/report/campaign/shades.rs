@@ -2,7 +2,7 @@
 //!
 //! Must not invent a value between two classes: a shade is a range that is written beside it.
 
-use super::facts::few;
+use super::number::few;
 use crate::report::axis::power_of_ten;
 use crate::report::chart::SHADES;
 use crate::report::frame::Frame;

@@ -2,7 +2,7 @@
 //!
 //! Must not know what is measured.
 
-use super::facts::few;
+use super::number::few;
 use crate::campaign::{AxisKind, Parameter, Table};
 use crate::report::axis::Axis;
 

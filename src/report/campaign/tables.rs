@@ -2,7 +2,8 @@
 //!
 //! Must not hide how much is left out.
 
-use super::facts::{Facts, claimed, few, quantile, ran, value};
+use super::facts::{Facts, claimed, quantile, ran, value};
+use super::number::few;
 use super::spread::shown;
 use crate::analysis::digits;
 use crate::campaign::{AxisKind, End, Row};

@@ -1,6 +1,7 @@
 //! Pages of small tables: every number on them is a row's, and strange tables make pages too.
 
-use super::facts::{Facts, few, quantile};
+use super::facts::{Facts, quantile};
+use super::number::few;
 use super::*;
 use crate::campaign::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic};
 use crate::report::page::{figures, page};

@@ -1,0 +1,258 @@
+//! A log, read row by row: which form of file it is, what is left out, and where a segment begins.
+
+use super::form::{DataError, Meaning, Options, Row, Rows};
+#[cfg(feature = "parquet")]
+use super::parquet;
+use super::stamp::Stamp;
+use super::{csv, mcap};
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::{self, Read, Seek};
+use std::path::{Path, PathBuf};
+
+/// So many rows are read ahead to learn the usual interval.
+const HEAD_ROWS: usize = 256;
+/// A pause of so many usual intervals is a gap, unless told otherwise.
+const GAP_INTERVALS: f64 = 5.0;
+/// A usual interval longer than this, or shorter than its inverse in ms, hints at another unit of time, s.
+const LONGEST_INTERVAL_S: f64 = 100.0;
+
+/// A row of a log.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Entry {
+    /// Where it stands in the file: its line, or its number where there are no lines; from 1.
+    pub row: u64,
+    /// The number of its segment, from 0.
+    pub segment: u64,
+    /// Whether it is the first of its segment.
+    pub begins: bool,
+    /// Since the log's first row, s.
+    pub time_s: f64,
+    /// The angular velocity, rad/s; not a number where it is not known.
+    pub rate_rad_s: [f64; 3],
+}
+
+/// What became of a log's rows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct Counts {
+    /// The rows that were read.
+    pub rows: u64,
+    /// Those that were used.
+    pub used: u64,
+    /// Those that lack a value that is needed; left out.
+    pub incomplete: u64,
+    /// Those with the stamp of the row before; left out.
+    pub repeated: u64,
+    /// How often the stamps went back; a new segment each time.
+    pub backward: u64,
+    /// How often they paused; a new segment each time.
+    pub gaps: u64,
+    /// The segments.
+    pub segments: u64,
+    /// Shortest and longest interval within a segment, s.
+    pub interval_s: [f64; 2],
+}
+
+/// A log, read from its beginning.
+pub struct Log {
+    path: PathBuf,
+    rows: Box<dyn Rows>,
+    needed: [bool; 3],
+    gap_s: f64,
+    /// Rows that were read ahead.
+    head: VecDeque<Row>,
+    row: Row,
+    first: Option<Stamp>,
+    /// The last row that was used.
+    last_time_s: f64,
+    last_key: Vec<u8>,
+    counts: Counts,
+    done: bool,
+}
+
+impl Log {
+    /// Opens a log; `-` is the standard input. What a file is is told by its first bytes: MCAP, Parquet, else CSV.
+    ///
+    /// # Errors
+    /// [`DataError`]: from here on, and for every row.
+    pub fn open(path: &Path, options: &Options) -> Result<Self, DataError> {
+        if path.as_os_str() == "-" {
+            return Self::from_csv(io::stdin(), "standard input".as_ref(), options);
+        }
+        let failed = |source| DataError::Read { path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(failed)?;
+        let about = file.metadata().map_err(failed)?;
+        if about.is_dir() {
+            return Err(failed(io::ErrorKind::IsADirectory.into()));
+        }
+        // A pipe cannot be read twice.
+        if about.is_file() {
+            let mut start = Vec::new();
+            file.by_ref().take(8).read_to_end(&mut start).map_err(failed)?;
+            file.rewind().map_err(failed)?;
+            if mcap::Mcap::is_begun(&start) {
+                return Self::new(Box::new(mcap::Mcap::new(file, path, options)), path, options);
+            }
+            #[cfg(feature = "parquet")]
+            if parquet::ParquetLog::is_begun(&start) {
+                return Self::new(Box::new(parquet::ParquetLog::new(file, path, options)?), path, options);
+            }
+            #[cfg(not(feature = "parquet"))]
+            if start.starts_with(b"PAR1") {
+                let reason = "it is Parquet, and this program was built without; build it with `--features parquet`";
+                return Err(DataError::Form { path: path.to_owned(), line: 0, reason: reason.to_owned() });
+            }
+        }
+        Self::from_csv(file, path, options)
+    }
+
+    /// Reads CSV from anywhere; `path` is its name in messages.
+    ///
+    /// Cells are parted by commas, semicolons or tabs, whichever the first line has most of; lines that begin with `#` are
+    /// comments. An empty cell, or one that says NaN, NA or null, is a value that is not known.
+    ///
+    /// # Errors
+    /// [`DataError`].
+    pub fn from_csv(source: impl Read + 'static, path: &Path, options: &Options) -> Result<Self, DataError> {
+        Self::new(Box::new(csv::Csv::new(Box::new(source), path, options)?), path, options)
+    }
+
+    fn new(mut rows: Box<dyn Rows>, path: &Path, options: &Options) -> Result<Self, DataError> {
+        if let Some(gap_s) = options.gap_s.filter(|gap_s| !(gap_s.is_finite() && *gap_s > 0.0)) {
+            let reason = format!("{gap_s} is no length of a pause; give a number of seconds above 0");
+            return Err(DataError::Option { name: "gap", reason });
+        }
+        let mut head = VecDeque::new();
+        while head.len() < HEAD_ROWS {
+            let mut row = Row::default();
+            if !rows.read(&mut row)? {
+                break;
+            }
+            head.push_back(row);
+        }
+        if head.is_empty() {
+            return Err(DataError::Empty { path: path.to_owned() });
+        }
+        let usual_s = usual_interval_s(&head);
+        let meaning = rows.meaning();
+        if let Some(interval_s) = usual_s.filter(|usual_s| {
+            meaning.assumed.contains(&"time") && !(1e-3 / LONGEST_INTERVAL_S..LONGEST_INTERVAL_S).contains(usual_s)
+        }) {
+            return Err(DataError::Unit { path: path.to_owned(), interval_s, unit: meaning.time.1 });
+        }
+        let gap_s = options.gap_s.or(usual_s.map(|usual_s| GAP_INTERVALS * usual_s)).unwrap_or(f64::INFINITY);
+        Ok(Self {
+            path: path.to_owned(),
+            rows,
+            needed: options.needed,
+            gap_s,
+            first: head.iter().find_map(|row| row.stamp),
+            head,
+            row: Row::default(),
+            last_time_s: f64::NAN,
+            last_key: Vec::new(),
+            counts: Counts { interval_s: [f64::INFINITY, 0.0], ..Counts::default() },
+            done: false,
+        })
+    }
+
+    /// Its name.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What its columns mean.
+    pub fn meaning(&self) -> &Meaning {
+        self.rows.meaning()
+    }
+
+    /// A longer pause begins a new segment, s.
+    pub fn gap_s(&self) -> f64 {
+        self.gap_s
+    }
+
+    /// What became of the rows so far.
+    pub fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// The name of the segment that the last row belongs to: what stands in the column of `by`, or its number from 1.
+    pub fn segment_name(&self) -> String {
+        match self.last_key.is_empty() {
+            true => self.counts.segments.to_string(),
+            false => String::from_utf8_lossy(&self.last_key).into_owned(),
+        }
+    }
+
+    /// The next row that is used; false at the end.
+    fn advance(&mut self) -> Result<Option<Entry>, DataError> {
+        loop {
+            match self.head.pop_front() {
+                Some(row) => self.row = row,
+                None if self.rows.read(&mut self.row)? => {}
+                None => return Ok(None),
+            }
+            self.counts.rows += 1;
+            if let Some(entry) = self.take() {
+                return Ok(Some(entry));
+            }
+        }
+    }
+
+    /// What the row that was read becomes; none if it is left out.
+    fn take(&mut self) -> Option<Entry> {
+        let known = |(needed, rate): (&bool, &f64)| !needed || rate.is_finite();
+        let complete = self.needed.iter().zip(&self.row.rate_rad_s).all(known);
+        let (Some(stamp), true) = (self.row.stamp, complete) else {
+            self.counts.incomplete += 1;
+            return None;
+        };
+        let time_s = stamp.since_s(self.first.get_or_insert(stamp));
+        let interval_s = time_s - self.last_time_s;
+        let another = self.counts.used == 0 || self.row.key != self.last_key;
+        if !another && interval_s == 0.0 {
+            self.counts.repeated += 1;
+            return None;
+        }
+        let (backward, gap) = (!another && interval_s < 0.0, !another && interval_s > self.gap_s);
+        self.counts.backward += u64::from(backward);
+        self.counts.gaps += u64::from(gap);
+        let begins = another || backward || gap;
+        if begins {
+            self.counts.segments += 1;
+        } else {
+            let [shortest, longest] = &mut self.counts.interval_s;
+            (*shortest, *longest) = (shortest.min(interval_s), longest.max(interval_s));
+        }
+        if another {
+            self.last_key.clone_from(&self.row.key);
+        }
+        self.counts.used += 1;
+        self.last_time_s = time_s;
+        let segment = self.counts.segments - 1;
+        Some(Entry { row: self.row.number, segment, begins, time_s, rate_rad_s: self.row.rate_rad_s })
+    }
+}
+
+impl Iterator for Log {
+    type Item = Result<Entry, DataError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let next = self.advance().transpose();
+        // Behind an error nothing is believed.
+        self.done = !matches!(next, Some(Ok(_)));
+        next
+    }
+}
+
+/// The median of the intervals above zero, s.
+fn usual_interval_s(head: &VecDeque<Row>) -> Option<f64> {
+    let pairs = head.iter().zip(head.iter().skip(1)).filter(|(last, next)| last.key == next.key);
+    let interval = |(last, next): (&Row, &Row)| Some(next.stamp?.since_s(&last.stamp?));
+    let mut intervals: Vec<f64> = pairs.filter_map(interval).filter(|interval_s| *interval_s > 0.0).collect();
+    intervals.sort_by(f64::total_cmp);
+    intervals.get(intervals.len() / 2).copied()
+}
