@@ -71,13 +71,20 @@ impl Accept {
             && self.unscored_ticks_max.is_none()
             && self.step_latency_p99_us_max.is_none()
     }
+
+    /// The limits of metrics by their keys.
+    pub(super) fn metric_limits(&self) -> BTreeMap<String, f64> {
+        let max = self.metric_max.iter().map(|(metric, limit)| (format!("{metric}_max"), *limit));
+        let peak = self.metric_peak.iter().map(|(metric, limit)| (format!("{metric}_peak"), *limit));
+        max.chain(peak).collect()
+    }
 }
 
-/// The criteria of metrics, by keys that are the rig's.
+/// The criteria of metrics, by keys that are the rig's, of any type: an unknown key is refused as that, not for its value.
 #[derive(Deserialize)]
 pub(super) struct Metrics {
     #[serde(default)]
-    pub accept: BTreeMap<String, f64>,
+    pub accept: toml::Table,
 }
 
 /// Returns true if a key is every rig's, so that no metric can have it.
@@ -95,12 +102,7 @@ pub(super) struct Setting<'a> {
 }
 
 /// Checks the criteria.
-pub(super) fn resolve(
-    raw: &Raw,
-    metrics: &BTreeMap<String, f64>,
-    setting: &Setting<'_>,
-    checks: &mut Checks<'_>,
-) -> Accept {
+pub(super) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, checks: &mut Checks<'_>) -> Accept {
     let mut accept = Accept {
         settled_by_s: instant("settled_by_s", raw.settled_by_s, setting, checks),
         peak_from_s: instant("peak_from_s", raw.peak_from_s, setting, checks),
@@ -125,12 +127,17 @@ pub(super) fn resolve(
         ),
         None => {}
     }
-    for (key, &value) in metrics {
+    for (key, value) in metrics {
         let path = format!("accept.{key}");
-        not_negative(&path, value, checks);
         let Some(metrics) = setting.metrics else { continue };
-        if !take_metric(&mut accept, key, value, metrics) {
-            checks.refuse(&path, format!("unknown criterion; {}", known(key, metrics)));
+        let number = value.as_float().or_else(|| value.as_integer().map(|count| count as f64));
+        match (limit_of(&mut accept, key, metrics), number) {
+            (None, _) => checks.refuse(&path, format!("unknown criterion; {}", known(key, metrics))),
+            (Some(_), None) => checks.refuse(&path, format!("got {value}; give a number")),
+            (Some((limits, metric)), Some(number)) => {
+                not_negative(&path, number, checks);
+                limits.insert(metric.to_owned(), number);
+            }
         }
     }
     let peaks = !accept.metric_peak.is_empty();
@@ -204,16 +211,17 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
     }
 }
 
-/// Takes a limit of a metric; false if it is none.
-fn take_metric(accept: &mut Accept, key: &str, value: f64, metrics: &[&str]) -> bool {
+/// The limits that a key belongs to, and its metric; `None` if it limits no metric.
+fn limit_of<'a>(
+    accept: &'a mut Accept,
+    key: &'a str,
+    metrics: &[&str],
+) -> Option<(&'a mut BTreeMap<String, f64>, &'a str)> {
     let of = |suffix: &str| key.strip_suffix(suffix).filter(|metric| metrics.contains(metric));
-    let (limits, metric) = match (of("_max"), of("_peak")) {
-        (Some(metric), _) => (&mut accept.metric_max, metric),
-        (None, Some(metric)) => (&mut accept.metric_peak, metric),
-        (None, None) => return false,
-    };
-    limits.insert(metric.to_owned(), value);
-    true
+    match (of("_max"), of("_peak")) {
+        (Some(metric), _) => Some((&mut accept.metric_max, metric)),
+        (None, metric) => Some((&mut accept.metric_peak, metric?)),
+    }
 }
 
 fn known(key: &str, metrics: &[&str]) -> String {

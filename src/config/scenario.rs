@@ -168,7 +168,7 @@ impl Scenario {
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
-        for (table, keys) in [("watchdog", maxima.watchdog), ("accept", metrics)] {
+        for (table, keys) in [("watchdog", maxima.watchdog), ("accept", accept.metric_limits())] {
             if let Some(toml::Value::Table(table)) = resolved.get_mut(table) {
                 table.extend(keys.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
             }
@@ -332,7 +332,7 @@ impl<'a> Checks<'a> {
 /// Checks the criteria against what is known of the rig.
 fn resolve_accept(
     raw: &Raw,
-    metrics: &BTreeMap<String, f64>,
+    metrics: &toml::Table,
     duration_s: f64,
     rig: Option<&AnyRig>,
     checks: &mut Checks<'_>,

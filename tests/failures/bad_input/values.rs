@@ -1,10 +1,10 @@
 //! Values that make no sense: what each key can be.
 
-use super::common::shipped;
 use super::{
     FILE, PAIR, assert_all_refused, assert_refused, assert_says, keys, line, line_of, place, refused, with,
     without_table,
 };
+use crate::common::shipped;
 use corotate::config::{SHIPPED, Scenario};
 
 #[test]

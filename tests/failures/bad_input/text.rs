@@ -1,10 +1,10 @@
 //! Texts that are no scenario: types, names, tables and syntax.
 
-use super::common::Bench;
 use super::{
     FILE, PAIR, assert_refused, assert_says, keys, line, line_of, place, refused, refused_in, replace, split, with,
     without_table,
 };
+use crate::common::Bench;
 
 #[test]
 fn every_key_refuses_every_other_type() {
@@ -138,7 +138,8 @@ fn a_table_is_a_table_and_a_list_is_a_list() {
     assert_refused(&single, "follower", &["got a table", "double brackets"]);
     let word = format!("follower = \"one\"\n{}", without_table("follower[0]"));
     assert_refused(&word, "follower", &["got string", "give a list"]);
-    assert_refused(&with(PAIR, "accept.deeper", "{ x = 1 }"), "accept.deeper", &["got a table", "give a number"]);
+    let limit = "accept.sync_error_rad_s_max";
+    assert_refused(&with(PAIR, limit, "{ x = 1 }"), limit, &["got { x = 1 }", "give a number"]);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! A device behind a serial line in the follower's seat: the real program, a device in a thread, and between them a cable
 //! of two ptys that can be faulty, cut, and joined again.
 
-#[path = "../examples/serial_device.rs"]
+#[path = "../../examples/serial_device.rs"]
 mod serial_device;
 
 use crate::common::{Bench, Done, Running, await_some, shipped};

@@ -1,7 +1,7 @@
 //! Files, overrides, options and command lines that make no sense, and what `corotate check` prints beside them.
 
-use super::common::{Bench, shipped};
 use super::{FILE, PAIR, assert_says, place, refused, refused_in, with};
+use crate::common::{Bench, shipped};
 use corotate::config::{SHIPPED, Scenario};
 
 #[test]
@@ -191,7 +191,7 @@ fn a_command_line_that_makes_no_sense_is_refused() {
         (&["init"], "<NAME>", "--help"),
         (&["init", "nosuch"], "no scenario `nosuch`", "known here: rigid-pair"),
         (&["init", ""], "no scenario ``", "known here: rigid-pair"),
-        (&["plant"], "--domain <DIR>", "--help"),
+        (&["plant"], "--body <NAME>", "--help"),
         (&["plant", "--domain", "/nonexistent"], "--body <NAME>", "--help"),
         (
             &["plant", "--domain", "/nonexistent", "--body", "leader"],
@@ -237,7 +237,8 @@ fn what_check_prints_is_the_scenario_it_checked() {
         let done = bench.run(&["check", "--resolved", path.to_str().unwrap()]);
         assert_eq!((done.code, done.stderr.as_str()), (Some(0), ""), "{name}");
         // The claims come first: here as comments, without the option alone.
-        let claims: String = done.stdout.lines().map_while(|line| Some(format!("{}\n", line.strip_prefix("# ")?))).collect();
+        let claims: String =
+            done.stdout.lines().map_while(|line| Some(format!("{}\n", line.strip_prefix("# ")?))).collect();
         assert_eq!(bench.run(&["check", path.to_str().unwrap()]).stdout, claims);
         assert!(claims.contains("the loop that runs") || claims.contains("no body is driven"), "{claims}");
         let resolved = Scenario::load(&path, &[]).unwrap().to_toml();

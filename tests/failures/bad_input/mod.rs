@@ -4,17 +4,15 @@
 //! Most cases change one line of the shipped scenario rigid-pair; the line that must be named is found in the changed text.
 
 mod commands;
-#[path = "../common/mod.rs"]
-mod common;
 mod random;
 mod text;
 mod values;
 
-use common::{Bench, Done};
+use crate::common::{Bench, Done};
 use std::path::PathBuf;
 
 /// The text that is spoilt.
-const PAIR: &str = include_str!("../../config/rigid-pair.toml");
+const PAIR: &str = include_str!("../../../config/rigid-pair.toml");
 /// The name that it is given, as messages must name it.
 const FILE: &str = "bad.toml";
 

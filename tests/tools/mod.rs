@@ -1,0 +1,12 @@
+//! Uses the other commands, the help and every command of the manual as a user does.
+
+mod bench;
+mod campaign;
+mod campaign_page;
+mod command_line;
+mod doctor;
+mod documents;
+#[cfg(feature = "foxglove")]
+mod foxglove;
+mod report;
+mod watch;
