@@ -17,7 +17,7 @@ fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
     let mut device = Device::new("fuzz", seat);
     let mut outputs = [0; 32];
     (outputs[0], outputs[1]) = (64, 56);
-    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1, version_1: true });
+    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1 });
     let mut frame = [0; MAX_FRAME];
     for (index, piece) in pieces.iter().enumerate() {
         let now_ns = index as u64 * 1_000_000;

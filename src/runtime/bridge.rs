@@ -15,7 +15,7 @@ use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
     Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse, Samples, Terms,
-    VERSION, Welcome, fits_version_1,
+    VERSION, Welcome,
 };
 use crate::telemetry::Outage;
 use std::path::{Path, PathBuf};
@@ -105,8 +105,7 @@ pub enum DeviceError {
     },
     /// It speaks another protocol version.
     #[error(
-        "the device on {} speaks protocol version {theirs} and this program version {VERSION} (and 1 with a driven body of \
-         short samples); update the older of the two",
+        "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
         path.display()
     )]
     Version {
@@ -281,7 +280,6 @@ impl DeviceLink {
             outputs,
             // A measurement, or an estimate. A controller may withhold any command.
             required: u32::from(roles != [RoleId::Controller]),
-            version_1: body && fits_version_1(&inputs, &written),
         };
         let greeting = Greeting {
             run,
@@ -322,7 +320,7 @@ impl DeviceLink {
 
     /// Returns what a reader must know of the device's samples, to stand behind its name.
     fn remark(&self) -> &'static str {
-        match self.greeting.bare_since_ns.is_some() || self.host.version() < VERSION {
+        match self.greeting.bare_since_ns.is_some() {
             true => " (states no layouts: its samples are trusted by their type names)",
             false => "",
         }

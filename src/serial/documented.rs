@@ -54,7 +54,6 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
     let welcome = Message::Welcome(Welcome { run: 300, next_tick: 0, device: "board 1" });
     let refuse = Message::Refuse(Refuse { reason: Reason::NotGreeted, detail: "greet me first" });
     let said = |sequence, message| write(sequence, message, &mut [0; MAX_PAYLOAD]).unwrap().to_vec();
-    let said_before = |sequence, message| v1::write(sequence, message, &mut [0; MAX_PAYLOAD]).unwrap().to_vec();
     let applied = CommandEvent::Applied;
     vec![
         ("Hello to a body, sequence 0", said(0, Message::Hello(hello))),
@@ -68,8 +67,6 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
             said(1, answer(1, CommandEvent::Held, measurement.content())),
         ),
         ("Stop, sequence 130", said(130, Message::Stop)),
-        ("Hello in version 1, sequence 1", said_before(1, Message::Hello(hello))),
-        ("Tick 200 in version 1, sequence 129", said_before(129, tick(1, command.content()))),
     ]
 }
 

@@ -5,10 +5,8 @@
 
 use super::frame::{Decoder, MAX_FRAME, MAX_PAYLOAD, encode};
 use super::message::{
-    Answer, Hello, MAX_CONTENT, MAX_SAMPLES, Message, ParseError, Reason, Refuse, Samples, Tick, VERSION, Welcome,
-    parse, write,
+    Answer, Hello, MAX_CONTENT, MAX_SAMPLES, Message, ParseError, Reason, Refuse, Samples, Tick, Welcome, parse, write,
 };
-use super::v1;
 use serde::{Deserialize, Serialize};
 
 /// Between two greetings, ns.
@@ -89,8 +87,6 @@ pub struct Terms {
     pub outputs: [u16; MAX_SAMPLES],
     /// Bit i: sample i is in every answer.
     pub required: u32,
-    /// Whether a device of version 1 will do: for a body whose samples it could take.
-    pub version_1: bool,
 }
 
 impl Terms {
@@ -119,10 +115,6 @@ pub struct Host {
     terms: Terms,
     decoder: Decoder,
     frame: [u8; MAX_FRAME],
-    /// Where the samples of an answer in version 1 are put together.
-    room: [u8; MAX_CONTENT],
-    /// The version that is spoken.
-    version: u8,
     sequence: u32,
     /// The device's highest sequence number.
     heard: Option<u32>,
@@ -148,8 +140,6 @@ impl Host {
             terms,
             decoder: Decoder::default(),
             frame: [0; MAX_FRAME],
-            room: [0; MAX_CONTENT],
-            version: VERSION,
             sequence: 0,
             heard: None,
             greeted: false,
@@ -216,17 +206,10 @@ impl Host {
 
     /// Takes a byte that has arrived, and tells what it completes.
     pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<Heard<'_>> {
-        let Self { terms, decoder, heard, counters, version, room, .. } = self;
+        let Self { terms, decoder, heard, counters, .. } = self;
         let payload = decoder.push(byte)?;
-        let parsed = if *version == VERSION { parse(payload) } else { v1::parse(payload, room) };
-        let (sequence, message) = match parsed {
+        let (sequence, message) = match parse(payload) {
             Ok(said) => said,
-            Err(ParseError::Version(theirs)) if terms.version_1 && matches!(theirs, v1::VERSION | VERSION) => {
-                // What it says in its own version is said again once it was greeted in that.
-                (*version, *heard) = (theirs, None);
-                (self.greeted, self.silent, self.greet_due_ns) = (false, 0, now_ns);
-                return None;
-            }
             Err(ParseError::Version(theirs)) => return Some(Heard::OtherVersion(theirs)),
             Err(ParseError::Malformed) => {
                 counters.malformed += 1;
@@ -325,11 +308,6 @@ impl Host {
         &self.terms
     }
 
-    /// The version of the protocol that is spoken.
-    pub fn version(&self) -> u8 {
-        self.version
-    }
-
     /// The counters.
     pub fn counters(&self) -> LineCounters {
         let frames = self.decoder.counters();
@@ -365,8 +343,7 @@ impl Host {
 
     fn say(&mut self, message: Message<'_>) -> &[u8] {
         let mut payload = [0; MAX_PAYLOAD];
-        let written = if self.version == VERSION { write } else { v1::write };
-        let frame = written(self.sequence, message, &mut payload)
+        let frame = write(self.sequence, message, &mut payload)
             .and_then(|payload| encode(payload, &mut self.frame))
             .expect("every message whose texts and contents are within their limits fits into a frame");
         self.sequence = self.sequence.wrapping_add(1);

@@ -16,7 +16,6 @@ mod message;
 mod seat;
 #[cfg(test)]
 mod tests;
-mod v1;
 
 pub use device::Device;
 pub use frame::{CRC, Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, TooLong, encode};
@@ -26,7 +25,6 @@ pub use message::{
     VERSION, Welcome, parse, write,
 };
 pub use seat::{BodySeat, ControllerSeat, FlightSeat, Inputs, Layout, ObserverSeat, Outputs, Seat};
-pub use v1::fits as fits_version_1;
 
 /// Takes any bytes as if they had come over a line, and hands on what is found in them: the whole way from bytes to
 /// messages, for a fuzzer or a recorder.

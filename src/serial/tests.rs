@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
-use crate::sample::{Message as _, RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
+use crate::sample::{RateCommand, RateMeasurement, RateTruth, Sample, Stamp, content_length};
 use proptest::prelude::*;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
@@ -74,51 +74,6 @@ fn device() -> Spinning {
     Device::new("spinner 1", |hello| Some(BodySeat::new(spinner(), hello)))
 }
 
-/// A device of version 1, as far as a line without faults asks for it.
-#[derive(Default)]
-struct Older {
-    decoder: Decoder,
-    plant: Option<Plant<Spinner>>,
-}
-
-impl Older {
-    fn receive(&mut self, bytes: &[u8], mut send: impl FnMut(&[u8])) {
-        let Self { decoder, plant } = self;
-        let mut say = |said: v1::Said<'_>| {
-            let mut payload = [0; MAX_PAYLOAD];
-            let envelope = v1::Envelope { version: v1::VERSION, sequence: 0, said };
-            send(encode(postcard::to_slice(&envelope, &mut payload).unwrap(), &mut [0; MAX_FRAME]).unwrap());
-        };
-        decoder.feed(bytes, |payload| match postcard::from_bytes::<v1::Envelope<'_>>(payload) {
-            _ if payload[0] != v1::VERSION => {
-                say(v1::Said::Refuse(Refuse { reason: Reason::Version, detail: "another version" }));
-            }
-            Ok(v1::Envelope { said: v1::Said::Hello(hello), .. }) => {
-                assert_eq!((hello.body, hello.command), ("follower", RateCommand::TYPE_NAME));
-                assert_eq!((hello.measurement, hello.truth), (RateMeasurement::TYPE_NAME, RateTruth::TYPE_NAME));
-                let actuation =
-                    Actuation { driven: true, delay_ticks: 1, timeout_ticks: hello.timeout_ticks, rearm: Rearm::Auto };
-                plant.get_or_insert_with(|| Plant::new(spinner(), actuation, hello.period_ns as f64 / 1e9));
-                say(v1::Said::Welcome(Welcome { run: hello.run, next_tick: 0, device: "spinner 0" }));
-            }
-            Ok(v1::Envelope { said: v1::Said::Tick { tick, command }, sequence, .. }) => {
-                let plant = plant.as_mut().unwrap();
-                let mut taken = RateCommand::default();
-                taken.stamp.tick = tick.saturating_sub(1);
-                let there = command.is_some_and(|content| taken.set_content(content));
-                let event = plant.command(tick, there.then_some(&taken));
-                let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
-                plant.measure(&Stamp::default(), &mut measurement);
-                plant.truth(&Stamp::default(), &mut truth);
-                plant.advance(1);
-                let (measurement, truth) = (measurement.content(), truth.content());
-                say(v1::Said::Answer { echo: sequence, tick, event, measurement, truth });
-            }
-            other => panic!("{:?}", other.map(|envelope| envelope.sequence)),
-        });
-    }
-}
-
 /// What befalls the bytes of a line, per byte.
 #[derive(Debug, Clone, Copy)]
 struct Faults {
@@ -133,8 +88,6 @@ const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0 };
 struct Rig {
     host: Host,
     device: Spinning,
-    /// In the place of the device.
-    older: Option<Older>,
     hello: Hello<'static>,
     faults: Faults,
     random: Pcg64,
@@ -158,10 +111,9 @@ impl Rig {
             period_ns: hello.realtime.then_some(PERIOD_NS),
             outputs: std::array::from_fn(|index| [MEASUREMENT, TRUTH].get(index).map_or(0, |length| *length as u16)),
             required: 1,
-            version_1: true,
         };
         let random = Pcg64::seed_from_u64(seed);
-        Self { host: Host::new(terms), device: device(), older: None, hello, faults, random, now_ns: 1, cut: false }
+        Self { host: Host::new(terms), device: device(), hello, faults, random, now_ns: 1, cut: false }
     }
 
     fn damage(&mut self, bytes: &[u8]) -> Vec<u8> {
@@ -190,10 +142,7 @@ impl Rig {
             up.extend_from_slice(frame);
         }
         let (up, mut down) = (self.damage(&up), Vec::new());
-        match &mut self.older {
-            Some(older) => older.receive(&up, |frame| down.extend_from_slice(frame)),
-            None => self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame)),
-        }
+        self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame));
         self.device.elapse(self.now_ns);
         let down = self.damage(&down);
         self.hear(&down)
@@ -286,23 +235,6 @@ fn a_device_answers_as_the_built_in_plant_does() {
         (counters.frames_sent, counters.frames_received, counters.crc_errors, counters.dropped_bytes),
         (51, 51, 0, 0)
     );
-}
-
-/// It refuses what it does not speak, and is asked in its own words from there on.
-#[test]
-fn a_device_of_version_1_answers_as_any() {
-    let mut rig = Rig::new(hello(1, false), CLEAN, 1);
-    rig.older = Some(Older::default());
-    for (tick, expected) in (0..).zip(built_in(50)) {
-        assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 1_000_000_000), Some(expected));
-    }
-    assert_eq!((rig.host.version(), rig.host.counters().handshakes, rig.host.counters().repeats), (1, 1, 0));
-    // It is replaced by a new one, which does not speak that any more.
-    rig.older = None;
-    let Some(Event::Answer(50, CommandEvent::Applied, ..)) = rig.ask(50, Some(0.0), 3_600_000_000_000) else {
-        panic!()
-    };
-    assert_eq!((rig.host.version(), rig.host.counters().restarts), (VERSION, 1));
 }
 
 proptest! {
@@ -548,10 +480,12 @@ fn foreign(version: u8) -> Vec<u8> {
 #[test]
 fn another_version_is_refused_by_both_ends() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
-    assert_eq!(rig.hear(&foreign(9)), [Event::OtherVersion(9)]);
-    let mut reply = Vec::new();
-    rig.device.receive(&foreign(9), 1, |frame| reply.extend_from_slice(frame));
-    assert!(matches!(&rig.hear(&reply)[..], [Event::Refused(Reason::Version, _)]));
+    for version in [1, 9] {
+        assert_eq!(rig.hear(&foreign(version)), [Event::OtherVersion(version)]);
+        let mut reply = Vec::new();
+        rig.device.receive(&foreign(version), 1, |frame| reply.extend_from_slice(frame));
+        assert!(matches!(&rig.hear(&reply)[..], [Event::Refused(Reason::Version, _)]));
+    }
 }
 
 #[test]

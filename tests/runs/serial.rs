@@ -745,8 +745,8 @@ fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], co
 
 #[test]
 fn a_device_of_another_version_is_refused_by_both_versions() {
-    let other = |path: &Path| Some(impostor(path, |_| framed(&[9, 0, 2, 0, 0])));
-    refused(other, &[], 2, &["protocol version 9", "this program version 2", "update the older"]);
+    let other = |path: &Path| Some(impostor(path, |_| framed(&[1, 0, 2, 0, 0])));
+    refused(other, &[], 2, &["protocol version 1", "this program version 2", "update the older"]);
 }
 
 #[test]
