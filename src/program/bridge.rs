@@ -1,7 +1,6 @@
 //! `corotate bridge`: a device behind a serial line, in a role's seat.
 
 use super::output::{Exit, fail, say};
-use super::qemu::Board;
 use super::runs;
 use super::signals::{die_with, terminated_by_signals};
 use crate::launch::line_words;
@@ -14,14 +13,8 @@ use std::path::PathBuf;
 #[command(after_long_help = EXAMPLES)]
 pub struct Arguments {
     /// The device's serial line, as /dev/ttyUSB0 or a pty; set to raw mode, eight bits, no parity
-    #[arg(long, value_name = "PATH", required_unless_present = "qemu", conflicts_with = "qemu")]
-    serial: Option<PathBuf>,
-    /// Run this program for a board in QEMU, with its UART as the line; QEMU ends with the bridge
-    #[arg(long, value_name = "ELF")]
-    qemu: Option<PathBuf>,
-    /// The board that QEMU is to be
-    #[arg(long, value_name = "NAME", default_value = "mps2-an386", requires = "qemu")]
-    machine: String,
+    #[arg(long, value_name = "PATH")]
+    serial: PathBuf,
     /// Its speed, bit/s [default: as it is]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(50..=20_000_000))]
     baud: Option<u32>,
@@ -51,8 +44,7 @@ const SCHEMA: &str = "corotate/bridge/v1";
 const EXAMPLES: &str = "\
 Example:
   corotate run pair.toml --external follower      prints DIR
-  corotate bridge --serial /dev/ttyACM0 --role follower --domain DIR
-  corotate bridge --qemu firmware.elf --role observer,controller --domain DIR";
+  corotate bridge --serial /dev/ttyACM0 --role follower --domain DIR";
 
 fn seconds(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}; give a number of seconds"))?;
@@ -69,25 +61,17 @@ fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
     arguments.parent.map_or(Ok(()), die_with)?;
     let terminated = terminated_by_signals()?;
     let domain = runs::domain(arguments.domain.as_deref())?;
-    let mut board = arguments.qemu.as_ref().map(|elf| Board::start(elf, &arguments.machine)).transpose();
-    let board = board.as_mut().map_err(|error| fail(Exit::Usage, error))?.as_mut();
-    let path =
-        board.as_ref().map_or_else(|| arguments.serial.clone().unwrap_or_default(), |board| board.line().to_owned());
     let seat = DeviceSeat {
         domain,
         roles: arguments.role.clone(),
-        path,
+        path: arguments.serial.clone(),
         baud: arguments.baud,
         patience_s: arguments.patience,
         other_device: arguments.allow_other_device,
     };
     let role = seat.roles.join(",");
     let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
-    let served = run_bridge(&seat, &terminated, welcomed);
-    let served = served.map_err(|error| match board.and_then(Board::ended) {
-        Some(ended) => fail(exit_of(&error), &format!("{ended}: {error}")),
-        None => fail(exit_of(&error), &error),
-    })?;
+    let served = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
     let Some(Served { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {
         let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });

@@ -23,7 +23,6 @@ mod identify;
 mod init;
 mod new;
 mod output;
-mod qemu;
 mod record;
 mod replay;
 mod report;
@@ -125,9 +124,6 @@ enum Command {
     /// Take the other end of a hop that is measured
     #[command(hide = true)]
     BenchPeer(bench::PeerArguments),
-    /// Become QEMU, and die with a bridge
-    #[command(hide = true)]
-    Emulate(qemu::Arguments),
     /// Clean up after processes of a run that were killed, and after its launcher
     #[command(hide = true)]
     Janitor(JanitorArguments),
@@ -283,7 +279,6 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
         Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
         Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
-        Some(Command::Emulate(arguments)) => qemu::emulate(&arguments),
         Some(Command::Janitor(arguments)) => janitor(&arguments),
     }
 }

@@ -32,7 +32,7 @@ const ELSEWHERE: [(&str, &str); 30] = [
     ("corotate run tests/hil/pair.toml --clock lockstep", "it waits for a partner; tests/runs/hil.rs"),
     ("$(tests/hil/venv) tests/hil/follower.py", "tests/runs/hil.rs"),
     ("corotate bridge --serial", "it needs a device; tests/runs/serial.rs"),
-    ("corotate bridge --qemu", "it needs firmware; tests/board"),
+    ("qemu-system-arm", "it needs firmware; tests/board"),
     ("socat", "it goes on until it is ended; tests/runs/serial.rs has a line of its own"),
     ("cargo run --release --example serial_device", "it needs a line; tests/runs/serial.rs"),
     ("corotate watch --once", "beside a run, below"),
