@@ -102,14 +102,13 @@ impl RawChain {
             words: WORDS,
             name: name.to_owned(),
             direction: 0,
-            descriptors: None,
         };
-        let mut relay = Peer::start(domain.domain(), true, Vec::new())?;
-        let mut last = Peer::start(domain.domain(), false, Vec::new())?;
-        let mut sender = Station { domain: domain.domain(), process: "bench" }.sender(&link("first"), None)?;
-        relay.open(link("first"), Some(link("second")))?;
+        let mut relay = Peer::start(domain.domain(), true)?;
+        let mut last = Peer::start(domain.domain(), false)?;
+        // Each receiver is open before its sender.
         last.open(link("second"), None)?;
-        sender.refresh()?;
+        relay.open(link("first"), Some(link("second")))?;
+        let sender = Station { domain: domain.domain(), process: "bench" }.sender(&link("first"))?;
         for peer in [&mut relay, &mut last] {
             board.granted(std::mem::take(&mut peer.grants));
         }

@@ -6,11 +6,13 @@ use super::page::Page;
 use super::session::BenchError;
 use crate::bus::domain::Domain;
 use crate::bus::iox::{IoxBus, IoxReader, IoxWriter};
-use crate::bus::raw::{RawBoardReader, RawBoardWriter, RawListener, RawNode, RawNotifier, RawPublisher, RawSubscriber};
+use crate::bus::raw::{RawListener, RawNode, RawNotifier, RawPublisher, RawSubscriber};
 use crate::bus::{Bus, Depths, Read, Reader, Signal, Topic, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::sample::{Sample, sample};
-use rustix::fd::OwnedFd;
+use std::io;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// The most words of a sample.
@@ -35,16 +37,8 @@ pub(super) enum Mechanism {
     Ours,
     /// iceoryx2 publish-subscribe, and its event.
     Iceoryx,
-    /// iceoryx2's blackboard.
-    Blackboard,
     /// A bare mailbox in shared memory, and a futex.
     SharedMemory,
-    /// The same mailbox, and an eventfd.
-    EventFd,
-    /// A pipe.
-    Pipe,
-    /// A Unix datagram socket.
-    UnixSocket,
     /// UDP over the loopback interface.
     Udp,
 }
@@ -75,19 +69,10 @@ impl Mechanism {
         match (self, wake) {
             (Self::Ours, _) => "ours",
             (Self::Iceoryx, _) => "iceoryx2",
-            (Self::Blackboard, _) => "iceoryx2 blackboard",
             (Self::SharedMemory, Wake::Spin) => "shared memory",
             (Self::SharedMemory, _) => "futex",
-            (Self::EventFd, _) => "eventfd",
-            (Self::Pipe, _) => "pipe",
-            (Self::UnixSocket, _) => "Unix socket",
             (Self::Udp, _) => "UDP loopback",
         }
-    }
-
-    /// Whether it needs descriptors that both ends share.
-    pub fn descriptors(self) -> bool {
-        matches!(self, Self::EventFd | Self::Pipe | Self::UnixSocket | Self::Udp)
     }
 }
 
@@ -113,37 +98,21 @@ pub(super) struct Opening {
     pub name: String,
     /// 0 from the sender, 1 back to it.
     pub direction: usize,
-    /// The descriptor to read from and to write to, where the mechanism needs some.
-    pub descriptors: Option<[i32; 2]>,
 }
 
 /// One end that sends.
 pub(super) struct Sender {
     carry: Box<dyn Out>,
-    notifier: Notification,
     words: usize,
 }
 
 /// One end that receives.
 pub(super) struct Receiver {
     carry: Box<dyn In>,
-    notifier: Notification,
     words: usize,
     wake: Wake,
     /// Whether the sender needs the core on which this one polls.
     gives_way: bool,
-}
-
-/// What wakes a sleeper.
-enum Notification {
-    /// Nobody sleeps, or what carries the sample wakes too.
-    None,
-    /// That of our links.
-    Ours,
-    Futex(Page, usize),
-    EventFd(OwnedFd),
-    Notifier(RawNotifier),
-    Listener(RawListener),
 }
 
 trait Out {
@@ -153,18 +122,14 @@ trait Out {
     fn prepare(&mut self) -> Result<(), BenchError> {
         Ok(())
     }
-    /// Tells readers that came late of this end.
-    fn refresh(&mut self) -> Result<(), BenchError> {
-        Ok(())
-    }
 }
 
 trait In {
-    /// Takes the next words, if they are there. What blocks by itself waits for them.
+    /// Takes the next words, if they are there. A socket waits for them.
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError>;
     /// Finds the shortest way to a writer that has come.
     fn refresh(&mut self) {}
-    /// Sleeps until there may be some, if it knows how to.
+    /// Sleeps until it is notified, where the receiver is opened to sleep.
     fn sleep(&mut self, _until_ns: u64) -> Result<(), BenchError> {
         Ok(())
     }
@@ -218,10 +183,6 @@ impl<S: Sample> Out for IoxWriter<S> {
     fn prepare(&mut self) -> Result<(), BenchError> {
         Ok(Write::prepare(self)?)
     }
-
-    fn refresh(&mut self) -> Result<(), BenchError> {
-        Ok(Write::refresh(self)?)
-    }
 }
 
 impl<S: Sample> In for IoxReader<S> {
@@ -243,50 +204,48 @@ impl<S: Sample> In for IoxReader<S> {
     }
 }
 
-impl<const WORDS: usize> Out for RawPublisher<WORDS> {
+/// A bare end of publish-subscribe, and of the event that wakes a sleeper.
+struct Iceoryx<End, Event>(End, Option<Event>);
+
+impl<const WORDS: usize> Out for Iceoryx<RawPublisher<WORDS>, RawNotifier> {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
-        Ok(RawPublisher::send(self, words)?)
+        self.0.send(words)?;
+        Ok(self.1.as_ref().map_or(Ok(()), RawNotifier::notify)?)
     }
 }
 
-impl<const WORDS: usize> In for RawSubscriber<WORDS> {
+impl<const WORDS: usize> In for Iceoryx<RawSubscriber<WORDS>, RawListener> {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
-        let there = RawSubscriber::receive(self, |sample| words.copy_from_slice(sample))?;
+        let there = self.0.receive(|sample| words.copy_from_slice(sample))?;
         Ok(there.is_some())
     }
-}
 
-impl<const WORDS: usize> Out for RawBoardWriter<WORDS> {
-    #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
-        RawBoardWriter::send(self, words);
-        Ok(())
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BenchError> {
+        Ok(self.1.as_ref().map_or(Ok(()), |listener| listener.wait(Duration::from_nanos(SLEEP_NS)))?)
     }
 }
 
-/// A blackboard with the number of the last value seen.
-struct Newest<const WORDS: usize>(RawBoardReader<WORDS>, u64);
-
-impl<const WORDS: usize> In for Newest<WORDS> {
-    #[inline]
-    fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
-        let value = self.0.get();
-        let there = value[0] != self.1;
-        self.1 = value[0];
-        words.copy_from_slice(&value);
-        Ok(there)
-    }
+/// A mailbox of a page.
+struct Mailbox {
+    page: Page,
+    direction: usize,
+    /// True if a futex wakes the receiver.
+    wakes: bool,
+    /// The number of the last words received.
+    last: u64,
+    /// The count of notifications before the mailbox was last looked into.
+    notified: u32,
 }
-
-/// A mailbox of a page, with the number of the last words seen.
-struct Mailbox(Page, usize, u64);
 
 impl Out for Mailbox {
     #[inline]
     fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
-        self.0.put(self.1, words);
+        self.page.put(self.direction, words);
+        if self.wakes {
+            self.page.notify(self.direction).map_err(|error| system("wake", error))?;
+        }
         Ok(())
     }
 }
@@ -294,32 +253,41 @@ impl Out for Mailbox {
 impl In for Mailbox {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
-        let there = self.0.take(self.1, self.2, words);
+        if self.wakes {
+            self.notified = self.page.notified(self.direction);
+        }
+        let there = self.page.take(self.direction, self.last, words);
         if there {
-            self.2 = words[0];
+            self.last = words[0];
         }
         Ok(there)
     }
-}
 
-/// What the kernel carries, and wakes for.
-struct Descriptor(OwnedFd);
-
-impl Out for Descriptor {
-    #[inline]
-    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
-        let bytes: &[u8] = bytemuck::cast_slice(words);
-        let sent = rustix::io::write(&self.0, bytes).map_err(|error| system("write", error))?;
-        if sent == bytes.len() { Ok(()) } else { Err(system("write", "only a part was taken")) }
+    fn sleep(&mut self, _until_ns: u64) -> Result<(), BenchError> {
+        if self.wakes {
+            self.page.wait(self.direction, self.notified);
+        }
+        Ok(())
     }
 }
 
-impl In for Descriptor {
+impl Out for UdpSocket {
+    #[inline]
+    fn send(&mut self, words: &[u64]) -> Result<(), BenchError> {
+        let sent = UdpSocket::send(self, bytemuck::cast_slice(words)).map_err(|error| system("send", error))?;
+        if sent == size_of_val(words) { Ok(()) } else { Err(system("send", "only a part was taken")) }
+    }
+}
+
+impl In for UdpSocket {
     #[inline]
     fn receive(&mut self, words: &mut [u64]) -> Result<bool, BenchError> {
-        let bytes: &mut [u8] = bytemuck::cast_slice_mut(words);
-        let received = rustix::io::read(&self.0, &mut *bytes).map_err(|error| system("read", error))?;
-        if received == bytes.len() { Ok(true) } else { Err(system("read", "the other end is gone")) }
+        match self.recv(bytemuck::cast_slice_mut(words)) {
+            Ok(received) if received == size_of_val(words) => Ok(true),
+            Ok(_) => Err(system("receive", "a part of a sample")),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(false),
+            Err(error) => Err(system("receive", error)),
+        }
     }
 }
 
@@ -355,17 +323,21 @@ impl Station<'_> {
         Ok((bus, Topic { scenario: "bench".to_owned(), body, signal: Signal::Measurement }))
     }
 
-    fn page(&self, opening: &Opening) -> Result<Page, BenchError> {
+    fn mailbox(&self, opening: &Opening) -> Result<Mailbox, BenchError> {
         let path = self.domain.shared(&format!("{}.page", opening.name));
-        Page::open(&path).map_err(|error| system("map shared memory", error))
+        let page = Page::open(&path).map_err(|error| system("map shared memory", error))?;
+        Ok(Mailbox { page, direction: opening.direction, wakes: opening.wake != Wake::Spin, last: 0, notified: 0 })
     }
 
-    /// Opens an end that sends.
-    pub fn sender(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Sender, BenchError> {
-        let (words, direction) = (opening.words, opening.direction);
-        let service = format!("bench/{}/{direction}", opening.name);
-        let sleeps = opening.wake != Wake::Spin;
-        let mut notifier = Notification::None;
+    /// The file in which a receiver leaves its port.
+    fn port(&self, opening: &Opening) -> PathBuf {
+        self.domain.shared(&format!("{}.port{}", opening.name, opening.direction))
+    }
+
+    /// Opens an end that sends; over UDP the end that receives must be open.
+    pub fn sender(&self, opening: &Opening) -> Result<Sender, BenchError> {
+        let words = opening.words;
+        let service = format!("bench/{}/{}", opening.name, opening.direction);
         let carry: Box<dyn Out> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
@@ -377,43 +349,30 @@ impl Station<'_> {
             }
             Mechanism::Iceoryx => {
                 let node = self.raw(opening)?;
-                if sleeps {
-                    notifier = Notification::Notifier(node.notifier(&service)?);
-                }
-                of_size!(words, SIZE => Box::new(node.publisher::<SIZE>(&service)?))
+                let notifier = (opening.wake != Wake::Spin).then(|| node.notifier(&service)).transpose()?;
+                of_size!(words, SIZE => Box::new(Iceoryx(node.publisher::<SIZE>(&service)?, notifier)))
             }
-            Mechanism::Blackboard => {
-                of_size!(words, SIZE => Box::new(self.raw(opening)?.board_writer::<SIZE>(&service)?))
-            }
-            Mechanism::SharedMemory => {
-                if sleeps {
-                    notifier = Notification::Futex(self.page(opening)?, direction);
-                }
-                Box::new(Mailbox(self.page(opening)?, direction, 0))
-            }
-            Mechanism::EventFd => {
-                notifier = descriptor.map_or(Notification::None, Notification::EventFd);
-                Box::new(Mailbox(self.page(opening)?, direction, 0))
-            }
-            Mechanism::Pipe | Mechanism::UnixSocket | Mechanism::Udp => {
-                Box::new(Descriptor(descriptor.ok_or_else(|| system("open a descriptor", "none was given"))?))
+            Mechanism::SharedMemory => Box::new(self.mailbox(opening)?),
+            Mechanism::Udp => {
+                let connect = || {
+                    let port = std::fs::read_to_string(self.port(opening))?;
+                    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
+                    socket.connect((Ipv4Addr::LOCALHOST, port.parse().map_err(io::Error::other)?))?;
+                    Ok(socket)
+                };
+                Box::new(connect().map_err(BenchError::system("connect a socket"))?)
             }
         };
-        Ok(Sender { carry, notifier, words })
+        Ok(Sender { carry, words })
     }
 
     /// Opens an end that receives.
-    pub fn receiver(&self, opening: &Opening, descriptor: Option<OwnedFd>) -> Result<Receiver, BenchError> {
-        let (words, direction, wake) = (opening.words, opening.direction, opening.wake);
-        let service = format!("bench/{}/{direction}", opening.name);
-        let sleeps = wake != Wake::Spin;
-        let mut notifier = Notification::None;
+    pub fn receiver(&self, opening: &Opening) -> Result<Receiver, BenchError> {
+        let (words, wake) = (opening.words, opening.wake);
+        let service = format!("bench/{}/{}", opening.name, opening.direction);
         let carry: Box<dyn In> = match opening.mechanism {
             Mechanism::Ours => {
                 let (bus, topic) = self.ours(opening)?;
-                if sleeps {
-                    notifier = Notification::Ours;
-                }
                 match words {
                     8 => Box::new(bus.reader::<Probe64>(&topic, Reader::Role)?),
                     16 => Box::new(bus.reader::<Probe128>(&topic, Reader::Role)?),
@@ -422,29 +381,21 @@ impl Station<'_> {
             }
             Mechanism::Iceoryx => {
                 let node = self.raw(opening)?;
-                if sleeps {
-                    notifier = Notification::Listener(node.listener(&service)?);
-                }
-                of_size!(words, SIZE => Box::new(node.subscriber::<SIZE>(&service)?))
+                let listener = (wake != Wake::Spin).then(|| node.listener(&service)).transpose()?;
+                of_size!(words, SIZE => Box::new(Iceoryx(node.subscriber::<SIZE>(&service)?, listener)))
             }
-            Mechanism::Blackboard => {
-                of_size!(words, SIZE => Box::new(Newest(self.raw(opening)?.board_reader::<SIZE>(&service)?, 0)))
-            }
-            Mechanism::SharedMemory => {
-                if sleeps {
-                    notifier = Notification::Futex(self.page(opening)?, direction);
-                }
-                Box::new(Mailbox(self.page(opening)?, direction, 0))
-            }
-            Mechanism::EventFd => {
-                notifier = descriptor.map_or(Notification::None, Notification::EventFd);
-                Box::new(Mailbox(self.page(opening)?, direction, 0))
-            }
-            Mechanism::Pipe | Mechanism::UnixSocket | Mechanism::Udp => {
-                Box::new(Descriptor(descriptor.ok_or_else(|| system("open a descriptor", "none was given"))?))
+            Mechanism::SharedMemory => Box::new(self.mailbox(opening)?),
+            Mechanism::Udp => {
+                let bind = || {
+                    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
+                    socket.set_read_timeout(Some(Duration::from_nanos(SLEEP_NS)))?;
+                    std::fs::write(self.port(opening), socket.local_addr()?.port().to_string())?;
+                    Ok(socket)
+                };
+                Box::new(bind().map_err(BenchError::system("open a socket"))?)
             }
         };
-        Ok(Receiver { carry, notifier, words, wake, gives_way: false })
+        Ok(Receiver { carry, words, wake, gives_way: false })
     }
 }
 
@@ -454,25 +405,12 @@ impl Sender {
     pub fn send(&mut self, number: u64, due_ns: u64) -> Result<(), BenchError> {
         let mut words = [number; MAX_WORDS];
         (words[1], words[2], words[3]) = (GENERATION, due_ns, monotonic_ns());
-        self.carry.send(&words[..self.words])?;
-        match &self.notifier {
-            Notification::Futex(page, direction) => page.notify(*direction).map_err(|error| system("wake", error)),
-            Notification::EventFd(fd) => {
-                rustix::io::write(fd, &1_u64.to_ne_bytes()).map(|_| ()).map_err(|e| system("wake", e))
-            }
-            Notification::Notifier(notifier) => Ok(notifier.notify()?),
-            Notification::None | Notification::Ours | Notification::Listener(_) => Ok(()),
-        }
+        self.carry.send(&words[..self.words])
     }
 
     /// Gets ready for the next sample, off the critical path.
     pub fn prepare(&mut self) -> Result<(), BenchError> {
         self.carry.prepare()
-    }
-
-    /// Tells readers that came late of this end.
-    pub fn refresh(&mut self) -> Result<(), BenchError> {
-        self.carry.refresh()
     }
 }
 
@@ -502,10 +440,6 @@ impl Receiver {
         let words = &mut words[..self.words];
         let mut polled = 0_u32;
         loop {
-            let notified = match &self.notifier {
-                Notification::Futex(page, direction) => page.notified(*direction),
-                _ => 0,
-            };
             if self.carry.receive(words)? {
                 let whole = words[STAMP..].iter().all(|word| *word == words[0]);
                 let content = Content { number: words[0], due_ns: words[2], sent_ns: words[3] };
@@ -524,25 +458,11 @@ impl Receiver {
             } else if monotonic_ns() > end_ns {
                 return Ok(None);
             } else {
-                self.sleep(notified)?;
+                match self.wake {
+                    Wake::Spin => sleep_until(monotonic_ns() + NAP_NS),
+                    Wake::Event | Wake::Hybrid => self.carry.sleep(monotonic_ns() + SLEEP_NS)?,
+                }
             }
         }
-    }
-
-    fn sleep(&mut self, notified: u32) -> Result<(), BenchError> {
-        match &self.notifier {
-            Notification::Futex(page, direction) => page.wait(*direction, notified),
-            Notification::EventFd(fd) => {
-                rustix::io::read(fd, &mut [0; 8]).map_err(|error| system("wait", error))?;
-            }
-            Notification::Listener(listener) => listener.wait(Duration::from_nanos(SLEEP_NS))?,
-            Notification::Ours => self.carry.sleep(monotonic_ns() + SLEEP_NS)?,
-            // What carries the sample blocks by itself, or the partner keeps a spinner waiting for too long.
-            Notification::None | Notification::Notifier(_) if self.wake == Wake::Spin => {
-                sleep_until(monotonic_ns() + NAP_NS)
-            }
-            Notification::None | Notification::Notifier(_) => {}
-        }
-        Ok(())
     }
 }

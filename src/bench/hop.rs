@@ -5,16 +5,11 @@
 
 use super::board::Board;
 use super::exchange::{Mechanism, Opening, Receiver, Sender, Station, Wake};
-use super::peer::{Descriptors, LOST_NS, Peer, SPIN_NS, lead_ns};
+use super::peer::{LOST_NS, Peer, SPIN_NS, lead_ns};
 use super::session::{Bench, BenchError};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::clock::{Grid, monotonic_ns, wait_until};
 use crate::telemetry::{Grant, Latency};
-use rustix::event::{EventfdFlags, eventfd};
-use rustix::fd::OwnedFd;
-use std::io;
-use std::net::UdpSocket;
-use std::os::unix::net::UnixDatagram;
 
 /// The pace of the open loop: 1 kHz.
 const PERIOD_NS: u64 = 1_000_000;
@@ -24,17 +19,8 @@ const START_NS: u64 = 5_000_000;
 const SIZES: [usize; 3] = [8, 16, 32];
 
 /// Who takes part, by how the receiver waits.
-const SPINNERS: [Mechanism; 4] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::Blackboard, Mechanism::SharedMemory];
-const SLEEPERS: [Mechanism; 7] = [
-    Mechanism::Ours,
-    Mechanism::Iceoryx,
-    Mechanism::SharedMemory,
-    Mechanism::EventFd,
-    Mechanism::Pipe,
-    Mechanism::UnixSocket,
-    Mechanism::Udp,
-];
-const HYBRIDS: [Mechanism; 3] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory];
+const POLLED: [Mechanism; 3] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory];
+const SLEEPERS: [Mechanism; 4] = [Mechanism::Ours, Mechanism::Iceoryx, Mechanism::SharedMemory, Mechanism::Udp];
 
 /// One way of one size with both of its ends.
 pub(super) struct Pair {
@@ -53,7 +39,7 @@ pub(super) struct Pair {
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let domain = OwnedDomain::create(0)?;
-    let ways = [(Wake::Spin, &SPINNERS[..]), (Wake::Event, &SLEEPERS[..]), (Wake::Hybrid, &HYBRIDS[..])];
+    let ways = [(Wake::Spin, &POLLED[..]), (Wake::Event, &SLEEPERS[..]), (Wake::Hybrid, &POLLED[..])];
     for (wake, mechanisms) in ways {
         for words in bench.size(&SIZES[..], &SIZES[..1]).iter().copied() {
             bench.next(&format!("hop: {}, {} bytes", wake.name(), 8 * words))?;
@@ -119,22 +105,13 @@ impl Pair {
         let floor = (mechanism == Mechanism::Ours).then(|| title(Mechanism::Iceoryx));
         let mut name: String = title(mechanism).chars().filter(|letter| letter.is_ascii_alphanumeric()).collect();
         name += if observer { "observer" } else { "controller" };
-        let descriptors = match mechanism.descriptors() {
-            true => Some(descriptors(mechanism).map_err(BenchError::system("open descriptors"))?),
-            false => None,
-        };
-        let numbers = descriptors.as_ref().map(Descriptors::numbers);
-        let opening =
-            |direction| Opening { mechanism, wake, words, name: name.clone(), direction, descriptors: numbers };
-        let (ours, theirs) = descriptors.map_or((None, Vec::new()), |pair| (Some(pair.ours), pair.theirs.into()));
-        let [read, write] = ours.map_or([None, None], |[read, write]| [Some(read), Some(write)]);
-        let mut peer = Peer::start(domain, observer, theirs)?;
+        let opening = |direction| Opening { mechanism, wake, words, name: name.clone(), direction };
+        let mut peer = Peer::start(domain, observer)?;
         let station = Station { domain, process: "bench" };
-        // A blackboard must be there before anybody reads it: the writers' ends come first.
-        let mut sender = station.sender(&opening(0), write)?;
+        // Each receiver is open before its sender, which looks for it once.
+        let back = station.receiver(&opening(1))?;
         peer.open(opening(0), Some(opening(1)))?;
-        let back = station.receiver(&opening(1), read)?;
-        sender.refresh()?;
+        let sender = station.sender(&opening(0))?;
         Ok(Self { name: title(mechanism), floor, sender, back, peer, number: 0, gives_way: false, lost: 0 })
     }
 
@@ -199,35 +176,4 @@ pub(super) fn send_paced(
     }
     *number = before + count;
     Ok(())
-}
-
-/// The descriptors of both ends and directions.
-fn descriptors(mechanism: Mechanism) -> io::Result<Descriptors> {
-    match mechanism {
-        Mechanism::Pipe => {
-            let ((their_read, our_write), (our_read, their_write)) = (io::pipe()?, io::pipe()?);
-            Ok(Descriptors {
-                ours: [our_read.into(), our_write.into()],
-                theirs: [their_read.into(), their_write.into()],
-            })
-        }
-        Mechanism::UnixSocket => {
-            let (ours, theirs) = UnixDatagram::pair()?;
-            both(ours.try_clone()?.into(), ours.into(), theirs.try_clone()?.into(), theirs.into())
-        }
-        Mechanism::Udp => {
-            let (ours, theirs) = (UdpSocket::bind("127.0.0.1:0")?, UdpSocket::bind("127.0.0.1:0")?);
-            ours.connect(theirs.local_addr()?)?;
-            theirs.connect(ours.local_addr()?)?;
-            both(ours.try_clone()?.into(), ours.into(), theirs.try_clone()?.into(), theirs.into())
-        }
-        _ => {
-            let (there, back) = (eventfd(0, EventfdFlags::CLOEXEC)?, eventfd(0, EventfdFlags::CLOEXEC)?);
-            both(back.try_clone()?, there.try_clone()?, there, back)
-        }
-    }
-}
-
-fn both(our_read: OwnedFd, our_write: OwnedFd, their_read: OwnedFd, their_write: OwnedFd) -> io::Result<Descriptors> {
-    Ok(Descriptors { ours: [our_read, our_write], theirs: [their_read, their_write] })
 }

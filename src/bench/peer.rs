@@ -11,7 +11,6 @@ use crate::config::Scenario;
 use crate::runtime::{Privileges, RoleId, take_privileges};
 use crate::system::this_program;
 use crate::telemetry::{Grant, Latency, StageReport};
-use rustix::fd::{AsRawFd, FromRawFd, OwnedFd};
 use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
@@ -90,8 +89,8 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
     match (order, ends) {
         (Order::Open { inlet, outlet }, ends) => {
             let station = Station { domain, process: "peer" };
-            let receiver = station.receiver(inlet, descriptor(inlet, 0))?;
-            let sender = outlet.as_ref().map(|outlet| station.sender(outlet, descriptor(outlet, 1))).transpose()?;
+            let receiver = station.receiver(inlet)?;
+            let sender = outlet.as_ref().map(|outlet| station.sender(outlet)).transpose()?;
             *ends = Some((receiver, sender));
             Ok(Answer::Open)
         }
@@ -114,13 +113,6 @@ fn obey(order: &Order, domain: &Domain, ends: &mut Option<(Receiver, Option<Send
         }
         _ => Err(system("obey", "nothing is open")),
     }
-}
-
-/// A descriptor that was inherited.
-#[allow(unsafe_code)]
-fn descriptor(opening: &Opening, index: usize) -> Option<OwnedFd> {
-    // SAFETY: the parent left this descriptor open for us alone, and says its number once.
-    opening.descriptors.map(|numbers| unsafe { OwnedFd::from_raw_fd(numbers[index]) })
 }
 
 /// How long before a sample is due both ends wake: at a short period there must be some sleep left.
@@ -172,12 +164,8 @@ pub(super) struct Peer {
 }
 
 impl Peer {
-    /// Starts a peer; it inherits `theirs`, which are of no more use here then.
-    pub fn start(domain: &Domain, observer: bool, theirs: Vec<OwnedFd>) -> Result<Self, BenchError> {
-        for fd in &theirs {
-            rustix::io::fcntl_setfd(fd, rustix::io::FdFlags::empty())
-                .map_err(|error| BenchError::system("hand a descriptor on")(error.into()))?;
-        }
+    /// Starts a peer.
+    pub fn start(domain: &Domain, observer: bool) -> Result<Self, BenchError> {
         let mut command = this_program().map_err(BenchError::system("find this program"))?;
         command.arg("bench-peer").arg("--domain").arg(domain.root());
         command.arg("--parent").arg(std::process::id().to_string());
@@ -267,18 +255,5 @@ impl Drop for Peer {
         self.orders.take();
         let _ = self.child.kill();
         let _ = self.child.wait();
-    }
-}
-
-/// Pairs of descriptors for an exchange in both directions: ours and theirs, each to read from and to write to.
-pub(super) struct Descriptors {
-    pub ours: [OwnedFd; 2],
-    pub theirs: [OwnedFd; 2],
-}
-
-impl Descriptors {
-    /// The numbers under which the peer will have its own.
-    pub fn numbers(&self) -> [i32; 2] {
-        [self.theirs[0].as_raw_fd(), self.theirs[1].as_raw_fd()]
     }
 }

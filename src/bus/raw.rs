@@ -9,9 +9,7 @@ use crate::files::Directory;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::reader::EntryHandle;
 use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::port::writer::EntryHandleMut;
 use iceoryx2::prelude::*;
 use std::fmt::Debug;
 use std::rc::Rc;
@@ -25,10 +23,6 @@ pub(crate) struct RawNode(Node<Ipc>, Rc<Directory>);
 pub(crate) struct RawPublisher<const WORDS: usize>(Publisher<Ipc, [u64; WORDS], ()>);
 /// The bare subscriber to the newest of them.
 pub(crate) struct RawSubscriber<const WORDS: usize>(Subscriber<Ipc, [u64; WORDS], ()>);
-/// The writing end of a bare blackboard with one entry.
-pub(crate) struct RawBoardWriter<const WORDS: usize>(EntryHandleMut<Ipc, u64, [u64; WORDS]>);
-/// Its reading end.
-pub(crate) struct RawBoardReader<const WORDS: usize>(EntryHandle<Ipc, u64, [u64; WORDS]>);
 /// The end of a bare event that notifies.
 pub(crate) struct RawNotifier(Notifier<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
 /// The end that waits.
@@ -91,31 +85,6 @@ impl RawNode {
         subscriber.map(RawSubscriber).map_err(|error| refused(name, "subscriber", error))
     }
 
-    /// The writing end of a blackboard, which it makes.
-    pub fn board_writer<const WORDS: usize>(&self, name: &str) -> Result<RawBoardWriter<WORDS>, BusError> {
-        let service = self
-            .0
-            .service_builder(&name.try_into().map_err(|error| refused(name, "writer", error))?)
-            .blackboard_creator::<u64>()
-            .add::<[u64; WORDS]>(0, [0; WORDS])
-            .create()
-            .map_err(|error| refused(name, "writer", error))?;
-        let writer = service.writer_builder().create().map_err(|error| refused(name, "writer", error))?;
-        writer.entry(&0).map(RawBoardWriter).map_err(|error| refused(name, "writer", error))
-    }
-
-    /// The reading end of a blackboard, which must be there.
-    pub fn board_reader<const WORDS: usize>(&self, name: &str) -> Result<RawBoardReader<WORDS>, BusError> {
-        let service = self
-            .0
-            .service_builder(&name.try_into().map_err(|error| refused(name, "reader", error))?)
-            .blackboard_opener::<u64>()
-            .open()
-            .map_err(|error| refused(name, "reader", error))?;
-        let reader = service.reader_builder().create().map_err(|error| refused(name, "reader", error))?;
-        reader.entry(&0).map(RawBoardReader).map_err(|error| refused(name, "reader", error))
-    }
-
     fn event(&self, name: &str, end: &'static str) -> Result<Event, BusError> {
         let name_of = name.try_into().map_err(|error| refused(name, end, error))?;
         self.0.service_builder(&name_of).event().open_or_create().map_err(|error| refused(name, end, error))
@@ -151,24 +120,6 @@ impl<const WORDS: usize> RawSubscriber<WORDS> {
     pub fn receive<T>(&mut self, read: impl FnOnce(&[u64]) -> T) -> Result<Option<T>, BusError> {
         let sample = self.0.receive().map_err(receive_failed)?;
         Ok(sample.map(|sample| read(sample.payload())))
-    }
-}
-
-impl<const WORDS: usize> RawBoardWriter<WORDS> {
-    /// Replaces the value.
-    #[inline]
-    pub fn send(&mut self, words: &[u64]) {
-        let mut content = [0; WORDS];
-        content.copy_from_slice(&words[..WORDS]);
-        self.0.update_with_copy(content);
-    }
-}
-
-impl<const WORDS: usize> RawBoardReader<WORDS> {
-    /// A copy of the value.
-    #[inline]
-    pub fn get(&self) -> [u64; WORDS] {
-        *self.0.get()
     }
 }
 

@@ -85,8 +85,8 @@ fn the_hop_stands_beside_all_its_floors() {
     let bench = Bench::new();
     let results = measure(&bench, &["hop"]);
     assert_rows(&bench, &results, &["hop"]);
-    let spinners = ["ours", "iceoryx2", "iceoryx2 blackboard", "shared memory"].map(|name| (name, "spin"));
-    let sleepers = ["ours", "iceoryx2", "futex", "eventfd", "pipe", "Unix socket", "UDP loopback"];
+    let spinners = ["ours", "iceoryx2", "shared memory"].map(|name| (name, "spin"));
+    let sleepers = ["ours", "iceoryx2", "futex", "UDP loopback"];
     let sleepers = sleepers.map(|name| (name, "event"));
     let hybrids = ["ours", "iceoryx2", "futex"].map(|name| (name, "hybrid"));
     for (name, wake) in spinners.into_iter().chain(sleepers).chain(hybrids) {
