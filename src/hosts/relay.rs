@@ -174,7 +174,7 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
     let bus = IoxBus::enter(&domain, RELAY, depths(&scenario))?;
     let mut relay = Relay::open(&domain, &scenario, &plan, &net.post(), shared, timing, &bus)?;
     let carriers = Carriers::start(&domain, &scenario, &plan, &net.post())?;
-    write(&ready_path(domain.root()), seat.seat.endpoint.address.to_string().as_bytes())?;
+    write(&ready_path(domain.root()), b"")?;
     let served = relay.serve(&inbox, &carriers, (&net, parts.as_deref()), terminated);
     let links = carriers.end();
     let report = relay.report(&links);

@@ -109,7 +109,7 @@ fn end(
     let text = serde_json::to_vec(&far_end).expect("an account of plain values is JSON");
     write_whole(&path, &text).map_err(|source| LaunchError::Write { path, source })?;
     let limit_ns = raw_ns() + TELL_NS;
-    while relay.lingers() && raw_ns() < limit_ns {
+    while relay.companion.lingers() && raw_ns() < limit_ns {
         clock::sleep_until(monotonic_ns() + LULL_NS);
     }
     Ok((far_end, ticks))

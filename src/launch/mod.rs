@@ -3,6 +3,7 @@
 //! Never leaves a process or a shared-memory file behind, however it ends. Must not compute what roles compute.
 
 mod children;
+mod companion;
 mod criteria;
 mod direct;
 mod external;

@@ -6,8 +6,9 @@
 mod joined;
 
 use super::children::{END_LIMIT, RoleProcess};
+use super::companion::Companion;
 use super::external::{ExternalWatch, Waiting};
-use super::foxglove::{FOXGLOVE, FoxgloveWatch};
+use super::foxglove;
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
@@ -219,7 +220,7 @@ pub(super) struct Supervisor<'a> {
     word: Schedule,
     incidents: Vec<Incident>,
     recorder: RecorderWatch,
-    foxglove: FoxgloveWatch,
+    foxglove: Companion,
     relay: RelayWatch,
 }
 
@@ -233,7 +234,7 @@ impl<'a> Supervisor<'a> {
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let mut recorder = RecorderWatch::start(launch.record.as_deref(), scenario, domain, bus)?;
-        let foxglove = FoxgloveWatch::start(launch.foxglove, domain)?;
+        let foxglove = foxglove::start(launch.foxglove, domain)?;
         let hub = launch.host.as_ref().map_or("", |seat| &seat.host);
         let relay = RelayWatch::start(launch.host.as_ref(), hub, scenario, domain)?;
         // All of them first: they come up while their links are opened here.
@@ -252,7 +253,7 @@ impl<'a> Supervisor<'a> {
         };
         let mut members = started.iter().map(open).collect::<Result<Vec<_>, _>>().map_err(|error| {
             let roles = started.iter_mut().map(|(role, process)| (role.name(scenario), process.as_mut()));
-            blame(error, roles.chain([(RECORDER, recorder.process())]))
+            blame(error, roles.chain([recorder.companion.process()]))
         })?;
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
@@ -263,7 +264,7 @@ impl<'a> Supervisor<'a> {
     /// See [`blame`].
     fn blame(&mut self, error: LaunchError) -> LaunchError {
         let members = self.members.iter_mut().map(|member| (&*member.name, member.process.as_mut()));
-        blame(error, members.chain([(RECORDER, self.recorder.process()), (RELAY, self.relay.process())]))
+        blame(error, members.chain([self.recorder.companion.process(), self.relay.companion.process()]))
     }
 
     /// Leads the roles through the phases of a run. Returns the signal that ended it, or 0.
@@ -375,7 +376,8 @@ impl<'a> Supervisor<'a> {
                 return Ok(false);
             }
             let recorder = self.recorder.has_reached(state)?;
-            let watchers = [(RECORDER, recorder), (FOXGLOVE, self.foxglove.ready()?), (RELAY, self.relay.ready()?)];
+            let foxglove = self.foxglove.ready(&foxglove::address_path(self.domain))?;
+            let watchers = [(RECORDER, recorder), ("foxglove", foxglove), (RELAY, self.relay.ready()?)];
             if let Some(incident) = self.relay.supervise(self.scenario, 0).into_iter().next() {
                 return Err(LaunchError::Died {
                     role: incident.role,
@@ -477,7 +479,7 @@ impl<'a> Supervisor<'a> {
         let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
         let over = self.scenario.clock == ClockKind::Realtime && now_ns > self.word.epoch_ns.saturating_add(ticks_ns);
         self.recorder.supervise(self.janitor);
-        self.foxglove.supervise(self.janitor);
+        self.foxglove.loss(false, self.janitor);
         for member in &mut self.members {
             member.in_ticks(over);
             let complete = member.ended_complete(self.scenario, self.domain);
@@ -596,7 +598,7 @@ impl<'a> Supervisor<'a> {
         let begun_ns = monotonic_ns();
         let within = |limit_ns: u64| monotonic_ns() - begun_ns < limit_ns;
         while self.foxglove.lingers() && within(END_LIMIT.as_nanos() as u64)
-            || (self.recorder.lingers() || self.relay.leads() && self.relay.lingers()) && within(HUNG_NS)
+            || (self.recorder.lingers() || self.relay.leads() && self.relay.companion.lingers()) && within(HUNG_NS)
         {
             let _ = self.announce();
             self.pause(monotonic_ns() + LOOK_NS);

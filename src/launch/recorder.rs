@@ -4,7 +4,7 @@
 //! nothing any more, hold the run up.
 
 use super::LaunchError;
-use super::children::{RoleProcess, program};
+use super::companion::Companion;
 use super::janitor::Janitor;
 use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
@@ -15,16 +15,16 @@ use crate::hosts::HostsSummary;
 use crate::record::{JOINING, RECORDER, RecordingReport};
 use crate::runtime::{report_path, topic};
 use crate::sample::{Health, RoleState};
-use crate::system::tell;
 use crate::telemetry::RoleReport;
 use std::path::Path;
+use std::process::Command;
 
 /// The most that one look adds to its silence, ns: a launcher that stood still blames nobody.
 const LOOK_MAX_NS: u64 = 100_000_000;
 
 /// A run's recorder, if it has one.
 pub(super) struct RecorderWatch {
-    process: Option<RoleProcess>,
+    pub companion: Companion,
     /// The name of the file, for a recorder of ours.
     file: Option<String>,
     health: <IoxBus as Bus>::Reader<Health>,
@@ -40,14 +40,14 @@ pub(super) struct RecorderWatch {
 impl RecorderWatch {
     /// Starts a recorder to `file`; without one, looks out for somebody else's.
     pub fn start(file: Option<&Path>, scenario: &Scenario, domain: &Domain, bus: &IoxBus) -> Result<Self, LaunchError> {
-        let start = |file: &Path| {
-            let mut command = program(RECORDER)?;
-            command.arg("record").arg("--domain").arg(domain.root()).arg("--out").arg(file);
-            RoleProcess::spawn(command, RECORDER.to_owned())
-        };
+        let arguments = file.map(|file| {
+            move |command: &mut Command| {
+                command.arg("record").arg("--domain").arg(domain.root()).arg("--out").arg(file);
+            }
+        });
         Ok(Self {
             health: bus.reader(&topic(scenario, RECORDER, Signal::Health), Reader::Role)?,
-            process: file.map(start).transpose()?,
+            companion: Companion::start(RECORDER, arguments)?,
             file: file.map(|file| file.file_name().unwrap_or_default().to_string_lossy().into_owned()),
             last: Health::default(),
             joined_at: None,
@@ -56,11 +56,6 @@ impl RecorderWatch {
             limit_ns: (scenario.supervision.heartbeat_timeout_s * 1e9) as u64,
             problem: None,
         })
-    }
-
-    /// Its process, if it is ours.
-    pub fn process(&mut self) -> Option<&mut RoleProcess> {
-        self.process.as_mut()
     }
 
     /// Hears how it is.
@@ -78,8 +73,8 @@ impl RecorderWatch {
 
     /// Whether it has come to a state before the ticks; how it failed if it never will.
     pub fn has_reached(&mut self, state: RoleState) -> Result<bool, LaunchError> {
-        let Some(process) = &mut self.process else { return Ok(true) };
-        process.require_alive(RECORDER)?;
+        let (name, Some(process)) = self.companion.process() else { return Ok(true) };
+        process.require_alive(name)?;
         Ok(self.state() >= state)
     }
 
@@ -103,29 +98,15 @@ impl RecorderWatch {
         if self.problem.is_some() || self.state() == RoleState::Done {
             return;
         }
-        let ended = self.process.as_mut().and_then(|process| process.ended().map(|status| process.failure(status)));
         let silent = self.active() && self.silent_ns > self.limit_ns;
-        let problem = match ended {
-            Some(failure) => failure.cause,
-            None if silent => {
-                self.process.as_mut().map(RoleProcess::kill);
-                "it said nothing any more".to_owned()
-            }
-            None => return,
-        };
-        tell(format_args!("corotate: the recorder failed: {problem}; the run goes on without"));
-        self.problem = Some(problem);
-        janitor.clear_dead();
+        self.problem = self.companion.loss(silent, janitor);
     }
 
     /// Whether it still writes: a process of ours has not ended, or somebody else's has not said that it is done.
     pub fn lingers(&mut self) -> bool {
         // Nothing is lost but its last words if the link has failed.
         let _ = self.listen();
-        match &mut self.process {
-            Some(process) => process.ended().is_none(),
-            None => self.active(),
-        }
+        self.companion.lingers() || self.file.is_none() && self.active()
     }
 
     /// Tells what is in the file, beside the roles' final counters. A recorder that has not ended by now is ended.
@@ -136,7 +117,8 @@ impl RecorderWatch {
         hosts: Option<&HostsSummary>,
     ) -> Option<RecordingReport> {
         let file = self.file.take()?;
-        let late = self.process.take().is_some_and(|mut process| process.ended().is_none());
+        let late = self.companion.lingers();
+        drop(self.companion);
         let left = std::fs::read(report_path(domain.root(), RECORDER)).ok();
         let report = left.and_then(|bytes| serde_json::from_slice(&bytes).ok());
         let mut report: RecordingReport = report.unwrap_or_else(|| {

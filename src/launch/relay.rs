@@ -3,14 +3,16 @@
 //! Must not carry anything, nor decide when a run ends; [`super::processes`] does.
 
 use super::LaunchError;
-use super::children::{RoleProcess, program};
-use super::supervision::{Action, Incident};
+use super::children::RoleProcess;
+use super::companion::Companion;
+use super::supervision::{Action, Failure, Incident};
 use crate::bus::domain::Domain;
 use crate::config::Scenario;
 use crate::hosts::{HostReport, HostSeat, RELAY, far_end_path, ready_path, relay_report_path};
 use crate::runtime::RoleId;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
+use std::process::Command;
 
 /// What the launcher of a host that joined leaves for the one of the run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -25,12 +27,10 @@ pub(super) struct FarEnd {
 
 /// A run's relay, if it has several hosts.
 pub(super) struct RelayWatch {
-    process: Option<RoleProcess>,
+    pub companion: Companion,
     root: PathBuf,
-    ready: bool,
     /// All hosts, and whether it is known how each of the others ended.
     hosts: Vec<(String, bool)>,
-    failed: bool,
     /// Whether this is the host that launched.
     leads: bool,
 }
@@ -43,27 +43,20 @@ impl RelayWatch {
         scenario: &Scenario,
         domain: &Domain,
     ) -> Result<Self, LaunchError> {
-        let start = |seat: &HostSeat| {
-            let mut command = program(RELAY)?;
-            command.arg(RELAY).arg("--domain").arg(domain.root()).args(["--host", &seat.host, "--hub", hub]);
-            command.args(seat.endpoint.options());
-            RoleProcess::spawn(command, RELAY.to_owned())
-        };
+        let arguments = seat.map(|seat| {
+            move |command: &mut Command| {
+                command.arg(RELAY).arg("--domain").arg(domain.root()).args(["--host", &seat.host, "--hub", hub]);
+                command.args(seat.endpoint.options());
+            }
+        });
         let hosts = scenario.hosts.hosts.iter().map(|host| (host.name.clone(), false));
         Ok(Self {
-            process: seat.map(start).transpose()?,
+            companion: Companion::start(RELAY, arguments)?,
             root: domain.root().to_owned(),
-            ready: seat.is_none(),
             // Only the host that launched is told of others.
             hosts: if seat.is_some_and(|seat| seat.host == hub) { hosts.collect() } else { Vec::new() },
-            failed: false,
             leads: seat.is_some_and(|seat| seat.host == hub),
         })
-    }
-
-    /// Its process.
-    pub fn process(&mut self) -> Option<&mut RoleProcess> {
-        self.process.as_mut()
     }
 
     /// Whether this is the host that launched: its relay ends with the run, that of another once it has told how the host ended.
@@ -73,21 +66,13 @@ impl RelayWatch {
 
     /// Whether it carries; how it failed if it never will.
     pub fn ready(&mut self) -> Result<bool, LaunchError> {
-        if let Some(process) = &mut self.process {
-            process.require_alive(RELAY)?;
-        }
-        self.ready |= ready_path(&self.root).exists();
-        Ok(self.ready)
+        self.companion.ready(&ready_path(&self.root))
     }
 
     /// What ends the run: the relay has failed, or a host has ended while ticks were to run. `tick` is the one at hand.
     pub fn supervise(&mut self, scenario: &Scenario, tick: u64) -> Vec<Incident> {
         let mut incidents = Vec::new();
-        if let Some(status) = self.process.as_mut().and_then(RoleProcess::ended).filter(|_| !self.failed) {
-            self.failed = true;
-            let failure = self.process.as_mut().map(|process| process.failure(status));
-            let (cause, last_words) =
-                failure.map_or_else(Default::default, |failure| (failure.cause, failure.last_words));
+        if let Some(Failure { cause, last_words, .. }) = self.companion.failure() {
             incidents.push(incident(RELAY.to_owned(), Vec::new(), tick, cause, last_words));
         }
         for (host, known) in self.hosts.iter_mut().filter(|(_, known)| !known) {
@@ -105,14 +90,9 @@ impl RelayWatch {
         incidents
     }
 
-    /// Whether it has not ended yet.
-    pub fn lingers(&mut self) -> bool {
-        self.process.as_mut().is_some_and(|process| process.ended().is_none())
-    }
-
     /// What the hosts tell at the end: their accounts, what went wrong there, and incidents that are not in `known`.
     pub fn finish(&mut self, known: &[Incident]) -> (Vec<HostReport>, Vec<String>, Vec<Incident>) {
-        self.process = None;
+        self.companion.process().1.map(RoleProcess::kill);
         let (mut reports, mut problems, mut incidents) = (Vec::new(), Vec::new(), Vec::new());
         for (host, _) in &self.hosts {
             let report = std::fs::read(relay_report_path(&self.root, host)).ok();

@@ -14,7 +14,7 @@ impl<'a> Supervisor<'a> {
     ) -> Result<Self, LaunchError> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let recorder = RecorderWatch::start(None, scenario, domain, bus)?;
-        let foxglove = FoxgloveWatch::start(None, domain)?;
+        let foxglove = foxglove::start(None, domain)?;
         let own = |role: &RoleId| role.host(scenario) == *role && scenario.hosts.of(role.name(scenario)) == Some(host);
         let roles = RoleId::all(scenario).into_iter().filter(own);
         let started = roles.map(|role| Ok((role, RoleProcess::start(scenario, role, domain)?)));
