@@ -114,13 +114,13 @@ pub(super) fn write(
     }
     #[cfg(feature = "parquet")]
     {
-        let kinds = kinds.into_iter().map(|kind| kind.unwrap_or(Kind::Word)).collect();
+        let kinds: Vec<_> = kinds.into_iter().map(|kind| kind.unwrap_or(Kind::Word)).collect();
         let rows = journal.entries()?.filter_map(|entry| match entry {
             Ok(Entry::Row(row)) => Some(Ok(row)),
             Ok(Entry::Margin { .. }) => None,
             Err(error) => Some(Err(io::Error::other(error))),
         });
-        write_file(&directory.join(CASES_PARQUET), |out| super::parquet::write(out, &table, kinds, rows))?;
+        write_file(&directory.join(CASES_PARQUET), |out| super::parquet::write(out, &table, &kinds, rows))?;
     }
     let summary = Summary {
         schema: SCHEMA,

@@ -7,7 +7,7 @@ use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;
 use crate::model::Inertia;
 #[cfg(feature = "parquet")]
-use crate::record::RowGroups;
+use crate::record::{Cell, ColumnKind, RowGroups};
 use crate::report::{HiddenFacts, HiddenPage};
 use crate::sample::FieldKind;
 use crate::system::remedy;
@@ -255,7 +255,7 @@ const COLUMNS: [(&str, FieldKind); 7] = [
 enum Table {
     Csv(BufWriter<files::Created>),
     #[cfg(feature = "parquet")]
-    Parquet(Box<RowGroups>),
+    Parquet(Box<RowGroups<files::Created>>),
 }
 
 impl Table {
@@ -271,9 +271,10 @@ impl Table {
 
     #[cfg(feature = "parquet")]
     fn begin_parquet(path: &Path) -> io::Result<Self> {
-        let (file, columns) = (files::create(path)?, COLUMNS.map(|(name, kind)| (name.to_owned(), kind)).to_vec());
+        let columns = COLUMNS.map(|(name, kind)| (name.to_owned(), kind.into()));
+        let columns = [("segment".to_owned(), ColumnKind::Word)].into_iter().chain(columns).collect();
         let about = vec![("version", env!("CARGO_PKG_VERSION").to_owned())];
-        RowGroups::begin(file, "estimate", Some("segment"), columns, about, ROWS_PER_GROUP)
+        RowGroups::begin(files::create(path)?, "estimate", columns, false, about, ROWS_PER_GROUP)
             .map(|groups| Self::Parquet(Box::new(groups)))
     }
 
@@ -304,7 +305,8 @@ impl Table {
             #[cfg(feature = "parquet")]
             Self::Parquet(groups) => {
                 let [time, estimate, deviation, measured, error] = numbers.map(f64::to_bits);
-                groups.row(Some(segment), &[row.entry.row, time, estimate, deviation, measured, error, observed])
+                let bits = [row.entry.row, time, estimate, deviation, measured, error, observed].map(Cell::Bits);
+                groups.row([Cell::Word(segment.to_owned())].into_iter().chain(bits).map(Some))
             }
         }
     }

@@ -8,7 +8,7 @@ mod csv;
 mod parquet;
 mod table;
 #[cfg(feature = "parquet")]
-pub(crate) use parquet::RowGroups;
+pub(crate) use parquet::{Cell, ColumnKind, RowGroups};
 
 use self::table::Table;
 use super::RecordError;

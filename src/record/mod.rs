@@ -27,9 +27,9 @@ mod writer;
 
 pub use diff::{Comparison, SignalDiff, Tolerances, ValueDiff, diff};
 #[cfg(feature = "parquet")]
-pub(crate) use export::RowGroups;
-#[cfg(feature = "parquet")]
 pub use export::export_parquet;
+#[cfg(feature = "parquet")]
+pub(crate) use export::{Cell, ColumnKind, RowGroups};
 pub use export::{ExportError, export_csv};
 pub use process::{RecorderSeat, run_recorder};
 pub use reader::{EndInfo, Recording, RunInfo, SignalInfo, Track};

@@ -7,13 +7,13 @@ use crate::files::Created;
 use crate::record::reader::{Recording, SignalInfo};
 use crate::sample::FieldKind;
 use parquet::basic::{Compression, LogicalType, Repetition, Type as Physical, ZstdLevel};
-use parquet::data_type::{ByteArray, ByteArrayType, DoubleType, Int64Type};
+use parquet::data_type::{BoolType, ByteArray, ByteArrayType, DoubleType, Int64Type};
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterVersion};
-use parquet::file::writer::SerializedFileWriter;
+use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use parquet::schema::types::{Type, TypePtr};
-use std::io;
+use std::io::{self, Write};
 use std::sync::Arc;
 
 /// The rows that wait for their group, those of all tables together, come to so many bytes.
@@ -23,18 +23,19 @@ const WAITING_BYTES: usize = 64 << 20;
 pub const COLUMNS_MAX: usize = 1 << 14;
 
 /// The table of a signal.
-pub struct Parquet(RowGroups);
+pub struct Parquet(RowGroups<Created>);
 
 impl Table for Parquet {
     const EXTENSION: &'static str = "parquet";
 
     fn begin(file: Created, recording: &Recording, signal: &SignalInfo) -> io::Result<Self> {
         let (name, about) = (&signal.layout.type_name, about(recording, signal));
-        RowGroups::begin(file, name, None, columns(&signal.layout), about, rows_per_group(recording)).map(Self)
+        let columns = columns(&signal.layout).into_iter().map(|(name, kind)| (name, kind.into())).collect();
+        RowGroups::begin(file, name, columns, false, about, rows_per_group(recording)).map(Self)
     }
 
     fn row(&mut self, bits: &[u64]) -> io::Result<()> {
-        self.0.row(None, bits)
+        self.0.row(bits.iter().map(|bits| Some(Cell::Bits(*bits))))
     }
 
     fn end(self) -> io::Result<()> {
@@ -42,76 +43,120 @@ impl Table for Parquet {
     }
 }
 
-/// Rows of numbers, and of a text before them where that is asked for, written a group at a time.
-pub struct RowGroups {
-    writer: SerializedFileWriter<Created>,
-    texts: Option<Vec<ByteArray>>,
+/// What the values of a column are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ColumnKind {
+    Unsigned,
+    Whole,
+    Number,
+    Flag,
+    Word,
+}
+
+impl From<FieldKind> for ColumnKind {
+    fn from(kind: FieldKind) -> Self {
+        match kind {
+            FieldKind::U64 => Self::Unsigned,
+            FieldKind::F64 => Self::Number,
+        }
+    }
+}
+
+/// The value of a row in a column.
+pub enum Cell {
+    /// The bits of a number, or of a flag 0 or 1.
+    Bits(u64),
+    Word(String),
+}
+
+/// Rows, written a group at a time.
+pub struct RowGroups<W: Write + Send> {
+    writer: SerializedFileWriter<W>,
     columns: Vec<Waiting>,
+    rows: usize,
     rows_per_group: usize,
 }
 
-/// The bits of one column that wait for their group.
+/// The values of one column that wait for their group.
 struct Waiting {
-    kind: FieldKind,
+    kind: ColumnKind,
     bits: Vec<u64>,
+    words: Vec<ByteArray>,
+    /// For each row 1 where there is a value and 0 for null, if rows may be without.
+    levels: Option<Vec<i16>>,
 }
 
-impl RowGroups {
-    /// A file of these columns, `text` the first if there is one, with what is to be known `about` it.
+impl Waiting {
+    fn push(&mut self, value: Option<Cell>) {
+        if let Some(levels) = &mut self.levels {
+            levels.push(value.is_some().into());
+        }
+        match value {
+            Some(Cell::Bits(bits)) => self.bits.push(bits),
+            Some(Cell::Word(word)) => self.words.push(word.into_bytes().into()),
+            None => {}
+        }
+    }
+
+    fn write<W: Write + Send>(&mut self, group: &mut SerializedRowGroupWriter<'_, W>) -> Result<(), ParquetError> {
+        let Self { kind, bits, words, levels } = self;
+        // The schema was made of these columns.
+        let Some(mut column) = group.next_column()? else { return Ok(()) };
+        let there = levels.as_deref();
+        match kind {
+            ColumnKind::Unsigned | ColumnKind::Whole => {
+                column.typed::<Int64Type>().write_batch(bytemuck::cast_slice(bits), there, None)?
+            }
+            ColumnKind::Number => column.typed::<DoubleType>().write_batch(bytemuck::cast_slice(bits), there, None)?,
+            ColumnKind::Flag => {
+                let flags: Vec<bool> = bits.iter().map(|bits| *bits != 0).collect();
+                column.typed::<BoolType>().write_batch(&flags, there, None)?
+            }
+            ColumnKind::Word => column.typed::<ByteArrayType>().write_batch(words, there, None)?,
+        };
+        bits.clear();
+        words.clear();
+        levels.iter_mut().for_each(Vec::clear);
+        column.close()
+    }
+}
+
+impl<W: Write + Send> RowGroups<W> {
+    /// Begins a file of these columns, with what is to be known `about` it. Where rows are `partial` any value may be null.
     pub fn begin(
-        file: Created,
+        file: W,
         name: &str,
-        text: Option<&str>,
-        columns: Vec<(String, FieldKind)>,
+        columns: Vec<(String, ColumnKind)>,
+        partial: bool,
         about: Vec<(&str, String)>,
         rows_per_group: usize,
     ) -> io::Result<Self> {
-        let schema = schema(name, text, &columns).map_err(bare)?;
+        let schema = schema(name, &columns, partial).map_err(bare)?;
         let writer = SerializedFileWriter::new(file, schema, Arc::new(properties(about))).map_err(bare)?;
-        let waiting = |(_, kind)| Waiting { kind, bits: Vec::with_capacity(rows_per_group) };
-        let columns = columns.into_iter().map(waiting).collect();
-        Ok(Self { writer, texts: text.map(|_| Vec::new()), columns, rows_per_group })
+        let waiting = |(_, kind)| {
+            let (bits, words, levels) = (Vec::new(), Vec::new(), partial.then(Vec::new));
+            Waiting { kind, bits, words, levels }
+        };
+        Ok(Self { writer, columns: columns.into_iter().map(waiting).collect(), rows: 0, rows_per_group })
     }
 
-    /// Adds a row.
-    pub fn row(&mut self, text: Option<&str>, bits: &[u64]) -> io::Result<()> {
-        if let Some(texts) = &mut self.texts {
-            texts.push(text.unwrap_or_default().into());
-        }
-        self.columns.iter_mut().zip(bits).for_each(|(column, word)| column.bits.push(*word));
-        if self.waiting() < self.rows_per_group { Ok(()) } else { self.write_group().map_err(bare) }
+    /// Adds a row of values.
+    pub fn row(&mut self, values: impl IntoIterator<Item = Option<Cell>>) -> io::Result<()> {
+        self.columns.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
+        self.rows += 1;
+        if self.rows < self.rows_per_group { Ok(()) } else { self.write_group().map_err(bare) }
     }
 
     /// Writes what waits, and the end.
     pub fn end(mut self) -> io::Result<()> {
-        let rest = if self.waiting() == 0 { Ok(()) } else { self.write_group() };
-        rest.and_then(|()| self.writer.close()).map(drop).map_err(bare)
-    }
-
-    /// How many rows wait.
-    fn waiting(&self) -> usize {
-        self.columns.first().map_or(0, |column| column.bits.len())
+        let rest = if self.rows == 0 { Ok(()) } else { self.write_group() };
+        rest.and_then(|()| self.writer.finish()).map(drop).map_err(bare)
     }
 
     fn write_group(&mut self) -> Result<(), ParquetError> {
         let mut group = self.writer.next_row_group()?;
-        if let Some(texts) = &mut self.texts
-            && let Some(mut column) = group.next_column()?
-        {
-            column.typed::<ByteArrayType>().write_batch(texts, None, None)?;
-            column.close()?;
-            texts.clear();
-        }
-        for Waiting { kind, bits } in &mut self.columns {
-            // The schema was made of these columns.
-            let Some(mut column) = group.next_column()? else { break };
-            match kind {
-                FieldKind::U64 => column.typed::<Int64Type>().write_batch(bytemuck::cast_slice(bits), None, None)?,
-                FieldKind::F64 => column.typed::<DoubleType>().write_batch(bytemuck::cast_slice(bits), None, None)?,
-            };
-            column.close()?;
-            bits.clear();
-        }
+        self.columns.iter_mut().try_for_each(|column| column.write(&mut group))?;
+        self.rows = 0;
         group.close().map(drop)
     }
 }
@@ -122,22 +167,20 @@ fn rows_per_group(recording: &Recording) -> usize {
     (WAITING_BYTES / row_bytes.sum::<usize>()).max(1)
 }
 
-fn schema(name: &str, text: Option<&str>, columns: &[(String, FieldKind)]) -> Result<TypePtr, ParquetError> {
-    let field = |(name, kind): &(String, FieldKind)| {
-        let of = match kind {
-            FieldKind::U64 => {
-                let unsigned = LogicalType::integer(64, false);
-                Type::primitive_type_builder(name, Physical::INT64).with_logical_type(Some(unsigned))
-            }
-            FieldKind::F64 => Type::primitive_type_builder(name, Physical::DOUBLE),
+fn schema(name: &str, columns: &[(String, ColumnKind)], partial: bool) -> Result<TypePtr, ParquetError> {
+    let field = |(name, kind): &(String, ColumnKind)| {
+        let (physical, logical) = match kind {
+            ColumnKind::Unsigned => (Physical::INT64, Some(LogicalType::integer(64, false))),
+            ColumnKind::Whole => (Physical::INT64, None),
+            ColumnKind::Number => (Physical::DOUBLE, None),
+            ColumnKind::Flag => (Physical::BOOLEAN, None),
+            ColumnKind::Word => (Physical::BYTE_ARRAY, Some(LogicalType::String)),
         };
-        of.with_repetition(Repetition::REQUIRED).build().map(Arc::new)
+        let repetition = if partial { Repetition::OPTIONAL } else { Repetition::REQUIRED };
+        let builder = Type::primitive_type_builder(name, physical).with_logical_type(logical);
+        builder.with_repetition(repetition).build().map(Arc::new)
     };
-    let text = text.map(|name| {
-        let of = Type::primitive_type_builder(name, Physical::BYTE_ARRAY).with_logical_type(Some(LogicalType::String));
-        of.with_repetition(Repetition::REQUIRED).build().map(Arc::new)
-    });
-    let fields = text.into_iter().chain(columns.iter().map(field)).collect::<Result<_, _>>()?;
+    let fields = columns.iter().map(field).collect::<Result<_, _>>()?;
     Type::group_type_builder(name).with_fields(fields).build().map(Arc::new)
 }
 
