@@ -5,6 +5,7 @@ use super::form::{DataError, Meaning, Options, Row, Rows};
 use super::parquet;
 use super::stamp::Stamp;
 use super::{csv, mcap};
+use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read, Seek};
@@ -252,7 +253,5 @@ impl Iterator for Log {
 fn usual_interval_s(head: &VecDeque<Row>) -> Option<f64> {
     let pairs = head.iter().zip(head.iter().skip(1)).filter(|(last, next)| last.key == next.key);
     let interval = |(last, next): (&Row, &Row)| Some(next.stamp?.since_s(&last.stamp?));
-    let mut intervals: Vec<f64> = pairs.filter_map(interval).filter(|interval_s| *interval_s > 0.0).collect();
-    intervals.sort_by(f64::total_cmp);
-    intervals.get(intervals.len() / 2).copied()
+    quantile(&sorted(pairs.filter_map(interval).filter(|interval_s| *interval_s > 0.0)), 0.5)
 }

@@ -8,6 +8,7 @@ use super::frame::Line;
 use super::model::{Block, Model, Section};
 use super::page::page;
 use crate::estimate::SegmentScore;
+use crate::telemetry::sorted;
 use std::mem::take;
 
 /// So many points of a segment are kept at most; then every other one is dropped.
@@ -149,9 +150,8 @@ fn spread(order: &[usize]) -> Vec<usize> {
 
 fn result(facts: &HiddenFacts<'_>) -> Vec<Block> {
     let mut blocks: Vec<Block> = facts.paragraphs.iter().cloned().map(Block::Text).collect();
-    let mut errors: Vec<f64> =
-        facts.segments.iter().map(|(_, score)| score.error_rad_s).filter(|error| error.is_finite()).collect();
-    errors.sort_by(f64::total_cmp);
+    let errors = facts.segments.iter().map(|(_, score)| score.error_rad_s);
+    let errors = sorted(errors.filter(|error| error.is_finite()));
     if errors.len() > 1 {
         let last = (errors.len() - 1) as f64;
         let points = errors.iter().enumerate().map(|(n, error)| (100.0 * n as f64 / last, *error)).collect();

@@ -22,5 +22,6 @@ pub(crate) use handover::{find, keep};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
+pub(crate) use latency::{quantile, sorted};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
 pub use report::{Grant, LinkRead, LinkWritten, Outage, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

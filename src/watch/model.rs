@@ -3,6 +3,7 @@
 //! Must not forget a peak: what is drawn narrower than it was seen keeps the largest value.
 
 use crate::sample::RoleState;
+use crate::telemetry::{quantile, sorted};
 use std::collections::VecDeque;
 
 /// Values that a history keeps at the most; beyond it two become one.
@@ -137,12 +138,8 @@ impl Window {
 
     /// The median and what 99 % are at most, µs. Of use only where no stamp lies [ahead](Self::ahead_us).
     pub fn percentiles_us(&self) -> Option<[f64; 2]> {
-        let mut sorted: Vec<i64> = self.values.iter().copied().collect();
-        sorted.sort_unstable();
-        let last = sorted.len().checked_sub(1)?;
-        // The nearest rank, as HdrHistogram counts.
-        let at = |quantile: f64| sorted[((quantile * sorted.len() as f64).ceil() as usize).clamp(1, last + 1) - 1];
-        Some([at(0.5), at(0.99)].map(|ns| ns as f64 / 1e3))
+        let sorted = sorted(self.values.iter().map(|ns| *ns as f64 / 1e3));
+        Some([quantile(&sorted, 0.5)?, quantile(&sorted, 0.99)?])
     }
 }
 

@@ -4,7 +4,7 @@
 //! Quantiles are values of cases, not between two. Lines join the values that were run; where values are drawn, they are level over a
 //! cell. Must not go on where no case is.
 
-use super::facts::{Facts, claimed_share, quantile, share};
+use super::facts::{Facts, claimed_share, share};
 use super::scatter;
 use super::shades::{by_factors, range};
 use super::spread::Cells;
@@ -13,6 +13,7 @@ use crate::report::axis::Axis;
 use crate::report::chart::Picture;
 use crate::report::frame::{Frame, LEFT, Line, RIGHT, TOP, WIDE, WIDTH};
 use crate::report::html::escape;
+use crate::telemetry::quantile;
 use std::fmt::Write;
 
 /// An axis is divided into at most so many cells, one for so many cases where its values are drawn.

@@ -5,6 +5,7 @@
 use super::spread::Spread;
 use crate::campaign::{CAMPAIGN, End, Metric, Row, Statistic, Table};
 use crate::rig::named;
+use crate::telemetry::sorted;
 use std::path::Path;
 
 /// The tables and keys in it that say what is accepted.
@@ -74,9 +75,7 @@ impl<'a> Facts<'a> {
 
     /// The rows whose values are numbers, or were lost, the least first.
     pub fn sorted<'r>(&self, rows: impl IntoIterator<Item = &'r Row>) -> Vec<f64> {
-        let mut values: Vec<f64> = rows.into_iter().filter_map(|row| self.value(row)).collect();
-        values.sort_by(f64::total_cmp);
-        values
+        sorted(rows.into_iter().filter_map(|row| self.value(row)))
     }
 
     /// The most cases that have the same values of all axes: they differ by their seeds.
@@ -144,12 +143,6 @@ fn decisive(table: &Table, limits: &[Option<f64>]) -> Option<usize> {
     let order = [Statistic::SettledMax, Statistic::Peak, Statistic::Last, Statistic::Ise];
     let of = |statistic| all.clone().find(|metric| table.metrics[*metric].statistic == statistic && known(*metric));
     limited.or_else(|| order.into_iter().find_map(of))
-}
-
-/// The value that this part of some sorted values does not exceed: one of them.
-pub fn quantile(sorted: &[f64], part: f64) -> Option<f64> {
-    let rank = (part * sorted.len() as f64).ceil() as usize;
-    sorted.get(rank.clamp(1, sorted.len().max(1)) - 1).copied()
 }
 
 /// The part of the cases with a verdict that were accepted; none if none has one.

@@ -2,7 +2,7 @@
 //!
 //! A border lies between two cells, never within one. Must not smooth or fill in: a cell without a case is empty.
 
-use super::facts::{Facts, claimed_share, quantile, share};
+use super::facts::{Facts, claimed_share, share};
 use super::number::few;
 use super::shades::Shades;
 use super::spread::{Cells, Spread};
@@ -11,6 +11,7 @@ use crate::report::axis::Axis;
 use crate::report::chart::Picture;
 use crate::report::frame::{Frame, LEFT, TOP, WIDE, WIDTH};
 use crate::report::html::escape;
+use crate::telemetry::quantile;
 use std::fmt::Write;
 
 /// The height of a map, and of each of several.

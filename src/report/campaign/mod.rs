@@ -25,6 +25,7 @@ mod tests;
 
 use super::model::{Block, Model, Section};
 use crate::campaign::Table;
+use crate::telemetry::sorted;
 use facts::{Facts, ran};
 use map::{Map, Paint, panels};
 use shades::Shades;
@@ -219,8 +220,7 @@ fn distribution(facts: &Facts<'_>) -> Option<Section> {
         caption += &format!(", in {lost} a body was lost");
     }
     figures.extend(picture.map(|picture| (picture, caption + ".")));
-    let mut settled: Vec<f64> = facts.table.rows.iter().filter_map(|row| row.settled_at_s).collect();
-    settled.sort_by(f64::total_cmp);
+    let settled = sorted(facts.table.rows.iter().filter_map(|row| row.settled_at_s));
     let title = "distribution of the time to settle";
     let picture = bands::distribution(title, "within all limits from, s", &settled, ran, None);
     let caption = format!(

@@ -2,12 +2,13 @@
 //!
 //! Must not hide how much is left out.
 
-use super::facts::{Facts, claimed, quantile, ran, value};
+use super::facts::{Facts, claimed, ran, value};
 use super::number::few;
 use super::spread::shown;
 use crate::analysis::digits;
 use crate::campaign::{AxisKind, End, Row};
 use crate::report::model::{Block, Section};
+use crate::telemetry::{quantile, sorted};
 use std::collections::BTreeMap;
 
 /// So many of the worst cases are told.
@@ -86,8 +87,7 @@ fn axes(facts: &Facts<'_>) -> Block {
 /// Quantiles of every metric.
 pub fn metrics(facts: &Facts<'_>) -> Block {
     let row = |(place, metric): (usize, &crate::campaign::Metric)| {
-        let mut values: Vec<f64> = facts.table.rows.iter().filter_map(|row| value(row, place)).collect();
-        values.sort_by(f64::total_cmp);
+        let values = sorted(facts.table.rows.iter().filter_map(|row| value(row, place)));
         if values.is_empty() {
             return None;
         }
@@ -157,8 +157,7 @@ pub fn certificate(facts: &Facts<'_>) -> Option<Section> {
     let text = "The certificate says of a case, before it is run, how fast a small error of its loop falls, or that nothing is \
                 claimed. [accept] asks for more than that errors fall: what is claimed may not be accepted all the same, and what is \
                 not may be.";
-    let mut rates: Vec<f64> = facts.table.rows.iter().filter_map(|row| row.predicted_rate_per_s).collect();
-    rates.sort_by(f64::total_cmp);
+    let rates = sorted(facts.table.rows.iter().filter_map(|row| row.predicted_rate_per_s));
     let range = rates.first().zip(rates.last()).map(|(low, high)| {
         Block::Text(format!("Rates from {} to {} 1/s, of {} cases.", digits(*low), digits(*high), rates.len()))
     });

@@ -1,10 +1,11 @@
 //! Pages of small tables: every number on them is a row's, and strange tables make pages too.
 
-use super::facts::{Facts, quantile};
+use super::facts::Facts;
 use super::number::few;
 use super::*;
 use crate::campaign::{Axis, AxisKind, End, Find, Margin, MarginPoint, Metric, Parameter, Row, Statistic};
 use crate::report::page::{figures, page};
+use crate::telemetry::quantile;
 use roxmltree::{Document, Node};
 
 fn axis(key: &str, kind: AxisKind, values: Vec<Parameter>) -> Axis {
