@@ -71,9 +71,12 @@ impl RelayWatch {
 
     /// What ends the run: the relay has failed, or a host has ended while ticks were to run. `tick` is the one at hand.
     pub fn supervise(&mut self, scenario: &Scenario, tick: u64) -> Vec<Incident> {
+        // It ends the run for more than a role.
+        let incident = |tick, cause| Incident { external: true, generation: 1, tick, cause, ..Incident::default() };
         let mut incidents = Vec::new();
         if let Some(Failure { cause, last_words, .. }) = self.companion.failure() {
-            incidents.push(incident(RELAY.to_owned(), Vec::new(), tick, cause, last_words));
+            let role = RELAY.to_owned();
+            incidents.push(Incident { role, last_words, ..incident(tick, cause) });
         }
         for (host, known) in self.hosts.iter_mut().filter(|(_, known)| !known) {
             let Some(end) = far_end(&self.root, host) else { continue };
@@ -84,7 +87,8 @@ impl RelayWatch {
             incidents.push(stopped.cloned().unwrap_or_else(|| {
                 let cause = end.failed.unwrap_or_else(|| "it ended before the run did".to_owned());
                 let cause = format!("the host {host} left: {cause}");
-                incident(roles.next().unwrap_or_default(), roles.collect(), tick, cause, String::new())
+                let role = roles.next().unwrap_or_default();
+                Incident { role, with: roles.collect(), ..incident(tick, cause) }
             }));
         }
         incidents
@@ -108,25 +112,4 @@ impl RelayWatch {
 
 fn far_end(root: &std::path::Path, host: &str) -> Option<FarEnd> {
     serde_json::from_slice(&std::fs::read(far_end_path(root, host)).ok()?).ok()
-}
-
-/// What ends a run for more than a role.
-fn incident(role: String, with: Vec<String>, tick: u64, cause: String, last_words: String) -> Incident {
-    Incident {
-        role,
-        external: true,
-        with,
-        generation: 1,
-        tick,
-        cause,
-        last_words,
-        panic: None,
-        repeated: false,
-        time_s: 0.0,
-        begins_anew: false,
-        replaced_by: None,
-        action: Action::Stopped,
-        outage_s: None,
-        recovery_s: None,
-    }
 }

@@ -38,7 +38,7 @@ const SILENT_PERIODS: f64 = 10.0;
 const PANICS_MAX: u64 = 2;
 
 /// A role that failed while the ticks ran, and what was done.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Incident {
     /// The role.
     pub role: String,
@@ -89,12 +89,13 @@ pub struct Replacement {
 }
 
 /// What is done about a role that failed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Action {
     /// It was started anew.
     Restarted,
     /// The run was ended in order.
+    #[default]
     Stopped,
     /// Nothing: it died after its last tick, and its results are complete.
     Noted,
@@ -131,19 +132,12 @@ impl Incident {
         Self {
             role: role.to_owned(),
             external: true,
-            with: Vec::new(),
             generation: 1,
             tick: outage.tick,
-            time_s: 0.0,
             cause: outage.cause.clone(),
-            last_words: String::new(),
-            panic: None,
-            repeated: false,
-            begins_anew: false,
-            replaced_by: None,
             action: Action::Continued,
             outage_s: outage.back_at_tick.map(|_| outage.seconds),
-            recovery_s: None,
+            ..Self::default()
         }
     }
 
@@ -151,20 +145,13 @@ impl Incident {
     pub(super) fn without_process(role: &str, ledger: &Ledger, failure: Failure, action: Action) -> Self {
         Self {
             role: role.to_owned(),
-            external: false,
-            with: Vec::new(),
             generation: ledger.generation(),
             tick: crate::runtime::next_tick(ledger),
             cause: failure.cause,
             last_words: failure.last_words,
             panic: failure.panic,
-            repeated: false,
-            time_s: 0.0,
-            begins_anew: false,
-            replaced_by: None,
             action,
-            outage_s: None,
-            recovery_s: None,
+            ..Self::default()
         }
     }
 }
@@ -466,19 +453,13 @@ impl Member {
         Some(Incident {
             role: self.name.clone(),
             external: true,
-            with: Vec::new(),
             generation: self.generation,
             tick: left.tick,
-            time_s: 0.0,
             cause: format!("its program, process {}, left; process {pid} took its seat at tick {tick}", left.pid),
-            last_words: String::new(),
-            panic: None,
-            repeated: false,
-            begins_anew: false,
             replaced_by: Some(Replacement { pid, tick }),
             action: Action::Continued,
             outage_s: Some(outage_s),
-            recovery_s: None,
+            ..Incident::default()
         })
     }
 
@@ -638,13 +619,8 @@ impl Member {
             cause: failure.cause,
             last_words: failure.last_words,
             panic: failure.panic,
-            repeated: false,
-            time_s: 0.0,
-            begins_anew: false,
-            replaced_by: None,
             action,
-            outage_s: None,
-            recovery_s: None,
+            ..Incident::default()
         }
     }
 
