@@ -1,8 +1,7 @@
 //! `corotate bridge`: a device behind a serial line, in a role's seat.
 
 use super::output::{Exit, fail, say};
-use super::runs;
-use super::signals::{die_with, terminated_by_signals};
+use super::runs::join;
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, NodeError, RoleError, Served, run_bridge};
 use crate::system::tell;
@@ -58,9 +57,7 @@ pub fn bridge(arguments: &Arguments) -> Exit {
 }
 
 fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
-    arguments.parent.map_or(Ok(()), die_with)?;
-    let terminated = terminated_by_signals()?;
-    let domain = runs::domain(arguments.domain.as_deref())?;
+    let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let seat = DeviceSeat {
         domain,
         roles: arguments.role.clone(),

@@ -1,7 +1,7 @@
 //! `corotate export`: a recording as tables.
 
 use super::output::{Exit, fail, say};
-use super::{record, runs};
+use super::record;
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
 
@@ -46,13 +46,9 @@ pub fn export(arguments: &Arguments) -> Exit {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
         return fail(Exit::Usage, &REFUSAL);
     }
-    let file = match runs::recording(arguments.run.as_deref()) {
-        Ok(file) => file,
-        Err(reason) => return fail(Exit::Usage, &reason),
-    };
-    let recording = match record::open(&file, arguments.accept_incomplete) {
-        Ok(recording) => recording,
-        Err(error) => return fail(record::exit_of(&error), &error),
+    let (file, recording) = match record::open_run(arguments.run.as_deref(), arguments.accept_incomplete) {
+        Ok(opened) => opened,
+        Err(exit) => return exit,
     };
     match write(arguments, &recording) {
         Ok(files) => {

@@ -59,18 +59,10 @@ fn serve(_: &Arguments) -> Exit {
 
 #[cfg(feature = "foxglove")]
 fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
-    use super::runs;
-    use super::signals::{die_with, terminated_by_signals};
+    use super::runs::join;
     use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
-    if let Some(Err(exit)) = parent.map(die_with) {
-        return exit;
-    }
-    let terminated = match terminated_by_signals() {
-        Ok(terminated) => terminated,
-        Err(exit) => return exit,
-    };
-    let domain = match runs::domain(domain.as_deref()) {
-        Ok(domain) => domain,
+    let (domain, terminated) = match join(*parent, domain.as_deref()) {
+        Ok(joined) => joined,
         Err(exit) => return exit,
     };
     let seat = FoxgloveSeat { domain: Some(domain), address: *address, tell: tell.clone() };

@@ -1,8 +1,7 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
 use super::output::{Exit, fail, remark, say};
-use super::runs;
-use super::signals::{die_with, terminated_by_signals};
+use super::runs::{self, join};
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -41,20 +40,13 @@ Examples:
 
 /// Records to the end of the run.
 pub fn record(arguments: &Arguments) -> Exit {
-    if let Some(Err(exit)) = arguments.parent.map(die_with) {
-        return exit;
-    }
-    let terminated = match terminated_by_signals() {
-        Ok(terminated) => terminated,
-        Err(exit) => return exit,
-    };
     let is_there = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
     if arguments.parent.is_none() && !arguments.overwrite && is_there() {
         let file = arguments.out.display();
         return fail(Exit::Usage, &format!("{file} is there; name another file with --out, or give --overwrite"));
     }
-    let domain = match runs::domain(arguments.domain.as_deref()) {
-        Ok(domain) => domain,
+    let (domain, terminated) = match join(arguments.parent, arguments.domain.as_deref()) {
+        Ok(joined) => joined,
         Err(exit) => return exit,
     };
     let seat = RecorderSeat { domain, file: arguments.out.clone() };
@@ -75,6 +67,16 @@ fn told(report: &RecordingReport, arguments: &Arguments) -> Exit {
         return exit;
     }
     report.problem.as_ref().map_or(Exit::Ok, |problem| fail(Exit::Failure, problem))
+}
+
+/// Opens the recording of a run as [`open`] does. Returns it with its file.
+///
+/// # Errors
+/// The exit code, once the reason is printed.
+pub fn open_run(run: Option<&Path>, accept_incomplete: bool) -> Result<(PathBuf, Recording), Exit> {
+    let file = runs::recording(run).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let recording = open(&file, accept_incomplete).map_err(|error| fail(exit_of(&error), &error))?;
+    Ok((file, recording))
 }
 
 /// Opens a recording that is all there; another one too where the user says so, with a remark.

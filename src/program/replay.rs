@@ -1,8 +1,7 @@
 //! `corotate replay`: a recording through the live roles.
 
 use super::output::{Exit, fail, harmless, say};
-use super::record::{exit_of, exit_with, open};
-use super::runs;
+use super::record::{exit_of, exit_with, open_run};
 use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
@@ -45,13 +44,9 @@ Examples:
 
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Exit {
-    let file = match runs::recording(arguments.run.as_deref()) {
-        Ok(file) => file,
-        Err(reason) => return fail(Exit::Usage, &reason),
-    };
-    let recording = match open(&file, arguments.accept_incomplete) {
-        Ok(recording) => recording,
-        Err(error) => return fail(exit_of(&error), &error),
+    let (file, recording) = match open_run(arguments.run.as_deref(), arguments.accept_incomplete) {
+        Ok(opened) => opened,
+        Err(exit) => return exit,
     };
     match attempt(arguments, &recording) {
         Ok(replays) => {

@@ -1,8 +1,7 @@
 //! `corotate plant|observer|controller`: one role, as the launcher starts it.
 
 use super::output::{Exit, fail};
-use super::runs;
-use super::signals::{die_with, terminated_by_signals};
+use super::runs::join;
 use crate::runtime::{RoleError, RoleSeat, run_role};
 use std::path::PathBuf;
 
@@ -36,15 +35,8 @@ pub struct PlantArguments {
 
 /// Serves a role to the end of the run.
 pub fn role(name: &str, arguments: &Arguments) -> Exit {
-    if let Some(Err(exit)) = arguments.parent.map(die_with) {
-        return exit;
-    }
-    let terminated = match terminated_by_signals() {
-        Ok(terminated) => terminated,
-        Err(exit) => return exit,
-    };
-    let domain = match runs::domain(arguments.domain.as_deref()) {
-        Ok(domain) => domain,
+    let (domain, terminated) = match join(arguments.parent, arguments.domain.as_deref()) {
+        Ok(joined) => joined,
         Err(exit) => return exit,
     };
     let seat = RoleSeat { domain, role: name.to_owned() };

@@ -4,6 +4,7 @@
 
 use super::output::{Exit, fail};
 use super::shipped::name;
+use super::signals::{die_with, terminated_by_signals};
 use crate::bus::domain::Domain;
 use crate::files::{self, Directory};
 use crate::launch::{LATEST, RECORDING, RUNS};
@@ -13,6 +14,8 @@ use std::fs;
 use std::io::ErrorKind;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// The results of a run: its directory, or a recording. Without a name, and by the name `latest`, those of the newest run in `runs/`;
 /// the domain of a run that is under way stands for its directory.
@@ -87,4 +90,15 @@ pub fn newest_recording(than: &Path) -> Option<PathBuf> {
 pub fn domain(given: Option<&Path>) -> Result<PathBuf, Exit> {
     let given = given.filter(|given| *given != Path::new(LATEST));
     run_under_way(given).map_err(|error| fail(Exit::Usage, &error))
+}
+
+/// Prepares a process to join a run: it dies with its parent, if one is given, and signals set a flag. Returns the run's domain and
+/// the flag.
+///
+/// # Errors
+/// The exit code, once the reason is printed.
+pub fn join(parent: Option<i32>, given: Option<&Path>) -> Result<(PathBuf, Arc<AtomicBool>), Exit> {
+    parent.map_or(Ok(()), die_with)?;
+    let terminated = terminated_by_signals()?;
+    Ok((domain(given)?, terminated))
 }
