@@ -85,20 +85,9 @@ impl Campaign {
             case: case.number,
             seed: case.seed,
             parameters: case.parameters.clone(),
-            accepted: None,
             verdict: "not judged: it did not run".to_owned(),
-            exit: End::Invalid,
-            reason: None,
-            settled_at_s: None,
             metrics: vec![None; self.metrics().len()],
-            executed: 0,
-            missed: 0,
-            starved: 0,
-            safe: 0,
-            lost: 0,
-            injected: 0,
-            hash: String::new(),
-            predicted_rate_per_s: None,
+            ..Row::default()
         };
         match ran {
             Ran::Invalid(error) => Row { reason: Some(error.to_string()), ..row },

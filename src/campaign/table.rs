@@ -135,7 +135,7 @@ impl fmt::Display for Parameter {
 }
 
 /// One case.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     /// Its number, from 0.
     pub case: u64,
@@ -176,7 +176,7 @@ pub struct Row {
 }
 
 /// How a case ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum End {
     /// It ran to its last tick.
@@ -186,6 +186,7 @@ pub enum End {
     /// A role failed, and the run was ended.
     Stopped,
     /// The scenario of this case is not valid; nothing ran.
+    #[default]
     Invalid,
     /// It could not be run.
     Failed,
@@ -277,17 +278,11 @@ pub(super) mod tests {
                 accepted: Some(true),
                 verdict: "accepted".to_owned(),
                 exit: End::Completed,
-                reason: None,
                 settled_at_s: Some(1.0 / 3.0),
                 metrics: vec![Some(1e-300), None, Some(5.0), None],
                 executed: 4,
-                missed: 0,
-                starved: 0,
-                safe: 0,
-                lost: 0,
-                injected: 0,
                 hash: "00ff00ff00ff00ff".to_owned(),
-                predicted_rate_per_s: None,
+                ..Row::default()
             }],
             margins: vec![Margin {
                 key: "fault.0.ticks".to_owned(),

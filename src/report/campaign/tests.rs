@@ -25,17 +25,10 @@ fn row(case: u64, parameters: Vec<Parameter>, value: Option<f64>, accepted: Opti
         accepted,
         verdict: accepted.map_or("not judged", word).to_owned(),
         exit: End::Completed,
-        reason: None,
         settled_at_s: value.filter(|_| accepted == Some(true)),
         metrics: vec![None, value, Some(7.0), None],
         executed: 4,
-        missed: 0,
-        starved: 0,
-        safe: 0,
-        lost: 0,
-        injected: 0,
-        hash: String::new(),
-        predicted_rate_per_s: None,
+        ..Row::default()
     }
 }
 
