@@ -1,6 +1,6 @@
 //! `corotate bridge`: a device behind a serial line, in a role's seat.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, NodeError, RoleError, Served, run_bridge};
@@ -52,11 +52,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// Serves the seat to the end of the run.
-pub fn bridge(arguments: &Arguments) -> Exit {
-    attempt(arguments).unwrap_or_else(|exit| exit)
-}
-
-fn attempt(arguments: &Arguments) -> Result<Exit, Exit> {
+pub fn bridge(arguments: &Arguments) -> Ended {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let seat = DeviceSeat {
         domain,

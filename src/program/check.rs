@@ -1,7 +1,7 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
 use super::campaign;
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::scenario::{Change, load};
 use crate::analysis::{Claim, apart, claims, digits};
 use crate::campaign::Campaign;
@@ -38,19 +38,15 @@ Examples:
                                    are they all valid? exit code 2 if not";
 
 /// Checks scenarios; all of them, even if one fails.
-pub fn check(arguments: &Arguments) -> Exit {
+pub fn check(arguments: &Arguments) -> Ended {
     let mut exit = Exit::Ok;
     for path in &arguments.files {
         match checked(arguments, path) {
-            Ok(text) => {
-                if let Err(gone) = say(&text) {
-                    return gone;
-                }
-            }
+            Ok(text) => drop(say(&text)?),
             Err(error) => exit = fail(Exit::Usage, &error),
         }
     }
-    exit
+    Ok(exit)
 }
 
 /// What there is to say of a scenario, or of a campaign.

@@ -1,6 +1,6 @@
 //! `corotate diff`: two recordings beside each other.
 
-use super::output::{Exit, fail, harmless, remark, say};
+use super::output::{Ended, Exit, fail, harmless, remark, say};
 use super::record::{exit_of, exit_with, open};
 use super::runs;
 use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
@@ -42,35 +42,23 @@ Examples:
                                    numbers within 1e-9 rad/s, rad/s2, ...";
 
 /// Compares.
-pub fn diff(arguments: &Arguments) -> Exit {
+pub fn diff(arguments: &Arguments) -> Ended {
     let tolerances = Tolerances { absolute: arguments.absolute, relative: arguments.relative };
     let bad = [("absolute", arguments.absolute), ("relative", arguments.relative)]
         .into_iter()
         .find(|(_, x)| !(0.0..).contains(x));
     if let Some((name, value)) = bad {
-        return fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more"));
+        return Err(fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more")));
     }
-    let files = match files(arguments) {
-        Ok(files) => files,
-        Err(reason) => return fail(Exit::Usage, &reason),
-    };
-    let open = |file| open(file, arguments.accept_incomplete);
-    let both = open(&files[0]).and_then(|a| Ok((a, open(&files[1])?)));
-    let (a, b) = match both {
-        Ok(both) => both,
-        Err(error) => return fail(exit_of(&error), &error),
-    };
+    let files = files(arguments).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let failed = |error| fail(exit_of(&error), &error);
+    let open = |file| open(file, arguments.accept_incomplete).map_err(failed);
+    let (a, b) = (open(&files[0])?, open(&files[1])?);
     let words = |comparison| if arguments.json { json(&files, comparison) } else { harmless(&table(comparison)) };
-    match compare(&a, &b, tolerances) {
-        Ok(comparison) => match say(&words(&comparison)) {
-            Ok(()) => {
-                let exit = if comparison.same() { Exit::Ok } else { Exit::NotAccepted };
-                exit_with(&a, exit_with(&b, exit))
-            }
-            Err(exit) => exit,
-        },
-        Err(error) => fail(exit_of(&error), &error),
-    }
+    let comparison = compare(&a, &b, tolerances).map_err(failed)?;
+    say(&words(&comparison))?;
+    let exit = if comparison.same() { Exit::Ok } else { Exit::NotAccepted };
+    Ok(exit_with(&a, exit_with(&b, exit)))
 }
 
 /// The two recordings. Without a second name it is the newest other recording in `runs/`.

@@ -1,7 +1,7 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
 use super::hosts::{self, KeyArguments};
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::scenario::{Change, load};
 use super::signals::catch_signals;
 use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
@@ -51,14 +51,11 @@ Examples:
   corotate doctor --clean --json   remove what dead runs left; for programs";
 
 /// Examines the machine.
-pub fn doctor(arguments: &Arguments) -> Exit {
+pub fn doctor(arguments: &Arguments) -> Ended {
     if let Some(address) = &arguments.link {
         return hosts::probe(address, &arguments.keys, f64::from(arguments.seconds), arguments.json);
     }
-    let scenario = match load(arguments.file.as_deref(), []) {
-        Ok(scenario) => scenario,
-        Err(error) => return fail(Exit::Usage, &error),
-    };
+    let scenario = load(arguments.file.as_deref(), []).map_err(|error| fail(Exit::Usage, &error))?;
     // If it cannot be done, the line on what is left says why.
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
     let demand = Demand::of(&scenario);
@@ -74,7 +71,7 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     checks.extend(left_in_shared_memory(abandoned(false)));
     let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {
         Ok(trial) => trial,
-        Err(Unmeasured::Exit(exit)) => return exit,
+        Err(Unmeasured::Exit(exit)) => return Err(exit),
         Err(Unmeasured::Failed(check)) => {
             checks.push(check);
             None
@@ -82,11 +79,7 @@ pub fn doctor(arguments: &Arguments) -> Exit {
     };
     let diagnosis = Diagnosis::new(&scenario.name, checks, trial);
     let text = if arguments.json { diagnosis.to_json() } else { diagnosis.to_string() };
-    match say(&text) {
-        Err(gone) => gone,
-        Ok(()) if diagnosis.fit == Some(false) => Exit::NotAccepted,
-        Ok(()) => Exit::Ok,
-    }
+    say(&text).map(|exit| if diagnosis.fit == Some(false) { Exit::NotAccepted } else { exit })
 }
 
 /// Why there is no measurement.

@@ -1,7 +1,7 @@
 //! `corotate estimate`: the rate about one axis of a body from a log of the other two.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, tell_log};
-use super::output::{Exit, fail, harmless, say};
+use super::output::{Ended, Exit, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
 use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;
@@ -110,15 +110,10 @@ struct Body {
 }
 
 /// Estimates.
-pub fn estimate(arguments: &Arguments) -> Exit {
-    let body = match body(arguments) {
-        Ok(body) => body,
-        Err((exit, reason)) => return fail(exit, &reason),
-    };
-    let inertia = match Inertia::new(body.moments.into()) {
-        Ok(inertia) => inertia,
-        Err(error) => return fail(Exit::Usage, &format!("the inertia: {error}")),
-    };
+pub fn estimate(arguments: &Arguments) -> Ended {
+    let body = body(arguments).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let inertia = Inertia::new(body.moments.into());
+    let inertia = inertia.map_err(|error| fail(Exit::Usage, &format!("the inertia: {error}")))?;
     let request = Request {
         axis: arguments.hidden,
         coefficients: inertia.coefficients(),
@@ -136,20 +131,20 @@ pub fn estimate(arguments: &Arguments) -> Exit {
     };
     let outputs = [&arguments.table, &arguments.page];
     if let Some(path) = outputs.into_iter().flatten().find(|path| is_same(path, &arguments.data)) {
-        return fail(Exit::Usage, &format!("{}: that is the log; name another file to write to", path.display()));
+        let reason = format!("{}: that is the log; name another file to write to", path.display());
+        return Err(fail(Exit::Usage, &reason));
     }
     if cfg!(not(feature = "parquet")) && arguments.table.as_deref().is_some_and(is_parquet) {
-        return fail(Exit::Usage, &"--table: this program writes no Parquet; build it with `--features parquet`");
+        let reason = "--table: this program writes no Parquet; build it with `--features parquet`";
+        return Err(fail(Exit::Usage, &reason));
     }
     let unwritten = |path: &Option<PathBuf>, error: io::Error| {
         let path = path.as_deref().unwrap_or(Path::new("")).display();
         fail(Exit::Failure, &format!("cannot write {path}: {error}; {}, or name another file", remedy(&error)))
     };
     let mut page = arguments.page.is_some().then(HiddenPage::default);
-    let mut table = match arguments.table.as_deref().map(Table::begin).transpose() {
-        Ok(table) => table,
-        Err(error) => return unwritten(&arguments.table, error),
-    };
+    let table = arguments.table.as_deref().map(Table::begin).transpose();
+    let mut table = table.map_err(|error| unwritten(&arguments.table, error))?;
     let done = estimate_log(&arguments.data, &arguments.log.options(), &request, |row, segment| {
         if let Some(page) = &mut page {
             let (told, measured) = (&row.told, row.principal_rad_s[request.axis - 1]);
@@ -157,14 +152,11 @@ pub fn estimate(arguments: &Arguments) -> Exit {
         }
         table.as_mut().map_or(Ok(()), |table| table.row(row, segment, request.axis))
     });
-    let estimation = match done {
-        Ok(estimation) => estimation,
-        Err(EstimateError::Sink(error)) => return unwritten(&arguments.table, error),
-        Err(error) => return fail(exit(&error), &error),
-    };
-    if let Some(Err(error)) = table.map(Table::end) {
-        return unwritten(&arguments.table, error);
-    }
+    let estimation = done.map_err(|error| match error {
+        EstimateError::Sink(error) => unwritten(&arguments.table, error),
+        error => fail(exit(&error), &error),
+    })?;
+    table.map_or(Ok(()), Table::end).map_err(|error| unwritten(&arguments.table, error))?;
     let told = tell(&request, &estimation);
     if let (Some(page), Some(path)) = (page, &arguments.page) {
         let facts = HiddenFacts {
@@ -173,9 +165,8 @@ pub fn estimate(arguments: &Arguments) -> Exit {
             paragraphs: told.split("\n\n").map(paragraph).collect(),
             segments: &estimation.segments,
         };
-        if let Err(error) = files::write(path, page.html(&facts).as_bytes()) {
-            return unwritten(&arguments.page, error);
-        }
+        let written = files::write(path, page.html(&facts).as_bytes());
+        written.map_err(|error| unwritten(&arguments.page, error))?;
     }
     let text = match arguments.json {
         true => format!("{}\n", to_json(&request, &estimation)),
@@ -184,7 +175,7 @@ pub fn estimate(arguments: &Arguments) -> Exit {
             files.fold(harmless(&told), |text, path| format!("{text}{}\n", path.display()))
         }
     };
-    say(&text).err().unwrap_or(Exit::Ok)
+    say(&text)
 }
 
 fn exit(error: &EstimateError) -> Exit {
@@ -204,17 +195,16 @@ fn is_same(one: &Path, other: &Path) -> bool {
 }
 
 /// The body as it was given.
-fn body(arguments: &Arguments) -> Result<Body, (Exit, String)> {
+fn body(arguments: &Arguments) -> Result<Body, String> {
     let Some(path) = &arguments.body else {
         let moments = arguments.inertia.unwrap_or_else(Vector3::zeros);
         return Ok(Body { moments, damping_per_s: 0.0, axes: None });
     };
-    let text = std::fs::read_to_string(path).map_err(|error| {
-        (Exit::Usage, format!("cannot read {}: {error}; name a file that can be read", path.display()))
-    })?;
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| format!("cannot read {}: {error}; name a file that can be read", path.display()))?;
     read_body(&text).map_err(|reason| {
         let remedy = "give what `corotate identify --json` printed";
-        (Exit::Usage, format!("{}: {reason}; {remedy}", path.display()))
+        format!("{}: {reason}; {remedy}", path.display())
     })
 }
 

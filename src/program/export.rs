@@ -1,6 +1,6 @@
 //! `corotate export`: a recording as tables.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::record;
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
@@ -42,28 +42,20 @@ const REFUSAL: &str =
     "--parquet: this program was built without Parquet; build it with `cargo build --release --features parquet`";
 
 /// Exports.
-pub fn export(arguments: &Arguments) -> Exit {
+pub fn export(arguments: &Arguments) -> Ended {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
-        return fail(Exit::Usage, &REFUSAL);
+        return Err(fail(Exit::Usage, &REFUSAL));
     }
-    let (file, recording) = match record::open_run(arguments.run.as_deref(), arguments.accept_incomplete) {
-        Ok(opened) => opened,
-        Err(exit) => return exit,
+    let (file, recording) = record::open_run(arguments.run.as_deref(), arguments.accept_incomplete)?;
+    let files = write(arguments, &recording).map_err(|error| fail(exit_of(&error), &error))?;
+    let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+    let text = if arguments.json {
+        let object = serde_json::json!({ "schema": SCHEMA, "file": file.display().to_string(), "tables": names });
+        format!("{object}\n")
+    } else {
+        names.iter().map(|name| format!("{name}\n")).collect()
     };
-    match write(arguments, &recording) {
-        Ok(files) => {
-            let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
-            let text = if arguments.json {
-                let object =
-                    serde_json::json!({ "schema": SCHEMA, "file": file.display().to_string(), "tables": names });
-                format!("{object}\n")
-            } else {
-                names.iter().map(|name| format!("{name}\n")).collect()
-            };
-            say(&text).err().unwrap_or(record::exit_with(&recording, Exit::Ok))
-        }
-        Err(error) => fail(exit_of(&error), &error),
-    }
+    say(&text).map(|exit| record::exit_with(&recording, exit))
 }
 
 fn write(arguments: &Arguments, recording: &Recording) -> Result<Vec<PathBuf>, ExportError> {

@@ -1,6 +1,6 @@
 //! `corotate foxglove`: a running loop on a Foxglove WebSocket, as `corotate run --foxglove` starts it or by hand.
 
-use super::output::{Exit, fail};
+use super::output::{Ended, Exit, fail};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -48,27 +48,22 @@ pub fn refusal() -> Option<&'static str> {
 }
 
 /// Shows a run to its end.
-pub fn foxglove(arguments: &Arguments) -> Exit {
-    refusal().map_or_else(|| serve(arguments), |reason| fail(Exit::Usage, &reason))
+pub fn foxglove(arguments: &Arguments) -> Ended {
+    refusal().map_or_else(|| serve(arguments), |reason| Err(fail(Exit::Usage, &reason)))
 }
 
 #[cfg(not(feature = "foxglove"))]
-fn serve(_: &Arguments) -> Exit {
-    Exit::Usage
+fn serve(_: &Arguments) -> Ended {
+    Err(Exit::Usage)
 }
 
 #[cfg(feature = "foxglove")]
-fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Exit {
-    use super::runs::join;
+fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Ended {
     use crate::foxglove::{FoxgloveError, FoxgloveSeat, run_foxglove};
-    let (domain, terminated) = match join(*parent, domain.as_deref()) {
-        Ok(joined) => joined,
-        Err(exit) => return exit,
-    };
+    let (domain, terminated) = super::runs::join(*parent, domain.as_deref())?;
     let seat = FoxgloveSeat { domain: Some(domain), address: *address, tell: tell.clone() };
-    match run_foxglove(&seat, &terminated) {
-        Ok(()) => Exit::Ok,
-        Err(error @ FoxgloveError::Run(_)) => fail(Exit::Usage, &error),
-        Err(error) => fail(Exit::Failure, &error),
-    }
+    run_foxglove(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+        FoxgloveError::Run(_) => fail(Exit::Usage, &error),
+        _ => fail(Exit::Failure, &error),
+    })
 }

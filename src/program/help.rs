@@ -3,7 +3,7 @@
 //! Must not describe a command twice: everything is made of the definition by which the command line is read.
 
 use super::color::When;
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::shipped::{name, scenarios, words_given};
 use crate::files;
 use crate::telemetry::Host;
@@ -132,22 +132,20 @@ fn about_build() -> String {
 }
 
 /// Prints the completions for a shell.
-pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) -> Exit {
+pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) -> Ended {
     let (all, mut text) = (named(definition), Vec::new());
     // What help does not tell of is not offered either.
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
     let mut line = clap::Command::new(name()).version(version());
     line = line.args(all.get_arguments().cloned()).subcommands(shown);
     clap_complete::generate(arguments.shell, &mut line, name(), &mut text);
-    say(&String::from_utf8_lossy(&text)).map_or_else(|exit| exit, |()| Exit::Ok)
+    say(&String::from_utf8_lossy(&text))
 }
 
 /// Writes the manual pages.
-pub fn man(arguments: &ManArguments, definition: clap::Command) -> Exit {
-    match write_pages(arguments, definition) {
-        Ok(written) => say(&written).map_or_else(|exit| exit, |()| Exit::Ok),
-        Err(error) => fail(Exit::Failure, &format!("{error}; name another directory")),
-    }
+pub fn man(arguments: &ManArguments, definition: clap::Command) -> Ended {
+    let written = write_pages(arguments, definition);
+    say(&written.map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory")))?)
 }
 
 fn write_pages(ManArguments { directory }: &ManArguments, definition: clap::Command) -> Result<String, String> {

@@ -1,6 +1,6 @@
 //! `corotate join`, the relay that it and `corotate run --listen` start, and the options by which hosts find one another.
 
-use super::output::{Exit, fail};
+use super::output::{Ended, Exit, fail};
 use super::signals::die_with;
 use crate::hosts::{Address, Endpoint, Keys};
 use std::path::PathBuf;
@@ -99,47 +99,40 @@ pub fn refusal() -> Option<&'static str> {
     (!cfg!(feature = "hosts")).then_some("this program was built without hosts; build it with `--features hosts`")
 }
 
+fn unusable(reason: String) -> Exit {
+    fail(Exit::Usage, &reason)
+}
+
 /// Takes a host's part in a run, to its end.
-pub fn join(arguments: &JoinArguments) -> Exit {
-    match arguments.keys.endpoint(arguments.address.clone()) {
-        Ok(endpoint) => with_hosts::join(arguments, endpoint),
-        Err(reason) => fail(Exit::Usage, &reason),
-    }
+pub fn join(arguments: &JoinArguments) -> Ended {
+    with_hosts::join(arguments, arguments.keys.endpoint(arguments.address.clone()).map_err(unusable)?)
 }
 
 /// Examines the way to a host that waits for others.
-pub fn probe(address: &Address, keys: &KeyArguments, seconds: f64, json: bool) -> Exit {
-    match keys.endpoint(address.clone()) {
-        Ok(endpoint) => with_hosts::probe(&endpoint, seconds, json),
-        Err(reason) => fail(Exit::Usage, &reason),
-    }
+pub fn probe(address: &Address, keys: &KeyArguments, seconds: f64, json: bool) -> Ended {
+    with_hosts::probe(&keys.endpoint(address.clone()).map_err(unusable)?, seconds, json)
 }
 
 /// Carries for a host of a run, to its end.
-pub fn relay(arguments: &RelayArguments) -> Exit {
-    if let Some(Err(exit)) = arguments.parent.map(die_with) {
-        return exit;
-    }
-    match arguments.keys.endpoint(arguments.address.clone()) {
-        Ok(endpoint) => with_hosts::relay(arguments, endpoint),
-        Err(reason) => fail(Exit::Usage, &reason),
-    }
+pub fn relay(arguments: &RelayArguments) -> Ended {
+    arguments.parent.map_or(Ok(()), die_with)?;
+    with_hosts::relay(arguments, arguments.keys.endpoint(arguments.address.clone()).map_err(unusable)?)
 }
 
 #[cfg(not(feature = "hosts"))]
 mod with_hosts {
     use super::*;
 
-    pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> Exit {
-        fail(Exit::Usage, &refusal().unwrap_or_default())
+    pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> Ended {
+        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
     }
 
-    pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Exit {
-        fail(Exit::Usage, &refusal().unwrap_or_default())
+    pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Ended {
+        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
     }
 
-    pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> Exit {
-        fail(Exit::Usage, &refusal().unwrap_or_default())
+    pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> Ended {
+        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
     }
 }
 
@@ -155,34 +148,23 @@ mod with_hosts {
     use crate::program::signals::terminated_by_signals;
     use crate::system::{random_bits, tell};
 
-    pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Exit {
-        let terminated = match terminated_by_signals() {
-            Ok(terminated) => terminated,
-            Err(exit) => return exit,
-        };
+    pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Ended {
+        let terminated = terminated_by_signals()?;
         let seat = HostSeat { host: arguments.host.clone(), endpoint };
         let seat = RelaySeat { domain: arguments.domain.clone(), seat, hub: arguments.hub.clone() };
-        match run_relay(&seat, &terminated) {
-            Ok(()) => Exit::Ok,
-            Err(error @ (RelayError::NoHost(..) | RelayError::Clock(_))) => fail(Exit::Usage, &error),
-            Err(error) => fail(Exit::Failure, &error),
-        }
+        run_relay(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+            RelayError::NoHost(..) | RelayError::Clock(_) => fail(Exit::Usage, &error),
+            _ => fail(Exit::Failure, &error),
+        })
     }
 
-    pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> Exit {
-        let probe = match crate::hosts::probe(endpoint, seconds) {
-            Ok(probe) => probe,
-            Err(error) => return fail(Exit::Failure, &error),
-        };
+    pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> Ended {
+        let probe = crate::hosts::probe(endpoint, seconds).map_err(|error| fail(Exit::Failure, &error))?;
         let object = || serde_json::to_string(&probe).expect("figures are JSON") + "\n";
-        say(&if json { object() } else { probe.to_string() }).err().unwrap_or(Exit::Ok)
+        say(&if json { object() } else { probe.to_string() })
     }
 
-    pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Exit {
-        attempt(arguments, endpoint).unwrap_or_else(|exit| exit)
-    }
-
-    fn attempt(arguments: &JoinArguments, endpoint: Endpoint) -> Result<Exit, Exit> {
+    pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Ended {
         let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
         let part = ask(arguments, &endpoint)?;
         let tells = |words: &str| {

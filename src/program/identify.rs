@@ -1,7 +1,7 @@
 //! `corotate identify`: a body's inertia from logs of its angular velocity.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
-use super::output::{Exit, fail, harmless, say};
+use super::output::{Ended, Exit, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;
@@ -68,28 +68,21 @@ struct Body {
 }
 
 /// Identifies.
-pub fn identify(arguments: &Arguments) -> Exit {
+pub fn identify(arguments: &Arguments) -> Ended {
     let axisymmetric = arguments.method == Method::Axisymmetric;
     if axisymmetric && arguments.symmetry_axis.is_none() {
-        return fail(Exit::Usage, &"--method axisymmetric needs the axis; add --symmetry-axis x, y or z");
+        return Err(fail(Exit::Usage, &"--method axisymmetric needs the axis; add --symmetry-axis x, y or z"));
     }
     let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
-    let identified = match identify_logs(&arguments.data, &arguments.log.options(), &ways) {
-        Ok(identified) => identified,
-        Err(error) => return fail(exit_of(&error), &error),
-    };
+    let identified = identify_logs(&arguments.data, &arguments.log.options(), &ways);
+    let identified = identified.map_err(|error| fail(exit_of(&error), &error))?;
     let body = body(arguments, &identified);
     let text = match arguments.json {
         true => format!("{}\n", to_json(arguments, &identified, body.as_ref().ok())),
         false => harmless(&tell(arguments, &identified, body.as_ref().ok())),
     };
-    if let Err(gone) = say(&text) {
-        return gone;
-    }
-    match body {
-        Ok(_) => Exit::Ok,
-        Err(reason) => fail(Exit::Failure, &reason),
-    }
+    say(&text)?;
+    body.map(|_| Exit::Ok).map_err(|reason| fail(Exit::Failure, &reason))
 }
 
 /// The body of the method that was asked for; why there is none.

@@ -1,6 +1,6 @@
 //! `corotate init`: print a shipped scenario or campaign, or the list of them.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::scenario::{title, unknown};
 use super::shipped::{campaigns, scenarios};
 
@@ -28,13 +28,13 @@ Examples:
   corotate init rigid-pair > pair.toml     a scenario with every key explained";
 
 /// Prints a scenario, or the list.
-pub fn init(arguments: &Arguments) -> Exit {
+pub fn init(arguments: &Arguments) -> Ended {
     let Some(name) = &arguments.name else {
-        return say(&list(arguments.json)).map_or_else(|exit| exit, |()| Exit::Ok);
+        return say(&list(arguments.json));
     };
     match scenarios().iter().chain(campaigns()).find(|(known, _)| known == name) {
-        Some((_, text)) => say(text).map_or_else(|exit| exit, |()| Exit::Ok),
-        None => fail(Exit::Usage, &unknown(name)),
+        Some((_, text)) => say(text),
+        None => Err(fail(Exit::Usage, &unknown(name))),
     }
 }
 

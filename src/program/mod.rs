@@ -250,9 +250,9 @@ struct BenchArguments {
 
 /// Does what the command line asks for.
 fn obey(command: Option<Command>) -> Exit {
-    match command {
-        None => run::run(&run::Arguments::default()),
-        Some(Command::Run(arguments)) => run::run(&arguments),
+    let ended = match command {
+        None => Ok(run::run(&run::Arguments::default())),
+        Some(Command::Run(arguments)) => Ok(run::run(&arguments)),
         Some(Command::Sweep(arguments)) => sweep::sweep(&arguments),
         Some(Command::Check(arguments)) => check::check(&arguments),
         Some(Command::Init(arguments)) => init::init(&arguments),
@@ -274,13 +274,14 @@ fn obey(command: Option<Command>) -> Exit {
         Some(Command::Identify(arguments)) => identify::identify(&arguments),
         Some(Command::Estimate(arguments)) => estimate::estimate(&arguments),
         Some(Command::Doctor(arguments)) => doctor::doctor(&arguments),
-        Some(Command::Bench(arguments)) => bench::bench(&arguments, crate::bench::ROWS),
+        Some(Command::Bench(arguments)) => Ok(bench::bench(&arguments, crate::bench::ROWS)),
         Some(Command::Schema(arguments)) => schema::schema(&arguments),
         Some(Command::Completions(arguments)) => help::completions(&arguments, Arguments::command()),
         Some(Command::Man(arguments)) => help::man(&arguments, Arguments::command()),
-        Some(Command::BenchPeer(arguments)) => bench::peer(&arguments),
-        Some(Command::Janitor(arguments)) => janitor(&arguments),
-    }
+        Some(Command::BenchPeer(arguments)) => Ok(bench::peer(&arguments)),
+        Some(Command::Janitor(arguments)) => Ok(janitor(&arguments)),
+    };
+    ended.unwrap_or_else(|exit| exit)
 }
 
 fn janitor(arguments: &JanitorArguments) -> Exit {

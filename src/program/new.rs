@@ -1,6 +1,6 @@
 //! `corotate new`: a crate of one's own to start from, the one of `examples/motor-pair` under another name.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use crate::files::{create_directories, write};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -40,23 +40,24 @@ Example:
                                    make the rig yours (docs/your-own-rig.md)";
 
 /// Writes the crate.
-pub fn new(arguments: &Arguments) -> Exit {
+pub fn new(arguments: &Arguments) -> Ended {
     let name = &arguments.name;
     let plain = (2..=32).contains(&name.len())
         && name.starts_with(|first: char| first.is_ascii_lowercase())
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     if !plain || name.ends_with('-') || TAKEN.contains(&&**name) {
         let reason = "cannot name a crate and its scenario; use 2 to 32 of a-z, 0-9 and -, a letter first";
-        return fail(Exit::Usage, &format!("`{name}` {reason}"));
+        return Err(fail(Exit::Usage, &format!("`{name}` {reason}")));
     }
     let directory = arguments.path.clone().unwrap_or_else(|| PathBuf::from(name));
     if directory.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         let path = directory.display();
-        return fail(Exit::Usage, &format!("{path} is there already and is not empty; name another with --path"));
+        let reason = format!("{path} is there already and is not empty; name another with --path");
+        return Err(fail(Exit::Usage, &reason));
     }
     match write_all(&directory, name) {
-        Ok(()) => say(&told(&directory, arguments.json)).map_or_else(|exit| exit, |()| Exit::Ok),
-        Err(error) => fail(Exit::Failure, &format!("{}: {error}; name another with --path", directory.display())),
+        Ok(()) => say(&told(&directory, arguments.json)),
+        Err(error) => Err(fail(Exit::Failure, &format!("{}: {error}; name another with --path", directory.display()))),
     }
 }
 

@@ -69,9 +69,12 @@ pub fn print(text: &str) -> Result<(), String> {
     }
 }
 
-/// Prints to stdout; where that fails, says so and gives the exit code.
-pub fn say(text: &str) -> Result<(), Exit> {
-    print(text).map_err(|reason| fail(Exit::Failure, &reason))
+/// How a command ended: with an error if it stopped early. Its reason is printed then.
+pub type Ended = Result<Exit, Exit>;
+
+/// Prints to stdout.
+pub fn say(text: &str) -> Ended {
+    print(text).map(|()| Exit::Ok).map_err(|reason| fail(Exit::Failure, &reason))
 }
 
 /// The exit code of a run, or a replay, that failed.

@@ -1,6 +1,6 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
-use super::output::{Exit, fail, remark, say};
+use super::output::{Ended, Exit, fail, remark, say};
 use super::runs::{self, join};
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
@@ -39,34 +39,30 @@ Examples:
                                    the run that `run --out runs/pair` began";
 
 /// Records to the end of the run.
-pub fn record(arguments: &Arguments) -> Exit {
+pub fn record(arguments: &Arguments) -> Ended {
     let is_there = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
     if arguments.parent.is_none() && !arguments.overwrite && is_there() {
         let file = arguments.out.display();
-        return fail(Exit::Usage, &format!("{file} is there; name another file with --out, or give --overwrite"));
+        return Err(fail(Exit::Usage, &format!("{file} is there; name another file with --out, or give --overwrite")));
     }
-    let (domain, terminated) = match join(arguments.parent, arguments.domain.as_deref()) {
-        Ok(joined) => joined,
-        Err(exit) => return exit,
-    };
+    let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let seat = RecorderSeat { domain, file: arguments.out.clone() };
-    match run_recorder(&seat, &terminated) {
-        Ok(report) => told(&report, arguments),
-        Err(error) => fail(exit_of(&error), &error),
-    }
+    let report = run_recorder(&seat, &terminated).map_err(|error| fail(exit_of(&error), &error))?;
+    told(&report, arguments)
 }
 
-fn told(report: &RecordingReport, arguments: &Arguments) -> Exit {
+fn told(report: &RecordingReport, arguments: &Arguments) -> Ended {
     let part = if report.whole { "" } else { ", from the midst of the run on" };
     let text = if arguments.json {
         format!("{}\n", serde_json::json!({ "schema": SCHEMA, "recording": report }))
     } else {
         format!("{}: {} samples, {} bytes{part}\n", report.file, report.messages, report.bytes)
     };
-    if let (None, Err(exit)) = (arguments.parent, say(&text)) {
-        return exit;
+    let said = say(&text);
+    if arguments.parent.is_none() {
+        said?;
     }
-    report.problem.as_ref().map_or(Exit::Ok, |problem| fail(Exit::Failure, problem))
+    report.problem.as_ref().map_or(Ok(Exit::Ok), |problem| Err(fail(Exit::Failure, problem)))
 }
 
 /// Opens the recording of a run as [`open`] does. Returns it with its file.

@@ -1,6 +1,6 @@
 //! `corotate replay`: a recording through the live roles.
 
-use super::output::{Exit, fail, harmless, say};
+use super::output::{Ended, Exit, fail, harmless, say};
 use super::record::{exit_of, exit_with, open_run};
 use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
@@ -43,24 +43,16 @@ Examples:
   corotate replay run.mcap --role observer --processes";
 
 /// Replays.
-pub fn replay(arguments: &Arguments) -> Exit {
-    let (file, recording) = match open_run(arguments.run.as_deref(), arguments.accept_incomplete) {
-        Ok(opened) => opened,
-        Err(exit) => return exit,
-    };
-    match attempt(arguments, &recording) {
-        Ok(replays) => {
-            let words = || harmless(&replays.iter().map(words).collect::<String>());
-            let text = if arguments.json { json(&file, &replays) } else { words() };
-            let differs = replays.iter().any(|replay| replay.difference.is_some());
-            match say(&text) {
-                Err(exit) => exit,
-                Ok(()) => exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }),
-            }
-        }
-        Err(LaunchError::Record(error)) => fail(exit_of(&error), &error),
-        Err(error) => fail(super::output::exit_of(&error), &error),
-    }
+pub fn replay(arguments: &Arguments) -> Ended {
+    let (file, recording) = open_run(arguments.run.as_deref(), arguments.accept_incomplete)?;
+    let replays = attempt(arguments, &recording).map_err(|error| match error {
+        LaunchError::Record(error) => fail(exit_of(&error), &error),
+        error => fail(super::output::exit_of(&error), &error),
+    })?;
+    let words = || harmless(&replays.iter().map(words).collect::<String>());
+    say(&if arguments.json { json(&file, &replays) } else { words() })?;
+    let differs = replays.iter().any(|replay| replay.difference.is_some());
+    Ok(exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }))
 }
 
 fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleReplay>, LaunchError> {

@@ -1,6 +1,6 @@
 //! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
 
-use super::output::{Exit, fail, remark, say};
+use super::output::{Ended, Exit, fail, remark, say};
 use super::record;
 use super::runs;
 use crate::campaign::JournalError;
@@ -57,11 +57,8 @@ Examples:
                                    both over each other, in comparison.html";
 
 /// Makes the page.
-pub fn report(arguments: &Arguments) -> Exit {
-    let source = match runs::results(arguments.run.as_deref()) {
-        Ok(source) => source,
-        Err(reason) => return fail(Exit::Usage, &reason),
-    };
+pub fn report(arguments: &Arguments) -> Ended {
+    let source = runs::results(arguments.run.as_deref()).map_err(|reason| fail(Exit::Usage, &reason))?;
     let directory = if source.is_dir() { &source } else { source.parent().unwrap_or(Path::new("")) };
     let page = if arguments.other.is_some() { "comparison.html".into() } else { directory.join("report.html") };
     let out = arguments.out.clone().unwrap_or(page);
@@ -78,10 +75,9 @@ pub fn report(arguments: &Arguments) -> Exit {
         arguments.figures.iter().try_for_each(|directory| report.write_figures(directory))?;
         report.write(&out).map(|()| if report.is_damaged() { Exit::Failure } else { Exit::Ok })
     });
-    match written {
-        Ok(exit) => say(&words(arguments.json, &out)).and_then(|()| show(arguments.open, &out)).err().unwrap_or(exit),
-        Err(error) => fail(exit_of(&error), &error),
-    }
+    let exit = written.map_err(|error| fail(exit_of(&error), &error))?;
+    say(&words(arguments.json, &out))?;
+    show(arguments.open, &out).map(|()| exit)
 }
 
 fn words(json: bool, out: &Path) -> String {

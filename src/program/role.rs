@@ -1,6 +1,6 @@
 //! `corotate plant|observer|controller`: one role, as the launcher starts it.
 
-use super::output::{Exit, fail};
+use super::output::{Ended, Exit, fail};
 use super::runs::join;
 use crate::runtime::{RoleError, RoleSeat, run_role};
 use std::path::PathBuf;
@@ -34,20 +34,13 @@ pub struct PlantArguments {
 }
 
 /// Serves a role to the end of the run.
-pub fn role(name: &str, arguments: &Arguments) -> Exit {
-    let (domain, terminated) = match join(arguments.parent, arguments.domain.as_deref()) {
-        Ok(joined) => joined,
-        Err(exit) => return exit,
-    };
+pub fn role(name: &str, arguments: &Arguments) -> Ended {
+    let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let seat = RoleSeat { domain, role: name.to_owned() };
-    match run_role(&seat, &terminated) {
-        Ok(()) => Exit::Ok,
-        Err(error) => {
-            let usage = matches!(
-                error,
-                RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. }
-            );
-            fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
+    run_role(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
+        RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. } => {
+            fail(Exit::Usage, &error)
         }
-    }
+        _ => fail(Exit::Failure, &error),
+    })
 }

@@ -1,6 +1,6 @@
 //! `corotate schema`: what a scenario may say, for editors.
 
-use super::output::{Exit, say};
+use super::output::{Ended, say};
 use super::shipped::{name, scenarios};
 
 /// Options of `corotate schema`.
@@ -18,8 +18,8 @@ Example, for editors with Taplo (Even Better TOML, Helix, Neovim):
   echo '#:schema ./scenario.schema.json' | cat - pair.toml > with-schema.toml";
 
 /// Prints the schema.
-pub fn schema(_: &Arguments) -> Exit {
+pub fn schema(_: &Arguments) -> Ended {
     let schema = crate::config::schema(name(), scenarios());
     let text = serde_json::to_string_pretty(&schema).expect("plain values are JSON");
-    say(&(text + "\n")).map_or_else(|exit| exit, |()| Exit::Ok)
+    say(&(text + "\n"))
 }

@@ -1,6 +1,6 @@
 //! `corotate seat`: what a foreign program must know to take a role's seat.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::runs;
 use super::scenario::{Change, load};
 use crate::config::ClockKind;
@@ -34,11 +34,7 @@ Example:
                                    services, samples and fields of that seat";
 
 /// Prints a seat.
-pub fn seat(arguments: &Arguments) -> Exit {
-    describe(arguments).map_or_else(|exit| exit, |()| Exit::Ok)
-}
-
-fn describe(arguments: &Arguments) -> Result<(), Exit> {
+pub fn seat(arguments: &Arguments) -> Ended {
     let clock = arguments.clock.iter().map(|clock| Change::Option("--clock", "clock", clock));
     let changes = arguments.set.iter().map(|argument| Change::Set(argument)).chain(clock);
     let scenario = load(Some(&arguments.file), changes).map_err(|error| fail(Exit::Usage, &error))?;

@@ -1,7 +1,7 @@
 //! `corotate sweep`: a campaign from file to table.
 
 use super::campaign;
-use super::output::{Exit, fail, print, remark};
+use super::output::{Ended, Exit, fail, print, remark};
 use super::signals::catch_signals;
 use crate::campaign::{
     Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
@@ -102,24 +102,19 @@ struct Telling {
 }
 
 /// Runs a campaign, or puts the parts of one together.
-pub fn sweep(arguments: &Arguments) -> Exit {
+pub fn sweep(arguments: &Arguments) -> Ended {
     match (&arguments.merge, &arguments.file) {
         (Some(Merge::Merge(given)), _) => put_together(given),
-        (None, Some(file)) => run(arguments, file).unwrap_or_else(|exit| exit),
-        (None, None) => fail(Exit::Usage, &"name a campaign"),
+        (None, Some(file)) => run(arguments, file),
+        (None, None) => Err(fail(Exit::Usage, &"name a campaign")),
     }
 }
 
-fn put_together(given: &MergeArguments) -> Exit {
+fn put_together(given: &MergeArguments) -> Ended {
     let telling = Telling { json: given.json, quiet: given.quiet };
-    match merge(&given.directories, &given.out) {
-        Ok(swept) => {
-            let counts = swept.counts.unwrap_or_default();
-            let head = format!("{} directories put together", given.directories.len());
-            tell(telling, &given.out, &head, &counts).map_or_else(|exit| exit, |()| Exit::Ok)
-        }
-        Err(error) => fail(exit_of(&error), &error),
-    }
+    let swept = merge(&given.directories, &given.out).map_err(|error| fail(exit_of(&error), &error))?;
+    let head = format!("{} directories put together", given.directories.len());
+    tell(telling, &given.out, &head, &swept.counts.unwrap_or_default()).map(|()| Exit::Ok)
 }
 
 fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {

@@ -1,6 +1,6 @@
 //! `corotate watch`: a screen on a running loop.
 
-use super::output::{Exit, fail, say};
+use super::output::{Ended, Exit, fail, say};
 use super::runs;
 use super::signals::catch_signals;
 use crate::sample::RoleState;
@@ -46,19 +46,10 @@ Examples:
                                    one screen as text, after five seconds";
 
 /// Watches until it is enough.
-pub fn watch(arguments: &Arguments) -> Exit {
-    let signal = match catch_signals() {
-        Ok(signal) => signal,
-        Err(error) => return fail(Exit::Failure, &error),
-    };
-    let domain = match runs::domain(arguments.domain.as_deref()) {
-        Ok(domain) => domain,
-        Err(exit) => return exit,
-    };
-    match attempt(arguments, &domain, &signal) {
-        Ok(exit) => exit,
-        Err(error) => fail(exit_of(&error), &error),
-    }
+pub fn watch(arguments: &Arguments) -> Ended {
+    let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+    let domain = runs::domain(arguments.domain.as_deref())?;
+    attempt(arguments, &domain, &signal).map_err(|error| fail(exit_of(&error), &error))
 }
 
 fn attempt(arguments: &Arguments, domain: &Path, signal: &AtomicUsize) -> Result<Exit, WatchError> {

@@ -353,11 +353,6 @@ impl Track {
         bytemuck::pod_read_unaligned(&self.sample(index)[..size_of::<Stamp>()])
     }
 
-    /// Whether it stands for a sample that does not exist.
-    pub fn is_void(&self, index: usize) -> bool {
-        self.stamp(index).generation & VOID != 0
-    }
-
     /// One element of a field of unsigned numbers in a sample; none if there is no such field.
     pub(super) fn unsigned(&self, index: usize, name: &str) -> Option<u64> {
         let column = self.info.layout.columns.iter().find(|column| column.name == name)?;
