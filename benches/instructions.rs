@@ -9,8 +9,9 @@
 #[allow(dead_code, reason = "the contest uses all of it")]
 mod product;
 
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::launch::{Launch, run};
+use corotate::scenario::Scenario;
 use product::{KINDS, pass, scenario};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

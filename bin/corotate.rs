@@ -4,7 +4,7 @@ use corotate::Program;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    let program = Program::new().rigs(corotate::rig::shipped());
+    let program = Program::new().rigs(corotate::scenario::shipped());
     let program =
         corotate::config::SHIPPED.into_iter().fold(program, |program, (name, text)| program.scenario(name, text));
     corotate::campaign::SHIPPED.into_iter().fold(program, |program, (name, text)| program.campaign(name, text)).main()

@@ -9,12 +9,11 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::Scenario;
 use crate::record::{Channel, MessageSink, RecordError, Taps};
-use crate::runtime::{
-    RoleError, depths, join_at_low_priority, join_whole, run_under_way, topic, with_realtime_priority, write_whole,
-};
+use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Layout, MESSAGE_ENCODING, Phase, SCHEMA_ENCODING, Schedule, frame, topic_of};
+use crate::scenario::Scenario;
+use crate::seat::{RoleError, join_whole, run_under_way, write_whole};
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle};
 use std::collections::BTreeMap;
 use std::io;

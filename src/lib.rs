@@ -16,8 +16,8 @@
 //! | [`role`] | plant, observer and controller as state machines without clock and I/O | yes, `no_std` |
 //! | [`rate`] | the observers and the law of angular velocities, as roles | yes, `no_std` |
 //! | `serial` | a device behind a byte stream: the protocol and both of its ends | yes, `no_std`, with `serial` |
-//! | `rig` | the registry: which plant, observer and law belong together | no |
-//! | `config` | scenario files: as typed, then as resolved | no |
+//! | `rig` | which plant, observer and law belong together | no |
+//! | `config` | scenario files: text with its checks, and the settings of a run | no |
 //! | `data` | logs that others wrote, read row by row | no |
 //! | `analysis` | what may be claimed of the loop that runs: its rate, its floor | no |
 //! | `bus` | links between roles: shared memory (iceoryx2) or in-memory | no |
@@ -26,6 +26,10 @@
 //! | `shared` | words of memory that processes share | no |
 //! | `telemetry` | histograms and counters, exported after the loop | no |
 //! | `runtime` | drives one role on a bus with a clock | no |
+//! | `score` | scores a run from the truth and the estimates | no |
+//! | `direct` | a run in one thread without links | no |
+//! | `scenario` | a scenario with its rig: the generic code below behind a table of functions; the registry of rigs | no |
+//! | `seat` | a role as a process: of this program, a function, a device, a foreign program | no |
 //! | `record` | writes every sample of a run to a file; reads, replays, compares and exports it | no |
 //! | `hosts` | a run over several computers: relay, clocks, who may join; with the feature of that name | no |
 //! | `launch` | starts, supervises and ends a run; scores it | no |
@@ -79,6 +83,8 @@ pub mod config;
 #[cfg(feature = "runtime")]
 pub mod data;
 #[cfg(feature = "runtime")]
+mod direct;
+#[cfg(feature = "runtime")]
 pub mod doctor;
 #[cfg(feature = "runtime")]
 pub mod files;
@@ -100,6 +106,12 @@ pub mod report;
 pub mod rig;
 #[cfg(feature = "runtime")]
 pub mod runtime;
+#[cfg(feature = "runtime")]
+pub mod scenario;
+#[cfg(feature = "runtime")]
+pub mod score;
+#[cfg(feature = "runtime")]
+pub mod seat;
 #[cfg(feature = "runtime")]
 pub mod shared;
 #[cfg(feature = "runtime")]

@@ -39,5 +39,5 @@ pub const ROWS: &[Row] = &[
 
 fn main() -> ExitCode {
     let (name, text) = SHIPPED[0];
-    Program::new().rigs(corotate::rig::shipped()).scenario(name, text).bench(ROWS)
+    Program::new().rigs(corotate::scenario::shipped()).scenario(name, text).bench(ROWS)
 }

@@ -1,10 +1,11 @@
 //! The product's estimate-and-control step on a second of a shipped scenario's measurements, called through a pointer once per
 //! sample. Clocks are read before and after all of them, never within.
 
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::rig::{Command, Estimate, Measurement, Rig};
 use corotate::role::{Body, Controller, Observer};
 use corotate::sample::Message;
+use corotate::scenario::Scenario;
 use corotate::with_shipped_rig;
 use std::hint::black_box;
 use std::time::Instant;

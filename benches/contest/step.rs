@@ -8,7 +8,7 @@ use super::ekf::Ekf;
 use super::product::{KINDS, Ours, SAMPLES, driven, measurements, pass, scenario, timed};
 use super::recording::{CASES, Recording};
 use corotate::bench::{Bench, BenchError, Board};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::model::Inertia;
 use corotate::observe::{
     Filter, GuardedKalman, HiddenRate, Interval, InvariantFilter, KalmanFilter, Observation, RateNoise,
@@ -17,6 +17,7 @@ use corotate::observe::{
 use corotate::rig::{Command, Estimate, Figure, Measurement, RateLaw, Rig, RigidBodyRig};
 use corotate::role::{Controller, Guard};
 use corotate::sample::{FieldKind, RateCommand, RateEstimate, RateMeasurement, Sample, status};
+use corotate::scenario::Scenario;
 use corotate::with_shipped_rig;
 use nalgebra::{Vector1, Vector3};
 use std::hint::black_box;

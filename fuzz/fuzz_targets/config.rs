@@ -1,7 +1,7 @@
 //! Any text as a scenario: refused with reasons, or resolved to one that resolves to itself.
 #![no_main]
 
-use corotate::config::Scenario;
+use corotate::scenario::Scenario;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| match Scenario::parse(text, "fuzz.toml", &[]) {

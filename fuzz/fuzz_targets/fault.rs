@@ -2,7 +2,8 @@
 #![no_main]
 
 use arbitrary::Arbitrary;
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use corotate::launch::{Launch, run};
 use libfuzzer_sys::fuzz_target;
 use std::fmt::Write;

@@ -1,7 +1,8 @@
 //! Any lines as `--set` arguments of a shipped scenario; the first byte says which.
 #![no_main]
 
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: (u8, &str)| {

@@ -2,7 +2,8 @@
 //! would be. Whatever can be opened can be exported, compared with itself and replayed.
 #![no_main]
 
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use corotate::launch::{Launch, run};
 use corotate::record::{Recording, Tolerances, diff, export_csv, replay_in_process};
 use corotate::runtime::RoleId;

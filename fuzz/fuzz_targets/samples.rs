@@ -4,8 +4,10 @@
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
 use corotate::clock::Grid;
-use corotate::config::{SHIPPED, Scenario};
-use corotate::runtime::{RunCondition, Input, Poll, ReadyNode, RoleId, build, depths, private_ledger, topic};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
+use corotate::runtime::{RunCondition, Input, Poll, ReadyNode, RoleId, depths, private_ledger, topic};
+use corotate::scenario::build;
 use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;

@@ -3,7 +3,8 @@
 
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use corotate::record::RecordingReport;
 use corotate::runtime::{Control, depths, topic};
 use corotate::sample::{Health, Message, RoleState, Schedule};

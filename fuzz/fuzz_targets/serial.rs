@@ -1,7 +1,8 @@
 //! Any bytes on the line, to both ends: as they are, and as the payloads of good frames, which no random bytes would be.
 #![no_main]
 
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use corotate::rig::{Rig, RigidBodyRig};
 use corotate::serial::{Device, FlightSeat, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;

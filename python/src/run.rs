@@ -1,11 +1,12 @@
 //! Runs, and what may be claimed of them.
 
 use corotate::Program;
-use corotate::config::{RunId, SHIPPED, Scenario};
+use corotate::config::{RunId, SHIPPED};
+use corotate::scenario::Scenario;
 use corotate::launch::{
     Launch, Outcome, Progress, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
 };
-use corotate::rig::shipped as rigs;
+use corotate::scenario::shipped as rigs;
 use pyo3::create_exception;
 use pyo3::exceptions::{PyException, PyValueError};
 use pyo3::prelude::*;
@@ -93,7 +94,8 @@ pub fn run(
     tell: Option<Py<PyAny>>,
 ) -> PyResult<(String, PathBuf)> {
     let id: RunId = new_run().map_err(failed)?;
-    let scenario = Scenario { run: Some(id), ..scenario(given, kind, &overrides)? };
+    let mut scenario = scenario(given, kind, &overrides)?;
+    scenario.run = Some(id);
     external
         .iter()
         .try_for_each(|role| scenario.check_external(role).map_err(|reason| refused(format!("{role}: {reason}"))))?;
@@ -141,5 +143,5 @@ pub fn run(
 #[pyfunction]
 pub fn certificate(py: Python<'_>, given: &str, kind: &str, overrides: Vec<String>) -> PyResult<String> {
     let scenario = scenario(given, kind, &overrides)?;
-    py.detach(|| serde_json::to_string(&corotate::analysis::claims(&scenario)).map_err(failed))
+    py.detach(|| serde_json::to_string(&corotate::scenario::claims(&scenario)).map_err(failed))
 }

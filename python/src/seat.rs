@@ -1,8 +1,10 @@
 //! A role's seat: its samples to a function, or to a loop that asks for tick after tick.
 
 use crate::run::{failed, scenario};
-use corotate::config::Scenario;
-use corotate::runtime::{Compute, ComputedTick, Port, RoleId, RoleSeat, ports, run_computed};
+use corotate::scenario::Scenario;
+use corotate::runtime::{Compute, ComputedTick, RoleId, ports};
+use corotate::bus::Port;
+use corotate::seat::{RoleSeat, run_computed};
 use corotate::sample::{FieldKind, Stamp};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -60,7 +62,7 @@ pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>,
 #[pyfunction]
 pub fn domain_of(given: PathBuf) -> PyResult<Option<PathBuf>> {
     use corotate::bus::domain::DomainError;
-    match corotate::runtime::run_under_way(Some(&given)) {
+    match corotate::seat::run_under_way(Some(&given)) {
         Ok(domain) => Ok(Some(domain).filter(|domain| domain.join("scenario.toml").exists())),
         Err(DomainError::NoRun | DomainError::Over { .. } | DomainError::NotADomain { .. }) => Ok(None),
         Err(error) => Err(failed(error)),

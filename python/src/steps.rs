@@ -23,7 +23,7 @@ type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, bool, Option<Acted<'py>>);
 pub struct Steps {
     steps: Option<corotate::launch::Steps>,
     /// Again, for the summary.
-    scenario: corotate::config::Scenario,
+    scenario: corotate::scenario::Scenario,
     /// Of each input, where its numbers are: first word and count.
     numbers: Vec<Vec<(usize, usize)>>,
     commands: Vec<Vec<u64>>,
@@ -67,9 +67,10 @@ impl Steps {
     fn new(given: &str, kind: &str, overrides: Vec<String>) -> PyResult<Self> {
         let scenario_again = || scenario(given, kind, &overrides);
         let steps = corotate::launch::Steps::new(scenario_again()?).map_err(failed)?;
-        let scenario = corotate::config::Scenario { run: Some(new_run().map_err(failed)?), ..scenario_again()? };
+        let mut scenario = scenario_again()?;
+        scenario.run = Some(new_run().map_err(failed)?);
         let ports = corotate::runtime::ports(&scenario, corotate::runtime::RoleId::Controller);
-        let numbers = |port: &corotate::runtime::Port| {
+        let numbers = |port: &corotate::bus::Port| {
             let numbers = port.fields.iter().filter(|field| field.kind == FieldKind::F64);
             numbers.map(|field| (field.offset / size_of::<u64>(), field.count)).collect::<Vec<_>>()
         };

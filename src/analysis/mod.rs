@@ -11,7 +11,7 @@ mod chain;
 mod exponent;
 mod fall;
 
-use crate::config::Scenario;
+use crate::config::Settings;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use chain::{Chain, Guards};
 use fall::Fall;
@@ -78,13 +78,8 @@ pub struct Reach {
     pub after_s: Option<f64>,
 }
 
-/// What may be claimed of every driven body's loop.
-pub fn claims(scenario: &Scenario) -> Vec<Claim> {
-    scenario.rig.face().claims(scenario)
-}
-
 /// The same for a rig whose type is known.
-pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<Claim> {
+pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
     let driven = rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
     let certificates = rig.certificates();
     let certificate = |name: &str| certificates.iter().find(|certificate| certificate.body == name);
@@ -95,12 +90,12 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<Claim> {
 struct Analysis<'a, R> {
     rig: &'a R,
     index: usize,
-    scenario: &'a Scenario,
+    scenario: &'a Settings,
     tick_s: f64,
 }
 
 impl<'a, R: Rig> Analysis<'a, R> {
-    fn new(rig: &'a R, index: usize, scenario: &'a Scenario) -> Self {
+    fn new(rig: &'a R, index: usize, scenario: &'a Settings) -> Self {
         Self { rig, index, scenario, tick_s: scenario.tick_s() }
     }
 
@@ -339,6 +334,7 @@ fn norm(values: &[f64]) -> f64 {
 mod tests {
     use super::*;
     use crate::config::SHIPPED;
+    use crate::scenario::{Scenario, claims};
 
     fn claim(overrides: &[&str]) -> Claim {
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();

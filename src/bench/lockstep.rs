@@ -6,14 +6,10 @@ use super::exchange::{Mechanism, Wake};
 use super::hop::Pair;
 use super::session::{Bench, BenchError, resolve};
 use crate::bus::domain::OwnedDomain;
-use crate::config::Scenario;
 use crate::launch::Progress;
-use crate::rig::{BodyInfo, Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{Body, Controller, Observer};
+use crate::rig::BodyInfo;
 use crate::runtime::{RoleId, take_privileges};
-use crate::sample::Message;
-use crate::telemetry::StateHash;
-use std::hint::black_box;
+use crate::scenario::Scenario;
 use std::sync::Barrier;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -47,7 +43,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
         let exchanges = bench.size(20_000, 200);
         let one_way_us = bench.in_the_leaders_place(board, |_| hop.back_to_back(exchanges))?;
         board.add("two raw hops back to back", "ticks/s", None, 1e6 / (HOPS * one_way_us));
-        if let [BodyInfo { driven: false, .. }, BodyInfo { driven: true, .. }] = measured.rig.face().bodies() {
+        if let [BodyInfo { driven: false, .. }, BodyInfo { driven: true, .. }] = measured.rig.bodies() {
             let four = bench.in_the_leaders_place(board, |_| four_raw(&measured, exchanges))?;
             board.add("four raw hops on the same cores", "ticks/s", None, four);
         }
@@ -58,7 +54,7 @@ pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), Be
             board.add(&format!("in one thread, {name}"), "ticks/s", floor, per_second);
         }
         for (name, with_hashes) in [(&arithmetic, false), (&hashed, true)] {
-            match measured.rig.face().arithmetic(&measured, with_hashes) {
+            match measured.rig.arithmetic(&measured, with_hashes) {
                 Some(per_second) => board.add(name, "ticks/s", None, per_second),
                 None => board.remark(format!("{name}: not measured: only that of a leader and one follower is")),
             }
@@ -117,43 +113,4 @@ fn four_raw(scenario: &Scenario, exchanges: u64) -> Result<f64, BenchError> {
         led.and(followed)?;
         Ok(exchanges as f64 / began.elapsed().as_secs_f64())
     })
-}
-
-/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others. If so
-/// told, with what a run cannot do without besides: the truths, and the hash of every sample.
-pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Scenario, hashed: bool) -> Option<f64> {
-    let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
-        return None;
-    };
-    let tick_s = scenario.tick_s();
-    let (mut leader, mut follower) = (rig.body(0), rig.body(1));
-    let (mut observer, mut controller) = (Observer::new(rig.estimator(), tick_s), Controller::new(rig.law(1)));
-    let mut measured = [Measurement::<R>::default(); 2];
-    let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
-    let (mut truth, mut hashes) = (Truth::<R>::default(), [(); 6].map(|()| StateHash::without_checkpoints()));
-    let began = Instant::now();
-    for tick in 0..=scenario.last_tick {
-        if tick > 0 {
-            black_box(follower.apply(&command));
-        }
-        let bodies = [&mut leader, &mut follower].into_iter().zip(&mut measured).zip(hashes.chunks_exact_mut(2));
-        for ((body, measured), hashes) in bodies {
-            body.measure(0, 0, measured);
-            measured.stamp_mut().tick = tick;
-            if hashed {
-                body.truth(0, &mut truth);
-                hashes[0].absorb(tick, measured.content());
-                hashes[1].absorb(tick, truth.content());
-            }
-            body.flow(tick_s);
-        }
-        observer.step(&measured[0], &mut estimate);
-        controller.step(&estimate, &measured[1], &mut command);
-        if hashed {
-            hashes[4].absorb(tick, estimate.content());
-            hashes[5].absorb(tick, command.content());
-        }
-    }
-    black_box((&command, &hashes));
-    Some((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
 }

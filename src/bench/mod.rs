@@ -22,7 +22,6 @@ mod tick;
 mod watch;
 
 pub use board::{Beside, Board, Figure};
-pub(crate) use lockstep::arithmetic_alone;
 pub use peer::serve_peer;
 pub use report::{Results, table, write_results};
 pub use session::{Bench, BenchError, Measure, Row, row};

@@ -4,9 +4,10 @@ use super::board::Board;
 use super::targets::Target;
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
-use crate::config::{ConfigError, SHIPPED, Scenario};
+use crate::config::{ConfigError, SHIPPED};
 use crate::launch::{self, Launch, LaunchError, Outcome, Progress};
 use crate::runtime::{Privileges, RoleId, release_priority, take_privileges};
+use crate::scenario::Scenario;
 use rustix::thread::{sched_getaffinity, sched_setaffinity};
 use std::io;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -167,7 +168,8 @@ impl Bench<'_> {
         work: impl FnOnce(&Privileges) -> Result<T, BenchError>,
     ) -> Result<T, BenchError> {
         let cores = sched_getaffinity(None).ok();
-        let place = take_privileges(&self.scenario(&[])?, RoleId::Plant(0));
+        let scenario = self.scenario(&[])?;
+        let place = take_privileges(&scenario, RoleId::Plant(0));
         board.granted(place.grants.clone());
         let done = work(&place);
         release_priority();

@@ -18,7 +18,8 @@ const LONGEST_NS: u64 = 1_000_000;
 /// Measures the row.
 pub(super) fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchError> {
     let (rounds, ticks) = (bench.size(5, 1), bench.size(2000, 100));
-    let leader = RoleId::Plant(0).name(&bench.scenario(&[])?).to_owned();
+    let scenario = bench.scenario(&[])?;
+    let leader = RoleId::Plant(0).name(&scenario).to_owned();
     for round in 1..=rounds {
         bench.next(&format!("tick: round {round} of {rounds}"))?;
         let outcome = run_live(bench, 1000, ticks as f64 / 1e3, APART)?;

@@ -8,12 +8,14 @@ pub mod iox;
 pub mod memory;
 mod names;
 mod notifier;
+mod port;
 pub(crate) mod raw;
 mod unfinished;
 mod words;
 
 pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};
+pub use port::Port;
 pub use words::{AnyBus, Ends, ReadWords, WordReader, WordWriter, WriteWords};
 
 use crate::sample::{FleetLayout, FleetSample, Sample};

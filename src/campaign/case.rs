@@ -6,9 +6,10 @@ use super::file::{Campaign, Case, resolved};
 use super::journal::Entry;
 use super::margin::Searched;
 use super::table::{End, MarginPoint, Metric, Row, Statistic};
-use crate::analysis::claims;
-use crate::config::{ClockKind, ConfigError, Document, Scenario};
+use crate::config::{ClockKind, ConfigError, Document};
 use crate::launch::{self, Action, Judged, Launch, MetricScore, Outcome, state_hash};
+use crate::scenario::Scenario;
+use crate::scenario::claims;
 use std::sync::atomic::AtomicUsize;
 use toml::Value;
 

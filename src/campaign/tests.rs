@@ -118,7 +118,7 @@ fn an_override_is_of_every_case_and_another_campaign() {
 fn a_fault_of_which_there_is_nothing_is_none() {
     let (_, text) = SHIPPED[0];
     let campaign = campaign(text);
-    let faults = |number| campaign.scenario(&campaign.case(number).unwrap()).unwrap().faults;
+    let faults = |number| campaign.scenario(&campaign.case(number).unwrap()).unwrap().faults.clone();
     assert_eq!(faults(0).len(), 0, "no loss");
     assert_eq!(faults(3).len(), 1);
     assert_eq!(faults(8 * 3).len(), 0, "no loss at another delay");

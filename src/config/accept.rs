@@ -2,10 +2,10 @@
 //!
 //! Must not judge; what a run came to is held against it by `launch`.
 
+use super::checks::Checks;
 use super::nearest;
 use super::raw::{Accept as Raw, RawTicks};
 use super::reader::keys_of;
-use super::scenario::Checks;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 
@@ -73,7 +73,7 @@ impl Accept {
     }
 
     /// The limits of metrics by their keys.
-    pub(super) fn metric_limits(&self) -> BTreeMap<String, f64> {
+    pub(crate) fn metric_limits(&self) -> BTreeMap<String, f64> {
         let max = self.metric_max.iter().map(|(metric, limit)| (format!("{metric}_max"), *limit));
         let peak = self.metric_peak.iter().map(|(metric, limit)| (format!("{metric}_peak"), *limit));
         max.chain(peak).collect()
@@ -82,18 +82,18 @@ impl Accept {
 
 /// The criteria of metrics, by keys that are the rig's, of any type: an unknown key is refused as that, not for its value.
 #[derive(Deserialize)]
-pub(super) struct Metrics {
+pub(crate) struct Metrics {
     #[serde(default)]
     pub accept: toml::Table,
 }
 
 /// Returns true if a key is every rig's, so that no metric can have it.
-pub(super) fn is_common(key: &str) -> bool {
+pub(crate) fn is_common(key: &str) -> bool {
     keys_of::<Raw>().contains(&key)
 }
 
 /// The scenario around the criteria. Without a rig, `metrics` are unknown, and keys that may be metrics are not checked.
-pub(super) struct Setting<'a> {
+pub(crate) struct Setting<'a> {
     pub duration_s: f64,
     pub metrics: Option<&'a [&'a str]>,
     pub roles: Option<&'a [&'a str]>,
@@ -102,7 +102,7 @@ pub(super) struct Setting<'a> {
 }
 
 /// Checks the criteria.
-pub(super) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, checks: &mut Checks<'_>) -> Accept {
+pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, checks: &mut Checks<'_>) -> Accept {
     let mut accept = Accept {
         settled_by_s: instant("settled_by_s", raw.settled_by_s, setting, checks),
         peak_from_s: instant("peak_from_s", raw.peak_from_s, setting, checks),

@@ -63,7 +63,7 @@ pub enum ConfigError {
 
 impl ConfigError {
     /// This mistake and others, if there are some, told at once. What is no mistake of a key stands alone.
-    pub(super) fn and(self, others: impl IntoIterator<Item = Self>) -> Self {
+    pub(crate) fn and(self, others: impl IntoIterator<Item = Self>) -> Self {
         let others: Vec<Problem> =
             others.into_iter().filter_map(|other| other.into_problems().ok()).flatten().collect();
         if others.is_empty() {
@@ -76,7 +76,7 @@ impl ConfigError {
     }
 
     /// Returns the mistake with a suggestion: a top-level key that belongs into a table is named with that table.
-    pub(super) fn within(self, nested: &[String]) -> Self {
+    pub(crate) fn within(self, nested: &[String]) -> Self {
         match self {
             Self::UnknownKey { place, key, remedy } => {
                 let remedy = nested_remedy(&key, nested).unwrap_or(remedy);

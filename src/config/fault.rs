@@ -3,20 +3,20 @@
 //! Must refuse a fault that would do nothing, or something else than its author meant.
 
 mod occurrence;
+mod raw;
 
+pub(crate) use raw::RawFault;
+
+use super::body::{BodyInfo, role_names};
+use super::checks::Checks;
 use super::nearest;
-use super::scenario::Checks;
-use crate::bus::Carried;
+use crate::bus::{Port, Signal};
 use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
-use crate::rig::{AnyRig, Command, Estimate, FleetCommand, FleetMeasurement, Measurement, Rig};
 use crate::sample::FieldKind;
-use occurrence::{DistributionName, RawChannel, RawWeaklyHard};
-use serde::{Deserialize, Serialize};
+use raw::Kind;
 
 /// The most faults of one scenario.
 const MAX_FAULTS: usize = 64;
-/// The longest delay, ticks: so many samples are kept.
-const MAX_DELAY_TICKS: u64 = 1000;
 /// The longest stall, ms.
 const MAX_STALL_MS: f64 = 60_000.0;
 /// The field whose bits tell which components of a sample are measured or observed.
@@ -34,83 +34,20 @@ pub struct ScriptedFault {
     pub fault: Fault,
 }
 
-/// The kinds, as a scenario names them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub(super) enum Kind {
-    Drop,
-    Duplicate,
-    Delay,
-    Freeze,
-    NotANumber,
-    Infinite,
-    OutOfRange,
-    BitFlip,
-    LostAxis,
-    NoiseBurst,
-    Stall,
-    Miss,
-    Kill,
-}
-
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct RawFault {
-    pub kind: Kind,
-    pub role: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub body: Option<String>,
-    pub from_tick: u64,
-    #[serde(default = "one")]
-    pub ticks: u64,
-    #[serde(default = "always")]
-    pub probability: f64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub every: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub gilbert_elliott: Option<RawChannel>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub weakly_hard: Option<RawWeaklyHard>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub field: Option<String>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub component: Option<usize>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub value: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub bit: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub deviation: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub delay_ticks: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub jitter_ticks: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub distribution: Option<DistributionName>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub spread_ticks: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub stall_ms: Option<f64>,
-}
-
-fn one() -> u64 {
-    1
-}
-
-fn always() -> f64 {
-    1.0
-}
-
 /// What faults are checked against.
-pub(super) struct Setting<'a> {
-    pub rig: &'a AnyRig,
+pub(crate) struct Setting<'a> {
+    pub bodies: &'a [BodyInfo],
+    /// The signals of the bodies.
+    pub signals: &'a [Port],
+    /// The number of components, counted from the first, of which the `valid` word of measurements and estimates tells.
+    pub axes: usize,
     pub last_tick: u64,
     pub seed: u64,
     pub actuation_delay_ticks: u64,
 }
 
 /// Checks all faults of a scenario. What is refused is noted and left out.
-pub(super) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<ScriptedFault> {
+pub(crate) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<ScriptedFault> {
     checks.require(raw.len() <= MAX_FAULTS, "fault", || {
         format!(
             "{} are more than a run takes; give at most {MAX_FAULTS}, with longer ticks or a probability",
@@ -200,10 +137,9 @@ impl One<'_, '_, '_> {
 
     /// The bodies whose signals are concerned; none, once, for a fault of the role itself.
     fn bodies(&mut self) -> Option<Vec<Option<String>>> {
-        let (raw, bodies) = (self.raw, self.setting.rig.bodies());
+        let (raw, bodies) = (self.raw, self.setting.bodies);
         let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
-        let mut roles: Vec<&str> = bodies.iter().map(|body| &*body.name).chain(["observer"]).collect();
-        roles.extend((!driven.is_empty()).then_some("controller"));
+        let roles = role_names(bodies);
         self.require(roles.contains(&&*raw.role), "role", || {
             format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
         })?;
@@ -229,8 +165,6 @@ impl One<'_, '_, '_> {
     /// What happens to the samples about this body, or to the role itself.
     fn action(&mut self, body: Option<&str>) -> Option<Action> {
         let raw = self.raw;
-        let info = self.setting.rig.bodies().iter().find(|info| Some(&*info.name) == body);
-        let fleet = info.and_then(|info| info.fleet);
         Some(match raw.kind {
             Kind::Drop => Action::Transport(Transport::Drop),
             Kind::Duplicate => Action::Transport(Transport::Duplicate),
@@ -245,10 +179,23 @@ impl One<'_, '_, '_> {
             Kind::Kill => Action::Role(Interruption::Kill),
             Kind::Miss => Action::Role(Interruption::Miss),
             _ => {
-                let fields = self.setting.rig.face().fields(&raw.role, fleet);
+                let fields = self.fields(body?)?;
                 Action::Content(self.tamper(&fields)?)
             }
         })
+    }
+
+    /// The fields of what the role sends about a body.
+    fn fields(&self, body: &str) -> Option<Fields> {
+        let signal = match &*self.raw.role {
+            "observer" => Signal::Estimate,
+            "controller" => Signal::Command,
+            _ => Signal::Measurement,
+        };
+        let port = self.setting.signals.iter().find(|port| port.topic.body == body && port.topic.signal == signal)?;
+        // A fleet's samples have no word for all of its bodies' components, nor have commands.
+        let has_axes = !port.fleet && signal != Signal::Command;
+        Some(Fields::of(port, if has_axes { self.setting.axes } else { 0 }))
     }
 
     fn tamper(&mut self, fields: &Fields) -> Option<Tamper> {
@@ -323,30 +270,21 @@ impl One<'_, '_, '_> {
     }
 }
 
-/// What a signal's sample is made of.
-pub(crate) struct Fields {
+/// The words of a signal's samples.
+struct Fields {
     all: Vec<(&'static str, Words, FieldKind)>,
     first: &'static str,
     content: Words,
-    /// How many leading components its `valid` word tells of.
+    /// The number of leading components that its `valid` word tells of.
     axes: usize,
 }
 
-/// The fields of what a role sends about a body, or a fleet of so many.
-pub(crate) fn fields<R: Rig>(role: &str, fleet: Option<usize>) -> Fields {
-    fn of<S: Carried + ?Sized>(bodies: usize, axes: usize) -> Fields {
-        let fields = S::fields(bodies);
-        // In a fleet's sample what is said of the whole comes before the vectors.
-        let first = fields.iter().find(|field| field.kind == FieldKind::F64).map_or(VALID, |field| field.name);
-        let names = fields.iter().map(|field| field.name).chain(["tick", "generation"]);
-        let all = names.filter_map(|name| fault::field(&fields, name).map(|(words, kind)| (name, words, kind)));
-        Fields { all: all.collect(), first, content: Words::content(8 * S::length(bodies)), axes }
-    }
-    match (role, fleet) {
-        ("observer", _) => of::<Estimate<R>>(1, R::AXES),
-        ("controller", None) => of::<Command<R>>(1, 0),
-        ("controller", Some(bodies)) => of::<FleetCommand<R>>(bodies, 0),
-        (_, None) => of::<Measurement<R>>(1, R::AXES),
-        (_, Some(bodies)) => of::<FleetMeasurement<R>>(bodies, 0),
+impl Fields {
+    fn of(port: &Port, axes: usize) -> Self {
+        // In a fleet's sample the fields of the whole precede the vectors.
+        let first = port.fields.iter().find(|field| field.kind == FieldKind::F64).map_or(VALID, |field| field.name);
+        let names = port.fields.iter().map(|field| field.name).chain(["tick", "generation"]);
+        let all = names.filter_map(|name| fault::field(&port.fields, name).map(|(words, kind)| (name, words, kind)));
+        Self { all: all.collect(), first, content: Words::content(port.size), axes }
     }
 }

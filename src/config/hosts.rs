@@ -2,7 +2,7 @@
 //!
 //! Must not know how anything crosses from one to another.
 
-use super::scenario::Checks;
+use super::checks::Checks;
 use serde::{Deserialize, Serialize};
 
 /// The longest budget, ticks: no command is on its way for longer.
@@ -62,7 +62,7 @@ impl Default for Network {
 }
 
 impl Network {
-    pub(super) fn is_default(&self) -> bool {
+    pub(crate) fn is_default(&self) -> bool {
         *self == Self::default()
     }
 }
@@ -121,7 +121,7 @@ impl Hosts {
 }
 
 /// Checks that every role has one host, and that the budgets fit into the delay of the actuators.
-pub(super) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], delay_ticks: u64, checks: &mut Checks<'_>) {
+pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], delay_ticks: u64, checks: &mut Checks<'_>) {
     let mut taken: Vec<&str> = Vec::new();
     for (index, host) in hosts.hosts.iter().enumerate() {
         let key = |part: &str| format!("host[{index}].{part}");
@@ -152,7 +152,7 @@ pub(super) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
 }
 
 /// Checks what can be judged without a rig.
-pub(super) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[String], checks: &mut Checks<'_>) {
+pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[String], checks: &mut Checks<'_>) {
     let mut names: Vec<&str> = Vec::new();
     for (index, host) in hosts.hosts.iter().enumerate() {
         let (name, key) = (host.name.as_str(), format!("host[{index}].name"));
@@ -209,7 +209,8 @@ pub(super) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
+    use crate::scenario::Scenario;
 
     const BODIES: [(&str, bool); 2] = [("leader", false), ("follower", true)];
 

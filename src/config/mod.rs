@@ -1,32 +1,35 @@
-//! Scenario files: text as typed, then a [`Scenario`] as resolved. Nothing is started on a scenario that is not valid.
+//! Scenario files: text as typed, with its checks, and the [`Settings`] that it resolves to. Nothing is started on a scenario that
+//! is not valid.
 //!
 //! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
 
-mod accept;
+pub(crate) mod accept;
+mod body;
+mod checks;
 mod document;
 mod edit;
 mod error;
-mod fault;
-mod hosts;
-mod raw;
+pub(crate) mod fault;
+pub(crate) mod hosts;
+pub(crate) mod raw;
 mod reader;
 mod run_id;
-mod scenario;
-mod schema;
+mod settings;
 mod shape;
-mod watchdog;
+pub(crate) mod watchdog;
 
 pub use accept::{Accept, TickAmount, TickLimit};
+pub use body::{BodyInfo, role_names};
+pub use checks::Checks;
 pub use document::{Document, read_text};
 pub use error::{ConfigError, Problem};
 pub use fault::ScriptedFault;
-pub(crate) use fault::{Fields, fields};
 pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub(crate) use reader::keys_of;
 pub use run_id::{NoRunId, RunId};
-pub use scenario::{Checks, Scenario};
-pub use schema::schema;
+pub use settings::Settings;
+pub(crate) use settings::{debugged_and_external, shared_with_external};
 pub(crate) use shape::{Key, Shape};
 
 pub(crate) use document::nearest;

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Raw {
+pub(crate) struct Raw {
     pub name: String,
     pub rig: String,
     #[serde(default)]
@@ -77,7 +77,7 @@ impl ClockKind {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Actuator {
+pub(crate) struct Actuator {
     pub command_timeout_ticks: u64,
     #[serde(with = "RearmName")]
     pub rearm: Rearm,
@@ -171,7 +171,7 @@ pub enum NamedCores {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Launch {
+pub(crate) struct Launch {
     pub startup_timeout_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub external_timeout_s: Option<f64>,
@@ -193,7 +193,7 @@ impl Default for Launch {
 /// What follows where the controller's inputs or its commands are beyond a bound. The bounds are keys of the rig's.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Watchdog {
+pub(crate) struct Watchdog {
     pub from_s: f64,
     pub on_breach: OnBreach,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -203,7 +203,7 @@ pub(super) struct Watchdog {
 /// What follows from a breach.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub(super) enum OnBreach {
+pub(crate) enum OnBreach {
     /// It is counted.
     #[default]
     Count,
@@ -228,7 +228,7 @@ pub struct Supervision {
 /// The criteria that every rig has. Those of metrics are keys of the rig's.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Accept {
+pub(crate) struct Accept {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub settled_by_s: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -251,7 +251,7 @@ pub(super) struct Accept {
     untagged,
     expecting = "this is no limit on ticks; give a number, a share such as \"1 %\", or a table such as { controller = 5 }"
 )]
-pub(super) enum RawTicks {
+pub(crate) enum RawTicks {
     Count(f64),
     Share(String),
     ByRole(BTreeMap<String, RawTicks>),

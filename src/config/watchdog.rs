@@ -2,24 +2,22 @@
 //!
 //! Must refuse a bound on what a rig does not tell: it would never be broken.
 
+use super::checks::Checks;
 use super::nearest;
 use super::raw::{OnBreach, Watchdog};
-use super::scenario::Checks;
 use crate::control::WatchBounds;
-use crate::rig::AnyRig;
 use std::collections::BTreeMap;
 
 /// Checks the bounds and resolves them to ticks.
-pub(super) fn resolve(
+pub(crate) fn resolve(
     raw: &Watchdog,
     maxima: &BTreeMap<String, f64>,
-    rig: &AnyRig,
+    monitors: &[(&'static str, Option<&'static str>)],
     tick_s: f64,
     duration_s: f64,
     checks: &mut Checks<'_>,
 ) -> WatchBounds {
     let mut bounds = WatchBounds { from_tick: (raw.from_s / tick_s).round() as u64, ..WatchBounds::NONE };
-    let monitors = rig.monitors();
     let keys: Vec<String> = monitors.iter().map(|(name, _)| format!("{name}_max")).collect();
     for (name, max) in maxima {
         let key = format!("watchdog.{name}");

@@ -3,8 +3,9 @@
 //! All files lie below a root, so that a test can be a machine. Must not write, but for opening what must be writable.
 
 use super::Check;
-use crate::config::{Realtime, Scenario};
+use crate::config::Realtime;
 use crate::runtime::{RoleId, shared_memory_bytes};
+use crate::scenario::Scenario;
 use rustix::fs::statvfs;
 use std::fs::OpenOptions;
 use std::io::ErrorKind;

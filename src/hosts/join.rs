@@ -2,8 +2,9 @@
 //!
 //! Must not open anything: bytes in, bytes out.
 
-use crate::config::{ConfigError, Document, Scenario};
+use crate::config::{ConfigError, Document};
 use crate::runtime::{RoleId, ports};
+use crate::scenario::Scenario;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -259,7 +260,7 @@ impl Part {
         for (key, name, content) in &self.files {
             let plain = Path::new(name).file_name().map_or_else(|| "data".into(), ToOwned::to_owned);
             let path = directory.join(plain);
-            let write = crate::runtime::write_whole(&path, content);
+            let write = crate::seat::write_whole(&path, content);
             write.map_err(|source| JoinError::Write { path: path.clone(), source })?;
             document.set(&format!("{key}={}", toml::Value::String(path.display().to_string())))?;
         }

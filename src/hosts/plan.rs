@@ -1,7 +1,9 @@
 //! Which signal goes from which host to which, found out from the scenario alone, so that all hosts find the same.
 
-use crate::config::{ClockKind, Scenario};
-use crate::runtime::{Port, RoleId, ports};
+use crate::bus::Port;
+use crate::config::ClockKind;
+use crate::runtime::{RoleId, ports};
+use crate::scenario::Scenario;
 
 /// A signal that is written on some host.
 pub struct Link {

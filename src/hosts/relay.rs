@@ -18,12 +18,11 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, WordReader, WordWriter, Write};
 use crate::clock::{Grid, RunClock, monotonic_ns, raw_ns};
-use crate::config::{ClockKind, Scenario};
-use crate::runtime::{
-    Kept, RoleError, clock_path, depths, go_before_roles, join, kept, open_ledger, report_path, scenario_path, topic,
-    write_whole,
-};
+use crate::config::ClockKind;
+use crate::runtime::{Kept, depths, go_before_roles, kept, topic};
 use crate::sample::{Health, Phase, Schedule, Stamp};
+use crate::scenario::Scenario;
+use crate::seat::{RoleError, clock_path, join, open_ledger, report_path, scenario_path, write_whole};
 use crate::system::{remedy, tell};
 use crate::telemetry::Latency;
 use std::path::{Path, PathBuf};

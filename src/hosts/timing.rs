@@ -5,7 +5,8 @@
 use super::offset::{Estimate, Exchange, OffsetEstimator};
 use super::report::ClockReport;
 use crate::clock::{Correction, RunClock, tai_offset_ns};
-use crate::config::{ClockKind, ClockSource, Scenario};
+use crate::config::{ClockKind, ClockSource};
+use crate::scenario::Scenario;
 
 /// Between two questions for the time, ns: before the ticks, and while they run.
 const FIRST_ASK_NS: u64 = 4_000_000;

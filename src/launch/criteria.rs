@@ -4,8 +4,9 @@
 
 use super::outcome::{Accounting, StageFigures, links_of};
 use super::{Action, Outcome};
-use crate::config::{ClockKind, Scenario, TickAmount, TickLimit};
+use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
+use crate::scenario::Scenario;
 use crate::telemetry::Ticks;
 use serde::{Serialize, Serializer};
 use std::fmt;

@@ -4,9 +4,10 @@
 
 use super::supervision::Member;
 use super::trace::Lack;
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::runtime::RoleId;
 use crate::sample::RoleState;
+use crate::scenario::Scenario;
 
 /// A role is named after it has kept the run waiting for so long, ns; then twice as late each time, up to the second.
 const FIRST_WORD_NS: u64 = 5_000_000_000;

@@ -1,36 +1,63 @@
 //! A run in one thread: the same roles over links in memory, or without links where nothing disturbs them. No iceoryx2, no
 //! files, no clock.
 
-use super::score;
 use super::supervision::Failure;
 use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
-use crate::config::{OnFailure, Scenario};
+use crate::config::OnFailure;
+use crate::direct::TURN_TICKS;
 use crate::panics;
 use crate::record::Recorder;
-use crate::runtime::{Ended, RoleId, build, depths, in_noted_turn, private_ledger, report};
+use crate::runtime::{Ended, RoleId, depths, in_noted_turn, private_ledger, report};
+use crate::scenario::Scenario;
+use crate::scenario::build;
+use crate::scenario::scorer as open_scorer;
 use crate::system::tell;
 use crate::telemetry::{Ledger, RoleReport};
 use std::cell::{Cell, RefCell};
 use std::sync::atomic::Ordering;
 
-/// Ticks between two looks at signals and progress.
-const TURN_TICKS: u64 = 1024;
-
 /// Runs all roles of a scenario in turn.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     // A panic comes again in the node of a role, which is told by name then.
-    match panics::catch_quietly(|| scenario.rig.face().direct(scenario, launch)) {
+    match panics::catch_quietly(|| run_directly(scenario, launch)) {
         Ok(Some(outcome)) => Ok(outcome),
         Ok(None) | Err(_) => run_nodes(scenario, launch),
     }
 }
 
+/// The same without links; none where it has to be done with them.
+fn run_directly(scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
+    if launch.record.is_some() {
+        return None;
+    }
+    let (mut stopped, checkpoints) = (false, launch.checkpoints);
+    let mut go_on = |tick, latest| {
+        stopped = !proceed(|| latest, scenario, launch, tick);
+        !stopped
+    };
+    let (reports, score) = scenario.rig.direct(scenario, checkpoints, &mut go_on)?;
+    let signal = if stopped { launch.signal.load(Ordering::Relaxed) } else { 0 };
+    Some(Outcome {
+        reports,
+        recording: None,
+        unbooked: Vec::new(),
+        problems: Vec::new(),
+        score,
+        incidents: Vec::new(),
+        hosts: Vec::new(),
+        grants: Vec::new(),
+        domain: None,
+        remains: None,
+        signal,
+    })
+}
+
 /// The same over links, whatever happens.
 fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     let bus = MemoryBus::new(depths(scenario));
-    let scorer = RefCell::new(score::open(scenario, &bus)?);
+    let scorer = RefCell::new(open_scorer(scenario, &bus)?);
     let seats: Vec<(RoleId, Ledger)> =
         RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
     let node = |(role, ledger): &(RoleId, Ledger)| build(scenario, *role, &bus, ledger);
@@ -144,7 +171,7 @@ mod tests {
         let mut progress = |_: &Progress<'_>| {};
         let mut launch = Launch::new(&signal, &mut progress);
         match direct {
-            true => scenario.rig.face().direct(scenario, &mut launch),
+            true => run_directly(scenario, &mut launch),
             false => Some(run_nodes(scenario, &mut launch).unwrap()),
         }
     }

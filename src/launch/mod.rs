@@ -5,7 +5,6 @@
 mod children;
 mod companion;
 mod criteria;
-mod direct;
 mod external;
 mod foxglove;
 mod in_process;
@@ -19,15 +18,14 @@ mod recorder;
 mod relay;
 mod replay;
 mod results;
-mod score;
 mod standstill;
 mod steps;
 mod supervision;
 mod table;
 mod trace;
 
+pub use crate::score::{CertificateScore, MetricScore, Score, Scorer};
 pub use criteria::{Criterion, Unjudged, tick_words};
-pub(crate) use direct::run_rig as run_directly;
 pub use janitor::janitor;
 #[cfg(feature = "hosts")]
 pub use join::{FarOutcome, join};
@@ -39,8 +37,6 @@ pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;
 pub use results::{Claim, LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
-pub use score::{CertificateScore, MetricScore, Score, Scorer};
-pub(crate) use score::{lyapunov_floor, score_rig};
 pub use steps::{BodyState, Steps};
 pub use supervision::{Action, Incident};
 pub use table::{line_words, table};
@@ -48,11 +44,12 @@ pub(crate) use table::{plain, reasons};
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::hosts::HostSeat;
 pub use crate::panics::Panic;
 use crate::record::RecordError;
 use crate::runtime::{NodeError, unavailable_cores};
+use crate::scenario::Scenario;
 use crate::system::remedy;
 use crate::telemetry::{Grant, LedgerError};
 use std::io;

@@ -6,13 +6,15 @@ use super::criteria::{Criterion, Judge, accepted, verdict};
 use super::processes::Remains;
 use super::results::{HASHES, LATENCY, LATENCY_LOG, SCENARIO, SUMMARY};
 use super::{Action, Incident, Score};
-use crate::analysis::{Claim, claims};
-use crate::config::{ClockKind, RunId, Scenario};
+use crate::analysis::Claim;
+use crate::config::{ClockKind, RunId};
 use crate::files;
 use crate::hosts::{HostReport, HostsSummary};
 use crate::record::RecordingReport;
 use crate::rig::Figure;
 use crate::runtime::{RoleId, ports};
+use crate::scenario::Scenario;
+use crate::scenario::claims;
 use crate::serial::LineCounters;
 use crate::system::utc;
 use crate::telemetry::{

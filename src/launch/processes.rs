@@ -12,7 +12,6 @@ use super::foxglove;
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
-use super::score::{self, Scorer};
 use super::standstill::attach_remedy;
 use super::supervision::{Action, Failure, Incident, Member};
 use super::{Launch, LaunchError, Outcome, Progress};
@@ -20,14 +19,17 @@ use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Signal, Write};
 use crate::clock::{Grid, monotonic_ns};
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::hosts::{HostsSummary, RELAY};
 use crate::record::RECORDER;
 use crate::runtime::{
-    Backoff, RoleId, depths, describe_seat, hold_low_latency_idle, report, report_path, results_path, scenario_path,
-    seat_path, shared_memory_bytes, take_short_turns, topic, window_ticks, write_whole,
+    Backoff, RoleId, depths, hold_low_latency_idle, report, shared_memory_bytes, take_short_turns, topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
+use crate::scenario::Scenario;
+use crate::scenario::scorer as open_scorer;
+use crate::score::Scorer;
+use crate::seat::{describe_seat, report_path, results_path, scenario_path, seat_path, write_whole};
 use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, Outage, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -78,7 +80,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     };
     let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
     let mut supervisor = Supervisor::start(scenario, launch, domain, &bus, &mut janitor)?;
-    let mut scorer = score::open(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
+    let mut scorer = open_scorer(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;
     let mut shutdown = supervisor.shut_down(if signal == 0 { END_LIMIT } else { SIGNALLED_END_LIMIT });
     let of = |report: &RoleReport| {

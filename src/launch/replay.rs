@@ -9,12 +9,11 @@ use crate::bus::domain::OwnedDomain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::Scenario;
 use crate::record::{Comparer, Inlets, Limit, Outlets, Recording, RoleReplay, Script};
-use crate::runtime::{
-    Backoff, Interruptions, RoleId, depths, scenario_path, shared_memory_bytes, topic, window_ticks, write_whole,
-};
+use crate::runtime::{Backoff, Interruptions, RoleId, depths, shared_memory_bytes, topic, window_ticks};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use crate::scenario::Scenario;
+use crate::seat::{scenario_path, write_whole};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// The files of a run.
-pub(crate) use crate::runtime::SUMMARY;
+pub(crate) use crate::seat::SUMMARY;
 pub(crate) const SCENARIO: &str = "scenario.toml";
 pub(crate) const HASHES: &str = "hashes.txt";
 pub(crate) const RECORDING: &str = "run.mcap";

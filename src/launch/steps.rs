@@ -3,16 +3,19 @@
 //!
 //! Must not decide anything for the controller: a tick without a command has none.
 
-use super::score::{self, Scorer};
 use super::{LaunchError, Outcome};
+use crate::bus::Port;
 use crate::bus::memory::MemoryBus;
 use crate::bus::{BusError, Reader, Signal, WordReader};
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::runtime::{
-    Compute, ComputedTick, Poll, Port, ReadyNode, RoleId, RoleImpl, RunCondition, build, depths, ports, private_ledger,
-    report,
+    Compute, ComputedTick, Poll, ReadyNode, RoleId, RoleImpl, RunCondition, depths, ports, private_ledger, report,
 };
 use crate::sample::Field;
+use crate::scenario::Scenario;
+use crate::scenario::build;
+use crate::scenario::scorer as open_scorer;
+use crate::score::Scorer;
 use crate::telemetry::Ledger;
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -95,7 +98,7 @@ impl TruthReader {
             state.status = self.status.map_or(0, |word| words[word]);
             state.applied.clear();
             state.applied.extend(words[first..first + count].iter().map(|bits| f64::from_bits(*bits)));
-            state.loss = scenario.rig.face().loss_words(words);
+            state.loss = scenario.rig.loss_words(words);
         }
         Ok(())
     }
@@ -118,8 +121,8 @@ impl Steps {
     ///
     /// # Errors
     /// [`LaunchError`]; [`LaunchError::NotStepped`] where it has no controller, a fleet, or a role that a fault kills.
-    pub fn new(scenario: Scenario) -> Result<Self, LaunchError> {
-        let scenario = Scenario { clock: ClockKind::InProcess, ..scenario };
+    pub fn new(mut scenario: Scenario) -> Result<Self, LaunchError> {
+        scenario.clock = ClockKind::InProcess;
         let refuse = |reason| Err(LaunchError::NotStepped { reason });
         let roles = RoleId::all(&scenario);
         if !roles.contains(&RoleId::Controller) {
@@ -130,7 +133,7 @@ impl Steps {
             return refuse("a fleet is driven as one, by our controller alone");
         }
         let bus = MemoryBus::new(depths(&scenario));
-        let scorer = score::open(&scenario, &bus)?;
+        let scorer = open_scorer(&scenario, &bus)?;
         let seats: Vec<(RoleId, Ledger)> =
             roles.into_iter().map(|role| (role, private_ledger(&scenario, role))).collect();
         let readers = of_controller.reads.iter().map(|port| port.reader(&bus, Reader::Scorer));

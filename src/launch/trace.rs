@@ -6,9 +6,9 @@
 
 use crate::bus::iox::IoxBus;
 use crate::bus::{BusError, Reader, Signal, Topic, WordReader, WriterProcess};
-use crate::config::Scenario;
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Health, RoleState, Stamp, VOID};
+use crate::scenario::Scenario;
 use std::fmt;
 
 /// The signals of an external role, watched.

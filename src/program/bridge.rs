@@ -3,7 +3,8 @@
 use super::output::{Ended, Exit, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
-use crate::runtime::{DeviceError, DeviceSeat, NodeError, RoleError, Served, run_bridge};
+use crate::runtime::{DeviceError, DeviceSeat, NodeError};
+use crate::seat::{RoleError, Served, run_bridge};
 use crate::system::tell;
 use std::path::PathBuf;
 

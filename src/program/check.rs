@@ -3,10 +3,11 @@
 use super::campaign;
 use super::output::{Ended, Exit, fail, say};
 use super::scenario::{Change, load};
-use crate::analysis::{Claim, apart, claims, digits};
+use crate::analysis::{Claim, apart, digits};
 use crate::campaign::Campaign;
-use crate::config::Scenario;
 use crate::launch::check_cores;
+use crate::scenario::Scenario;
+use crate::scenario::claims;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 

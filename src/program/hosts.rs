@@ -139,13 +139,13 @@ mod with_hosts {
 #[cfg(feature = "hosts")]
 mod with_hosts {
     use super::*;
-    use crate::config::Scenario;
     use crate::hosts::{HostSeat, JoinError, NetError, Part, RelayError, RelaySeat, Request, ask_to_join, run_relay};
     use crate::launch::{FarOutcome, Launch, new_domain};
     use crate::program::output::exit_of;
     use crate::program::output::say;
     use crate::program::signals::catch_signals;
     use crate::program::signals::terminated_by_signals;
+    use crate::scenario::Scenario;
     use crate::system::{random_bits, tell};
 
     pub fn relay(arguments: &RelayArguments, endpoint: Endpoint) -> Ended {

@@ -2,10 +2,10 @@
 
 use super::output::{Ended, Exit, fail, harmless, say};
 use super::record::{exit_of, exit_with, open_run};
-use crate::config::Scenario;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
 use crate::runtime::RoleId;
+use crate::scenario::Scenario;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 

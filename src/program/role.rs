@@ -2,7 +2,7 @@
 
 use super::output::{Ended, Exit, fail};
 use super::runs::join;
-use crate::runtime::{RoleError, RoleSeat, run_role};
+use crate::seat::{RoleError, RoleSeat, run_role};
 use std::path::PathBuf;
 
 /// Options of every role.

@@ -8,7 +8,7 @@ use super::output::{Exit, exit_of, fail, print, remark};
 use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
 use super::signals::catch_signals;
-use crate::config::{ClockKind, RunId, Scenario};
+use crate::config::{ClockKind, RunId};
 use crate::doctor::Machine;
 use crate::files;
 use crate::hosts::{Address, HostSeat};
@@ -16,7 +16,9 @@ use crate::launch::{
     Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, junit, make_directory, make_latest,
     new_run, table, tick_words, write_run,
 };
-use crate::runtime::{priority_remedy, refused_priority, seat_path};
+use crate::runtime::{priority_remedy, refused_priority};
+use crate::scenario::Scenario;
+use crate::seat::seat_path;
 use crate::system::tell;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::collections::BTreeMap;
@@ -228,7 +230,10 @@ pub fn run(arguments: &Arguments) -> Exit {
             return fail(Exit::Failure, &format!("the run gets no identifier: no random numbers: {error}; {reason}"));
         }
     };
-    let loaded = arguments.scenario().map(|scenario| Scenario { run: Some(run), ..scenario });
+    let loaded = arguments.scenario().map(|mut scenario| {
+        scenario.run = Some(run);
+        scenario
+    });
     let name = loaded.as_ref().map_or_else(|_| stem(arguments.file.as_deref()), |scenario| scenario.name.clone());
     let write_verdict = |ended| arguments.junit.as_deref().map_or(Ok(()), |path| write_junit(path, &name, run, ended));
     // Whoever reads the file finds no older verdict, however this run ends.

@@ -8,7 +8,7 @@ use super::signals::{die_with, terminated_by_signals};
 use crate::bus::domain::Domain;
 use crate::files::{self, Directory};
 use crate::launch::{LATEST, RECORDING, RUNS};
-use crate::runtime::{results_path, run_under_way};
+use crate::seat::{results_path, run_under_way};
 use std::ffi::OsString;
 use std::fs;
 use std::io::ErrorKind;

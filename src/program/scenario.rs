@@ -4,7 +4,8 @@
 
 use super::shipped::{campaigns, name, scenarios};
 use crate::campaign::{Shipped, is_campaign};
-use crate::config::{ConfigError, Document, Scenario, is_name, nearest, read_text};
+use crate::config::{ConfigError, Document, is_name, nearest, read_text};
+use crate::scenario::Scenario;
 use std::borrow::Cow;
 use std::fs::File;
 use std::io;

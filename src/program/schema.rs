@@ -19,7 +19,7 @@ Example, for editors with Taplo (Even Better TOML, Helix, Neovim):
 
 /// Prints the schema.
 pub fn schema(_: &Arguments) -> Ended {
-    let schema = crate::config::schema(name(), scenarios());
+    let schema = crate::scenario::schema(name(), scenarios());
     let text = serde_json::to_string_pretty(&schema).expect("plain values are JSON");
     say(&(text + "\n"))
 }

@@ -4,7 +4,8 @@ use super::output::{Ended, Exit, fail, say};
 use super::runs;
 use super::scenario::{Change, load};
 use crate::config::ClockKind;
-use crate::runtime::{RoleError, RoleId, describe_seat, join_run};
+use crate::runtime::RoleId;
+use crate::seat::{RoleError, describe_seat, join_run};
 use crate::system::tell;
 use std::path::PathBuf;
 

@@ -6,7 +6,7 @@ use super::signals::catch_signals;
 use crate::campaign::{
     Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
 };
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::launch::{Launch, Progress, RUNS, Summary, claim, make_directory, new_run, plain, write_run};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::collections::BTreeMap;
@@ -319,9 +319,9 @@ fn record_worst(
 }
 
 fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -> Result<(), String> {
-    let scenario = campaign.scenario(case).map_err(|error| error.to_string())?;
+    let mut scenario = campaign.scenario(case).map_err(|error| error.to_string())?;
     let run = new_run().map_err(|error| format!("no random numbers: {error}"))?;
-    let scenario = Scenario { run: Some(run), record: true, ..scenario };
+    (scenario.run, scenario.record) = (Some(run), true);
     // The samples of a case are the same whenever it runs.
     let claim = claim(path, run, true).map_err(|error| error.to_string())?;
     if let Some(names) = claim.removed_names() {

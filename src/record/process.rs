@@ -10,12 +10,14 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::runtime::{
-    Backoff, RoleError, RoleId, depths, go_before_ordinary, join_at_low_priority, join_whole, open_ledger, report,
-    report_path, topic, window_ticks, with_realtime_priority, write_whole,
+    Backoff, RoleId, depths, go_before_ordinary, join_at_low_priority, report, topic, window_ticks,
+    with_realtime_priority,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use crate::scenario::Scenario;
+use crate::seat::{RoleError, join_whole, open_ledger, report_path, write_whole};
 use crate::telemetry::RoleReport;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -8,9 +8,10 @@
 use super::RecordError;
 use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
-use crate::config::{RunId, Scenario, ScriptedFault};
+use crate::config::{RunId, ScriptedFault};
 use crate::files;
 use crate::sample::{CDR_HEADER, FieldKind, Layout, Stamp, VOID};
+use crate::scenario::Scenario;
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -266,7 +267,7 @@ impl Recording {
     /// # Errors
     /// [`RecordError::Scenario`].
     pub fn faults(&self) -> Result<Vec<ScriptedFault>, RecordError> {
-        Ok(self.scenario()?.faults)
+        Ok(self.scenario()?.faults.clone())
     }
 
     /// The samples of some signals, of all of them if `wanted` says so, in memory.

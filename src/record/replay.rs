@@ -8,9 +8,10 @@ use super::reader::{Recording, Track};
 use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
-use crate::config::Scenario;
-use crate::runtime::{NodeError, Poll, ReadyNode, RoleId, RunCondition, build, depths, ports, private_ledger};
+use crate::runtime::{NodeError, Poll, ReadyNode, RoleId, RunCondition, depths, ports, private_ledger};
 use crate::sample::{FieldKind, Stamp, VOID};
+use crate::scenario::Scenario;
+use crate::scenario::build;
 use crate::telemetry::Ledger;
 
 /// The columns that say by which of a role's processes a sample was sent, and when: no output of the role.

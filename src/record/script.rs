@@ -9,11 +9,13 @@
 
 use super::RecordError;
 use super::reader::{Recording, SignalInfo, Track};
+use crate::bus::Port;
 use crate::clock::Grid;
-use crate::config::{ClockKind, Scenario, ScriptedFault};
+use crate::config::{ClockKind, ScriptedFault};
 use crate::fault::{Action, Change, Course, Interruption, Tamper, Transport};
-use crate::runtime::{Port, RoleId, ports};
+use crate::runtime::{RoleId, ports};
 use crate::sample::{Stamp, VOID, status};
+use crate::scenario::Scenario;
 use crate::telemetry::Ticks;
 use std::collections::{BTreeMap, BTreeSet};
 

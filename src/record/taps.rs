@@ -4,11 +4,13 @@
 //! know what becomes of a message.
 
 use super::RecordError;
+use crate::bus::Port;
 use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};
-use crate::config::{ClockKind, Scenario};
-use crate::runtime::{Port, RoleId, ports};
+use crate::config::ClockKind;
+use crate::runtime::{RoleId, ports};
 use crate::sample::{Layout, Stamp, VOID};
+use crate::scenario::Scenario;
 use std::collections::BTreeMap;
 
 /// The most gaps that are told one by one.

@@ -4,9 +4,9 @@
 
 use super::error::ReportError;
 use super::traces::{Traces, trace};
-use crate::config::Scenario;
 use crate::launch::{Launch, run};
 use crate::record::Recording;
+use crate::scenario::Scenario;
 use std::sync::atomic::AtomicUsize;
 
 /// Longer runs are not computed again: it would take a while, and an orbit repeats itself.

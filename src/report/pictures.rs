@@ -8,9 +8,10 @@ use super::frame::Line;
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::{BODIES_SHOWN, Key, MetricTrace, Traces};
-use crate::analysis::{claims, digits};
-use crate::config::Scenario;
+use crate::analysis::digits;
 use crate::rig;
+use crate::scenario::Scenario;
+use crate::scenario::claims;
 
 /// Errors below this are drawn at the foot: less than rounding of numbers about 1.
 const ERROR_FLOOR: f64 = 1e-18;
@@ -417,7 +418,7 @@ fn lyapunov(of: &rig::Lyapunov, traces: &Traces, time: &Axis, tick_s: f64) -> Fi
 
 /// How late every role sent, over time.
 pub fn lateness(source: &Source, traces: &Traces, time: &Axis) -> Section {
-    let tick_s = source.scenario.as_ref().map_or(0.0, Scenario::tick_s);
+    let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
     let told = |row: &&super::traces::RoleTrace| row.lateness_us.iter().next().is_some();
     let rows: Vec<(String, &Columns<Extremes>)> =
         traces.roles.iter().filter(told).map(|row| (row.role.clone(), &row.lateness_us)).collect();

@@ -5,10 +5,11 @@
 use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
 use super::summary::Summary;
-use crate::config::{ClockKind, RunId, Scenario};
+use crate::config::{ClockKind, RunId};
 use crate::files;
 use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY};
 use crate::record::Recording;
+use crate::scenario::Scenario;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};

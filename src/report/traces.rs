@@ -5,12 +5,14 @@
 
 use super::columns::{Columns, Corners, Count, Extremes};
 use crate::bus::Signal;
-use crate::config::Scenario;
-use crate::launch::lyapunov_floor;
 use crate::record::{RecordError, Recording, SignalInfo};
-use crate::rig::{AnyRig, Picture, Plane, WordGuard};
+use crate::rig::{Picture, Plane, WordGuard};
 use crate::sample::{Column, FieldKind, Stamp, VOID, status};
+use crate::scenario::AnyRig;
+use crate::scenario::Scenario;
+use crate::score::lyapunov_floor;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// So many ticks behind the newest, a tick is scored with the samples that it has.
 const WINDOW_TICKS: u64 = 2048;
@@ -108,7 +110,7 @@ struct Pending {
 }
 
 struct Tracer {
-    rig: AnyRig,
+    rig: Arc<dyn AnyRig>,
     tick_s: f64,
     settled_by_s: f64,
     epoch_ns: u64,
@@ -140,7 +142,7 @@ impl Tracer {
         };
         let bodies = rig.bodies().iter().map(|body| body.name.to_string()).collect();
         let mut traces = Traces { bodies, metrics: rig.metrics().iter().map(metric).collect(), ..Traces::default() };
-        let signals = recording.signals().iter().map(|signal| SignalTrace::new(rig, signal, &mut traces)).collect();
+        let signals = recording.signals().iter().map(|signal| SignalTrace::new(&**rig, signal, &mut traces)).collect();
         Self {
             rig: rig.clone(),
             tick_s: info.period_ns as f64 / 1e9,
@@ -267,7 +269,7 @@ impl Tracer {
             Signal::Estimate => pending.estimate.as_deref(),
             _ => None,
         };
-        self.rig.face().score_words(&words, &mut self.metrics);
+        self.rig.score_words(&words, &mut self.metrics);
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
             metric.values.at(tick).take(value);
@@ -283,7 +285,7 @@ impl Tracer {
 
     /// How fast V fell from the last command to this one, and how fast it had to.
     fn fall(&mut self, body: usize, tick: u64, command: &[u64]) {
-        let Some((v, bound)) = self.rig.face().lyapunov_words(command) else { return };
+        let Some((v, bound)) = self.rig.lyapunov_words(command) else { return };
         let name = &self.traces.bodies[body];
         if let Some((before, v_before, bound)) = self.before.insert(body, (tick, v, bound))
             && before + 1 == tick
@@ -315,17 +317,17 @@ impl Tracer {
 }
 
 impl SignalTrace {
-    fn new(rig: &AnyRig, info: &SignalInfo, traces: &mut Traces) -> Self {
+    fn new(rig: &dyn AnyRig, info: &SignalInfo, traces: &mut Traces) -> Self {
         let body = rig.bodies().iter().position(|body| body.name == info.body);
         let fleet = body.and_then(|body| rig.bodies()[body].fleet);
         let signals = [Signal::Truth, Signal::Measurement, Signal::Estimate, Signal::Command];
         // A file may hold anything: a signal that the scenario does not have, or has otherwise, is not shown.
         let fits = |signal: &Signal| {
-            let length = body.and_then(|body| rig.face().length(body, *signal));
+            let length = body.and_then(|body| rig.length(body, *signal));
             info.signal == signal.name() && length.is_some_and(|words| 8 * words == info.layout.size())
         };
         let kind = signals.into_iter().find(fits);
-        let guard = kind.zip(body).and_then(|(signal, body)| rig.face().guard(body, signal));
+        let guard = kind.zip(body).and_then(|(signal, body)| rig.guard(body, signal));
         let body = body.unwrap_or(0);
         let shown = kind.is_some() && body <= BODIES_SHOWN;
         let columns = info.layout.columns.iter().skip(Stamp::FIELDS.len());
@@ -335,7 +337,7 @@ impl SignalTrace {
         let valid = named("valid").filter(|_| kind == Some(Signal::Measurement));
         let name = kind.map_or("", Signal::name);
         let field = |(place, column): (usize, &Column)| {
-            let valid = valid.filter(|_| place == 0 && column.count == rig.face().axes()).map(|valid| valid.offset);
+            let valid = valid.filter(|_| place == 0 && column.count == rig.axes()).map(|valid| valid.offset);
             Field { valid, ..Field::new(column, info, name, fleet.unwrap_or(1)) }
         };
         let fields = columns.enumerate().map(field).collect();

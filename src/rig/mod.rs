@@ -2,28 +2,24 @@
 //!
 //! Must not know how roles are driven, nor what carries their samples; `any.rs` alone knows who asks.
 
-mod any;
 mod delay;
 mod fleet;
 mod orbit;
 mod pictures;
-mod registry;
 mod rigid_body;
 mod simple;
 mod words;
 
-pub use any::AnyRig;
+pub use crate::config::BodyInfo;
 pub use delay::{DelayLine, Due};
 pub use fleet::{Fleet, NoFleet};
 pub use orbit::{OrbitLaw, OrbitObserver, OrbitPlant, OrbitRig};
 pub(crate) use pictures::named;
 pub use pictures::{Graph, Inputs, Lyapunov, Picture, Plane, Point, graphs};
-pub use registry::{RigKind, register, shipped};
-pub(crate) use registry::{resolve, sections, shapes, tables};
 pub use rigid_body::{RateLaw, RigidBodyRig};
 pub(crate) use simple::field_named;
 pub use simple::{Bounded, Difference, SimpleRig};
-pub(crate) use words::{WordGuard, WordView};
+pub use words::{WordGuard, WordView};
 
 use crate::config::{Checks, ConfigError, Document};
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
@@ -32,7 +28,6 @@ use crate::sample::FleetSample;
 use crate::state::Persist;
 use nalgebra::SVector;
 use serde::Serialize;
-use std::borrow::Cow;
 
 /// The samples of a rig, by signal.
 pub type Truth<R> = <<R as Rig>::Body as Body>::Truth;
@@ -49,24 +44,6 @@ pub type FleetTruth<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::
 pub type FleetMeasurement<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement>;
 /// The samples of a rig's fleets, by signal.
 pub type FleetCommand<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command>;
-
-/// One body of a rig, or a fleet of them.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct BodyInfo {
-    /// The name of its role and its part of service names.
-    pub name: Cow<'static, str>,
-    /// Whether the controller drives it.
-    pub driven: bool,
-    /// How many bodies it is, if it is a fleet: many in one process, driven as one.
-    pub fleet: Option<usize>,
-}
-
-impl BodyInfo {
-    /// How many bodies its signals tell of.
-    pub fn bodies(&self) -> usize {
-        self.fleet.unwrap_or(1)
-    }
-}
 
 /// Where a loop begins that is analysed.
 #[derive(Debug, Clone, Copy, PartialEq)]

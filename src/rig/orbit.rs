@@ -434,9 +434,10 @@ fn worse(a: f64, b: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
     use crate::role::{Body, Estimator, Guard, Law};
     use crate::sample::{OrbitCommand, OrbitMeasurement, Stamp};
+    use crate::scenario::Scenario;
 
     fn rig(name: &str, overrides: &[&str]) -> OrbitRig {
         let text = SHIPPED.iter().find(|(shipped, _)| *shipped == name).unwrap().1;

@@ -2,19 +2,22 @@
 //!
 //! Must not interpret a sample that is shorter or longer than the rig's own.
 
-use super::{Command, Estimate, FleetTruth, Measurement, Rig, Truth};
-use crate::bus::Signal;
+use super::{Command, Estimate, FleetCommand, FleetMeasurement, FleetTruth, Measurement, Rig, Truth};
+use crate::bus::{Carried, Port, Signal, Topic};
+use crate::config::BodyInfo;
 use crate::role::Guard;
 use crate::sample::{FleetSample, Sample};
 
 /// A guard of one reading end that is given a sample's words.
-pub(crate) trait WordGuard {
+pub trait WordGuard {
     /// Returns true if the sample is accepted.
     fn accepts(&mut self, words: &[u64]) -> bool;
 }
 
 /// A view of a rig's samples as words. Bodies are given by their index.
-pub(crate) trait WordView {
+pub trait WordView {
+    /// Returns the signals of all bodies in a scenario of this name.
+    fn signals(&self, scenario: &str) -> Vec<Port>;
     /// Returns the number of words of a body's sample; none if the body has no such signal, or not of this type.
     fn length(&self, body: usize, signal: Signal) -> Option<usize>;
     /// Returns the guard of a reader that observes a body's signal; none for a signal without one.
@@ -30,6 +33,24 @@ pub(crate) trait WordView {
 }
 
 impl<R: Rig> WordView for R {
+    fn signals(&self, scenario: &str) -> Vec<Port> {
+        let topic = |body: &str, signal| Topic { scenario: scenario.to_owned(), body: body.to_owned(), signal };
+        let estimate = Port::of::<Estimate<R>>(topic(&self.bodies()[0].name, Signal::Estimate), None);
+        let of_body = |body: &BodyInfo| {
+            let command = topic(&body.name, Signal::Command);
+            let command = body.driven.then(|| either::<Command<R>, FleetCommand<R>>(command, body.fleet));
+            let measurement = topic(&body.name, Signal::Measurement);
+            let truth = topic(&body.name, Signal::Truth);
+            [
+                Some(either::<Measurement<R>, FleetMeasurement<R>>(measurement, body.fleet)),
+                Some(either::<Truth<R>, FleetTruth<R>>(truth, body.fleet)),
+                command,
+            ]
+        };
+        let bodies = self.bodies().iter().flat_map(of_body).flatten();
+        std::iter::once(estimate).chain(bodies).collect()
+    }
+
     fn length(&self, body: usize, signal: Signal) -> Option<usize> {
         let info = self.bodies().get(body)?;
         let bytes = match (signal, info.fleet) {
@@ -73,6 +94,11 @@ impl<R: Rig> WordView for R {
     }
 }
 
+/// The signal of a single body, or of a fleet.
+fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
+    if fleet.is_some() { Port::of::<Many>(topic, fleet) } else { Port::of::<One>(topic, None) }
+}
+
 /// Reads words as the sample that they are; none if they are not as many.
 fn cast<S: Sample>(words: &[u64]) -> Option<&S> {
     bytemuck::try_from_bytes(bytemuck::cast_slice(words)).ok()
@@ -93,8 +119,9 @@ impl<S: Sample, G: Guard<S>> WordGuard for Typed<G, S> {
 #[cfg(test)]
 mod tests {
     use crate::bus::Signal;
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
     use crate::sample::{Message, RateEstimate, RateTruth};
+    use crate::scenario::Scenario;
 
     #[test]
     fn words_are_scored_as_the_samples_that_they_are() {
@@ -108,7 +135,7 @@ mod tests {
             (0, Signal::Estimate) => Some(estimate.words()),
             _ => None,
         };
-        let (view, mut values) = (scenario.rig.face(), [f64::NAN; 2]);
+        let (view, mut values) = (scenario.rig, [f64::NAN; 2]);
         view.score_words(&words, &mut values);
         assert_eq!(values, [2.0, 0.5]);
         assert_eq!(view.lyapunov_words(&[0; 3]), None, "too short for a command");

@@ -3,7 +3,8 @@
 //!
 //! Must not keep anything of a tick: what a function remembers is its own, and ends with its process.
 
-use super::node::{NodeError, Ports};
+use super::error::NodeError;
+use super::node::Ports;
 use crate::sample::{Field, Stamp};
 
 /// Words of a stamp.

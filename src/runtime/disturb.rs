@@ -4,7 +4,7 @@
 
 use crate::bus::{Carried, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Scenario, ScriptedFault};
+use crate::config::{ClockKind, ScriptedFault, Settings};
 use crate::fault::{Action, Change, Course, Fault, Interruption, Transport, Way};
 use crate::state::{Persist, Words};
 use crate::telemetry::TickCounters;
@@ -25,7 +25,7 @@ pub struct Disturbance<S: Carried + ?Sized> {
 impl<S: Carried + ?Sized> Disturbance<S> {
     /// What a scenario does to a role's signal about a body, or a fleet of so many, from a tick on; nothing if there is
     /// nothing.
-    pub fn of(scenario: &Scenario, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
+    pub fn of(scenario: &Settings, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
         Self::new(courses(scenario, role, Some(body), next_tick), bodies)
     }
 
@@ -91,7 +91,7 @@ impl<S: Carried + ?Sized> Persist for Disturbance<S> {
 
 /// What a scenario does to a role (`body` none) or to its signal about a body. What a predecessor has passed is decided here,
 /// and not at its successor's first tick.
-fn courses(scenario: &Scenario, role: &str, body: Option<&str>, next_tick: u64) -> Vec<Course> {
+fn courses(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) -> Vec<Course> {
     let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == body;
     let course = |scripted: &ScriptedFault| {
         let mut course = Course::new(scripted.fault.clone());
@@ -114,7 +114,7 @@ pub struct LateSamples(Vec<Course>);
 
 impl LateSamples {
     /// Those of a signal about a body; nothing if there are none that a reader could take for samples in time.
-    pub fn of(scenario: &Scenario, signal: Signal, body: &str) -> Option<Box<Self>> {
+    pub fn of(scenario: &Settings, signal: Signal, body: &str) -> Option<Box<Self>> {
         let role = match signal {
             Signal::Measurement => body,
             Signal::Estimate => "observer",
@@ -138,12 +138,12 @@ fn delay_bound(fault: &Fault) -> u64 {
 }
 
 /// How many late samples may come at once on a signal of a scenario, at the most.
-pub fn late_samples(scenario: &Scenario) -> usize {
+pub fn late_samples(scenario: &Settings) -> usize {
     scenario.faults.iter().map(|scripted| delay_bound(&scripted.fault) as usize).sum()
 }
 
 /// How many samples per tick a signal of a scenario may carry beyond the one that is its own.
-pub fn extra_samples(scenario: &Scenario) -> usize {
+pub fn extra_samples(scenario: &Settings) -> usize {
     let extra = |scripted: &&ScriptedFault| match scripted.fault.action {
         Action::Transport(transport) => transport != Transport::Drop,
         // A flip of a bit may make a sample that belongs to no tick, beside the void in its place.
@@ -175,7 +175,7 @@ pub struct Interruptions {
 
 impl Interruptions {
     /// What a scenario does to a role in this generation of it, from a tick on.
-    pub fn of(scenario: &Scenario, role: &str, generation: u64, next_tick: u64) -> Self {
+    pub fn of(scenario: &Settings, role: &str, generation: u64, next_tick: u64) -> Self {
         let process = scenario.clock != ClockKind::InProcess;
         let faults = courses(scenario, role, None, next_tick);
         Self { faults, first_life: generation == 1, process, next: 0 }

@@ -3,8 +3,10 @@
 //! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a notifier; what is
 //! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
 
+use super::error::NodeError;
 use super::hooks::{self, Failpoint};
-use super::node::{Node, NodeError, Poll, ReadyNode, RoleId, RunCondition};
+use super::node::{Node, Poll, ReadyNode, RunCondition};
+use super::role_id::RoleId;
 use crate::bus::{Bus, BusError, Read, Write};
 use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};

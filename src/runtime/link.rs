@@ -16,9 +16,10 @@ mod tests {
     use super::*;
     use crate::bus::memory::MemoryBus;
     use crate::bus::{Bus, Depths, Read, Reader, Signal, Topic, Write};
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
     use crate::runtime::disturb::Disturbance;
     use crate::sample::RateCommand;
+    use crate::scenario::Scenario;
     use crate::state::{Persist, Restore, Words};
     use crate::telemetry::{Ledger, LinkRead, LinkWritten};
 

@@ -4,26 +4,28 @@
 //! arrive from outside. Must not decide what a run is for, nor start processes.
 
 mod absence;
-mod bridge;
 mod budget;
 mod compute;
+mod device;
 mod disturb;
-mod drive;
-mod hooks;
+pub(crate) mod drive;
+mod error;
+pub(crate) mod hooks;
 mod line;
 mod link;
 mod node;
+mod occupant;
 mod privileges;
-mod process;
-mod seat;
+mod role_id;
 mod share;
 
-pub use bridge::{DeviceError, DeviceLink, DeviceSeat, Served, run_bridge};
 pub use budget::{empty_budgets, grant_budgets};
 pub use compute::{Compute, ComputedTick};
+pub use device::{DeviceLink, DeviceSeat};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
 pub(crate) use drive::in_noted_turn;
 pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use error::{DeviceError, NodeError};
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]
 pub(crate) use link::Kept;
@@ -31,10 +33,10 @@ pub use link::{AcceptedTicks, Input, Output, Seek};
 #[cfg(feature = "hosts")]
 pub(crate) use node::kept;
 pub use node::{
-    Node, NodeError, Poll, Port, Ports, ReadyNode, RoleId, RoleImpl, RunCondition, build, build_rig, ports,
-    private_ledger, report, shared_ledger, topic,
+    Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
 };
-pub(crate) use node::{accepted_ticks, next_tick, ports_of_rig, shared_memory_bytes};
+pub(crate) use node::{accepted_ticks, ledger_file, ledger_words, next_tick, shared_memory_bytes};
+pub use occupant::RoleImpl;
 #[cfg(feature = "hosts")]
 pub(crate) use privileges::go_before_roles;
 pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
@@ -42,18 +44,10 @@ pub(crate) use privileges::{
     go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
     with_realtime_priority,
 };
-pub(crate) use process::SUMMARY;
-pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
-#[cfg(feature = "hosts")]
-pub(crate) use process::{clock_path, join};
-pub(crate) use process::{
-    device_words_path, join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path,
-    write_whole,
-};
-pub use seat::{SeatDescription, describe_seat, join_run, seat_path};
+pub use role_id::RoleId;
 
 use crate::bus::Depths;
-use crate::config::{ClockKind, Scenario};
+use crate::config::{ClockKind, Settings};
 use crate::sample::FleetTruth;
 
 /// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks: at most, and with large samples.
@@ -64,19 +58,19 @@ const WAITING_BYTES: usize = 1 << 20;
 const SCORED_BYTES: usize = 1 << 22;
 
 /// How long the longest sample of a fleet is, bytes; none without a fleet.
-fn longest_sample(scenario: &Scenario) -> Option<usize> {
-    let fleets = scenario.rig.bodies().iter().filter_map(|body| body.fleet);
+fn longest_sample(scenario: &Settings) -> Option<usize> {
+    let fleets = scenario.bodies.iter().filter_map(|body| body.fleet);
     fleets.max().map(|bodies| FleetTruth::length(bodies) * size_of::<u64>())
 }
 
 /// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks.
-pub fn window_ticks(scenario: &Scenario) -> u64 {
+pub fn window_ticks(scenario: &Settings) -> u64 {
     let fits = longest_sample(scenario).map_or(u64::MAX, |bytes| (WAITING_BYTES / 2 / bytes) as u64);
     fits.clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
 }
 
 /// How deep the links of a scenario are.
-pub fn depths(scenario: &Scenario) -> Depths {
+pub fn depths(scenario: &Settings) -> Depths {
     // The scorer looks about every 20 ms, the recorder every 5. Neither has priority: beside 18 ready tasks on two cores the
     // recorder was not run for 0.4 s.
     let second = (1_000_000_000 / scenario.period_ns).next_power_of_two() as usize;

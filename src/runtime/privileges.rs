@@ -3,8 +3,8 @@
 //! Must not fail a run: whether a missing privilege matters is decided by `--require-rt`.
 
 use super::budget::{empty_budgets, grant_budgets};
-use super::node::RoleId;
-use crate::config::{Cores, NamedCores, Realtime, Scenario};
+use super::role_id::RoleId;
+use crate::config::{Cores, NamedCores, Realtime, Settings};
 use crate::telemetry::Grant;
 use rustix::io::Errno;
 use rustix::mm::{MlockAllFlags, mlockall};
@@ -49,7 +49,7 @@ pub struct Privileges {
 }
 
 /// Takes what a role of a scenario asks for, for the calling thread.
-pub fn take(scenario: &Scenario, role: RoleId) -> Privileges {
+pub fn take(scenario: &Settings, role: RoleId) -> Privileges {
     let settings = &scenario.realtime;
     // No privilege: without SCHED_FIFO the kernel would let timers run late by 50 us to save power.
     let _ = set_current_timer_slack(NonZero::new(1));
@@ -147,8 +147,8 @@ fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
 /// The core of a role's process: plants in turn, for all of them act when the tick is due; observer and controller on cores
 /// of their own if there are any, else beside the leader and beside the first follower, whose measurements they wait for. A
 /// process of several roles is where the first of them would be.
-fn core_of(cores: &[usize], role: RoleId, scenario: &Scenario) -> Option<usize> {
-    let bodies = scenario.rig.bodies().len();
+fn core_of(cores: &[usize], role: RoleId, scenario: &Settings) -> Option<usize> {
+    let bodies = scenario.bodies.len();
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
     let place = match role.host(scenario).hosted(scenario).first()? {
         RoleId::Plant(index) => *index,
@@ -164,7 +164,7 @@ fn set_fifo(priority: i32) -> io::Result<()> {
 
 /// Opens links to a loop that may be running, for a process that no role waits for, and yields to all roles from then on: at this
 /// niceness, off their cores.
-pub fn join_at_low_priority<T>(scenario: &Scenario, niceness: i32, open: impl FnOnce() -> T) -> T {
+pub fn join_at_low_priority<T>(scenario: &Settings, niceness: i32, open: impl FnOnce() -> T) -> T {
     let opened = with_realtime_priority(open);
     yield_cores(scenario, niceness);
     opened
@@ -189,7 +189,7 @@ pub fn go_before_ordinary() {
 /// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
 /// does little, and whoever spins for a sample that it has would hold it up. What is not granted is done without.
 #[cfg(feature = "hosts")]
-pub fn go_before_roles(scenario: &Scenario) {
+pub fn go_before_roles(scenario: &Settings) {
     let _ = set_current_timer_slack(NonZero::new(1));
     if (1..99).contains(&scenario.realtime.priority) {
         let _ = set_fifo(scenario.realtime.priority + 1);
@@ -197,7 +197,7 @@ pub fn go_before_roles(scenario: &Scenario) {
 }
 
 /// Takes a niceness, and leaves the cores that the scenario names for roles. What is not granted is no harm.
-fn yield_cores(scenario: &Scenario, niceness: i32) {
+fn yield_cores(scenario: &Settings, niceness: i32) {
     let _ = nice(niceness);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
         critical.iter().for_each(|core| allowed.unset(*core));
@@ -256,6 +256,7 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
 mod tests {
     use super::*;
     use crate::config::SHIPPED;
+    use crate::scenario::Scenario;
 
     fn shipped(name: &str, overrides: &[&str]) -> Scenario {
         let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).unwrap();

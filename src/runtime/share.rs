@@ -4,9 +4,9 @@
 //! The roles stay the nodes that they are, with links, guards, watchdog and counters; only what they send comes from the
 //! device. Must not invent anything: what is not answered before the next tick is due is missed.
 
-use super::bridge::DeviceLink;
 use super::compute::Computing;
-use super::node::NodeError;
+use super::device::DeviceLink;
+use super::error::NodeError;
 use crate::clock::{Grid, monotonic_ns};
 use crate::sample::Stamp;
 use crate::serial::{Answer, LineCounters, MAX_CONTENT, Samples};

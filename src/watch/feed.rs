@@ -4,15 +4,18 @@
 //! is shown is copied.
 
 use super::model::{Model, RoleLine, Series, SignalLine};
+use crate::bus::Port;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, Topic, WordReader};
 use crate::clock::{Grid, monotonic_ns};
-use crate::config::{ClockKind, Scenario};
+use crate::config::ClockKind;
 use crate::fault::{Action, Fault, Interruption, Transport};
-use crate::rig::AnyRig;
-use crate::runtime::{Port, RoleId, ports, topic, window_ticks};
+use crate::runtime::{RoleId, ports, topic, window_ticks};
 use crate::sample::{Field, FieldKind, Health, RoleState, Stamp, VOID, status};
+use crate::scenario::AnyRig;
+use crate::scenario::Scenario;
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 /// Between two looks, ns: seldom enough that their traces are not in the 99 % of a loop at 1 kHz, and less than what waits.
 pub(super) const LOOK_NS: u64 = 100_000_000;
@@ -160,7 +163,7 @@ struct RoleFeed {
 pub(super) struct Feed {
     taps: Vec<Tap>,
     roles: Vec<RoleFeed>,
-    rig: AnyRig,
+    rig: Arc<dyn AnyRig>,
     faults: Vec<(u64, String)>,
     realtime: bool,
     stride: u64,
@@ -332,10 +335,10 @@ impl Feed {
         let words = |body: usize, signal| of(signal).find(|tap| tap.topic.body == bodies[body].name)?.at(tick);
         let mut values = vec![f64::NAN; model.series.len()];
         let metrics = values.len() - usize::from(model.series.last().is_some_and(|series| series.name == LYAPUNOV));
-        self.rig.face().score_words(&words, &mut values[..metrics]);
+        self.rig.score_words(&words, &mut values[..metrics]);
         model.series.iter_mut().zip(values).for_each(|(series, value)| series.push(value));
         let commands = (0..bodies.len()).filter_map(|body| words(body, Signal::Command));
-        let functions = commands.filter_map(|command| self.rig.face().lyapunov_words(command));
+        let functions = commands.filter_map(|command| self.rig.lyapunov_words(command));
         let v = functions.map(|(v, _)| v).fold(f64::NAN, f64::max);
         if !v.is_nan() {
             if metrics == model.series.len() {

@@ -26,7 +26,7 @@ pub use terminal::show;
 
 use crate::bus::BusError;
 use crate::bus::domain::DomainError;
-use crate::runtime::RoleError;
+use crate::seat::RoleError;
 use std::io;
 
 /// Why there is nothing to watch.

@@ -9,11 +9,10 @@ use crate::bus::domain::Domain;
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{Grid, monotonic_ns, sleep_until};
-use crate::config::Scenario;
-use crate::runtime::{
-    RoleError, depths, join_at_low_priority, join_whole, run_under_way, topic, with_realtime_priority,
-};
+use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
+use crate::scenario::Scenario;
+use crate::seat::{RoleError, join_whole, run_under_way};
 use std::path::Path;
 
 /// How much a watcher gives way to everybody.

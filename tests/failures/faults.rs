@@ -2,9 +2,9 @@
 //! balance, the loop converges again; and the clocks agree on all of it.
 
 use crate::common::{Bench, shipped};
-use corotate::config::Scenario;
 use corotate::launch::{Launch, Summary, run};
 use corotate::role::DOUBTS;
+use corotate::scenario::Scenario;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::sync::Mutex;

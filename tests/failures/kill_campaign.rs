@@ -4,8 +4,9 @@
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
 use crate::common::{Bench, Done, Running, send_signal};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::runtime::RoleId;
+use corotate::scenario::Scenario;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 use serde_json::Value;

@@ -3,9 +3,10 @@
 //! The suite takes a part of all damages; `COROTATE_DAMAGE=all cargo test --release --test all damage::` takes them all.
 
 use crate::common::{Bench, Done, rewrite_metadata};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::launch::{Launch, run};
 use corotate::record::Recording;
+use corotate::scenario::Scenario;
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};

@@ -4,12 +4,13 @@ use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, 
 use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
-use corotate::config::Scenario;
 use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process};
 use corotate::runtime::{
-    Poll, ReadyNode, RoleId, RunCondition, build, depths, in_turn, ports, private_ledger, report, shared_ledger,
+    Poll, ReadyNode, RoleId, RunCondition, depths, in_turn, ports, private_ledger, report, shared_ledger,
 };
 use corotate::sample::topic_of;
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
 use serde_json::Value;

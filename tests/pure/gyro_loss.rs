@@ -4,9 +4,10 @@
 use crate::common::shipped;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::config::Scenario;
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth, status};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 
 /// What is known of one tick.
 struct Row {

@@ -4,12 +4,13 @@
 use crate::common::{Bench, WITHOUT_TICK_LIMITS, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::config::Scenario;
 use corotate::control::{OrbitGains, OrbitHold};
 use corotate::model::{CentralField, OrbitState};
 use corotate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
 use corotate::sample::{OrbitEstimate, OrbitTruth};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 use nalgebra::{Vector2, Vector4};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;

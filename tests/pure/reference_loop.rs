@@ -3,9 +3,10 @@
 use crate::common::{Bench, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::config::Scenario;
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 use serde_json::Value;
 
 /// What the columns of `let_pair*.csv` may differ by.

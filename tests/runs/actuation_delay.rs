@@ -2,11 +2,12 @@
 //! rate of the loop, held against an independent computation.
 
 use crate::common::{Bench, shipped};
-use corotate::analysis::claims;
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::launch::{Launch, Summary, run};
 use corotate::nalgebra::{Matrix3, Vector3};
 use corotate::record::{Recording, SignalInfo, Track};
+use corotate::scenario::Scenario;
+use corotate::scenario::claims;
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;

@@ -4,12 +4,13 @@
 use corotate::bus::domain::OwnedDomain;
 use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
-use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::{
-    DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, Service, build_rig, depths, private_ledger, serve, topic,
+    DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
+use corotate::scenario::Scenario;
+use corotate::seat::{Service, serve};
 use corotate::serial::{BodySeat, Device, FlightSeat, Hello, Seat};
 use corotate::telemetry::RoleReport;
 use corotate::with_shipped_rig;

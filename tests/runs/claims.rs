@@ -6,13 +6,16 @@
 //! `tests/claims-campaign N SEED FIRST` draws N scenarios from number FIRST on; the short form in the suite is the first 60
 //! of seed 1.
 
-use corotate::analysis::{Claim, claims};
+use corotate::analysis::Claim;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::rig::{Estimate, Rig, Truth};
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, report, topic};
+use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, report, topic};
 use corotate::sample::{FieldKind, Sample};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
+use corotate::scenario::claims;
 use corotate::with_shipped_rig;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};

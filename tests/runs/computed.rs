@@ -3,12 +3,14 @@
 
 use crate::common::{Bench, Running, await_some};
 use bytemuck::{bytes_of, from_bytes};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
 use corotate::launch::{Launch, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
 use corotate::role::Law;
-use corotate::runtime::{Compute, ComputedTick, RoleError, RoleSeat, run_computed};
+use corotate::runtime::{Compute, ComputedTick};
 use corotate::sample::Message;
+use corotate::scenario::Scenario;
+use corotate::seat::{RoleError, RoleSeat, run_computed};
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::time::SystemTime;
 

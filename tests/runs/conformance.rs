@@ -1,7 +1,8 @@
 //! What every rig and every shipped scenario must fulfil; a new one is picked up from the list by itself.
 
 use crate::common::{Bench, shipped};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use serde_json::Value;
 
 /// Runs every shipped scenario as processes in lockstep and in one thread: accepted, and the same bits.

@@ -4,9 +4,10 @@
 use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
-use corotate::config::Scenario;
-use corotate::runtime::{Input, RoleId, build, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
 use corotate::sample::{FleetTruth, RateTruth};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 use serde_json::Value;
 
 const SIGKILL: i32 = 9;

@@ -7,13 +7,14 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
-use corotate::config::{ClockKind, Scenario};
-use corotate::runtime::{
-    Input, Poll, RoleId, RunCondition, Seek, build, depths, describe_seat, in_turn, private_ledger, seat_path, topic,
-};
+use corotate::config::ClockKind;
+use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, in_turn, private_ledger, topic};
 use corotate::sample::{
     FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
 };
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
+use corotate::seat::{describe_seat, seat_path};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -5,10 +5,10 @@
 mod serial_device;
 
 use crate::common::{Bench, Done, Running, await_some, shipped};
-use corotate::config::Scenario;
 use corotate::rig::Rig;
 use corotate::runtime::Line;
 use corotate::sample::{RateCommand, Sample};
+use corotate::scenario::Scenario;
 use corotate::serial::{
     BodySeat, ControllerSeat, Decoder, Device, FlightSeat, Hello, MAX_FRAME, MAX_PAYLOAD, Message, ObserverSeat,
     Reason, Refuse, Seat, Welcome, encode, parse, write,

@@ -2,7 +2,8 @@
 //! runs that are too short.
 
 use crate::common::{ANY_TICKS, Bench, Done, await_some, send_signal};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use serde_json::Value;
 
 const SIGKILL: i32 = 9;

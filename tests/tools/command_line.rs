@@ -470,7 +470,7 @@ fn the_schema_holds_of_every_shipped_scenario_and_of_no_wrong_one() {
     let mut files: Vec<(String, Option<&str>)> = Vec::new();
     for (name, text) in corotate::config::SHIPPED {
         // As shipped, and with every default filled in.
-        let resolved = corotate::config::Scenario::parse(text, name, &[]).unwrap().to_toml();
+        let resolved = corotate::scenario::Scenario::parse(text, name, &[]).unwrap().to_toml();
         for (form, text) in [("shipped", text), ("resolved", &resolved)] {
             let file = format!("{name}-{form}.toml");
             fs::write(bench.path(&file), text).unwrap();

@@ -3,8 +3,8 @@
 use crate::common::{self, Bench, Done, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Signal, Write};
-use corotate::config::Scenario;
 use corotate::record::Recorder;
+use corotate::scenario::Scenario;
 use roxmltree::{Document, Node, ParsingOptions};
 use serde_json::Value;
 use std::borrow::Cow;

@@ -2,51 +2,13 @@
 //!
 //! Must refuse two answers to one question, and what would never act as its author meant.
 
-use super::{Kind, MAX_DELAY_TICKS, One, RawFault};
+use super::One;
+use super::raw::{DistributionName, Kind, MAX_DELAY_TICKS, PatternName, RawChannel, RawFault, RawWeaklyHard};
 use crate::fault::{Channel, Delay, Distribution, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
-use serde::{Deserialize, Serialize};
-
-/// The channel of Gilbert and Elliott, as a scenario has it.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(in crate::config) struct RawChannel {
-    good_to_bad: f64,
-    bad_to_good: f64,
-    #[serde(default)]
-    when_good: f64,
-    #[serde(default = "super::always")]
-    when_bad: f64,
-}
-
-/// A weakly-hard constraint, as a scenario has it.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(in crate::config) struct RawWeaklyHard {
-    misses: u64,
-    window: u64,
-    pattern: PatternName,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum PatternName {
-    Random,
-    Burst,
-    Even,
-}
-
-/// The distributions of a delay's jitter, as a scenario names them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub(in crate::config) enum DistributionName {
-    Uniform,
-    Geometric,
-    Normal,
-}
 
 impl One<'_, '_, '_> {
     /// On which of its ticks the fault acts.
-    pub(super) fn occurrence(&mut self) -> Option<Occurrence> {
+    pub(crate) fn occurrence(&mut self) -> Option<Occurrence> {
         let RawFault { every, gilbert_elliott, weakly_hard, probability, .. } = *self.raw;
         let answers = [
             ("every", every.is_some()),
@@ -133,7 +95,7 @@ impl One<'_, '_, '_> {
     }
 
     /// How late samples are.
-    pub(super) fn delay(&mut self) -> Option<Delay> {
+    pub(crate) fn delay(&mut self) -> Option<Delay> {
         // A command has until it is to act; everything else, until its own tick is over.
         let commands = self.raw.role == "controller";
         let slack_ticks = if commands { self.setting.actuation_delay_ticks - 1 } else { 0 };
@@ -189,7 +151,7 @@ impl One<'_, '_, '_> {
     }
 
     /// Whether the fault is one of the role itself.
-    pub(super) fn of_role(&self) -> bool {
+    pub(crate) fn of_role(&self) -> bool {
         matches!(self.raw.kind, Kind::Stall | Kind::Kill | Kind::Miss)
     }
 }

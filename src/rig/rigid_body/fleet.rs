@@ -400,9 +400,10 @@ fn near(values: &[f64], from: &[f64], change: f64) -> bool {
 mod tests {
     use super::*;
     use crate::bus::FleetBuffer;
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
     use crate::rig::Rig;
     use crate::sample::{RateMeasurement, Stamp};
+    use crate::scenario::Scenario;
 
     fn rig(overrides: &[&str]) -> RigidBodyRig {
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();

@@ -2,17 +2,19 @@
 //!
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
-use super::{
-    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
-    commit_last, length, restore,
-};
+use super::contract::{Node, Poll, RunCondition};
+use super::missed::MissedTicks;
+use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
 use crate::role::CommandEvent;
-use crate::runtime::bridge::DeviceLink;
+use crate::runtime::device::DeviceLink;
 use crate::runtime::disturb::Interruptions;
+use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Sample, Stamp, content_length, copy_fields};
 use crate::serial::{Answer, LineCounters, Samples};
 use crate::state::{Persist, Words};

@@ -1,17 +1,19 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
+use super::contract::{Node, Poll, RunCondition};
+use super::missed::MissedTicks;
+use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use super::ports::driven;
-use super::{
-    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
-    commit_last, length, restore,
-};
+use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::control::Watchdog;
 use crate::rig::{BodyInfo, Command, Estimate, Fleet, FleetCommand, Rig, Watched};
 use crate::role::{Controller, Guard, Law};
 use crate::runtime::disturb::Interruptions;
+use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_id::RoleId;
 use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
 use crate::serial::LineCounters;
@@ -202,7 +204,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computer>) -> Result<Self, BusError> {
-        let bodies = |fleets: bool| driven(rig).filter(move |(_, body)| body.fleet.is_some() == fleets);
+        let bodies = |fleets: bool| driven(rig.bodies()).filter(move |(_, body)| body.fleet.is_some() == fleets);
         // In the order of the counters: everything written, then everything read; fleets last.
         let written = |(_, body)| seat.output(body, Signal::Command);
         let commands: Vec<Output<B, Command<R>>> = bodies(false).map(written).collect::<Result<_, _>>()?;

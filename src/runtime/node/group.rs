@@ -4,8 +4,10 @@
 //! In real time whoever has a short way to a sample sees it at once, and what else there is to do waits until all have done
 //! their tick, or one of them has to wait. Must not compute, nor change what any of them sends.
 
-use super::{Node, NodeError, Poll, ReadyNode, RoleId, RunCondition};
+use super::contract::{Node, Poll, ReadyNode, RunCondition};
 use crate::clock::{Grid, monotonic_ns};
+use crate::runtime::error::NodeError;
+use crate::runtime::role_id::RoleId;
 use crate::telemetry::{LedgerError, StageReport, Ticks};
 
 /// So long a group sleeps on one input if it lacks several from outside, ns.
@@ -228,8 +230,10 @@ mod tests {
     use super::*;
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
-    use crate::config::{SHIPPED, Scenario};
-    use crate::runtime::{RoleImpl, build, depths, private_ledger, report, shared_ledger};
+    use crate::config::SHIPPED;
+    use crate::runtime::{RoleImpl, depths, private_ledger, report, shared_ledger};
+    use crate::scenario::Scenario;
+    use crate::scenario::build;
     use crate::telemetry::Ledger;
 
     const LAST: u64 = 6;

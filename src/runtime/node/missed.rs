@@ -41,10 +41,12 @@ mod tests {
     use crate::bus::domain::OwnedDomain;
     use crate::bus::iox::IoxBus;
     use crate::bus::{Bus, Signal, Write};
-    use crate::config::{SHIPPED, Scenario};
+    use crate::config::SHIPPED;
     use crate::runtime::node::{Node, Poll, RoleId, RunCondition, topic};
-    use crate::runtime::{build, depths, private_ledger};
+    use crate::runtime::{depths, private_ledger};
     use crate::sample::{RateCommand, RateMeasurement, Stamp};
+    use crate::scenario::Scenario;
+    use crate::scenario::build;
     use crate::telemetry::Percentiles;
 
     const MS: u64 = 1_000_000;

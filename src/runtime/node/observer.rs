@@ -1,15 +1,17 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
-use super::{
-    Inherited, LOOK_NS, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit,
-    commit_last, length, restore,
-};
+use super::contract::{Node, Poll, RunCondition};
+use super::missed::MissedTicks;
+use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Estimate, Measurement, Rig};
 use crate::role::Observer;
 use crate::runtime::disturb::Interruptions;
+use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_id::RoleId;
 use crate::runtime::share::{Computed, Computer};
 use crate::sample::Message;
 use crate::serial::LineCounters;

@@ -1,16 +1,18 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
-use super::{
-    Inherited, MissedTicks, Node, NodeError, Persistent, Poll, RoleId, RunCondition, Seat, commit, commit_last, length,
-    restore,
-};
+use super::contract::{Node, Poll, RunCondition};
+use super::missed::MissedTicks;
+use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
+use super::seat::Seat;
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{BodyInfo, DelayLine, Due};
 use crate::role::{Body, CommandEvent, Guard, Plant};
 use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
+use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};

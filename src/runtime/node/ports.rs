@@ -1,56 +1,11 @@
-//! Which signals a role writes and reads, with the layout of each: the one list, for counters and for foreign programs.
+//! Which signals a role writes and reads: the one list, for counters and for foreign programs.
 //!
 //! In the order in which the nodes open them, which is that of their counters. Must not open anything.
 
-use super::{RoleId, topic};
-use crate::bus::iox::Qos;
-use crate::bus::{AnyBus, BusError, Carried, Depths, Ends, Reader, Signal, Topic, WordReader, WordWriter};
-use crate::config::Scenario;
-use crate::rig::{BodyInfo, Command, Estimate, Fleet, Measurement, Rig, Truth};
-use crate::sample::{Field, FleetSample, Health, Schedule};
-
-/// One signal as it travels: where, and what its bytes mean.
-#[derive(Debug, Clone)]
-pub struct Port {
-    /// The signal and its service.
-    pub topic: Topic,
-    /// Name and version of the layout.
-    pub type_name: &'static str,
-    /// The type name with a hash of the fields, by which services and devices know it.
-    pub layout: &'static str,
-    /// The length of a sample, bytes.
-    pub size: usize,
-    /// The fields after the stamp, in order.
-    pub fields: Vec<Field>,
-    /// Whether it tells of a fleet, and travels as a slice of words.
-    pub fleet: bool,
-    bodies: usize,
-    ends: Ends,
-}
-
-impl Port {
-    /// What to ask of its service.
-    pub fn qos(&self, depths: Depths) -> Qos {
-        let signal = self.topic.signal;
-        if self.fleet { Qos::of_fleet(signal, depths) } else { Qos::of(signal, depths) }
-    }
-
-    /// Opens it for reading, as words.
-    ///
-    /// # Errors
-    /// [`BusError::Open`].
-    pub fn reader<'a>(&self, bus: impl Into<AnyBus<'a>>, reader: Reader) -> Result<WordReader, BusError> {
-        self.ends.reader(bus.into(), &self.topic, self.bodies, reader)
-    }
-
-    /// Opens it for writing, as words.
-    ///
-    /// # Errors
-    /// [`BusError::Open`].
-    pub fn writer<'a>(&self, bus: impl Into<AnyBus<'a>>) -> Result<WordWriter, BusError> {
-        self.ends.writer(bus.into(), &self.topic, self.bodies)
-    }
-}
+use crate::bus::{Port, Signal, Topic};
+use crate::config::{BodyInfo, Settings};
+use crate::runtime::RoleId;
+use crate::sample::{Health, Schedule};
 
 /// The signals of a role.
 #[derive(Debug, Clone)]
@@ -65,95 +20,57 @@ pub struct Ports {
     pub schedule: Port,
 }
 
-/// The signals of a role of a scenario.
-pub fn ports(scenario: &Scenario, role: RoleId) -> Ports {
-    let (writes, reads) = scenario.rig.face().ports(scenario, role);
-    Ports {
-        writes,
-        reads,
-        health: port::<Health>(topic(scenario, role.name(scenario), Signal::Health), None),
-        schedule: port::<Schedule>(topic(scenario, "run", Signal::Schedule), None),
-    }
-}
-
-/// The layouts of a rig's fleets.
-type TruthOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth;
-type MeasurementOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement;
-type CommandOf<R> = <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command;
-
-/// A body's signals, single or fleet's.
-struct Signals<'a, R> {
-    rig: &'a R,
-    scenario: &'a Scenario,
-}
-
-impl<R: Rig> Signals<'_, R> {
-    fn topic(&self, body: &BodyInfo, signal: Signal) -> Topic {
-        topic(self.scenario, &body.name, signal)
-    }
-
-    fn estimate(&self) -> Port {
-        port::<Estimate<R>>(self.topic(&self.rig.bodies()[0], Signal::Estimate), None)
-    }
-
-    fn truth(&self, body: &BodyInfo) -> Port {
-        either::<Truth<R>, FleetSample<TruthOf<R>>>(self.topic(body, Signal::Truth), body.fleet)
-    }
-
-    fn measurement(&self, body: &BodyInfo) -> Port {
-        either::<Measurement<R>, FleetSample<MeasurementOf<R>>>(self.topic(body, Signal::Measurement), body.fleet)
-    }
-
-    fn command(&self, body: &BodyInfo) -> Port {
-        either::<Command<R>, FleetSample<CommandOf<R>>>(self.topic(body, Signal::Command), body.fleet)
-    }
-}
-
 /// The driven bodies in the order in which a controller serves them: single ones, then fleets.
-pub(super) fn driven<R: Rig>(rig: &R) -> impl Iterator<Item = (usize, &BodyInfo)> {
-    let driven = || rig.bodies().iter().enumerate().filter(|(_, body)| body.driven);
+pub(super) fn driven(bodies: &[BodyInfo]) -> impl Iterator<Item = (usize, &BodyInfo)> {
+    let driven = || bodies.iter().enumerate().filter(|(_, body)| body.driven);
     driven().filter(|(_, body)| body.fleet.is_none()).chain(driven().filter(|(_, body)| body.fleet.is_some()))
 }
 
-/// What a role writes, and what it reads.
-pub(crate) fn ports_of_rig<R: Rig>(rig: &R, scenario: &Scenario, role: RoleId) -> (Vec<Port>, Vec<Port>) {
-    let signals = Signals { rig, scenario };
-    match role {
+/// Returns the signals of a role.
+///
+/// # Panics
+/// If the role is not one of the settings' own.
+pub fn ports(settings: &Settings, role: RoleId) -> Ports {
+    let bodies = &settings.bodies;
+    let port = |body: &BodyInfo, signal: Signal| {
+        let matches = |port: &&Port| port.topic.body == body.name && port.topic.signal == signal;
+        settings.signals.iter().find(matches).expect("a body has the signals of its role").clone()
+    };
+    let (writes, reads) = match role {
         RoleId::Plant(index) => {
-            let body = &rig.bodies()[index];
-            let command = body.driven.then(|| signals.command(body));
-            (vec![signals.measurement(body), signals.truth(body)], command.into_iter().collect())
+            let body = &bodies[index];
+            let command = body.driven.then(|| port(body, Signal::Command));
+            (vec![port(body, Signal::Measurement), port(body, Signal::Truth)], command.into_iter().collect())
         }
-        RoleId::Observer => (vec![signals.estimate()], vec![signals.measurement(&rig.bodies()[0])]),
+        RoleId::Observer => (vec![port(&bodies[0], Signal::Estimate)], vec![port(&bodies[0], Signal::Measurement)]),
         RoleId::Controller => {
-            let measurements = driven(rig).map(|(_, body)| signals.measurement(body));
-            let reads = std::iter::once(signals.estimate()).chain(measurements);
-            (driven(rig).map(|(_, body)| signals.command(body)).collect(), reads.collect())
+            let measurements = driven(bodies).map(|(_, body)| port(body, Signal::Measurement));
+            let reads = std::iter::once(port(&bodies[0], Signal::Estimate)).chain(measurements);
+            (driven(bodies).map(|(_, body)| port(body, Signal::Command)).collect(), reads.collect())
         }
+    };
+    Ports {
+        writes,
+        reads,
+        health: Port::of::<Health>(topic(settings, role.name(settings), Signal::Health), None),
+        schedule: Port::of::<Schedule>(topic(settings, "run", Signal::Schedule), None),
     }
 }
 
-/// The signal of a single body, or of a fleet.
-fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
-    if fleet.is_some() { port::<Many>(topic, fleet) } else { port::<One>(topic, None) }
-}
-
-fn port<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
-    let bodies = fleet.unwrap_or(1);
-    let size = S::length(bodies) * size_of::<u64>();
-    let (type_name, layout) = (S::type_name(), S::layout());
-    let (fields, ends) = (S::fields(bodies), Ends::of::<S>());
-    Port { topic, type_name, layout, size, fields, fleet: fleet.is_some(), bodies, ends }
+/// The topic of a signal in a scenario.
+pub fn topic(scenario: &Settings, body: &str, signal: Signal) -> Topic {
+    Topic { scenario: scenario.name.clone(), body: body.to_owned(), signal }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bus::Bus;
     use crate::bus::memory::MemoryBus;
+    use crate::bus::{Bus, BusError, Reader, Topic};
     use crate::config::SHIPPED;
     use crate::runtime::{build_rig, depths, private_ledger};
     use crate::sample::{FleetLayout, Sample};
+    use crate::scenario::Scenario;
     use crate::with_shipped_rig;
     use std::cell::RefCell;
 

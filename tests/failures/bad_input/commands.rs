@@ -2,7 +2,8 @@
 
 use super::{FILE, PAIR, assert_says, place, refused, refused_in, with};
 use crate::common::{Bench, shipped};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 
 #[test]
 fn what_is_no_file_is_refused() {

@@ -1,7 +1,8 @@
 //! Random texts, bytes and overrides: the parser answers with a scenario or a message, and never panics.
 
 use super::{FILE, keys};
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::RngSeed;

@@ -5,7 +5,8 @@ use super::{
     without_table,
 };
 use crate::common::shipped;
-use corotate::config::{SHIPPED, Scenario};
+use corotate::config::SHIPPED;
+use corotate::scenario::Scenario;
 
 #[test]
 fn a_name_a_rig_and_a_clock_are_what_they_can_be() {

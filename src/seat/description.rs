@@ -2,15 +2,14 @@
 //!
 //! Must not hold anything that a foreign program would have to look up elsewhere, nor anything that is not so.
 
-use super::node::{Port, RoleId, ports};
 use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, scenario_path};
-use super::{depths, window_ticks};
 use crate::bus::domain::Domain;
 use crate::bus::iox::{self, Qos};
-use crate::bus::{Depths, Reader, Signal};
-use crate::config::Scenario;
+use crate::bus::{Depths, Port, Reader, Signal};
 use crate::role::Rearm;
+use crate::runtime::{RoleId, depths, ports, window_ticks};
 use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, VOID, status};
+use crate::scenario::Scenario;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

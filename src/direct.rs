@@ -4,18 +4,21 @@
 //! run is begun anew by the nodes, which know what to do then: the same bits up to there, by the same roles. Must not do
 //! anything that a node would not have done, nor go on where one would have had a choice.
 
-use super::in_process::proceed;
-use super::score::Scoring;
-use super::{Launch, Outcome};
 use crate::bus::Signal;
 use crate::clock::Grid;
-use crate::config::Scenario;
+use crate::config::{BodyInfo, Settings};
 use crate::control::WatchBounds;
 use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{CommandEvent, Controller, Guard, Observer, Plant};
+use crate::role::{Body, CommandEvent, Controller, Guard, Observer, Plant};
 use crate::runtime::{RoleId, ports};
 use crate::sample::{Message, Stamp};
+use crate::score::{Score, Scoring};
 use crate::telemetry::{Checkpoints, Ledger, LinkRead, LinkWritten, RoleReport, StateHash, Ticks};
+use std::hint::black_box;
+use std::time::Instant;
+
+/// Ticks between two looks at signals and progress.
+pub(crate) const TURN_TICKS: u64 = 1024;
 
 /// One body with what it sends, and what the controller makes of that.
 struct Driven<R: Rig> {
@@ -36,16 +39,22 @@ struct Controlled<R: Rig> {
     hash: StateHash,
 }
 
-/// Whether a run of this scenario may be a direct one.
-fn is_plain(scenario: &Scenario, launch: &Launch<'_>) -> bool {
+/// Returns true if a run of this scenario may be a direct one.
+fn is_plain(scenario: &Settings) -> bool {
     let watch = WatchBounds { from_tick: scenario.watch.from_tick, ..WatchBounds::NONE };
-    let single = scenario.rig.bodies().iter().all(|body| body.fleet.is_none());
-    single && scenario.faults.is_empty() && launch.record.is_none() && scenario.watch.max == watch.max
+    let single = scenario.bodies.iter().all(|body| body.fleet.is_none());
+    single && scenario.faults.is_empty() && scenario.watch.max == watch.max
 }
 
-/// Runs a scenario; none if it has to be run by the nodes.
-pub(crate) fn run_rig<R: Rig>(rig: &R, scenario: &Scenario, launch: &mut Launch<'_>) -> Option<Outcome> {
-    is_plain(scenario, launch).then(|| Run::new(rig, scenario, launch.checkpoints).run(launch)).flatten()
+/// Runs a scenario that nobody records; none if it has to be run by the nodes. `proceed` is told every [`TURN_TICKS`] ticks which
+/// one was executed, with the latest value of the first metric; the run ends if it returns false.
+pub(crate) fn run_rig<R: Rig>(
+    rig: &R,
+    scenario: &Settings,
+    checkpoints: bool,
+    proceed: &mut dyn FnMut(u64, f64) -> bool,
+) -> Option<(Vec<RoleReport>, Score)> {
+    is_plain(scenario).then(|| Run::new(rig, scenario, checkpoints).run(proceed)).flatten()
 }
 
 /// Where the command of a tick lies, and where that lay which is applied then. As a rule without a division.
@@ -54,7 +63,7 @@ fn place(tick: u64, delay_ticks: u64) -> usize {
 }
 
 struct Run<'a, R: Rig> {
-    scenario: &'a Scenario,
+    scenario: &'a Settings,
     grid: Grid,
     bodies: Vec<Driven<R>>,
     observer: Observer<R::Estimator>,
@@ -67,12 +76,12 @@ struct Run<'a, R: Rig> {
 }
 
 impl<'a, R: Rig> Run<'a, R> {
-    fn new(rig: &R, scenario: &'a Scenario, checkpoints: bool) -> Self {
+    fn new(rig: &R, scenario: &'a Settings, checkpoints: bool) -> Self {
         let hash = || match checkpoints {
             true => StateHash::open(&Ledger::private(StateHash::words(scenario.last_tick)), scenario.last_tick),
             false => StateHash::without_checkpoints(),
         };
-        let body = |(index, info): (usize, &crate::rig::BodyInfo)| Driven {
+        let body = |(index, info): (usize, &BodyInfo)| Driven {
             plant: Plant::new(rig.body(index), scenario.actuation(info.driven), scenario.tick_s()),
             measurement: Measurement::<R>::default(),
             truth: Truth::<R>::default(),
@@ -99,19 +108,20 @@ impl<'a, R: Rig> Run<'a, R> {
         }
     }
 
-    fn run(mut self, launch: &mut Launch<'_>) -> Option<Outcome> {
-        let (mut ticks, mut signal) = (0, 0);
+    fn run(mut self, proceed: &mut dyn FnMut(u64, f64) -> bool) -> Option<(Vec<RoleReport>, Score)> {
+        let mut ticks = 0;
         for tick in 0..=self.scenario.last_tick {
             if !self.tick(tick) {
                 return None;
             }
             ticks = tick + 1;
-            if !proceed(|| self.scoring.latest(), self.scenario, launch, tick) {
-                signal = launch.signal.load(std::sync::atomic::Ordering::Relaxed);
+            if tick.is_multiple_of(TURN_TICKS) && !proceed(tick, self.scoring.latest()) {
                 break;
             }
         }
-        Some(self.outcome(ticks, signal))
+        let score = self.scoring.finish(core::iter::repeat_n(ticks, self.bodies.len() + 1));
+        let reports = RoleId::all(self.scenario).into_iter().map(|role| self.report(role, ticks)).collect();
+        Some((reports, score))
     }
 
     /// One tick through all roles; false if one of them has a choice.
@@ -166,24 +176,6 @@ impl<'a, R: Rig> Run<'a, R> {
         true
     }
 
-    fn outcome(mut self, ticks: u64, signal: usize) -> Outcome {
-        let score = self.scoring.finish(core::iter::repeat_n(ticks, self.bodies.len() + 1));
-        let reports = RoleId::all(self.scenario).into_iter().map(|role| self.report(role, ticks)).collect();
-        Outcome {
-            reports,
-            recording: None,
-            unbooked: Vec::new(),
-            problems: Vec::new(),
-            score,
-            incidents: Vec::new(),
-            hosts: Vec::new(),
-            grants: Vec::new(),
-            domain: None,
-            remains: None,
-            signal,
-        }
-    }
-
     /// The account of a role that executed every tick on every input.
     fn report(&self, role: RoleId, ticks: u64) -> RoleReport {
         let ports = ports(self.scenario, role);
@@ -225,7 +217,7 @@ impl<'a, R: Rig> Run<'a, R> {
     }
 
     fn checkpoints(&self, name: &str, signal: Signal) -> Checkpoints {
-        let index = self.scenario.rig.bodies().iter().position(|body| body.name == name).unwrap_or(0);
+        let index = self.scenario.bodies.iter().position(|body| body.name == name).unwrap_or(0);
         let body = &self.bodies[index];
         let hash = match (signal, &body.command) {
             (Signal::Measurement, _) => &body.hashes[0],
@@ -235,4 +227,43 @@ impl<'a, R: Rig> Run<'a, R> {
         };
         hash.checkpoints()
     }
+}
+
+/// Ticks per second of the mathematics of all roles of a leader and a follower, called one after the other; none of others. If so
+/// told, with what a run cannot do without besides: the truths, and the hash of every sample.
+pub(crate) fn arithmetic_alone<R: Rig>(rig: &R, scenario: &Settings, hashed: bool) -> Option<f64> {
+    let [BodyInfo { driven: false, fleet: None, .. }, BodyInfo { driven: true, fleet: None, .. }] = rig.bodies() else {
+        return None;
+    };
+    let tick_s = scenario.tick_s();
+    let (mut leader, mut follower) = (rig.body(0), rig.body(1));
+    let (mut observer, mut controller) = (Observer::new(rig.estimator(), tick_s), Controller::new(rig.law(1)));
+    let mut measured = [Measurement::<R>::default(); 2];
+    let (mut estimate, mut command) = (Estimate::<R>::default(), Command::<R>::default());
+    let (mut truth, mut hashes) = (Truth::<R>::default(), [(); 6].map(|()| StateHash::without_checkpoints()));
+    let began = Instant::now();
+    for tick in 0..=scenario.last_tick {
+        if tick > 0 {
+            black_box(follower.apply(&command));
+        }
+        let bodies = [&mut leader, &mut follower].into_iter().zip(&mut measured).zip(hashes.chunks_exact_mut(2));
+        for ((body, measured), hashes) in bodies {
+            body.measure(0, 0, measured);
+            measured.stamp_mut().tick = tick;
+            if hashed {
+                body.truth(0, &mut truth);
+                hashes[0].absorb(tick, measured.content());
+                hashes[1].absorb(tick, truth.content());
+            }
+            body.flow(tick_s);
+        }
+        observer.step(&measured[0], &mut estimate);
+        controller.step(&estimate, &measured[1], &mut command);
+        if hashed {
+            hashes[4].absorb(tick, estimate.content());
+            hashes[5].absorb(tick, command.content());
+        }
+    }
+    black_box((&command, &hashes));
+    Some((scenario.last_tick + 1) as f64 / began.elapsed().as_secs_f64())
 }

@@ -2,9 +2,9 @@
 //!
 //! Must not hold the loop up, except by the credit it gives in lockstep.
 
-use crate::bus::{AnyBus, Bus, BusError, Carried, Reader, Signal, Topic};
+use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
 use crate::clock::Grid;
-use crate::config::{Accept, Scenario};
+use crate::config::{Accept, Settings};
 use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
@@ -111,18 +111,10 @@ pub trait Scorer {
     fn finish(&mut self) -> Result<Score, BusError>;
 }
 
-/// Opens a scorer on the run's bus.
-///
-/// # Errors
-/// [`BusError::Open`].
-pub fn open<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>) -> Result<Box<dyn Scorer>, BusError> {
-    scenario.rig.face().scorer(scenario, bus.into())
-}
-
 /// The same for a rig whose type is known.
 pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
-    scenario: &Scenario,
+    scenario: &Settings,
     bus: &B,
 ) -> Result<Box<dyn Scorer>, BusError> {
     Ok(Box::new(RigScorer::open(rig, scenario, bus)?))
@@ -243,7 +235,7 @@ struct RigScorer<R: Rig, B: Bus> {
 }
 
 /// The score in the making, whoever has the samples.
-pub(super) struct Scoring<R: Rig> {
+pub(crate) struct Scoring<R: Rig> {
     rig: R,
     accept: Accept,
     tick_s: f64,
@@ -260,7 +252,7 @@ pub(super) struct Scoring<R: Rig> {
 }
 
 impl<R: Rig> Scoring<R> {
-    pub fn new(rig: &R, scenario: &Scenario) -> Self {
+    pub fn new(rig: &R, scenario: &Settings) -> Self {
         let bodies = rig.bodies().iter();
         // The certificate is about single bodies.
         let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
@@ -391,7 +383,7 @@ impl<R: Rig> Scoring<R> {
 }
 
 impl<R: Rig, B: Bus> RigScorer<R, B> {
-    fn open(rig: &R, scenario: &Scenario, bus: &B) -> Result<Self, BusError> {
+    fn open(rig: &R, scenario: &Settings, bus: &B) -> Result<Self, BusError> {
         // What no role uses is not scored either.
         let mut estimate =
             Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?

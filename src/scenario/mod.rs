@@ -1,18 +1,41 @@
-//! A scenario as resolved: every value checked, every default filled in, ready to run.
+//! A scenario as resolved: every value checked, every default filled in, its rig made; ready to run.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `any` | the rig behind a table of functions: the generic code of the modules below, for code that does not know its type |
+//! | `registry` | the rigs that scenarios of this program may name |
+//! | `schema` | a JSON Schema of scenarios |
+//!
+//! Modules below know a scenario as its [`Settings`], and the rig as a type parameter. Must not touch the machine beyond reading
+//! the file.
 
-use super::fault::{self, ScriptedFault};
-use super::hosts::{self, Hosts};
-use super::raw::{Launch, Policy, Raw};
-use super::{
-    ClockKind, ConfigError, Document, Problem, Realtime, RunId, Shape, Supervision, accept, nearest, watchdog,
+mod any;
+mod registry;
+mod schema;
+
+pub use any::AnyRig;
+pub use registry::{RigKind, register, shipped};
+pub use schema::schema;
+
+use crate::analysis::Claim;
+use crate::bus::{AnyBus, BusError};
+use crate::config::accept::{self, Accept};
+use crate::config::hosts::{self, Hosts};
+use crate::config::raw::{Launch, Policy, Raw};
+use crate::config::{
+    Checks, ClockKind, ConfigError, Cores, Document, Realtime, Settings, Shape, Supervision, debugged_and_external,
+    fault, nearest, shared_with_external, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
-use crate::rig::{self, AnyRig, Context};
-use crate::role::{Actuation, Rearm};
+use crate::rig::Context;
+use crate::runtime::{ReadyNode, RoleImpl};
+use crate::score::Scorer;
+use crate::telemetry::Ledger;
 use serde::Deserialize;
-use std::cell::RefCell;
 use std::collections::BTreeMap;
+use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The slowest tick: a period must lie well within what a latency histogram holds.
 const MIN_TICK_HZ: f64 = 0.1;
@@ -30,61 +53,32 @@ struct Maxima {
     watchdog: BTreeMap<String, f64>,
 }
 
-/// A scenario that can be run.
+/// A scenario that can be run: its settings, with the rig and the file that they come from.
 #[derive(Debug)]
 pub struct Scenario {
-    /// Its name: part of service names and of the run directory's.
-    pub name: String,
-    /// What drives the ticks.
-    pub clock: ClockKind,
-    /// The rate that was asked for, Hz.
-    pub tick_hz: f64,
-    /// The period h, ns.
-    pub period_ns: u64,
-    /// The last tick; the first is 0.
-    pub last_tick: u64,
-    /// The seed of all randomness.
-    pub seed: u64,
-    /// Whether every sample is to be recorded.
-    pub record: bool,
-    /// After how many missing commands a driven body goes to its safe command.
-    pub command_timeout_ticks: u64,
-    /// From so many ticks after its measurement on a command acts.
-    pub actuation_delay_ticks: u64,
-    /// What ends the safe command.
-    pub rearm: Rearm,
-    /// What a real-time run asks of the machine.
-    pub realtime: Realtime,
-    /// How long the roles may take until all are ready, s.
-    pub startup_timeout_s: f64,
-    /// For how long an external role may keep the run waiting, s; if none, for ever until the ticks run, and then 30 s.
-    pub external_timeout_s: Option<f64>,
-    /// The roles that share a process, where roles are processes.
-    pub processes: Vec<Vec<String>>,
-    /// Roles that somebody else starts: hardware, or a foreign program.
-    pub external: Vec<String>,
-    /// Roles that wait for a debugger before the first tick.
-    pub debug: Vec<String>,
-    /// What the launcher does about roles that fail.
-    pub supervision: Supervision,
-    /// The computers, if there are several, and what holds between them.
-    pub hosts: Hosts,
-    /// What is to go wrong.
-    pub faults: Vec<ScriptedFault>,
-    /// What the controller watches.
-    pub watch: WatchBounds,
-    /// What the run is judged by.
-    pub accept: accept::Accept,
+    settings: Settings,
     /// Bodies, observer and laws.
-    pub rig: AnyRig,
+    pub rig: Arc<dyn AnyRig>,
     /// The scenario as a file that resolves to itself.
     pub resolved: toml::Table,
     /// Files that it names: key and path.
     pub files: Vec<(String, PathBuf)>,
     /// Settings without effect in a run of this length, by key.
     pub warnings: Vec<String>,
-    /// The run whose scenario this is, where there is one. Whoever starts another gives it another.
-    pub run: Option<RunId>,
+}
+
+impl Deref for Scenario {
+    type Target = Settings;
+
+    fn deref(&self) -> &Settings {
+        &self.settings
+    }
+}
+
+impl DerefMut for Scenario {
+    fn deref_mut(&mut self) -> &mut Settings {
+        &mut self.settings
+    }
 }
 
 impl Scenario {
@@ -114,8 +108,8 @@ impl Scenario {
     /// # Errors
     /// [`ConfigError`].
     pub fn of(mut document: Document) -> Result<Self, ConfigError> {
-        document.refuse_lists(&[&rig::tables()[..], &TABLES].concat())?;
-        let sections = document.split_off(&rig::sections());
+        document.refuse_lists(&[&registry::tables()[..], &TABLES].concat())?;
+        let sections = document.split_off(&registry::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
         let metrics = document.split_off_within("accept", |key| !accept::is_common(key));
         let metrics = metrics.read_into::<accept::Metrics>();
@@ -125,10 +119,10 @@ impl Scenario {
             (raw, metrics) => {
                 // The rig's own sections are read all the same; of what they say nothing can be judged.
                 let context = Context { tick_s: 1.0 / MAX_TICK_HZ, duration_s: 1.0, seed: 0, actuation_delay_ticks: 1 };
-                let own = document.text("rig").map(|rig| rig::resolve(rig, &sections, context, &mut checks));
-                let rig = own.as_ref().and_then(|own| own.as_ref().ok()?.0.as_ref());
+                let own = document.text("rig").map(|rig| registry::resolve(rig, &sections, context, &mut checks));
+                let rig = own.as_ref().and_then(|own| own.as_ref().ok()?.0.as_deref());
                 let nested = nested_keys(document.text("rig"), rig);
-                checks.problems.retain(|problem| problem.key == "rig");
+                checks.retain(|key| key == "rig");
                 let others = checks.finish::<()>(None).err();
                 let errors = raw.err().map(|error| error.within(&nested)).into_iter().chain(metrics.err());
                 let mut errors = errors.chain(own.and_then(Result::err)).chain(others);
@@ -143,28 +137,37 @@ impl Scenario {
         let length_s = if length_possible(&raw) { raw.duration_s } else { 0.0 };
         let actuation_delay_ticks = raw.actuation_delay_ticks.clamp(1, ACTUATION_DELAY_MAX);
         let context = Context { tick_s, duration_s: length_s, seed: raw.seed, actuation_delay_ticks };
-        let (rig, rig_table) = match rig::resolve(&raw.rig, &sections, context, &mut checks) {
+        let (rig, rig_table) = match registry::resolve(&raw.rig, &sections, context, &mut checks) {
             Ok(resolved) => resolved,
             Err(error) => return Err(error.and(checks.finish::<()>(None).err())),
         };
         let last_tick = (raw.duration_s * 1e9 / period_ns as f64).round() as u64;
         // Nothing is concluded from a length or a tick that is refused.
         let duration_s = if length_possible(&raw) { raw.duration_s } else { f64::INFINITY };
-        let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_ref(), &mut checks);
-        check_external(&raw, rig.as_ref().map(AnyRig::roles), &mut checks);
+        let accept = resolve_accept(&raw, &metrics, duration_s, rig.as_deref(), &mut checks);
+        check_external(&raw, rig.as_deref().map(<dyn AnyRig>::roles), &mut checks);
         let hosts = Hosts { hosts: raw.host.clone(), network: raw.network.clone() };
         hosts::check_alone(&hosts, &raw.launch.processes, &raw.launch.external, &mut checks);
-        let (mut faults, mut watch) = (Vec::new(), WatchBounds::NONE);
+        let (mut faults, mut watch, mut signals) = (Vec::new(), WatchBounds::NONE, Vec::new());
         if let Some(rig) = &rig {
             let bodies: Vec<(&str, bool)> = rig.bodies().iter().map(|body| (&*body.name, body.driven)).collect();
             hosts::check(&hosts, &bodies, &rig.roles(), actuation_delay_ticks, &mut checks);
-            check_roles(&raw.supervision.on_failure, rig, &mut checks);
+            check_roles(&raw.supervision.on_failure, &rig.roles(), &mut checks);
             let last_tick = if tick_possible(raw.tick_hz) && length_possible(&raw) { last_tick } else { u64::MAX };
-            let setting = fault::Setting { rig, last_tick, seed: raw.seed, actuation_delay_ticks };
+            signals = rig.signals(&raw.name);
+            let setting = fault::Setting {
+                bodies: rig.bodies(),
+                signals: &signals,
+                axes: rig.axes(),
+                last_tick,
+                seed: raw.seed,
+                actuation_delay_ticks,
+            };
             faults = fault::resolve(&raw.fault, &setting, &mut checks);
-            watch = watchdog::resolve(&raw.watchdog, &maxima.watchdog, rig, tick_s, duration_s, &mut checks);
+            watch =
+                watchdog::resolve(&raw.watchdog, &maxima.watchdog, &rig.monitors(), tick_s, duration_s, &mut checks);
         }
-        let (files, warnings) = (checks.files.take(), std::mem::take(&mut checks.warnings));
+        let (files, warnings) = checks.take_remarks();
         let rig = checks.finish(rig)?;
         let mut resolved = toml::Table::try_from(&raw).expect("a scenario of plain values is TOML");
         resolved.extend(rig_table);
@@ -173,7 +176,7 @@ impl Scenario {
                 table.extend(keys.into_iter().map(|(key, max)| (key, toml::Value::Float(max))));
             }
         }
-        Ok(Self {
+        let settings = Settings {
             name: raw.name,
             clock: raw.clock,
             tick_hz: raw.tick_hz,
@@ -195,36 +198,12 @@ impl Scenario {
             faults,
             watch,
             accept,
-            rig,
-            resolved,
-            files,
-            warnings,
             run: document.run(),
-        })
-    }
-
-    /// Why somebody else cannot start this role in a run of the scenario, if it is so.
-    ///
-    /// # Errors
-    /// The reason, with what to do.
-    pub fn check_external(&self, role: &str) -> Result<(), String> {
-        let roles = self.rig.roles();
-        if self.clock == ClockKind::InProcess {
-            return Err("one process has no room for another's role; give --clock realtime or lockstep".to_owned());
-        }
-        if !roles.contains(&role) {
-            return Err(format!("there is no such role; this scenario has: {}", roles.join(", ")));
-        }
-        if self.debug.iter().any(|debugged| debugged == role) {
-            return Err(debugged_and_external(role));
-        }
-        let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
-        if shared { Err(shared_with_external(role)) } else { Ok(()) }
-    }
-
-    /// How many ticks after its tick a role may still wait for what crosses hosts on the way to it.
-    pub fn lag_ticks(&self, role: &str) -> u64 {
-        self.hosts.lag_ticks(role, self.rig.bodies().iter().map(|body| (&*body.name, body.driven)))
+            bodies: rig.bodies().to_vec(),
+            signals,
+            monitors: rig.monitors().into_iter().map(|(name, _)| name).collect(),
+        };
+        Ok(Self { settings, rig, resolved, files, warnings })
     }
 
     /// Returns notes for readers of the results: on the tick, and on the rig.
@@ -238,29 +217,6 @@ impl Scenario {
         rounded.into_iter().chain(self.rig.notes()).collect()
     }
 
-    /// Returns how long another host may be silent, s. One that starts is loaded, and its session may have to be replaced: it has
-    /// as long as a role has to come up.
-    pub fn host_silence_s(&self, running: bool) -> f64 {
-        let limit_s = self.hosts.network.silence_timeout_s;
-        if running { limit_s } else { limit_s.max(self.startup_timeout_s) }
-    }
-
-    /// The period h, s.
-    pub fn tick_s(&self) -> f64 {
-        self.period_ns as f64 / 1e9
-    }
-
-    /// The time of a tick since the first, s.
-    pub fn time_s(&self, tick: u64) -> f64 {
-        tick as f64 * self.tick_s()
-    }
-
-    /// How the actuators of a body treat their commands.
-    pub fn actuation(&self, driven: bool) -> Actuation {
-        let (delay_ticks, timeout_ticks) = (self.actuation_delay_ticks, self.command_timeout_ticks);
-        Actuation { driven, delay_ticks, timeout_ticks, rearm: self.rearm }
-    }
-
     /// The scenario as the file of its run, which the first line names.
     pub fn to_file(&self) -> String {
         self.run.map_or(String::new(), |run| format!("# {}\n", run.comment())) + &self.to_toml()
@@ -272,61 +228,30 @@ impl Scenario {
     }
 }
 
-/// Collects findings, so that all of them are told at once.
-pub struct Checks<'a> {
-    document: &'a Document,
-    problems: Vec<Problem>,
-    warnings: Vec<String>,
-    files: RefCell<Vec<(String, PathBuf)>>,
+/// Returns what may be claimed of every driven body's loop.
+pub fn claims(scenario: &Scenario) -> Vec<Claim> {
+    scenario.rig.claims(scenario)
 }
 
-impl<'a> Checks<'a> {
-    pub(crate) fn new(document: &'a Document) -> Self {
-        Self { document, problems: Vec::new(), warnings: Vec::new(), files: RefCell::default() }
-    }
+/// Opens a role's links and builds its node, with its counters in the ledger: new, or a predecessor's.
+///
+/// # Errors
+/// [`BusError::Open`].
+pub fn build<'a>(
+    scenario: &Scenario,
+    occupant: impl Into<RoleImpl>,
+    bus: impl Into<AnyBus<'a>>,
+    ledger: &Ledger,
+) -> Result<ReadyNode, BusError> {
+    scenario.rig.node(scenario, occupant.into(), bus.into(), ledger)
+}
 
-    /// Notes that the value at `key` makes no sense.
-    pub fn refuse(&mut self, key: &str, reason: impl Into<String>) {
-        let place = self.document.place(key);
-        self.problems.push(Problem { place, key: key.to_owned(), reason: reason.into() });
-    }
-
-    /// Notes that the value at `key` has no effect: the scenario is valid all the same.
-    pub fn warn(&mut self, key: &str, reason: impl std::fmt::Display) {
-        self.warnings.push(format!("{key}: {reason}"));
-    }
-
-    /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
-    pub fn file(&self, key: &str, name: &str) -> PathBuf {
-        let here = self.document.place(key).starts_with("--set");
-        let path = if here { name.into() } else { self.document.directory().join(name) };
-        self.files.borrow_mut().push((key.to_owned(), path.clone()));
-        path
-    }
-
-    /// Notes it unless `holds`.
-    pub fn require(&mut self, holds: bool, key: &str, reason: impl FnOnce() -> String) {
-        if !holds {
-            self.refuse(key, reason());
-        }
-    }
-
-    /// Notes a number that is not positive. Non-finite numbers never get so far.
-    pub fn positive(&mut self, key: &str, value: f64) {
-        self.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
-    }
-
-    /// Takes the value, or notes why there is none.
-    pub fn accept<T>(&mut self, key: &str, value: Result<T, impl std::fmt::Display>) -> Option<T> {
-        value.map_err(|error| self.refuse(key, error.to_string())).ok()
-    }
-
-    pub(crate) fn finish<T>(self, value: Option<T>) -> Result<T, ConfigError> {
-        match value {
-            Some(value) if self.problems.is_empty() => Ok(value),
-            _ => Err(ConfigError::Invalid { problems: self.problems }),
-        }
-    }
+/// Opens a scorer on the run's bus.
+///
+/// # Errors
+/// [`BusError::Open`].
+pub fn scorer<'a>(scenario: &Scenario, bus: impl Into<AnyBus<'a>>) -> Result<Box<dyn Scorer>, BusError> {
+    scenario.rig.scorer(scenario, bus.into())
 }
 
 /// Checks the criteria against what is known of the rig.
@@ -334,20 +259,20 @@ fn resolve_accept(
     raw: &Raw,
     metrics: &toml::Table,
     duration_s: f64,
-    rig: Option<&AnyRig>,
+    rig: Option<&dyn AnyRig>,
     checks: &mut Checks<'_>,
-) -> accept::Accept {
-    let (names, roles) = (rig.map(AnyRig::metrics), rig.map(AnyRig::roles));
-    let bodies = rig.map_or(&[][..], AnyRig::bodies);
+) -> Accept {
+    let (names, roles) = (rig.map(|rig| rig.metrics()), rig.map(<dyn AnyRig>::roles));
+    let bodies = rig.map_or(&[][..], |rig| rig.bodies());
     let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
     let setting = accept::Setting { duration_s, metrics: names.as_deref(), roles: roles.as_deref(), driven: &driven };
     accept::resolve(&raw.accept, metrics, &setting, checks)
 }
 
 /// The keys of tables, as `accept.settled_by_s`, with those that the rig of this name gives names to.
-fn nested_keys(name: Option<&str>, rig: Option<&AnyRig>) -> Vec<String> {
+fn nested_keys(name: Option<&str>, rig: Option<&dyn AnyRig>) -> Vec<String> {
     let mut nested = Vec::new();
-    let shapes = rig::shapes();
+    let shapes = registry::shapes();
     let own = shapes.iter().filter(|(rig, _)| name == Some(*rig)).flat_map(|(_, keys)| keys);
     let Shape::Table { keys: common, .. } = Shape::of::<Raw>() else { unreachable!("a scenario is a table") };
     for key in own.chain(&common) {
@@ -473,26 +398,13 @@ fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
     }
 }
 
-/// Why a run cannot wait for a debugger of a role that another program takes.
-fn debugged_and_external(role: &str) -> String {
-    format!(
-        "another program takes the {role}: start that in a debugger, as `gdb --args …`, and take it out of launch.debug"
-    )
-}
-
-/// Why a role that shares a process of ours cannot be somebody else's.
-fn shared_with_external(role: &str) -> String {
-    format!("launch.processes has the {role} in a process of ours, so nobody else can be it; take it out there")
-}
-
 /// Roles that a policy names must exist.
-fn check_roles(policy: &Policy, rig: &AnyRig, checks: &mut Checks<'_>) {
+fn check_roles(policy: &Policy, known: &[&str], checks: &mut Checks<'_>) {
     let Policy::ByRole(roles) = policy else { return };
-    let known = rig.roles();
     for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
         checks.refuse(
             &format!("supervision.on_failure.{role}"),
-            format!("there is no such role; {}", nearest(role, &known)),
+            format!("there is no such role; {}", nearest(role, known)),
         );
     }
 }
@@ -510,7 +422,7 @@ fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", || {
         format!("{} is no part of the period; give a number above 0, up to 1", realtime.cutoff)
     });
-    if let super::Cores::List(cores) = &realtime.cores {
+    if let Cores::List(cores) = &realtime.cores {
         checks.require(!cores.is_empty() && cores.iter().all(|core| *core < 1024), "realtime.cores", || {
             "the list is empty or names a core beyond 1023; name cores of this machine, \"auto\" or \"any\"".to_owned()
         });

@@ -1,24 +1,24 @@
-//! A device in a role's seat: the link to it, and the process that serves it.
+//! The link to a device in a role's seat.
 //!
 //! A silent device is waited for, asked again, greeted anew, and its line opened again, for a bounded time. Must not know
 //! what its samples mean.
 
 use super::absence::Absences;
-use super::line::{Line, LineError};
-use super::node::{NodeError, RoleId, RoleImpl, ports};
-use super::process::{
-    RoleError, device_words_path, find_role, in_domain, join, require_process, take_ledger, words_path, write_whole,
-};
+use super::error::DeviceError;
+use super::line::Line;
+use super::node::ports;
+use super::role_id::RoleId;
+use crate::bus::Port;
 use crate::clock::{monotonic_ns, sleep_until};
-use crate::config::{ClockKind, Scenario};
+use crate::config::{ClockKind, Settings};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
     Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse, Samples, Terms,
-    VERSION, Welcome,
+    Welcome,
 };
 use crate::telemetry::Outage;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Between two tries to open a line again, ns.
@@ -50,109 +50,6 @@ pub struct DeviceSeat {
     pub patience_s: f64,
     /// Go on with a device of another name that answers in the midst of a run.
     pub other_device: bool,
-}
-
-/// The result of a device's run.
-#[derive(Debug, Clone)]
-pub struct Served {
-    /// The line's counters.
-    pub counters: LineCounters,
-    /// When the device was absent.
-    pub outages: Vec<Outage>,
-    /// Why the device was lost to the run, if it was: at the end, or in real time for longer than commands last.
-    pub lost: Option<String>,
-}
-
-/// Why there is no device, or none any more.
-#[derive(Debug, thiserror::Error)]
-pub enum DeviceError {
-    /// Its line could not be opened.
-    #[error(transparent)]
-    Line(#[from] LineError),
-    /// It takes too long to say what must be said.
-    #[error(
-        "at {baud} baud one tick takes {line_us} us on the line, and the run has {tick_us} us for it; give --baud {least} \
-         or more, or run with a lower tick_hz"
-    )]
-    TooSlow {
-        /// The speed, bit/s.
-        baud: u32,
-        /// One request and its answer, µs.
-        line_us: u64,
-        /// The period up to its cutoff, µs.
-        tick_us: u64,
-        /// The least speed that would do, bit/s.
-        least: u64,
-    },
-    /// The run asks for what a device does not do.
-    #[error(
-        "a device applies a command at the tick after it, and the run has actuation_delay_ticks = {ticks}; give 1, or let \
-         a simulated plant take part"
-    )]
-    Delayed {
-        /// The run's delay, ticks.
-        ticks: u64,
-    },
-    /// It does not answer.
-    #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
-    Silent {
-        /// The line.
-        path: PathBuf,
-        /// How long it was waited for, s.
-        waited_s: f64,
-        /// What to look at.
-        hint: String,
-    },
-    /// It speaks another protocol version.
-    #[error(
-        "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
-        path.display()
-    )]
-    Version {
-        /// The line.
-        path: PathBuf,
-        /// The device's version.
-        theirs: u8,
-    },
-    /// Another device answers in its place.
-    #[error(
-        "on {} the device `{found}` answers in the place of `{expected}`; connect that one again, or give \
-         --allow-other-device",
-        path.display()
-    )]
-    Other {
-        /// The line.
-        path: PathBuf,
-        /// The name of the device that the run began with.
-        expected: String,
-        /// The name of the other one.
-        found: String,
-    },
-    /// What it would have to say is too much for a message.
-    #[error(
-        "`{role}` reads {read} and writes {written} bytes in {samples} samples per tick, and a message holds {MAX_CONTENT} \
-         bytes in {MAX_SAMPLES} samples, whose names take {MAX_NAMES} bytes; no device can have this seat: drive fewer bodies"
-    )]
-    TooLong {
-        /// The role.
-        role: String,
-        /// Bytes of the samples that it reads.
-        read: usize,
-        /// The same of those that it writes.
-        written: usize,
-        /// The number of samples in the longer message.
-        samples: usize,
-    },
-    /// It refuses to take part.
-    #[error("the device on {} refuses to be `{role}`: {reason}", path.display())]
-    Refused {
-        /// The line.
-        path: PathBuf,
-        /// The role.
-        role: String,
-        /// Its reason, and what to do.
-        reason: String,
-    },
 }
 
 /// What a device is greeted with.
@@ -209,12 +106,12 @@ struct Layouts {
 
 impl Layouts {
     /// Those of a role, or of observer and controller together, which keep the estimate to themselves.
-    fn of(scenario: &Scenario, roles: &[RoleId]) -> Self {
+    fn of(scenario: &Settings, roles: &[RoleId]) -> Self {
         let mut layouts = Self { reads: Vec::new(), writes: Vec::new() };
         for role in roles {
             let ports = ports(scenario, *role);
             let kept = usize::from(roles.len() > 1 && *role == RoleId::Controller);
-            let layout = |port: &super::node::Port| (port.layout, port.size - size_of::<Stamp>());
+            let layout = |port: &Port| (port.layout, port.size - size_of::<Stamp>());
             layouts.reads.extend(ports.reads.iter().skip(kept).map(layout));
             layouts.writes.extend(ports.writes.iter().map(layout));
         }
@@ -261,7 +158,7 @@ impl DeviceLink {
     ///
     /// # Errors
     /// [`DeviceError::Line`], [`DeviceError::Delayed`], [`DeviceError::TooLong`] and [`DeviceError::TooSlow`].
-    pub fn open(seat: &DeviceSeat, scenario: &Scenario, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
+    pub fn open(seat: &DeviceSeat, scenario: &Settings, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
         let body = matches!(roles, [RoleId::Plant(_)]);
         if body && scenario.actuation_delay_ticks > 1 {
             return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
@@ -308,6 +205,11 @@ impl DeviceLink {
         })
     }
 
+    /// The names of its roles, with spaces between them.
+    pub(crate) fn role(&self) -> &str {
+        &self.greeting.role
+    }
+
     /// Bytes of each sample that the device reads, in order.
     pub(super) fn inputs(&self) -> &[usize] {
         &self.inputs
@@ -319,7 +221,7 @@ impl DeviceLink {
     }
 
     /// Returns what a reader must know of the device's samples, to stand behind its name.
-    fn remark(&self) -> &'static str {
+    pub(crate) fn remark(&self) -> &'static str {
         match self.greeting.bare_since_ns.is_some() {
             true => " (states no layouts: its samples are trusted by their type names)",
             false => "",
@@ -509,7 +411,7 @@ fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError
 }
 
 /// Whether a tick and its answer have room in the period.
-fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result<(), DeviceError> {
+fn check_speed(baud: Option<u32>, scenario: &Settings, content: usize) -> Result<(), DeviceError> {
     let (Some(baud), ClockKind::Realtime) = (baud, scenario.clock) else { return Ok(()) };
     let bits = BITS_PER_BYTE * (2 * FRAME_OVERHEAD + content as u64);
     let tick_us = (scenario.period_ns as f64 * scenario.realtime.cutoff / 1e3) as u64;
@@ -519,85 +421,4 @@ fn check_speed(baud: Option<u32>, scenario: &Scenario, content: usize) -> Result
         return Err(DeviceError::TooSlow { baud, line_us, tick_us, least });
     }
     Ok(())
-}
-
-/// The seat's roles, in the order of a tick, if a device can have them: one that travels in samples of fixed size, or observer
-/// and controller together.
-fn roles(scenario: &Scenario, names: &[String]) -> Result<Vec<RoleId>, RoleError> {
-    let mut roles = names.iter().map(|name| find_role(scenario, name)).collect::<Result<Vec<_>, _>>()?;
-    roles.sort_by_key(|role| *role == RoleId::Controller);
-    let bodies = scenario.rig.bodies();
-    let single = |index: usize| bodies[index].fleet.is_none();
-    let fits = match roles[..] {
-        [RoleId::Plant(index)] => bodies[index].driven && single(index),
-        [RoleId::Observer] => true,
-        [RoleId::Controller] | [RoleId::Observer, RoleId::Controller] => (0..bodies.len()).all(single),
-        _ => false,
-    };
-    if fits {
-        return Ok(roles);
-    }
-    let driven = bodies.iter().filter(|body| body.driven && body.fleet.is_none()).map(|body| &*body.name);
-    let driven = driven.collect::<Vec<_>>().join(", ");
-    Err(RoleError::NoDevice { roles: names.join(","), driven })
-}
-
-/// The file in a domain's directory with the name of the device that has a seat, for a bridge that is started again.
-fn device_path(root: &Path, roles: &str) -> PathBuf {
-    root.join(format!("{roles}.device"))
-}
-
-/// Puts a device into a role's seat and serves it to the end of the run. `welcomed` is told the device's name.
-/// Gives an account of it, if a run was served.
-///
-/// # Errors
-/// [`RoleError`].
-pub fn run_bridge(
-    seat: &DeviceSeat,
-    terminated: &AtomicBool,
-    welcomed: impl FnOnce(&str),
-) -> Result<Option<Served>, RoleError> {
-    let (domain, scenario) = join(&seat.domain)?;
-    let roles = roles(&scenario, &seat.roles)?;
-    roles.iter().try_for_each(|role| require_process(&scenario, *role))?;
-    // A bridge that is started again in the same run finds a device that knows it.
-    let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
-    let mut link = DeviceLink::open(seat, &scenario, &roles, run)?;
-    let known = device_path(domain.root(), &link.greeting.role);
-    let before = std::fs::read_to_string(&known).ok();
-    let Some(name) = link.greet(before, terminated)? else { return Ok(None) };
-    welcomed(&format!("{name}{}", link.remark()));
-    write_whole(&known, name.as_bytes()).map_err(|source| RoleError::Report { path: known.clone(), source })?;
-    let (last, others) = roles.split_last().expect("a seat has a role");
-    let others = others.iter().map(|other| Ok((*other, take_ledger(&domain, &scenario, *other)?)));
-    let others = others.collect::<Result<_, RoleError>>()?;
-    let (mut served, occupant) = (None, RoleImpl::Device(*last, others, Box::new(link)));
-    let done = in_domain(&domain, &scenario, occupant, terminated, |report| {
-        if let Some(counters) = report.line {
-            let lost = report.outages.iter().rev().find_map(|outage| lost(outage, &scenario));
-            served = Some(Served { counters, outages: report.outages.clone(), lost });
-        }
-    });
-    if let Err(RoleError::Node(NodeError::Device(error))) = &done {
-        // For the launcher, which has no line to it. If the run is gone, the caller is told all the same.
-        for role in &roles {
-            let path = if scenario.clock == ClockKind::Realtime { device_words_path } else { words_path };
-            let _ = write_whole(&path(domain.root(), role.name(&scenario)), error.to_string().as_bytes());
-        }
-    }
-    done.map(|()| served)
-}
-
-/// Returns why an outage has cost the run its device, if it has.
-fn lost(outage: &Outage, scenario: &Scenario) -> Option<String> {
-    let timeout_s = scenario.command_timeout_ticks as f64 * scenario.tick_s();
-    let Outage { tick, cause, .. } = outage;
-    let at_s = scenario.time_s(*tick);
-    match outage.back_at_tick {
-        None => Some(format!("at tick {tick} ({at_s:.3} s) {cause}, to the end of the run")),
-        Some(back) if scenario.clock == ClockKind::Realtime && outage.seconds > timeout_s => {
-            Some(format!("at tick {tick} ({at_s:.3} s) {cause}; it answered again at tick {back}"))
-        }
-        Some(_) => None,
-    }
 }

@@ -2,9 +2,9 @@
 //!
 //! Must not promise more than it checks: what two keys say together is judged where a scenario is resolved.
 
-use super::raw::Raw;
-use super::shape::{Key, Shape};
-use crate::rig;
+use super::registry;
+use crate::config::raw::Raw;
+use crate::config::{Key, Shape};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ type Notes = BTreeMap<(String, String), String>;
 /// The schema of the scenarios of a program, some of which it ships, by name and text.
 pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
     let notes = notes(shipped);
-    let rigs = rig::shapes();
+    let rigs = registry::shapes();
     let names: Vec<&str> = rigs.iter().map(|(name, _)| *name).collect();
     let Shape::Table { keys: common, .. } = Shape::of::<Raw>() else { unreachable!("a scenario is a table") };
     let mut properties = Map::new();
@@ -29,7 +29,7 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
     properties["watchdog"]["patternProperties"] = json!({ "_max$": { "type": "number" } });
     properties["accept"]["additionalProperties"] = json!({ "type": "number" });
     // An editor completes from here, whichever the rig is.
-    for section in rig::sections() {
+    for section in registry::sections() {
         let of = |(name, keys): &(&str, Vec<Key>)| {
             keys.iter().find(|key| key.name == section).map(|key| of_key(key, "", &notes, Some(name)))
         };
@@ -54,7 +54,7 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
 /// What holds of the rig's own sections where this rig is named.
 fn case(name: &str, keys: &[Key], notes: &Notes) -> Value {
     let mut properties = Map::new();
-    for section in rig::sections() {
+    for section in registry::sections() {
         let own = keys.iter().find(|key| key.name == section);
         properties.insert(section.to_owned(), own.map_or(json!(false), |key| of_key(key, "", notes, Some(name))));
     }

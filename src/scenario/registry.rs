@@ -2,8 +2,10 @@
 //!
 //! Must not know more of a rig than how it is named, which tables are its own, and how it is made of them.
 
-use super::{AnyRig, Context, OrbitRig, Rig, RigidBodyRig};
+use super::any::AnyRig;
 use crate::config::{Checks, ConfigError, Document, Key, Shape, nearest};
+use crate::rig::{Context, OrbitRig, Rig, RigidBodyRig};
+use std::sync::Arc;
 use std::sync::OnceLock;
 
 /// A rig that scenarios may name.
@@ -16,14 +18,14 @@ pub struct RigKind {
 }
 
 /// A rig, unless a problem with it was noted, and its tables with every default filled in.
-type Resolved = Result<(Option<AnyRig>, toml::Table), ConfigError>;
+type Resolved = Result<(Option<Arc<dyn AnyRig>>, toml::Table), ConfigError>;
 
 impl RigKind {
     /// That of a rig.
     pub fn of<R: Rig>() -> Self {
         let resolve = |name: &str, sections: &Document, context: Context, checks: &mut Checks<'_>| {
             let (rig, table) = R::resolve(name, sections, context, checks)?;
-            Ok((rig.map(AnyRig::new), table))
+            Ok((rig.map(|rig| Arc::new(rig) as Arc<dyn AnyRig>), table))
         };
         Self { names: R::NAMES, tables: R::tables(), lists: R::LISTS, resolve }
     }

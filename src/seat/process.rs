@@ -2,21 +2,21 @@
 //!
 //! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
 
-use super::bridge::DeviceError;
-use super::compute::Compute;
-use super::drive::{Control, Drive, Ended, Heartbeat, Waiting};
-use super::hooks::{self, Failpoint};
-use super::node::{self, NodeError, ReadyNode, RoleId, RoleImpl, ledger_file, ledger_words, report, topic};
-use super::privileges::Privileges;
-use super::{depths, privileges, window_ticks};
 use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Reader, Signal};
 use crate::clock::{self, Grid, monotonic_ns, sleep_until};
-use crate::config::{ClockKind, ConfigError, Realtime, Scenario, Wake};
+use crate::config::{ClockKind, ConfigError, Realtime, Settings, Wake};
 use crate::files;
 use crate::panics;
+use crate::runtime::drive::{Control, Drive, Ended, Heartbeat, Waiting};
+use crate::runtime::hooks::{self, Failpoint};
+use crate::runtime::{
+    Compute, DeviceError, NodeError, Privileges, ReadyNode, RoleId, RoleImpl, depths, ledger_file, ledger_words, ports,
+    release_priority, report, take_privileges, take_short_turns, topic, window_ticks,
+};
 use crate::sample::{Phase, RoleState, Schedule};
+use crate::scenario::{self, Scenario};
 use crate::system::remedy;
 use crate::telemetry::{Latency, Ledger, LedgerError, RoleReport, StageReport};
 use std::io;
@@ -225,7 +225,7 @@ pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &Ato
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
     require_process(&scenario, role)?;
-    let ports = node::ports(&scenario, role);
+    let ports = ports(&scenario, role);
     if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
         return Err(RoleError::Fleet { role: seat.role.clone() });
     }
@@ -238,7 +238,7 @@ pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &Ato
 }
 
 /// Refuses a role that has no process of its own.
-pub(super) fn require_process(scenario: &Scenario, role: RoleId) -> Result<(), RoleError> {
+pub(super) fn require_process(scenario: &Settings, role: RoleId) -> Result<(), RoleError> {
     let host = role.host(scenario);
     let name = |role: RoleId| role.name(scenario).to_owned();
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
@@ -270,9 +270,9 @@ pub(crate) fn join_whole(directory: &Path) -> Result<(Domain, Scenario), RoleErr
 }
 
 /// The role of this name.
-pub(super) fn find_role(scenario: &Scenario, name: &str) -> Result<RoleId, RoleError> {
+pub(super) fn find_role(scenario: &Settings, name: &str) -> Result<RoleId, RoleError> {
     RoleId::named(scenario, name)
-        .ok_or_else(|| RoleError::NoSuchRole { role: name.to_owned(), known: scenario.rig.roles().join(", ") })
+        .ok_or_else(|| RoleError::NoSuchRole { role: name.to_owned(), known: scenario.roles().join(", ") })
 }
 
 /// Serves a seat in a domain to the end of the run, and leaves its report there; `reported` sees it too.
@@ -286,10 +286,10 @@ pub(super) fn in_domain(
     let role = occupant.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
-    privileges::take_short_turns();
+    take_short_turns();
     // What computes in an interpreter has threads and memory of its own.
     let takes = realtime && !matches!(occupant, RoleImpl::Computed(..));
-    let privileges = if takes { privileges::take(scenario, role) } else { Privileges::default() };
+    let privileges = if takes { take_privileges(scenario, role) } else { Privileges::default() };
     let ledger = take_ledger(domain, scenario, role)?;
     let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
     if roles.iter().any(|role| scenario.debug.iter().any(|name| name == role)) {
@@ -299,7 +299,7 @@ pub(super) fn in_domain(
     hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Failpoint::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
-    let build = |occupant| node::build(scenario, occupant, &bus, &ledger);
+    let build = |occupant| scenario::build(scenario, occupant, &bus, &ledger);
     let service = Service { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
     let served = serve(service, occupant, build, |report| {
         reported(report);
@@ -311,16 +311,16 @@ pub(super) fn in_domain(
 }
 
 /// A role's ledger in a domain, to be read.
-pub(crate) fn open_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
+pub(crate) fn open_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::shared(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
 
 /// The same, to be written by this process alone.
-pub(super) fn take_ledger(domain: &Domain, scenario: &Scenario, role: RoleId) -> Result<Ledger, LedgerError> {
+pub(super) fn take_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
 
-fn ledger_path(domain: &Domain, scenario: &Scenario, role: RoleId) -> PathBuf {
+fn ledger_path(domain: &Domain, scenario: &Settings, role: RoleId) -> PathBuf {
     domain.shared(&ledger_file(scenario, role))
 }
 
@@ -341,7 +341,7 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// What a seat is served with.
 pub struct Service<'a, B> {
     /// The scenario.
-    pub scenario: &'a Scenario,
+    pub scenario: &'a Settings,
     /// The bus.
     pub bus: &'a B,
     /// The counters, new or a predecessor's.
@@ -390,7 +390,7 @@ pub fn serve<B: Bus + 'static>(
     };
     node.finish()?;
     if scenario.clock == ClockKind::Realtime {
-        privileges::release();
+        release_priority();
     }
     if bus.is_gone() {
         let told = control.schedule().is_ok_and(|word| Phase::from_number(word.phase) == Phase::Stop);
@@ -444,7 +444,7 @@ impl Patience {
 /// From open links to the word to run. The links of a successor carry samples already. Whoever has the leader measures the
 /// machine. `None` if the run was stopped before.
 fn begin<B: Bus>(
-    scenario: &Scenario,
+    scenario: &Settings,
     leads: bool,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
@@ -479,7 +479,7 @@ fn baseline() -> Latency {
 }
 
 fn await_phase<B: Bus>(
-    scenario: &Scenario,
+    scenario: &Settings,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,
     state: RoleState,
@@ -503,7 +503,7 @@ fn await_phase<B: Bus>(
 }
 
 /// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
-fn waiting<'a>(scenario: &Scenario, role: RoleId, privileges: &'a Privileges) -> Waiting<'a> {
+fn waiting<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges) -> Waiting<'a> {
     // A way between hosts may take its budget: one tick, less what comes after the cutoff, is there in any case.
     let lag_ticks = scenario.lag_ticks(role.name(scenario)).saturating_sub(1);
     let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
@@ -517,7 +517,7 @@ fn waiting<'a>(scenario: &Scenario, role: RoleId, privileges: &'a Privileges) ->
 }
 
 fn drive<B: Bus>(
-    scenario: &Scenario,
+    scenario: &Settings,
     role: RoleId,
     node: &mut ReadyNode,
     control: &mut Control<'_, B>,

@@ -1,0 +1,57 @@
+//! A signal as data: its place, the layout of its samples, and what opens its ends without knowing their type.
+
+use super::iox::Qos;
+use super::{AnyBus, BusError, Carried, Depths, Ends, Reader, Topic, WordReader, WordWriter};
+use crate::sample::Field;
+
+/// One signal as it travels: where, and what its bytes mean.
+#[derive(Debug, Clone)]
+pub struct Port {
+    /// The signal and its service.
+    pub topic: Topic,
+    /// Name and version of the layout.
+    pub type_name: &'static str,
+    /// The type name with a hash of the fields, by which services and devices know it.
+    pub layout: &'static str,
+    /// The length of a sample, bytes.
+    pub size: usize,
+    /// The fields after the stamp, in order.
+    pub fields: Vec<Field>,
+    /// Whether it tells of a fleet, and travels as a slice of words.
+    pub fleet: bool,
+    bodies: usize,
+    ends: Ends,
+}
+
+impl Port {
+    /// The signal of a kind of sample, of a single body or of a fleet of so many.
+    pub fn of<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Self {
+        let bodies = fleet.unwrap_or(1);
+        let size = S::length(bodies) * size_of::<u64>();
+        let (type_name, layout) = (S::type_name(), S::layout());
+        let (fields, ends) = (S::fields(bodies), Ends::of::<S>());
+        Self { topic, type_name, layout, size, fields, fleet: fleet.is_some(), bodies, ends }
+    }
+
+    /// What to ask of its service.
+    pub fn qos(&self, depths: Depths) -> Qos {
+        let signal = self.topic.signal;
+        if self.fleet { Qos::of_fleet(signal, depths) } else { Qos::of(signal, depths) }
+    }
+
+    /// Opens it for reading, as words.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn reader<'a>(&self, bus: impl Into<AnyBus<'a>>, reader: Reader) -> Result<WordReader, BusError> {
+        self.ends.reader(bus.into(), &self.topic, self.bodies, reader)
+    }
+
+    /// Opens it for writing, as words.
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    pub fn writer<'a>(&self, bus: impl Into<AnyBus<'a>>) -> Result<WordWriter, BusError> {
+        self.ends.writer(bus.into(), &self.topic, self.bodies)
+    }
+}

@@ -1,0 +1,64 @@
+//! The roles of a scenario by name and number, and in whose process each runs. Must not open anything.
+
+use crate::config::{ClockKind, Settings};
+
+/// Which role of a scenario.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RoleId {
+    /// The plant of the body with this index.
+    Plant(usize),
+    /// The observer of the first body.
+    Observer,
+    /// The controller of all driven bodies.
+    Controller,
+}
+
+impl RoleId {
+    /// All roles of a scenario, in the order in which one tick passes through them.
+    pub fn all(scenario: &Settings) -> Vec<Self> {
+        let plants = (0..scenario.bodies.len()).map(Self::Plant);
+        let driven = scenario.bodies.iter().any(|body| body.driven);
+        plants.chain([Self::Observer]).chain(driven.then_some(Self::Controller)).collect()
+    }
+
+    /// The role's name: a body's, `observer` or `controller`.
+    pub fn name(self, scenario: &Settings) -> &str {
+        match self {
+            Self::Plant(index) => &scenario.bodies[index].name,
+            Self::Observer => "observer",
+            Self::Controller => "controller",
+        }
+    }
+
+    /// The role of this name, if the scenario has one.
+    pub fn named(scenario: &Settings, name: &str) -> Option<Self> {
+        Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
+    }
+
+    /// The role in whose process it runs: its own, unless the scenario gives it one together with others. Then it is the last of
+    /// them in the order of a tick.
+    pub fn host(self, scenario: &Settings) -> Self {
+        let name = self.name(scenario);
+        let process = scenario.processes.iter().find(|roles| roles.iter().any(|role| role == name));
+        let Some(process) = process.filter(|_| scenario.clock != ClockKind::InProcess) else { return self };
+        let mut roles = Self::all(scenario);
+        roles.retain(|role| process.iter().any(|name| name == role.name(scenario)));
+        roles.pop().unwrap_or(self)
+    }
+
+    /// The roles that run in its process, in the order of a tick; none if it is in another's.
+    pub fn hosted(self, scenario: &Settings) -> Vec<Self> {
+        let mut hosted = Self::all(scenario);
+        hosted.retain(|role| role.host(scenario) == self);
+        hosted
+    }
+
+    /// What kind of role it is, as the command line calls it.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Plant(_) => "plant",
+            Self::Observer => "observer",
+            Self::Controller => "controller",
+        }
+    }
+}

@@ -1,0 +1,150 @@
+//! A rig behind a table of functions: what the program asks of a rig whose type it does not know, answered once for every [`Rig`].
+//!
+//! Must not compute anything: each answer is the generic code of a module below.
+
+use crate::analysis::{self, Claim};
+use crate::bus::{AnyBus, BusError};
+use crate::config::{BodyInfo, Settings, role_names};
+use crate::direct::{self, arithmetic_alone};
+use crate::rig::{CertificateReport, Figure, Picture, Rig, WordView};
+use crate::runtime::{ReadyNode, RoleImpl, build_rig};
+use crate::score::{Score, Scorer, score_rig};
+use crate::telemetry::{Ledger, RoleReport};
+use std::any::Any;
+use std::fmt;
+
+/// Any rig.
+pub trait AnyRig: WordView + Any + Send + Sync {
+    /// The bodies; the first is the observed one.
+    fn bodies(&self) -> &[BodyInfo];
+    /// The metrics by which a run is scored.
+    fn metrics(&self) -> Vec<&'static str>;
+    /// The proofs about the closed loop, one per driven body.
+    fn certificates(&self) -> Vec<CertificateReport>;
+    /// The physical bounds that the guards work with.
+    fn limits(&self) -> Vec<Figure>;
+    /// The quantities that the controller can watch, each with the reason why it cannot in this scenario, if so.
+    fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)>;
+    /// Notes for readers of the results.
+    fn notes(&self) -> Vec<String>;
+    /// The pictures of the motion in a report.
+    fn pictures(&self) -> Vec<Picture>;
+    /// See [`Rig::counterpart`].
+    fn counterpart(&self) -> &'static [&'static str];
+    /// See [`claims`](super::claims).
+    fn claims(&self, settings: &Settings) -> Vec<Claim>;
+    /// See [`build`](super::build).
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn node(
+        &self,
+        settings: &Settings,
+        occupant: RoleImpl,
+        bus: AnyBus<'_>,
+        ledger: &Ledger,
+    ) -> Result<ReadyNode, BusError>;
+    /// See [`scorer`](super::scorer).
+    ///
+    /// # Errors
+    /// [`BusError::Open`].
+    fn scorer(&self, settings: &Settings, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
+    /// Runs the roles one after the other in this thread, on samples that stay in place: see [`direct::run_rig`].
+    fn direct(
+        &self,
+        settings: &Settings,
+        checkpoints: bool,
+        proceed: &mut dyn FnMut(u64, f64) -> bool,
+    ) -> Option<(Vec<RoleReport>, Score)>;
+    /// Returns the ticks per second of the roles' mathematics alone: see [`arithmetic_alone`].
+    fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64>;
+}
+
+impl<R: Rig> AnyRig for R {
+    fn bodies(&self) -> &[BodyInfo] {
+        Rig::bodies(self)
+    }
+
+    fn metrics(&self) -> Vec<&'static str> {
+        Rig::metrics(self)
+    }
+
+    fn certificates(&self) -> Vec<CertificateReport> {
+        Rig::certificates(self)
+    }
+
+    fn limits(&self) -> Vec<Figure> {
+        Rig::limits(self)
+    }
+
+    fn monitors(&self) -> Vec<(&'static str, Option<&'static str>)> {
+        R::monitors().iter().map(|monitor| (monitor.name, (monitor.absent)(self))).collect()
+    }
+
+    fn notes(&self) -> Vec<String> {
+        Rig::notes(self)
+    }
+
+    fn pictures(&self) -> Vec<Picture> {
+        R::pictures()
+    }
+
+    fn counterpart(&self) -> &'static [&'static str] {
+        Rig::counterpart(self)
+    }
+
+    fn claims(&self, settings: &Settings) -> Vec<Claim> {
+        analysis::of_rig(self, settings)
+    }
+
+    fn node(
+        &self,
+        settings: &Settings,
+        occupant: RoleImpl,
+        bus: AnyBus<'_>,
+        ledger: &Ledger,
+    ) -> Result<ReadyNode, BusError> {
+        match bus {
+            AnyBus::Memory(bus) => build_rig(self, settings, occupant, bus, ledger),
+            AnyBus::Shared(bus) => build_rig(self, settings, occupant, bus, ledger),
+        }
+    }
+
+    fn scorer(&self, settings: &Settings, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError> {
+        match bus {
+            AnyBus::Memory(bus) => score_rig(self, settings, bus),
+            AnyBus::Shared(bus) => score_rig(self, settings, bus),
+        }
+    }
+
+    fn direct(
+        &self,
+        settings: &Settings,
+        checkpoints: bool,
+        proceed: &mut dyn FnMut(u64, f64) -> bool,
+    ) -> Option<(Vec<RoleReport>, Score)> {
+        direct::run_rig(self, settings, checkpoints, proceed)
+    }
+
+    fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64> {
+        arithmetic_alone(self, settings, hashed)
+    }
+}
+
+impl dyn AnyRig {
+    /// The rig, if it is of this type.
+    pub fn downcast_ref<R: Rig>(&self) -> Option<&R> {
+        (self as &dyn Any).downcast_ref()
+    }
+
+    /// The names of all roles, in the order in which one tick passes through them.
+    pub fn roles(&self) -> Vec<&str> {
+        role_names(self.bodies())
+    }
+}
+
+impl fmt::Debug for dyn AnyRig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("AnyRig").field(&self.bodies()).finish()
+    }
+}
