@@ -18,7 +18,7 @@ const ROUNDING: f64 = 1e-11;
 /// The parts of the ticks looked at must give one rate, to within this part of it: two of them where the error fell by
 /// e^-[`FALL`] in all, as it must unless that takes more than [`TICKS_MAX`]: before, what falls more slowly may not have
 /// shown; else four.
-const AGREEMENT: f64 = 0.03;
+pub(super) const AGREEMENT: f64 = 0.03;
 const FALL: f64 = 20.0;
 /// Wherever the error falls by so much, e^-depth, it must do so at that rate to within this factor: a run may come to its
 /// floor before the motion comes back, or before the error has swung once. Three decades, and six.

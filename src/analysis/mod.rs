@@ -15,11 +15,13 @@ use crate::config::Settings;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use chain::{Chain, Guards};
 use fall::Fall;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Ticks that are looked at, at the least and at the most.
 const TICKS_MIN: u64 = 2_000;
 const TICKS_MAX: u64 = 256_000;
+/// Ticks of a long scenario that are looked at if the rate does not ask for more.
+const SCENARIO_TICKS_MAX: u64 = TICKS_MAX / 8;
 /// An error has settled after so many of its time constants, and a quarter of them more is looked at.
 const SETTLED: f64 = 60.0;
 /// The error of the scenario's own start must fall at that rate to within this factor, where it falls for long enough.
@@ -39,7 +41,7 @@ const DIVERGED: f64 = 1e6;
 const COMFORTABLE: f64 = 0.75;
 
 /// What may be claimed of one driven body: of the law in continuous time, and of the loop that runs.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Claim {
     /// The driven body.
     pub body: String,
@@ -48,6 +50,8 @@ pub struct Claim {
     /// The exponent at which the error of the sampled, held and delayed loop falls once it is small, 1/s; none if no such
     /// claim holds.
     pub loop_rate_per_s: Option<f64>,
+    /// The stretch of the motion, from its start, over which the rate and the floors were computed, s; none without a rate.
+    pub over_s: Option<f64>,
     /// Why none is claimed.
     pub reason: Option<String>,
     /// The first of `floors`.
@@ -66,13 +70,14 @@ pub struct Claim {
 }
 
 /// When a metric reaches its limit.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Reach {
     /// The metric.
     pub metric: String,
     /// Its limit in `[accept]`.
     pub limit: f64,
     /// What it is at the start.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub from: f64,
     /// How long a fall from there takes at the loop's rate, s; none if the limit is below the floor.
     pub after_s: Option<f64>,
@@ -121,6 +126,7 @@ impl<'a, R: Rig> Analysis<'a, R> {
             body: body.to_owned(),
             continuous_rate_per_s: certificate.and_then(|certificate| certificate.continuous_rate_per_s),
             loop_rate_per_s,
+            over_s: loop_rate_per_s.map(|rate| self.ticks_to_settle(rate) as f64 * self.tick_s),
             floor: floors.first().copied(),
             reaches: loop_rate_per_s.map_or(Vec::new(), |rate| self.reaches(rate, &floors)),
             floors: self.named(&floors),
@@ -157,10 +163,12 @@ impl<'a, R: Rig> Analysis<'a, R> {
         limited.filter_map(reach).collect()
     }
 
-    /// Ticks after whose first three quarters an error that falls at this rate has settled; at least those of the scenario.
+    /// Returns the ticks after whose first three quarters an error that falls at this rate has settled; at least those of the
+    /// scenario, up to [`SCENARIO_TICKS_MAX`].
     fn ticks_to_settle(&self, rate_per_s: f64) -> u64 {
         let ticks = SETTLED / (rate_per_s.max(0.0) * self.tick_s);
-        (ticks.min(TICKS_MAX as f64) as u64).max(self.scenario.last_tick).clamp(TICKS_MIN, TICKS_MAX)
+        (ticks.min(TICKS_MAX as f64) as u64)
+            .clamp(self.scenario.last_tick.clamp(TICKS_MIN, SCENARIO_TICKS_MAX), TICKS_MAX)
     }
 
     /// The largest error per metric of a loop that was synchronised from the start, with all that disturbs it.
@@ -267,6 +275,11 @@ impl<'a, R: Rig> Analysis<'a, R> {
 }
 
 impl Claim {
+    /// Returns the loop's rate with the digits that are known, 1/s.
+    pub fn loop_rate_text(&self) -> Option<String> {
+        self.loop_rate_per_s.map(|rate| to_tolerance(rate, exponent::AGREEMENT * rate))
+    }
+
     /// Adds what stands against it.
     fn warn(&mut self) {
         match (self.loop_rate_per_s, self.continuous_rate_per_s) {
@@ -274,7 +287,7 @@ impl Claim {
             (Some(rate), Some(continuous)) if rate < COMFORTABLE * continuous => self.warnings.push(format!(
                 "sampling, hold and delay leave {} of the continuous law's {} 1/s; raise tick_hz, lower the gains, or set \
                  controller.predict",
-                digits(rate),
+                self.loop_rate_text().unwrap_or_default(),
                 digits(continuous)
             )),
             _ => {}

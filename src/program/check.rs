@@ -144,9 +144,12 @@ fn tell_claim(claim: &Claim, late: &str, text: &mut String) -> std::fmt::Result 
         None => writeln!(text, "  no constant rate: the observer's gain varies")?,
     }
     writeln!(text, "{}, the loop that runs: sampled, held, {late} late", claim.body)?;
-    match (claim.loop_rate_per_s, &claim.reason) {
-        (Some(rate), _) => writeln!(text, "  once it is small, the error falls as exp(-{} t)", digits(rate))?,
-        (None, reason) => writeln!(text, "  no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
+    match (claim.loop_rate_text(), claim.over_s, &claim.reason) {
+        (Some(rate), Some(over_s), _) => {
+            let over = digits(over_s);
+            writeln!(text, "  once it is small, the error falls as exp(-{rate} t); computed over the first {over} s")?;
+        }
+        (_, _, reason) => writeln!(text, "  no rate is claimed: {}", reason.as_deref().unwrap_or_default())?,
     }
     for floor in &claim.floors {
         writeln!(text, "  floor to expect: {} {}", floor.name, digits(floor.value))?;

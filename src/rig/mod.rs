@@ -27,7 +27,7 @@ use crate::role::{Body, Estimator, Guard, Law, SingleBody};
 use crate::sample::FleetSample;
 use crate::state::Persist;
 use nalgebra::SVector;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// The samples of a rig, by signal.
 pub type Truth<R> = <<R as Rig>::Body as Body>::Truth;
@@ -224,22 +224,25 @@ pub struct CertificateReport {
 }
 
 /// A number that a certificate rests on.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Figure {
     /// What it is, with its unit.
     pub name: String,
     /// Its value.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub value: f64,
 }
 
 /// One condition of a certificate.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ConditionReport {
     /// Which one, with its source.
     pub name: String,
     /// What is there.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub value: f64,
     /// What it must exceed.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub required: f64,
     /// Whether it does.
     pub holds: bool,

@@ -68,8 +68,11 @@ pub struct Percentiles {
     pub mean_us: f64,
 }
 
-/// JSON has no NaN: it is written as null.
-fn number_or_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+/// Reads a number; null, as JSON writes a number that is not finite, becomes NaN.
+///
+/// # Errors
+/// Those of the deserializer.
+pub(crate) fn number_or_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     Ok(<Option<f64> as serde::Deserialize>::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
 

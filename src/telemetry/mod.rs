@@ -21,6 +21,7 @@ pub use export::{write_hgrm, write_hlog};
 pub(crate) use handover::{find, keep};
 pub use hash::{Checkpoints, StateHash, combine};
 pub use host::Host;
+pub(crate) use latency::number_or_nan;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
 pub(crate) use latency::{quantile, sorted};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
