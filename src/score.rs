@@ -9,11 +9,11 @@ use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
 use crate::role::Guard;
 use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
 use crate::sample::{Message, Sample, Stamp, status};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The score of a run.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// Ticks at which every sample was there.
     pub scored_ticks: u64,
@@ -29,15 +29,16 @@ pub struct Score {
     #[serde(skip)]
     pub received: Vec<(String, u64)>,
     /// Per signal, at how many ticks its status said what; only what was said.
-    pub statuses: BTreeMap<String, BTreeMap<&'static str, u64>>,
-    /// Per incident: from its tick until every metric with a limit was within it for good, or until the next incident, s.
+    pub statuses: BTreeMap<String, BTreeMap<String, u64>>,
+    /// Per incident that the loop recovered from, by its number: the time from its tick until every metric with a limit was within
+    /// it for good, or until the next incident, s.
     #[serde(skip)]
-    pub recoveries_s: Vec<Option<f64>>,
+    pub recoveries_s: BTreeMap<u64, f64>,
 }
 
 /// For how many steps of all driven bodies the bound on V̇ held, of the true errors: V(k+1) ≤ V(k) + h·bound(k). Together
 /// these are all steps: a tick of a body is one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct CertificateScore {
     /// It held, or V was at the floor of rounding.
     pub held: u64,
@@ -60,11 +61,12 @@ pub(crate) fn lyapunov_floor(tick_s: f64) -> f64 {
 }
 
 /// The score by one metric.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricScore {
     /// Its name; the unit is the last part.
     pub name: String,
     /// At the last tick that could be scored; NaN where none could.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub last: f64,
     /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
     pub settled_max: Option<f64>,
@@ -75,6 +77,7 @@ pub struct MetricScore {
     /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
     pub settled_at_s: Option<f64>,
     /// The integral of its square over the run: (its unit)² s; a tick at which it could not be scored adds nothing.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub ise: f64,
     /// Ticks from `accept.settled_by_s` on that were passed over without a value.
     #[serde(skip)]
@@ -102,8 +105,8 @@ pub trait Scorer {
     fn latest(&self) -> f64;
     /// Hands over the time grid, once the epoch is known: no sample is of a tick that is not due.
     fn start(&mut self, grid: Grid);
-    /// Notes that a role failed at a tick.
-    fn incident(&mut self, tick: u64);
+    /// Notes that a role failed at a tick; the recovery is told by the number of the incident.
+    fn incident(&mut self, id: u64, tick: u64);
     /// Scores what is there, complete or not, and closes the account.
     ///
     /// # Errors
@@ -245,8 +248,8 @@ pub(crate) struct Scoring<R: Rig> {
     statuses: Vec<Statuses>,
     services: Vec<String>,
     next_tick: u64,
-    /// Per incident: its tick, and the last tick from there on at which some metric was not known to be within its limit.
-    incidents: Vec<(u64, u64)>,
+    /// Per incident: its number, its tick, and the last tick from there on at which some metric was not known to be within its limit.
+    incidents: Vec<(u64, u64, u64)>,
     values: Vec<f64>,
     score: Score,
 }
@@ -292,7 +295,7 @@ impl<R: Rig> Scoring<R> {
                 certificate: None,
                 received: Vec::new(),
                 statuses: BTreeMap::new(),
-                recoveries_s: Vec::new(),
+                recoveries_s: BTreeMap::new(),
             },
         }
     }
@@ -323,7 +326,7 @@ impl<R: Rig> Scoring<R> {
         }
         if !self.incidents.is_empty()
             && !self.within()
-            && let Some((_, last)) = self.incidents.iter_mut().rfind(|(from, _)| *from <= tick)
+            && let Some((_, _, last)) = self.incidents.iter_mut().rfind(|(_, from, _)| *from <= tick)
         {
             *last = tick;
         }
@@ -352,13 +355,13 @@ impl<R: Rig> Scoring<R> {
     }
 
     /// The recoveries, as far as there are limits to recover to.
-    fn recoveries_s(&self) -> Vec<Option<f64>> {
-        let recovery = |&(from, last_outside): &(u64, u64)| {
+    fn recoveries_s(&self) -> BTreeMap<u64, f64> {
+        let recovery = |&(id, from, last_outside): &(u64, u64, u64)| {
             let back = last_outside + 1;
             let judged = !self.accept.metric_max.is_empty() && back < self.next_tick;
-            judged.then(|| back.saturating_sub(from) as f64 * self.tick_s)
+            judged.then(|| (id, back.saturating_sub(from) as f64 * self.tick_s))
         };
-        self.incidents.iter().map(recovery).collect()
+        self.incidents.iter().filter_map(recovery).collect()
     }
 
     /// Closes the account. `received` holds how many samples came, of the estimate and of every body's truth.
@@ -370,7 +373,12 @@ impl<R: Rig> Scoring<R> {
             let steps = self.next_tick * self.driven.len() as u64;
             certificate.unjudged = steps - certificate.held - certificate.broken;
         }
-        let told = |statuses: &Statuses| (statuses.signal.clone(), statuses.told().collect::<BTreeMap<_, _>>());
+        let told = |statuses: &Statuses| {
+            (
+                statuses.signal.clone(),
+                statuses.told().map(|(name, ticks)| (name.to_owned(), ticks)).collect::<BTreeMap<_, _>>(),
+            )
+        };
         self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
         let (tick_s, ticks) = (self.tick_s, self.next_tick);
         for metric in &mut self.score.metrics {
@@ -498,8 +506,8 @@ impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
         self.estimate.expect(accepted_ticks);
     }
 
-    fn incident(&mut self, tick: u64) {
-        self.scoring.incidents.push((tick, tick));
+    fn incident(&mut self, id: u64, tick: u64) {
+        self.scoring.incidents.push((id, tick, tick));
     }
 
     fn finish(&mut self) -> Result<Score, BusError> {

@@ -3,8 +3,8 @@
 //! A role dies with its launcher by the kernel's hand (parent-death signal). Must not leave a zombie.
 
 use super::LaunchError;
+use super::incident::Failure;
 use super::standstill::is_zombie;
-use super::supervision::Failure;
 use crate::bus::domain::Domain;
 use crate::panics::Panic;
 use crate::runtime::RoleId;

@@ -4,8 +4,8 @@
 
 use super::LaunchError;
 use super::children::{RoleProcess, program};
+use super::incident::Failure;
 use super::janitor::Janitor;
-use super::supervision::Failure;
 use crate::system::tell;
 use std::path::Path;
 use std::process::Command;

@@ -8,7 +8,7 @@ use crate::config::{ClockKind, TickAmount, TickLimit};
 use crate::fault::{Action as FaultAction, Interruption};
 use crate::scenario::Scenario;
 use crate::telemetry::Ticks;
-use serde::{Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
 /// The part of a role's ticks that may be missed, and starved, where a scenario states no limit.
@@ -17,11 +17,12 @@ const DEFAULT_SHARE: TickAmount = TickAmount::Share(0.01);
 const NOTICED_S: f64 = 0.1;
 
 /// A criterion and its verdict.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Criterion {
     /// The key in `[accept]`.
     pub name: String,
     /// The limit.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub limit: f64,
     /// The value; none if it was not measured.
     pub value: Option<f64>,
@@ -34,7 +35,7 @@ pub struct Criterion {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Unjudged>,
     /// True if the scenario states no such limit, and the default holds.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub default: bool,
 }
 
@@ -51,6 +52,8 @@ pub enum Unjudged {
     Unscored(u64, u64, f64),
     /// The role keeps no counters.
     Unbooked,
+    /// A reason read back from a summary.
+    Recorded(String),
 }
 
 impl fmt::Display for Unjudged {
@@ -63,6 +66,7 @@ impl fmt::Display for Unjudged {
                 write!(f, "{unscored} of {ticks} ticks from {from_s} s on were not scored")
             }
             Self::Unbooked => f.write_str("the role keeps no counters"),
+            Self::Recorded(reason) => f.write_str(reason),
         }
     }
 }
@@ -70,6 +74,12 @@ impl fmt::Display for Unjudged {
 impl Serialize for Unjudged {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for Unjudged {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer).map(Self::Recorded)
     }
 }
 

@@ -1,8 +1,8 @@
 //! A run in one thread: the same roles over links in memory, or without links where nothing disturbs them. No iceoryx2, no
 //! files, no clock.
 
-use super::supervision::Failure;
-use super::{Action, Incident, Launch, LaunchError, Outcome, Progress};
+use super::incident::{Action, Failure, Incident, Incidents};
+use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::memory::MemoryBus;
 use crate::clock::Grid;
 use crate::config::OnFailure;
@@ -62,12 +62,11 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         RoleId::all(scenario).into_iter().map(|role| (role, private_ledger(scenario, role))).collect();
     let node = |(role, ledger): &(RoleId, Ledger)| build(scenario, *role, &bus, ledger);
     let mut nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
-    let mut incidents = Vec::new();
+    let mut incidents = Incidents::default();
     let revive = |index: usize| {
         let incident = incident(scenario, &seats[index]);
-        scorer.borrow_mut().incident(incident.tick);
+        let incident = incidents.add(incident, &mut |id, tick| scorer.borrow_mut().incident(id, tick));
         let (tick, action) = (incident.tick, incident.action);
-        incidents.push(incident);
         if action == Action::Stopped {
             return Ok(None);
         }
@@ -108,8 +107,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
             }
             let (role, ledger) = &seats[index];
             let incident = Incident::without_process(role.name(scenario), ledger, Failure::of(panic), Action::Stopped);
-            scorer.borrow_mut().incident(incident.tick);
-            incidents.push(incident);
+            incidents.add(incident, &mut |id, tick| scorer.borrow_mut().incident(id, tick));
             Ended::Stopped
         }
     };
@@ -117,9 +115,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
         return Err(error.into());
     }
     let score = scorer.borrow_mut().finish()?;
-    for (incident, recovery_s) in incidents.iter_mut().zip(&score.recoveries_s) {
-        incident.recovery_s = *recovery_s;
-    }
+    let incidents = incidents.finish(&score.recoveries_s);
     let reports: Vec<RoleReport> =
         seats.iter().map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new())).collect();
     let recording = recorder.map(|mut recorder| {

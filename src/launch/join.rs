@@ -4,9 +4,9 @@
 //! Leads nothing: phases, epoch and credit are the word of the host that launched. Must not score, nor record.
 
 use super::children::END_LIMIT;
+use super::incident::Incident;
 use super::processes::{Supervisor, prepare};
 use super::relay::{FarEnd, RelayWatch};
-use super::supervision::Incident;
 use super::{Launch, LaunchError};
 use crate::bus::domain::{Domain, OwnedDomain};
 use crate::bus::iox::IoxBus;
@@ -172,7 +172,7 @@ impl Follower<'_> {
                 if supervisor.phase() == Phase::Stop {
                     return Ok(None);
                 }
-                let go_on = supervisor.supervise(&mut |_| {}, 0, now_ns)?;
+                let go_on = supervisor.supervise(&mut |_, _| {}, 0, now_ns)?;
                 if !go_on {
                     return Ok(Some("a role failed".to_owned()));
                 }

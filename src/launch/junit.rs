@@ -74,7 +74,7 @@ fn properties(xml: &mut Xml, run: RunId, summary: Option<&Summary>) -> io::Resul
         ];
         properties.extend(told.map(|(name, value)| (name.to_owned(), value)));
         for (signal, told) in &summary.score.statuses {
-            let ticks = |(name, ticks): (&&str, &u64)| (format!("ticks {name} of {signal}"), ticks.to_string());
+            let ticks = |(name, ticks): (&String, &u64)| (format!("ticks {name} of {signal}"), ticks.to_string());
             properties.extend(told.iter().map(ticks));
         }
         let rejected = summary.books.links.iter().filter(|link| link.rejected > 0);

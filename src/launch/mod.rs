@@ -8,6 +8,7 @@ mod criteria;
 mod external;
 mod foxglove;
 mod in_process;
+mod incident;
 mod janitor;
 #[cfg(feature = "hosts")]
 mod join;
@@ -26,19 +27,19 @@ mod trace;
 
 pub use crate::score::{CertificateScore, MetricScore, Score, Scorer};
 pub use criteria::{Criterion, Unjudged, tick_words};
+pub use incident::{Action, Incident};
 pub use janitor::janitor;
 #[cfg(feature = "hosts")]
 pub use join::{FarOutcome, join};
 pub use junit::junit;
 pub(crate) use outcome::{Judged, State, state_hash};
-pub use outcome::{Outcome, Summary, write_run};
+pub use outcome::{LinkCounters, Outcome, StageFigures, Summary, write_run};
 #[cfg(feature = "hosts")]
 pub(crate) use processes::new_domain;
 pub use replay::replay_as_process;
 pub use results::{Claim, LATEST, RUNS, ResultsError, claim, make_directory, make_latest, new_run};
 pub(crate) use results::{GENERATOR, LATENCY, RECORDING, SCENARIO, SUMMARY};
 pub use steps::{BodyState, Steps};
-pub use supervision::{Action, Incident};
 pub use table::{line_words, table};
 pub(crate) use table::{plain, reasons};
 

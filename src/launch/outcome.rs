@@ -21,14 +21,14 @@ use crate::telemetry::{
     Checkpoints, Grant, Host, Latency, LinkRead, LinkWritten, Percentiles, RoleReport, Ticks, WatchReport, combine,
     write_hgrm, write_hlog,
 };
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// Layout version of `summary.json`.
-const SCHEMA: &str = "corotate/summary/v1";
+pub const SCHEMA: &str = "corotate/summary/v1";
 
 /// Everything that a run left in memory.
 #[derive(Debug)]
@@ -59,25 +59,29 @@ pub struct Outcome {
 }
 
 /// A run's summary, as it is written to `summary.json`.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct Summary {
-    schema: &'static str,
-    pub(super) version: &'static str,
-    pub(super) revision: &'static str,
+    schema: String,
+    /// The program's version.
+    pub version: String,
+    /// The revision of its sources.
+    pub revision: String,
     /// The run's identifier, which all of its files carry.
     pub run: Option<RunId>,
     /// The scenario's name.
     pub scenario: String,
     /// The clock's name.
-    pub clock: &'static str,
+    pub clock: String,
     /// Ticks per second.
     pub tick_hz: f64,
     /// The last tick of the scenario.
     pub last_tick: u64,
-    pub(super) started_utc: String,
-    host: Host,
+    /// The time at which it was started.
+    pub started_utc: String,
+    /// The machine.
+    pub host: Host,
     /// Roles that had no process of their own, with the role in whose process they were.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub hosted: BTreeMap<String, String>,
     domain: Option<PathBuf>,
     /// The signal that ended the run before its time, or 0.
@@ -107,7 +111,7 @@ pub struct Summary {
     /// One entry per role and stage, in the order of a tick.
     pub latencies: Vec<StageFigures>,
     /// The counters of the serial lines, by the body whose seat a device has; as far back as its bridge was started.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub lines: BTreeMap<String, LineCounters>,
     /// The part of each host, if the run had several.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -118,12 +122,12 @@ pub struct Summary {
     /// Everything that was asked of the machine.
     pub privileges: Vec<RoleGrant>,
     /// Roles with a process of their own that report no privileges.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub privileges_unknown: Vec<String>,
 }
 
 /// The counters of a run.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct Accounting {
     /// Whether they balance.
     pub balanced: bool,
@@ -136,21 +140,21 @@ pub struct Accounting {
     /// Per reading end.
     pub links: Vec<LinkCounters>,
     /// Per external role that keeps no counters: ticks of which its readers had no sample.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub absent_ticks: BTreeMap<String, u64>,
     /// Ticks missed or starved, all roles together.
     pub missed_ticks: u64,
     /// Samples received and not believed, all links together.
     pub rejected_samples: u64,
     /// Samples received and rejected, by reason.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched, and stalls.
     pub injected_faults: u64,
 }
 
 /// One reading end beside its writing end. Of a writer that keeps no counters nothing is known but what its reader met.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct LinkCounters {
     /// The service.
     pub service: String,
@@ -173,14 +177,14 @@ pub struct LinkCounters {
     /// Samples received and not believed.
     pub rejected: u64,
     /// Samples received and rejected, by reason.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub rejected_by: BTreeMap<String, u64>,
     /// Samples that scripted faults touched on the writing end.
     pub injected: Option<u64>,
 }
 
 /// The state hash of a run, comparable between clocks.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct State {
     /// The hash over everything that was published.
     pub hash: String,
@@ -198,7 +202,7 @@ pub struct State {
 }
 
 /// One stage's figures.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct StageFigures {
     /// The role.
     pub role: String,
@@ -215,7 +219,7 @@ pub struct StageFigures {
 }
 
 /// A privilege of a role.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct RoleGrant {
     /// The role, or `launcher`.
     pub role: String,
@@ -287,16 +291,32 @@ fn hashes(reports: &[RoleReport]) -> Vec<(&String, &Checkpoints)> {
 }
 
 impl Summary {
+    /// Reads a summary.
+    ///
+    /// # Errors
+    /// The reason, if it has another layout or lacks something.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        struct Head {
+            schema: String,
+        }
+        let head: Head = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if head.schema != SCHEMA {
+            return Err(format!("its layout is {}, and this version reads {SCHEMA}", head.schema));
+        }
+        serde_json::from_str(text).map_err(|error| error.to_string())
+    }
+
     /// Draws up the summary of a run that began at `started`.
     pub fn new(scenario: &Scenario, outcome: &Outcome, started: SystemTime) -> Self {
         let Judged { latencies, books, criteria, accepted, verdict } = Judged::new(scenario, outcome);
         Self {
-            schema: SCHEMA,
-            version: env!("CARGO_PKG_VERSION"),
-            revision: env!("COROTATE_REVISION"),
+            schema: SCHEMA.to_owned(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            revision: env!("COROTATE_REVISION").to_owned(),
             run: scenario.run,
             scenario: scenario.name.clone(),
-            clock: scenario.clock.name(),
+            clock: scenario.clock.name().to_owned(),
             tick_hz: 1e9 / scenario.period_ns as f64,
             last_tick: scenario.last_tick,
             started_utc: utc(started),

@@ -9,11 +9,12 @@ use super::children::{END_LIMIT, RoleProcess};
 use super::companion::Companion;
 use super::external::{ExternalWatch, Waiting};
 use super::foxglove;
+use super::incident::{Action, Failure, Incident, Incidents};
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
 use super::standstill::attach_remedy;
-use super::supervision::{Action, Failure, Incident, Member};
+use super::supervision::Member;
 use super::{Launch, LaunchError, Outcome, Progress};
 use crate::bus::domain::{Domain, OwnedDomain, require_files};
 use crate::bus::iox::IoxBus;
@@ -92,16 +93,16 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let ShutdownReport { reports, unbooked, mut problems } = shutdown;
     let (hosts, told, elsewhere) = supervisor.relay.finish(&supervisor.incidents);
     problems.extend(told);
-    elsewhere.iter().for_each(|incident| scorer.incident(incident.tick));
-    supervisor.incidents.extend(elsewhere);
+    let mut note = |id, tick| scorer.incident(id, tick);
+    for incident in elsewhere {
+        supervisor.incidents.add(incident, &mut note);
+    }
     for (role, outage) in outages {
-        let incident = Incident::of_device(&role, &outage);
+        let incident = supervisor.incidents.add(Incident::of_device(&role, &outage), &mut note);
         tell(format_args!("corotate: {incident}"));
-        scorer.incident(incident.tick);
-        supervisor.incidents.push(incident);
     }
     let score = scorer.finish()?;
-    let (incidents, recorder) = supervisor.incidents(&score.recoveries_s);
+    let (incidents, recorder) = (supervisor.incidents.finish(&score.recoveries_s), supervisor.recorder);
     let recording = recorder.finish(domain, &reports, HostsSummary::of(&hosts).as_ref());
     let domain = Some(domain.root().to_owned());
     let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
@@ -220,7 +221,7 @@ pub(super) struct Supervisor<'a> {
     externals: ExternalWatch,
     schedule: <IoxBus as Bus>::Writer<Schedule>,
     word: Schedule,
-    incidents: Vec<Incident>,
+    incidents: Incidents,
     recorder: RecorderWatch,
     foxglove: Companion,
     relay: RelayWatch,
@@ -259,7 +260,7 @@ impl<'a> Supervisor<'a> {
         })?;
         members.iter_mut().zip(started).for_each(|(member, (_, process))| member.process = process);
         let externals = ExternalWatch::new(members.len());
-        let (word, incidents) = (Schedule::default(), Vec::new());
+        let (word, incidents) = (Schedule::default(), Incidents::default());
         Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
     }
 
@@ -439,7 +440,7 @@ impl<'a> Supervisor<'a> {
                 self.announce()?;
                 self.listen()?;
                 let tick = scorer.next_tick();
-                if !self.supervise(&mut |tick| scorer.incident(tick), tick, now_ns)? {
+                if !self.supervise(&mut |id, tick| scorer.incident(id, tick), tick, now_ns)? {
                     return Ok(0);
                 }
                 let stopped = self.look_at_standstills(launch);
@@ -468,14 +469,12 @@ impl<'a> Supervisor<'a> {
         Ok(0)
     }
 
-    /// Notices roles that have failed and brings them back, and hosts that left; false if the run is to end for that. `note` is told
-    /// the tick of each failure; `tick` is the one at hand.
-    pub fn supervise(&mut self, note: &mut dyn FnMut(u64), tick: u64, now_ns: u64) -> Result<bool, LaunchError> {
+    /// Notices roles that have failed and brings them back, and hosts that left; returns false if the run is to end for that.
+    /// `note` gets the number and the tick of each incident; `tick` is the one at hand.
+    pub fn supervise(&mut self, note: &mut dyn FnMut(u64, u64), tick: u64, now_ns: u64) -> Result<bool, LaunchError> {
         let mut go_on = true;
         for incident in self.relay.supervise(self.scenario, tick) {
-            tell(format_args!("corotate: {incident}"));
-            note(incident.tick);
-            self.incidents.push(incident);
+            tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
             go_on = false;
         }
         let ticks_ns = (self.scenario.last_tick + 1).saturating_mul(self.scenario.period_ns);
@@ -490,24 +489,19 @@ impl<'a> Supervisor<'a> {
                     true => member.note(failure, self.scenario),
                     false => member.fail(failure, self.scenario, now_ns),
                 };
-                tell(format_args!("corotate: {incident}"));
-                self.janitor.clear_dead();
-                note(incident.tick);
                 go_on &= incident.action != Action::Stopped;
-                self.incidents.push(incident);
+                tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
+                self.janitor.clear_dead();
             }
             if let Some(incident) = member.replaced() {
-                tell(format_args!("corotate: {incident}"));
-                note(incident.tick);
-                self.incidents.push(incident);
+                tell(format_args!("corotate: {}", self.incidents.add(incident, note)));
             }
             // A successor finds its links free once the remains of its predecessor are put away.
             if !self.janitor.is_busy() {
                 member.restart(self.scenario, self.domain, now_ns)?;
             }
             if let Some(outage_ns) = member.back_after_ns(now_ns) {
-                let last = self.incidents.iter_mut().rev().find(|incident| incident.role == member.name);
-                last.into_iter().for_each(|incident| incident.outage_s = Some(outage_ns as f64 / 1e9));
+                self.incidents.end_outage(&member.name, outage_ns as f64 / 1e9);
             }
         }
         Ok(go_on)
@@ -523,9 +517,8 @@ impl<'a> Supervisor<'a> {
                     let failure = Failure::new(cause, String::new());
                     let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
                     let incident = Incident { tick, ..incident };
+                    let incident = self.incidents.add(incident, &mut |id, tick| scorer.incident(id, tick));
                     tell(format_args!("corotate: {incident}"));
-                    scorer.incident(incident.tick);
-                    self.incidents.push(incident);
                     go_on = false;
                 }
             }
@@ -613,8 +606,8 @@ impl<'a> Supervisor<'a> {
                     true => member.note(failure, self.scenario),
                     false => Incident { action: Action::Stopped, ..member.fail(failure, self.scenario, 0) },
                 };
-                tell(format_args!("corotate: {incident}"));
-                self.incidents.push(incident);
+                // All ticks are over: there is nothing to recover from.
+                tell(format_args!("corotate: {}", self.incidents.add(incident, &mut |_, _| ())));
             }
             for (role, ledger) in member.books() {
                 shutdown.gather(self.scenario, self.domain, role, ledger);
@@ -625,13 +618,6 @@ impl<'a> Supervisor<'a> {
         let place = |name: &str| order.iter().position(|role| role.name(self.scenario) == name);
         shutdown.reports.sort_by_key(|report| place(&report.role));
         shutdown
-    }
-
-    /// What happened, with the scorer's times of recovery; and the recorder, which has yet to end.
-    fn incidents(self, recoveries_s: &[Option<f64>]) -> (Vec<Incident>, RecorderWatch) {
-        let recoveries = recoveries_s.iter().copied().chain(std::iter::repeat(None));
-        let recovered = self.incidents.into_iter().zip(recoveries);
-        (recovered.map(|(incident, recovery_s)| Incident { recovery_s, ..incident }).collect(), self.recorder)
     }
 }
 

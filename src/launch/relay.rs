@@ -5,7 +5,7 @@
 use super::LaunchError;
 use super::children::RoleProcess;
 use super::companion::Companion;
-use super::supervision::{Action, Failure, Incident};
+use super::incident::{Action, Failure, Incident, Incidents};
 use crate::bus::domain::Domain;
 use crate::hosts::{HostReport, HostSeat, RELAY, far_end_path, ready_path, relay_report_path};
 use crate::runtime::RoleId;
@@ -71,12 +71,9 @@ impl RelayWatch {
 
     /// What ends the run: the relay has failed, or a host has ended while ticks were to run. `tick` is the one at hand.
     pub fn supervise(&mut self, scenario: &Scenario, tick: u64) -> Vec<Incident> {
-        // It ends the run for more than a role.
-        let incident = |tick, cause| Incident { external: true, generation: 1, tick, cause, ..Incident::default() };
         let mut incidents = Vec::new();
-        if let Some(Failure { cause, last_words, .. }) = self.companion.failure() {
-            let role = RELAY.to_owned();
-            incidents.push(Incident { role, last_words, ..incident(tick, cause) });
+        if let Some(failure) = self.companion.failure() {
+            incidents.push(incident(RELAY.to_owned(), Vec::new(), tick, failure));
         }
         for (host, known) in self.hosts.iter_mut().filter(|(_, known)| !known) {
             let Some(end) = far_end(&self.root, host) else { continue };
@@ -87,15 +84,14 @@ impl RelayWatch {
             incidents.push(stopped.cloned().unwrap_or_else(|| {
                 let cause = end.failed.unwrap_or_else(|| "it ended before the run did".to_owned());
                 let cause = format!("the host {host} left: {cause}");
-                let role = roles.next().unwrap_or_default();
-                Incident { role, with: roles.collect(), ..incident(tick, cause) }
+                incident(roles.next().unwrap_or_default(), roles.collect(), tick, Failure::new(cause, String::new()))
             }));
         }
         incidents
     }
 
     /// What the hosts tell at the end: their accounts, what went wrong there, and incidents that are not in `known`.
-    pub fn finish(&mut self, known: &[Incident]) -> (Vec<HostReport>, Vec<String>, Vec<Incident>) {
+    pub fn finish(&mut self, known: &Incidents) -> (Vec<HostReport>, Vec<String>, Vec<Incident>) {
         self.companion.process().1.map(RoleProcess::kill);
         let (mut reports, mut problems, mut incidents) = (Vec::new(), Vec::new(), Vec::new());
         for (host, _) in &self.hosts {
@@ -112,4 +108,9 @@ impl RelayWatch {
 
 fn far_end(root: &std::path::Path, host: &str) -> Option<FarEnd> {
     serde_json::from_slice(&std::fs::read(far_end_path(root, host)).ok()?).ok()
+}
+
+/// An incident that ends a run for more than a role.
+fn incident(role: String, with: Vec<String>, tick: u64, failure: Failure) -> Incident {
+    Incident { external: true, with, ..Incident::new(role, tick, failure, Action::Stopped) }
 }

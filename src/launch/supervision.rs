@@ -4,6 +4,7 @@
 
 use super::LaunchError;
 use super::children::{END_LIMIT, RoleProcess};
+use super::incident::{Action, Failure, Incident, Replacement};
 use super::janitor::Janitor;
 use super::standstill::{Standstill, standstill};
 use super::trace::Trace;
@@ -18,9 +19,7 @@ use crate::sample::{Health, RoleState};
 use crate::scenario::Scenario;
 use crate::seat::{device_words_path, open_ledger, panic_path, report_path, words_path};
 use crate::system::tell;
-use crate::telemetry::{Ledger, Outage};
-use serde::{Deserialize, Serialize};
-use std::fmt;
+use crate::telemetry::Ledger;
 
 /// The most that one look adds to a role's silence, ns. Whoever stops the whole machine, or just the launcher, stops the
 /// clock of silence too: a role is only judged for the time in which it was listened to.
@@ -38,145 +37,6 @@ const SILENT_PERIODS: f64 = 10.0;
 
 /// So many starts in a row may end with the same panic: the second of them began without the state of the first.
 const PANICS_MAX: u64 = 2;
-
-/// A role that failed while the ticks ran, and what was done.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Incident {
-    /// The role.
-    pub role: String,
-    /// Whether it is somebody else's program: then nobody knows whether it died.
-    pub external: bool,
-    /// Other roles in the same process, which failed with it.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub with: Vec<String>,
-    /// Which generation of it.
-    pub generation: u64,
-    /// The tick that it had not finished.
-    pub tick: u64,
-    /// When that was, s from the first tick.
-    #[serde(default)]
-    pub time_s: f64,
-    /// How it failed.
-    pub cause: String,
-    /// The end of its error output.
-    pub last_words: String,
-    /// The panic that ended its process, if one did: its message as it was written, and its place.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub panic: Option<Panic>,
-    /// True if it panicked as before, so that another start would not help.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub repeated: bool,
-    /// Whether its successor begins with its counters alone: the state that it had itself inherited may be what it died of.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub begins_anew: bool,
-    /// The program that took its seat, if one did.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub replaced_by: Option<Replacement>,
-    /// What was done.
-    pub action: Action,
-    /// From when it was noticed until its successor ran, s.
-    pub outage_s: Option<f64>,
-    /// From `tick` on until every metric with a limit was within it and stayed there, s. None if that did not happen, or if
-    /// there is no limit.
-    pub recovery_s: Option<f64>,
-}
-
-/// A program that took the seat of another one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Replacement {
-    /// Its process, by the number that it knows itself by.
-    pub pid: u32,
-    /// The tick of its first sample.
-    pub tick: u64,
-}
-
-/// What is done about a role that failed.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Action {
-    /// It was started anew.
-    Restarted,
-    /// The run was ended in order.
-    #[default]
-    Stopped,
-    /// Nothing: it died after its last tick, and its results are complete.
-    Noted,
-    /// Nothing: the run went on without it, and with it again once it was back.
-    Continued,
-}
-
-impl fmt::Display for Incident {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let with: String = self.with.iter().map(|role| format!(", and {role} with it,")).collect();
-        let failed = match (self.action, self.external) {
-            (Action::Continued, _) => "was absent",
-            (_, true) => "failed",
-            (_, false) => "died",
-        };
-        write!(f, "{}{with} {failed} at tick {}: {}", self.role, self.tick, self.cause)?;
-        if !self.last_words.is_empty() {
-            write!(f, "; it said: {}", self.last_words)?;
-        }
-        f.write_str(match self.action {
-            Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
-            Action::Restarted => "; it is started anew",
-            Action::Stopped if self.repeated => "; as before, so it is not started anew; the run ends",
-            Action::Stopped => "; the run ends",
-            Action::Noted => " after its last tick; its results are complete",
-            Action::Continued => "; the run goes on",
-        })
-    }
-}
-
-impl Incident {
-    /// An absence of the device in a role's seat.
-    pub(super) fn of_device(role: &str, outage: &Outage) -> Self {
-        Self {
-            role: role.to_owned(),
-            external: true,
-            generation: 1,
-            tick: outage.tick,
-            cause: outage.cause.clone(),
-            action: Action::Continued,
-            outage_s: outage.back_at_tick.map(|_| outage.seconds),
-            ..Self::default()
-        }
-    }
-
-    /// The end of a role that has no process of its own: after a scripted one its successor is there at once.
-    pub(super) fn without_process(role: &str, ledger: &Ledger, failure: Failure, action: Action) -> Self {
-        Self {
-            role: role.to_owned(),
-            generation: ledger.generation(),
-            tick: crate::runtime::next_tick(ledger),
-            cause: failure.cause,
-            last_words: failure.last_words,
-            panic: failure.panic,
-            action,
-            ..Self::default()
-        }
-    }
-}
-
-/// How a role failed, in words.
-pub(super) struct Failure {
-    pub cause: String,
-    pub last_words: String,
-    /// The panic that ended its process, if one did.
-    pub panic: Option<Panic>,
-}
-
-impl Failure {
-    /// A failure of a process that did not panic.
-    pub fn new(cause: String, last_words: String) -> Self {
-        Self { cause, last_words, panic: None }
-    }
-
-    /// A panic; its message is all that is told of the error output, which ends with a backtrace.
-    pub fn of(panic: Panic) -> Self {
-        Self { cause: panic.to_string(), last_words: String::new(), panic: Some(panic) }
-    }
-}
 
 /// The program in the seat of an external role, by what it sends.
 #[derive(Default)]
@@ -452,16 +312,13 @@ impl Member {
     /// Returns the incident of an external role whose program has been replaced by another: once, when that sends.
     pub fn replaced(&mut self) -> Option<Incident> {
         let (left, pid, tick, outage_s) = self.occupant.replaced()?;
+        let cause = format!("its program, process {}, left; process {pid} took its seat at tick {tick}", left.pid);
         Some(Incident {
-            role: self.name.clone(),
             external: true,
             generation: self.generation,
-            tick: left.tick,
-            cause: format!("its program, process {}, left; process {pid} took its seat at tick {tick}", left.pid),
             replaced_by: Some(Replacement { pid, tick }),
-            action: Action::Continued,
             outage_s: Some(outage_s),
-            ..Incident::default()
+            ..Incident::new(self.name.clone(), left.tick, Failure::new(cause, String::new()), Action::Continued)
         })
     }
 
@@ -612,17 +469,12 @@ impl Member {
     }
 
     fn incident(&self, failure: Failure, scenario: &Scenario, action: Action) -> Incident {
+        let tick = if self.counts() { crate::runtime::next_tick(&self.ledger) } else { self.last.stamp.tick };
         Incident {
-            role: self.name.clone(),
             external: self.external,
             with: self.hosted.iter().map(|(role, _)| role.name(scenario).to_owned()).collect(),
             generation: self.generation,
-            tick: if self.counts() { crate::runtime::next_tick(&self.ledger) } else { self.last.stamp.tick },
-            cause: failure.cause,
-            last_words: failure.last_words,
-            panic: failure.panic,
-            action,
-            ..Incident::default()
+            ..Incident::new(self.name.clone(), tick, failure, action)
         }
     }
 

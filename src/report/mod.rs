@@ -3,7 +3,6 @@
 //! | file | duty |
 //! |---|---|
 //! | `source` | what there is: a run's directory, or a recording alone |
-//! | `summary` | `summary.json`, read back |
 //! | `traces` | one pass over a recording |
 //! | `columns` | signals of any length in a bounded number of columns, their extremes kept |
 //! | `hidden` | another page: the hidden component of a log |
@@ -36,7 +35,6 @@ mod percentiles;
 mod pictures;
 mod single;
 mod source;
-mod summary;
 mod tables;
 mod traces;
 

@@ -11,10 +11,10 @@ use super::model::{Block, Model, Section, latency_section};
 use super::percentiles::{Curve, pictures};
 use super::pictures::{by_unit, error_axis};
 use super::source::Source;
-use super::summary::{Metric, Summary};
 use super::tables::figures_cells;
 use super::traces::{Key, MetricTrace, Traces, trace};
 use crate::analysis::digits;
+use crate::launch::{MetricScore, StageFigures, Summary};
 use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
 use crate::rig;
 use std::collections::BTreeSet;
@@ -118,7 +118,7 @@ fn about(source: &Source) -> String {
 }
 
 /// A figure of a metric.
-type Pick = fn(&Metric) -> Option<f64>;
+type Pick = fn(&MetricScore) -> Option<f64>;
 
 /// What the launchers of both said.
 fn told(runs: &[Run<'_>; 2]) -> Section {
@@ -136,7 +136,7 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
     }
     let mut rows = vec![vec!["verdict".to_owned(), summary(&runs[0]), summary(&runs[1])]];
     let figures: [(&str, Pick); 4] = [
-        ("at the end", |metric| metric.last),
+        ("at the end", |metric| Some(metric.last).filter(|last| last.is_finite())),
         ("largest settled", |metric| metric.settled_max),
         ("peak", |metric| metric.peak),
         ("within its limit from, s", |metric| metric.settled_at_s),
@@ -363,7 +363,7 @@ fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
     let of = |run: &Run<'_>| {
         let name = run.name;
         let stages = run.source.summary.iter().flat_map(|summary| &summary.latencies);
-        let row = move |stage: &super::summary::Stage| {
+        let row = move |stage: &StageFigures| {
             let mut row = vec![stage.role.clone(), stage.stage.clone(), name.to_owned()];
             row.extend(figures_cells(&stage.figures));
             row

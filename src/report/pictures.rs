@@ -367,7 +367,7 @@ fn rescored(source: &Source, traces: &Traces) -> Block {
         vec![
             metric.name.to_owned(),
             number(Some(metric.last).filter(|last| !last.is_nan())),
-            number(told.and_then(|told| told.last)),
+            number(told.map(|told| told.last).filter(|last| last.is_finite())),
             number(metric.settled_max),
             number(told.and_then(|told| told.settled_max)),
             number(told.and_then(|told| told.peak)),

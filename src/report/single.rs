@@ -90,7 +90,7 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
         unseen: merged(unseen.collect()).into_iter().map(seconds).collect(),
         faults: faults.map(span).collect(),
         incidents: incidents
-            .map(|incident| (incident.tick as f64 * tick_s, format!("{} {}", incident.role, incident.action)))
+            .map(|incident| (incident.tick as f64 * tick_s, format!("{} {}", incident.role, incident.action.name())))
             .collect(),
         missing: missing.iter().map(|(from, to)| (*from as f64 * tick_s, *to as f64 * tick_s)).collect(),
     };

@@ -4,10 +4,9 @@
 
 use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
-use super::summary::Summary;
 use crate::config::{ClockKind, RunId};
 use crate::files;
-use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY};
+use crate::launch::{LATENCY, RECORDING, SCENARIO, SUMMARY, Summary};
 use crate::record::Recording;
 use crate::scenario::Scenario;
 use std::fs;

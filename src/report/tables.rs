@@ -3,10 +3,11 @@
 use super::model::{Block, Section};
 use super::source::Source;
 use super::traces::Traces;
-use crate::analysis::{apart, digits};
+use crate::analysis::{Claim, Reach, apart, digits};
 use crate::hosts::{HostReport, LinkEnd, Silence};
-use crate::launch::{State, reasons};
-use crate::telemetry::{Percentiles, Ticks};
+use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, reasons};
+use crate::rig::{ConditionReport, Figure};
+use crate::telemetry::{Host, Percentiles, Ticks};
 
 /// A scripted fault as it stands in the scenario.
 #[derive(Debug)]
@@ -43,7 +44,8 @@ pub fn faults(source: &Source) -> Vec<FaultRow> {
 /// A number in few digits; the verdict's are told in full.
 fn number(value: Option<f64>) -> String {
     let short = |value: f64| Some(format!("{value}")).filter(|text| text.len() <= 8);
-    value.map_or("–".to_owned(), |value| short(value).unwrap_or_else(|| format!("{value:.4e}")))
+    let finite = value.filter(|value| value.is_finite());
+    finite.map_or("–".to_owned(), |value| short(value).unwrap_or_else(|| format!("{value:.4e}")))
 }
 
 fn strings(cells: &[&dyn ToString]) -> Vec<String> {
@@ -62,12 +64,15 @@ fn held(holds: Option<bool>) -> &'static str {
 pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     if let Some(summary) = &source.summary {
-        let row = |criterion: &super::summary::Criterion| {
+        let row = |criterion: &Criterion| {
             let value =
                 criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:.2e}"));
             let default = criterion.default.then(|| "default".to_owned());
             let about: Vec<String> =
-                [default, criterion.role.clone(), criterion.reason.clone()].into_iter().flatten().collect();
+                [default, criterion.role.clone(), criterion.reason.as_ref().map(ToString::to_string)]
+                    .into_iter()
+                    .flatten()
+                    .collect();
             let about = if about.is_empty() { String::new() } else { format!(" ({})", about.join(", ")) };
             let verdict = format!("{}{about}", held(criterion.holds));
             vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), verdict]
@@ -134,13 +139,13 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     blocks.extend(traces.map(|traces| unseen(traces, tick_s)));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
     let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), digits);
-    let row = |incident: &super::summary::Incident| {
+    let row = |incident: &Incident| {
         let cause = match incident.last_words.as_str() {
             "" => incident.cause.clone(),
             words => format!("{}; it said: {words}", incident.cause),
         };
         let (outage, recovery) = (time(incident.outage_s), time(incident.recovery_s));
-        strings(&[&seconds(incident.tick), &incident.role, &cause, &incident.action, &outage, &recovery])
+        strings(&[&seconds(incident.tick), &incident.role, &cause, &incident.action.name(), &outage, &recovery])
     };
     let rows: Vec<_> = incidents.iter().map(row).collect();
     let head = vec!["at, s", "role", "cause", "what was done", "back after, s", "recovered after, s"];
@@ -166,7 +171,7 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
 
 /// The figures of every stage.
 pub fn latencies(source: &Source) -> Block {
-    let row = |stage: &super::summary::Stage| {
+    let row = |stage: &StageFigures| {
         let mut row = strings(&[&stage.role, &stage.stage]);
         row.extend(figures_cells(&stage.figures));
         row
@@ -209,7 +214,7 @@ pub fn books(source: &Source) -> Section {
         }
         let rows = books.roles.iter().map(ticks_row).collect();
         blocks.push(Block::table("Ticks", roles.to_vec(), rows));
-        let row = |link: &super::summary::Link| {
+        let row = |link: &LinkCounters| {
             let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
             let void = format!("{}, {}", told(link.void.0), link.void.1);
             strings(&[
@@ -319,11 +324,8 @@ pub fn certificate(source: &Source) -> Section {
         return Section { id: "certificate", title: "Certificate", blocks };
     };
     for certificate in &summary.certificates {
-        let row = |condition: &super::summary::Condition| {
-            let [value, required] = match (condition.value, condition.required) {
-                (Some(value), Some(required)) => apart(value, required),
-                (value, required) => [value, required].map(number),
-            };
+        let row = |condition: &ConditionReport| {
+            let [value, required] = apart(condition.value, condition.required);
             let verdict = if condition.holds { "✓ holds" } else { "✗ does not hold" };
             strings(&[&condition.name, &value, &required, &verdict])
         };
@@ -349,34 +351,36 @@ pub fn certificate(source: &Source) -> Section {
         };
         blocks.push(Block::Text(format!("The bound on dV/dt {told}; {} could not be judged.", score.unjudged)));
     }
-    let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(limit.value)]).collect();
+    let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(Some(limit.value))]).collect();
     let caption = "What samples are held against".to_owned();
     blocks.extend((!rows.is_empty()).then(|| Block::table(&caption, vec!["limit", "value"], rows)));
     Section { id: "certificate", title: "Certificate", blocks }
 }
 
 /// What is claimed of the loop that ran.
-fn told_of_loop(certificate: &super::summary::Certificate) -> String {
-    let rate = match (certificate.loop_rate_per_s, &certificate.reason) {
-        (Some(rate), _) => format!("once it is small, the error falls as exp(−{} t)", digits(rate)),
+fn told_of_loop(certificate: &Claim) -> String {
+    let rate = match (certificate.loop_rate_text(), &certificate.reason) {
+        (Some(rate), _) => format!("once it is small, the error falls as exp(−{rate} t)"),
         (None, reason) => format!("no rate is claimed: {}", reason.as_deref().unwrap_or("none was computed")),
     };
-    let floor = |floor: &super::summary::Figure| format!("{} {}", floor.name, number(floor.value));
+    let floor = |floor: &Figure| format!("{} {}", floor.name, number(Some(floor.value)));
     let floors: Vec<String> = certificate.floors.iter().map(floor).collect();
     let floors = if floors.is_empty() { String::new() } else { format!(" Floors to expect: {}.", floors.join(", ")) };
-    let reach = |reach: &super::summary::Reach| match reach.after_s {
+    let over =
+        certificate.over_s.map_or(String::new(), |over_s| format!(", computed over the first {} s", digits(over_s)));
+    let reach = |reach: &Reach| match reach.after_s {
         Some(after_s) => format!("{} ≤ {} after {} s at that rate", reach.metric, digits(reach.limit), digits(after_s)),
         None => format!("{} ≤ {} is below the floor", reach.metric, digits(reach.limit)),
     };
     let reaches: String = certificate.reaches.iter().map(|one| format!(" From the start, {}.", reach(one))).collect();
-    format!("The sampled loop of {}: {rate}.{floors}{reaches}", certificate.body)
+    format!("The sampled loop of {}: {rate}{over}.{floors}{reaches}", certificate.body)
 }
 
 /// Where it ran, with which privileges, and the scenario.
 pub fn machine(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let info = source.recording.as_ref().map(|recording| recording.info());
-    let told = |text: &String| serde_json::from_str::<super::summary::Host>(text).ok();
+    let told = |text: &String| serde_json::from_str::<Host>(text).ok();
     let recorded = info.and_then(|info| told(&info.host));
     if let Some(host) = source.summary.as_ref().map(|summary| &summary.host).or(recorded.as_ref()) {
         blocks.push(Block::Text(format!("{}: {}, {} cores, {}.", host.name, host.cpu, host.cores, host.kernel)));

@@ -1,9 +1,9 @@
 //! The machine that a run was made on, for whoever reads its results elsewhere. Must not fail: what is not told is unknown.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// A machine.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Host {
     /// Its name.
     pub name: String,

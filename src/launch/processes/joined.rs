@@ -1,6 +1,7 @@
 //! The supervisor of a host that joined: its own roles, led by the word of another host. Must not lead them itself.
 
 use super::*;
+use std::collections::BTreeMap;
 
 impl<'a> Supervisor<'a> {
     /// The roles of a host in a run that another one leads.
@@ -25,7 +26,7 @@ impl<'a> Supervisor<'a> {
         let started = started.collect::<Result<Vec<_>, LaunchError>>()?;
         let members = started.into_iter().map(open).collect::<Result<Vec<_>, LaunchError>>()?;
         let externals = ExternalWatch::new(members.len());
-        let (word, incidents) = (Schedule::default(), Vec::new());
+        let (word, incidents) = (Schedule::default(), Incidents::default());
         Ok(Self { scenario, domain, janitor, members, externals, schedule, word, incidents, recorder, foxglove, relay })
     }
 
@@ -57,6 +58,6 @@ impl<'a> Supervisor<'a> {
 
     /// What happened, and the relay, once all roles have ended.
     pub fn dismiss(self) -> (Vec<Incident>, RelayWatch) {
-        (self.incidents, self.relay)
+        (self.incidents.finish(&BTreeMap::new()), self.relay)
     }
 }
