@@ -3,8 +3,8 @@
 
 use arbitrary::Arbitrary;
 use corotate::config::SHIPPED;
-use corotate::scenario::Scenario;
 use corotate::launch::{Launch, run};
+use corotate::scenario::Scenario;
 use libfuzzer_sys::fuzz_target;
 use std::fmt::Write;
 use std::sync::atomic::AtomicUsize;
@@ -84,7 +84,8 @@ fuzz_target!(|tables: Vec<Table>| {
             let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
             // As text: what is not a number is unequal to itself.
             assert_eq!(format!("{:?}", again.faults), format!("{:?}", scenario.faults));
-            let outcome = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).expect("a run in one thread comes to its end");
+            let outcome = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {}))
+                .expect("a run in one thread comes to its end");
             assert!(outcome.reports.len() == 4 && outcome.problems.is_empty(), "{:?}", outcome.problems);
         }
         Err(error) => assert!(!error.to_string().is_empty()),

@@ -3,10 +3,10 @@
 #![no_main]
 
 use corotate::config::SHIPPED;
-use corotate::scenario::Scenario;
 use corotate::launch::{Launch, run};
 use corotate::record::{Recording, Tolerances, diff, export_csv, replay_in_process};
 use corotate::runtime::RoleId;
+use corotate::scenario::Scenario;
 use libfuzzer_sys::fuzz_target;
 use mcap::records::Metadata;
 use std::cell::OnceCell;
@@ -29,7 +29,8 @@ impl Bench {
         let short = ["clock=in-process", "duration_s=0.02", "accept={}"].map(str::to_owned);
         let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).expect("it is shipped");
         let path = directory.path().join("whole.mcap");
-        run(&scenario, &mut Launch { record: Some(path.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) }).expect("it runs");
+        run(&scenario, &mut Launch { record: Some(path.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) })
+            .expect("it runs");
         Self { whole: std::fs::read(path).expect("it was recorded"), directory }
     }
 

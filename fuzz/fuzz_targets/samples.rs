@@ -5,10 +5,10 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
 use corotate::clock::Grid;
 use corotate::config::SHIPPED;
-use corotate::scenario::Scenario;
-use corotate::runtime::{RunCondition, Input, Poll, ReadyNode, RoleId, depths, private_ledger, topic};
-use corotate::scenario::build;
+use corotate::runtime::{Input, Poll, ReadyNode, RoleId, RunCondition, depths, private_ledger, topic};
 use corotate::sample::{RateCommand, RateEstimate, RateMeasurement, Sample};
+use corotate::scenario::Scenario;
+use corotate::scenario::build;
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
 

@@ -4,10 +4,10 @@
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
 use corotate::config::SHIPPED;
-use corotate::scenario::Scenario;
 use corotate::record::RecordingReport;
 use corotate::runtime::{Control, depths, topic};
 use corotate::sample::{Health, Message, RoleState, Schedule};
+use corotate::scenario::Scenario;
 use corotate::telemetry::RoleReport;
 use corotate::watch::RoleLine;
 use libfuzzer_sys::fuzz_target;

@@ -2,8 +2,8 @@
 #![no_main]
 
 use corotate::config::SHIPPED;
-use corotate::scenario::Scenario;
 use corotate::rig::{Rig, RigidBodyRig};
+use corotate::scenario::Scenario;
 use corotate::serial::{Device, FlightSeat, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;

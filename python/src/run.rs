@@ -2,10 +2,10 @@
 
 use corotate::Program;
 use corotate::config::{RunId, SHIPPED};
-use corotate::scenario::Scenario;
 use corotate::launch::{
     Launch, Outcome, Progress, Summary, claim, make_directory, make_latest, new_run, run as launch, write_run,
 };
+use corotate::scenario::Scenario;
 use corotate::scenario::shipped as rigs;
 use pyo3::create_exception;
 use pyo3::exceptions::{PyException, PyValueError};

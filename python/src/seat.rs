@@ -1,11 +1,11 @@
 //! A role's seat: its samples to a function, or to a loop that asks for tick after tick.
 
 use crate::run::{failed, scenario};
-use corotate::scenario::Scenario;
-use corotate::runtime::{Compute, ComputedTick, RoleId, ports};
 use corotate::bus::Port;
-use corotate::seat::{RoleSeat, run_computed};
+use corotate::runtime::{Compute, ComputedTick, RoleId, ports};
 use corotate::sample::{FieldKind, Stamp};
+use corotate::scenario::Scenario;
+use corotate::seat::{RoleSeat, run_computed};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 use std::path::PathBuf;
