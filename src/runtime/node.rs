@@ -16,7 +16,9 @@ mod seat;
 pub use contract::{Node, Poll, ReadyNode, RunCondition};
 pub use ports::{Ports, ports, topic};
 pub use seat::Seat;
-pub(crate) use seat::{accepted_ticks, kept, ledger_file, ledger_words, next_tick};
+#[cfg(feature = "hosts")]
+pub(crate) use seat::kept;
+pub(crate) use seat::{accepted_ticks, ledger_file, ledger_words, next_tick};
 
 use super::compute::Computing;
 use super::link;
