@@ -2,8 +2,9 @@
 //!
 //! Must not derive by hand what the code does: two loops run beside each other, and the logarithm of their distance tells.
 
-use super::{Analysis, LOST, TICKS_MAX, TICKS_MIN, digits, exceeds, norm};
-use crate::analysis::chain::Chain;
+use super::chain::Chain;
+use super::digits::digits;
+use super::subject::{Analysis, LOST, TICKS_MAX, TICKS_MIN, exceeds, norm};
 use crate::rig::{Rig, Start};
 use crate::sample::status;
 

@@ -8,18 +8,20 @@
 //! the filter, the law and the delay are. Must not derive by hand what the code does.
 
 mod chain;
+mod digits;
 mod exponent;
 mod fall;
+mod subject;
+
+pub use digits::{apart, digits, to_tolerance};
 
 use crate::config::Settings;
 use crate::rig::{CertificateReport, ConditionReport, Figure, Rig, Start};
 use chain::{Chain, Guards};
 use fall::Fall;
 use serde::{Deserialize, Serialize};
+use subject::{Analysis, LOST, TICKS_MAX, TICKS_MIN, exceeds, norm};
 
-/// Ticks that are looked at, at the least and at the most.
-const TICKS_MIN: u64 = 2_000;
-const TICKS_MAX: u64 = 256_000;
 /// Ticks of a long scenario that are looked at if the rate does not ask for more.
 const SCENARIO_TICKS_MAX: u64 = TICKS_MAX / 8;
 /// An error has settled after so many of its time constants, and a quarter of them more is looked at.
@@ -32,8 +34,6 @@ const SMALL: f64 = 1e-2;
 const USELESS: f64 = 0.05;
 const USELESS_REASON: &str = "even from where it is settled the error comes to a floor that is no synchronisation: rounding, \
                               quadrature or noise outweigh what the motion tells; raise tick_hz, or choose another axis";
-/// A loop that was settled, and says so many times what it said then, does not stay settled.
-const LOST: f64 = 20.0;
 /// A loop that says so many times what it said at its start has diverged. A transient may be large: a wrong first guess at a
 /// high gain.
 const DIVERGED: f64 = 1e6;
@@ -91,19 +91,7 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
     driven.map(|(index, body)| Analysis::new(rig, index, scenario).claim(&body.name, certificate(&body.name))).collect()
 }
 
-/// The analysis of one driven body's loop.
-struct Analysis<'a, R> {
-    rig: &'a R,
-    index: usize,
-    scenario: &'a Settings,
-    tick_s: f64,
-}
-
-impl<'a, R: Rig> Analysis<'a, R> {
-    fn new(rig: &'a R, index: usize, scenario: &'a Settings) -> Self {
-        Self { rig, index, scenario, tick_s: scenario.tick_s() }
-    }
-
+impl<R: Rig> Analysis<'_, R> {
     fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
         let (rate, floors) = match self.rig.alone(self.index, Start::Settled, false) {
             None => (Err("this rig does not tell where its loop is settled".to_owned()), Vec::new()),
@@ -302,47 +290,6 @@ impl Claim {
     }
 }
 
-/// A number in four digits or more, however small it is.
-pub fn digits(value: f64) -> String {
-    let decimals = match value.abs() {
-        0.1..1e6 => 4,
-        0.01..0.1 => 5,
-        1e-3..0.01 => 6,
-        0.0 => return "0".to_owned(),
-        _ => return format!("{value:.3e}"),
-    };
-    let text = format!("{value:.decimals$}");
-    text.trim_end_matches('0').trim_end_matches('.').to_owned()
-}
-
-/// Formats a number that is known to a tolerance, with one decimal more than the tolerance has; a whole number stands as it is.
-pub fn to_tolerance(value: f64, tolerance: f64) -> String {
-    let power = |value: f64| value.abs().log10().floor() as i32;
-    let last = power(tolerance) - 1;
-    if value.fract() == 0.0 && value.abs() < 1e15 {
-        format!("{value:.0}")
-    } else if (1e-3..1e15).contains(&value.abs()) {
-        format!("{value:.*}", (-last).clamp(0, 17) as usize)
-    } else {
-        format!("{value:.*e}", (power(value) - last).clamp(0, 17) as usize)
-    }
-}
-
-/// Two numbers that are compared, with enough digits to be told apart.
-pub fn apart(a: f64, b: f64) -> [String; 2] {
-    let few = [a, b].map(digits);
-    if few[0] == few[1] { [a, b].map(|value| value.to_string()) } else { few }
-}
-
-/// Whether a size is beyond a limit, or no number.
-fn exceeds(size: f64, limit: f64) -> bool {
-    size.is_nan() || size > limit.max(f64::MIN_POSITIVE)
-}
-
-fn norm(values: &[f64]) -> f64 {
-    values.iter().map(|value| value * value).sum::<f64>().sqrt()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -353,23 +300,6 @@ mod tests {
         let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
         let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-pair").unwrap().1;
         claims(&Scenario::parse(text, "test", &overrides).unwrap()).remove(0)
-    }
-
-    #[test]
-    fn a_tolerance_says_how_many_digits_a_number_has() {
-        for (value, tolerance, text) in [
-            (0.5541015625000001, 0.01, "0.554"),
-            (3.642_089_843_75, 0.5, "3.64"),
-            (-12.26, 5.0, "-12.3"),
-            (41.0, 5.0, "41"),
-            (0.0, 0.01, "0"),
-            (123_456.7, 1000.0, "123457"),
-            (5.123_456_789e-6, 1e-9, "5.1235e-6"),
-            (1e-5, 0.01, "1e-5"),
-            (1e20, 1.0, "1.00000000000000000e20"),
-        ] {
-            assert_eq!(to_tolerance(value, tolerance), text);
-        }
     }
 
     /// Rates from an independent program: the product of the one-tick transitions of (e, command on its way, ε), linearised
@@ -439,13 +369,5 @@ mod tests {
             let warned = |part: &str| claim.warnings.iter().any(|warning| warning.contains(part));
             assert!(warned(cause) && warned("raise tick_hz"), "{claim:?}");
         }
-    }
-
-    #[test]
-    fn small_numbers_have_digits() {
-        let told = [0.0, 4.0, 0.25, 0.0123456, 0.002, 1.5e-7, -2e-4].map(digits);
-        assert_eq!(told, ["0", "4", "0.25", "0.01235", "0.002", "1.500e-7", "-2.000e-4"]);
-        assert_eq!(apart(1.0, 0.99999), ["1", "0.99999"]);
-        assert_eq!(apart(0.5, 0.25), ["0.5", "0.25"]);
     }
 }

@@ -401,7 +401,7 @@ pub fn tick_words(books: &Accounting) -> String {
 mod tests {
     use super::*;
     use crate::config::SHIPPED;
-    use crate::launch::outcome::Judged;
+    use crate::launch::summary::Judged;
     use crate::launch::{Launch, run};
     use std::sync::atomic::AtomicUsize;
 

@@ -13,6 +13,7 @@ use super::incident::{Action, Failure, Incident, Incidents};
 use super::janitor::Janitor;
 use super::recorder::RecorderWatch;
 use super::relay::RelayWatch;
+use super::remains::Remains;
 use super::standstill::attach_remedy;
 use super::supervision::Member;
 use super::{Launch, LaunchError, Outcome, Progress};
@@ -35,7 +36,6 @@ use crate::system::tell;
 use crate::telemetry::{Grant, Ledger, Outage, RoleReport};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use std::fmt;
 use std::os::fd::AsFd;
 use std::os::unix::ffi::OsStrExt;
 use std::sync::atomic::Ordering;
@@ -105,7 +105,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
     let (incidents, recorder) = (supervisor.incidents.finish(&score.recoveries_s), supervisor.recorder);
     let recording = recorder.finish(domain, &reports, HostsSummary::of(&hosts).as_ref());
     let domain = Some(domain.root().to_owned());
-    let remains = Some(Remains { _bus: bus, _domain: owned, _janitor: janitor });
+    let remains = Some(Remains::new(bus, owned, janitor));
     Ok(Outcome { reports, unbooked, problems, score, incidents, hosts, grants, recording, domain, signal, remains })
 }
 
@@ -125,20 +125,6 @@ pub(super) fn prepare(scenario: &Scenario, launch: &Launch<'_>, domain: &Domain)
         write_whole(&path, results.as_os_str().as_bytes()).map_err(|source| LaunchError::Write { path, source })?;
     }
     describe_seats(scenario, launch, domain)
-}
-
-/// What is still there of a run whose roles have ended. It is removed when this is dropped, in this order: after the
-/// results have been written and told.
-pub(super) struct Remains {
-    _bus: IoxBus,
-    _domain: OwnedDomain,
-    _janitor: Janitor,
-}
-
-impl fmt::Debug for Remains {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("Remains").field(&self._domain).finish()
-    }
 }
 
 fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {

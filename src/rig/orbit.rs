@@ -4,59 +4,28 @@
 //! leader, and followers, if there are any, are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
 //! `resolve`, the mathematics in `model`, `observe` and `control`.
 
+mod design;
 mod limits;
 mod resolve;
 mod roles;
 
+pub use design::OrbitRig;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use roles::{OrbitLaw, OrbitObserver, OrbitPlant};
 
+use super::contract::pair;
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, FleetTruth, Graph, Monitor, NoFleet,
-    Picture, Plane, Rig, Start, Watched, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FleetTruth, Graph, Monitor, NoFleet, Picture, Plane,
+    Rig, Start, Watched,
 };
 use crate::config::{Checks, ConfigError, Document};
-use crate::control::{Condition, OrbitCertificate, OrbitGains, OrbitHold};
-use crate::model::{CentralField, Noise, OrbitFault, OrbitState};
+use crate::control::{Condition, OrbitCertificate, OrbitHold};
+use crate::model::{Noise, OrbitFault, OrbitState};
 use crate::observe::OrbitVelocity;
 use crate::sample::{OrbitEstimate, OrbitTruth, status};
-use limits::Limits;
+use design::{ControllerDesign, Sensors};
 use nalgebra::Vector2;
 use roles::{Aim, POSITION, VELOCITY};
-
-/// Bodies in a central field, the observer of the first one's velocity, and the law of the driven ones.
-#[derive(Debug, Clone)]
-pub struct OrbitRig {
-    bodies: Vec<BodyInfo>,
-    field: CentralField,
-    initial: Vec<OrbitState>,
-    sensors: Vec<Sensors>,
-    filter: FilterDesign<2>,
-    initial_guess: Vector2<f64>,
-    /// None where no body is driven.
-    controller: Option<ControllerDesign>,
-    aim: Aim,
-    limits: Limits,
-    tick_s: f64,
-}
-
-/// The law of the driven bodies.
-#[derive(Debug, Clone, Copy)]
-struct ControllerDesign {
-    gains: OrbitGains,
-    law: OrbitHold,
-    /// From so many ticks after its measurement on a command acts.
-    delay_ticks: u64,
-    predict: bool,
-}
-
-/// What a body's sensors add to (r, θ, Vr, Vθ).
-#[derive(Debug, Clone, PartialEq)]
-struct Sensors {
-    noise: Noise<4>,
-    deviation: [f64; 4],
-    bias: [f64; 4],
-}
 
 impl OrbitRig {
     /// The radius (du) of the circular orbit about which the loop is linearised: the target, or the leader's pericentre,

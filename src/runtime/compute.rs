@@ -4,7 +4,7 @@
 //! Must not keep anything of a tick: what a function remembers is its own, and ends with its process.
 
 use super::error::NodeError;
-use super::node::Ports;
+use super::node::ports::Ports;
 use crate::sample::{Field, Stamp};
 
 /// Words of a stamp.

@@ -10,7 +10,7 @@ mod missed;
 mod observer;
 mod persistent;
 mod plant;
-mod ports;
+pub(super) mod ports;
 mod seat;
 
 pub use contract::{Node, Poll, ReadyNode, RunCondition};

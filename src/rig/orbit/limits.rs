@@ -5,7 +5,8 @@
 use super::roles::{POSITION, VELOCITY};
 use crate::config::Checks;
 use crate::model::{CentralField, OrbitState};
-use crate::rig::{Figure, SURE_DEVIATIONS};
+use crate::rig::Figure;
+use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, Plausible, Refusal};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
 use crate::state::persist_fields;

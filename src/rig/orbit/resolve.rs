@@ -2,13 +2,15 @@
 //!
 //! Must name the key and the remedy of everything it refuses, all at once.
 
+use super::design::{ControllerDesign, OrbitRig, Sensors};
 use super::limits::{Limits, RawLimits};
 use super::roles::Aim;
-use super::{BodyInfo, ControllerDesign, OrbitRig, Sensors};
-use crate::config::{Checks, ConfigError, Document};
+use crate::config::{BodyInfo, Checks, ConfigError, Document};
 use crate::control::{OrbitGains, OrbitHold};
 use crate::model::{CentralField, CentralFieldError, Noise, OrbitState};
-use crate::rig::{Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION, check_name};
+use crate::rig::Context;
+use crate::rig::contract::check_name;
+use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 

@@ -5,7 +5,7 @@
 use crate::control::{InFlight, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use crate::rig::FilterDesign;
+use crate::rig::filter::FilterDesign;
 use crate::role::{Body, Estimator, Law};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth, status};
 use crate::state::persist_fields;

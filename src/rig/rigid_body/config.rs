@@ -3,7 +3,7 @@
 use super::limits::RawLimits;
 use super::playback::RawPlayback;
 use crate::config::Checks;
-use crate::rig::check_name;
+use crate::rig::contract::check_name;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 

@@ -2,17 +2,19 @@
 //!
 //! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
 
-use super::MAX_TURN_RAD;
 use crate::config::Checks;
 use crate::model::RigidBody;
 use crate::rate::ALL;
-use crate::rig::{Figure, SURE_DEVIATIONS};
+use crate::rig::Figure;
+use crate::rig::filter::SURE_DEVIATIONS;
 use crate::role::{Bounds, Guard, Plausible, Pursuit, Refusal};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+/// The largest turn of a body in one tick, rad: half a turn cannot be told from its complement.
+pub(super) const MAX_TURN_RAD: f64 = 3.0;
 /// A default rate limit lies so far above what the initial rates allow.
 const RATE_MARGIN: f64 = 2.0;
 

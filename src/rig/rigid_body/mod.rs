@@ -4,6 +4,7 @@
 //! Parameters, and the glue between samples and vectors; the mathematics is in `model`, `observe` and `control`.
 
 mod config;
+mod design;
 mod fleet;
 mod limits;
 mod plant;
@@ -11,77 +12,27 @@ mod playback;
 mod resolve;
 
 pub use crate::rate::{HiddenObserver, KalmanObserver, Learner, RateLaw, RateObserver};
+pub use design::RigidBodyRig;
 pub use fleet::RateFleet;
 pub use limits::{CommandGuard, EstimateGuard, MeasurementGuard};
 pub use plant::RatePlant;
 
+use super::contract::pair;
+use super::filter::{FilterDesign, UNKNOWN_DEVIATION};
 use super::{
-    BodyInfo, CertificateReport, ConditionReport, Context, Figure, FilterDesign, Graph, Inputs, Lyapunov, Monitor,
-    Picture, Plane, Rig, Start, UNKNOWN_DEVIATION, Watched, pair,
+    BodyInfo, CertificateReport, ConditionReport, Context, Figure, Graph, Inputs, Lyapunov, Monitor, Picture, Plane,
+    Rig, Start, Watched,
 };
 use crate::config::{Checks, ConfigError, Document};
 use crate::control::{Certificate, Synchronizer};
 use crate::model::{Inertia, Noise, RigidBody};
-use crate::observe::{HiddenRate, RateNoise};
-use crate::rate::{ALL, Parts, RateLawDesign};
+use crate::observe::RateNoise;
+use crate::rate::{ALL, RateLawDesign};
 use crate::sample::{FleetTruth, RateCommand, RateEstimate, RateTruth, status};
+use design::{ControllerDesign, ObserverDesign};
 use fleet::farthest;
-use limits::{Limits, Sensed};
+use limits::{MAX_TURN_RAD, Sensed};
 use nalgebra::{Vector1, Vector3};
-use plant::Outage;
-use playback::Playback;
-use std::sync::Arc;
-
-/// The farthest that a body may turn in one tick, rad: at half a turn nobody can tell it from its complement.
-const MAX_TURN_RAD: f64 = 3.0;
-
-/// A leader, its observer, and the followers with their laws.
-#[derive(Debug, Clone)]
-pub struct RigidBodyRig {
-    bodies: Vec<BodyInfo>,
-    inertia: Inertia,
-    /// Per body: initial rate, and inertia over the nominal one.
-    initial_rates: Vec<Vector3<f64>>,
-    /// Per body, how far a fleet's initial rates are spread to either side, and what the draws follow from.
-    spreads: Vec<Vector3<f64>>,
-    seed: u64,
-    inertia_factors: Vec<Vector3<f64>>,
-    /// Bit i set: the leader's component i has a gyro.
-    measured: u64,
-    outages: Vec<Outage>,
-    /// The motion that the leader repeats instead of moving by itself.
-    playback: Option<Arc<Playback>>,
-    /// The component that the observer supplies, 1 to 3.
-    supplied_axis: Option<usize>,
-    observer: ObserverDesign,
-    controller: Option<ControllerDesign>,
-    /// Per body, what its gyros add, and of which standard deviation and bias that is.
-    noise: Vec<Noise<3>>,
-    deviations_rad_s: Vec<Vector3<f64>>,
-    biases_rad_s: Vec<Vector3<f64>>,
-    limits: Limits,
-    notes: Vec<String>,
-    tick_s: f64,
-    actuation_delay_ticks: u64,
-    /// What is proven of any follower: they differ in nothing that it knows of.
-    certificate: Option<Certificate>,
-}
-
-/// The observer's parameters.
-#[derive(Debug, Clone)]
-enum ObserverDesign {
-    Hidden { relation: HiddenRate, filter: FilterDesign<1>, guess_rad_s: f64 },
-    Learner(Parts),
-}
-
-/// The controller's parameters.
-#[derive(Debug, Clone, Copy)]
-struct ControllerDesign {
-    gain_per_s: Vector3<f64>,
-    predict: bool,
-    learned: bool,
-    adaptation_gain: f64,
-}
 
 impl RigidBodyRig {
     /// The component that the observer supplies, 0 to 2; where there is none, any serves.

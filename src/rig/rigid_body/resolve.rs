@@ -3,15 +3,16 @@
 //! Must name the key and the remedy of everything it refuses, all at once.
 
 use super::config::{self, Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
+use super::design::{ControllerDesign, ObserverDesign, RigidBodyRig};
 use super::limits::{Circumstances, Limits};
 use super::plant::Outage;
 use super::playback::{self, Playback};
-use super::{ControllerDesign, ObserverDesign, RigidBodyRig};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
 use crate::rate::{Identifier, Parts};
-use crate::rig::{BodyInfo, Context, FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
+use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
+use crate::rig::{BodyInfo, Context};
 use nalgebra::{Matrix3, Vector1, Vector3};
 use std::sync::Arc;
 

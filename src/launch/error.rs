@@ -1,0 +1,105 @@
+//! Why a run failed.
+
+use crate::bus::BusError;
+use crate::bus::domain::DomainError;
+use crate::panics::Panic;
+use crate::record::RecordError;
+use crate::runtime::NodeError;
+use crate::system::remedy;
+use crate::telemetry::{Grant, LedgerError};
+use std::io;
+use std::path::PathBuf;
+
+/// Why a run failed. Whatever had been started is gone.
+#[derive(Debug, thiserror::Error)]
+pub enum LaunchError {
+    /// The run cannot be stepped.
+    #[error("the scenario cannot be stepped: {reason}; run it")]
+    NotStepped {
+        /// Why.
+        reason: &'static str,
+    },
+    /// The scenario names cores that this process cannot be bound to.
+    #[error("realtime.cores: this run cannot be bound to {}: not online, or not in its cpuset; name other cores, or \"auto\"", cores.iter().map(|core| format!("core {core}")).collect::<Vec<_>>().join(", "))]
+    Cores {
+        /// The cores.
+        cores: Vec<usize>,
+    },
+    /// The domain could not be made.
+    #[error(transparent)]
+    Domain(#[from] DomainError),
+    /// A link failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A role cannot go on.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// The roles' counters could not be opened.
+    #[error(transparent)]
+    Ledger(#[from] LedgerError),
+    /// There are too few descriptors. Found out later it would fail in the midst of the transport.
+    #[error("the limit on open files is {limit} and this run may need {needed}; raise it with `ulimit -n {needed}`")]
+    Descriptors {
+        /// The limit.
+        limit: u64,
+        /// What each process of the run may open.
+        needed: u64,
+    },
+    /// A file of the domain could not be written.
+    #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A process could not be started.
+    #[error("cannot start {role}: {source}; {}", remedy(source))]
+    Spawn {
+        /// The role.
+        role: String,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A role failed before the ticks ran.
+    #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; it said: {last_words}") })]
+    Died {
+        /// The role.
+        role: String,
+        /// Exit status or signal.
+        cause: String,
+        /// The end of its error output.
+        last_words: String,
+    },
+    /// The rig's score, or its other parts in the launcher, panicked.
+    #[error("the rig failed outside of its roles: {panic}")]
+    Panicked {
+        /// The panic.
+        panic: Panic,
+    },
+    /// Roles were not ready in time.
+    #[error("not ready within {limit_s} s: {roles}; on a slow machine raise launch.startup_timeout_s")]
+    StartUp {
+        /// The limit.
+        limit_s: f64,
+        /// The roles.
+        roles: String,
+    },
+    /// Roles stopped making progress.
+    #[error("no progress for {limit_s} s; furthest behind: {roles}")]
+    Hung {
+        /// The limit.
+        limit_s: f64,
+        /// The roles.
+        roles: String,
+    },
+    /// The recording could not be begun, or not be written where nobody else does.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// A privilege was required and not granted.
+    #[error("required and not granted: {}", denied.iter().map(|(role, grant)| format!("{role}: {} {} ({})", grant.privilege, grant.asked, grant.reason)).collect::<Vec<_>>().join("; "))]
+    Privileges {
+        /// Role and privilege.
+        denied: Vec<(String, Grant)>,
+    },
+}

@@ -1,0 +1,79 @@
+//! The design of the filter of a rig's observer, by the three keys of which a scenario gives one.
+
+use crate::config::Checks;
+use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
+use nalgebra::SVector;
+
+/// How a filter is designed: its order, and what follows from that.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum FilterDesign<const N: usize> {
+    /// The papers' filter, by its decay rates, 1/s.
+    First([f64; N]),
+    /// Second order by its bandwidths, rad/s.
+    Second([f64; N]),
+    /// Second order by the noise: density of what drives the unknown, (unit of the unknown)²/s.
+    Kalman(f64),
+}
+
+/// The damping of filters of second order: the flattest pass band (Butterworth).
+const DAMPING: f64 = core::f64::consts::FRAC_1_SQRT_2;
+/// The standard deviation of a guess of which nothing is known, in the unit of the unknown.
+pub(super) const UNKNOWN_DEVIATION: f64 = 10.0;
+/// Of white noise, so many standard deviations never occur: once in 10¹⁸ samples.
+pub(super) const SURE_DEVIATIONS: f64 = 9.0;
+
+impl<const N: usize> FilterDesign<N> {
+    /// Checks the three keys of which one must be given.
+    pub fn resolve(
+        checks: &mut Checks<'_>,
+        decay: Option<[f64; N]>,
+        bandwidth: Option<[f64; N]>,
+        density: (&str, Option<f64>),
+    ) -> Option<Self> {
+        let keys = ["observer.decay_rate_per_s", "observer.bandwidth_rad_s", &format!("observer.{}", density.0)];
+        for (key, values) in [(keys[0], &decay), (keys[1], &bandwidth)] {
+            values.iter().flatten().for_each(|value| checks.positive(key, *value));
+        }
+        checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], || {
+            "a density below zero is none; give 0 for a perfect model, or more".to_owned()
+        });
+        match (decay, bandwidth, density.1) {
+            (Some(decay), None, None) => Some(Self::First(decay)),
+            (None, Some(bandwidth), None) => Some(Self::Second(bandwidth)),
+            (None, None, Some(density)) => Some(Self::Kalman(density)),
+            (None, None, None) => {
+                checks.refuse(
+                    keys[0],
+                    format!("is missing; add it (first order), or give {} or {} (second)", keys[1], keys[2]),
+                );
+                None
+            }
+            _ => {
+                let last = if density.1.is_some() { keys[2] } else { keys[1] };
+                checks.refuse(last, format!("does not go with the other choice; give one of {}", keys.join(", ")));
+                None
+            }
+        }
+    }
+
+    /// A filter of this design at a guess.
+    pub fn filter(&self, guess: SVector<f64, N>) -> Filter<N> {
+        match self {
+            Self::First(decay) => Filter::First(InvariantFilter::new((*decay).into(), guess)),
+            Self::Second(bandwidth) => Filter::Second(SecondOrderFilter::new((*bandwidth).into(), DAMPING, guess)),
+            Self::Kalman(density) => {
+                let deviation = SVector::repeat(UNKNOWN_DEVIATION);
+                Filter::Kalman(KalmanFilter::new(SVector::repeat(*density), guess, deviation))
+            }
+        }
+    }
+
+    /// The exponents of the error's decay, 1/s, where they are constant.
+    pub fn decay_rates(&self) -> Option<[f64; N]> {
+        match self {
+            Self::First(decay) => Some(*decay),
+            Self::Second(bandwidth) => Some(bandwidth.map(|bandwidth| DAMPING * bandwidth)),
+            Self::Kalman(_) => None,
+        }
+    }
+}

@@ -1,0 +1,43 @@
+//! The parameters of an orbit rig, as a scenario resolves to them.
+
+use super::limits::Limits;
+use super::roles::Aim;
+use crate::config::BodyInfo;
+use crate::control::{OrbitGains, OrbitHold};
+use crate::model::{CentralField, Noise, OrbitState};
+use crate::rig::filter::FilterDesign;
+use nalgebra::Vector2;
+
+/// Bodies in a central field, the observer of the first one's velocity, and the law of the driven ones.
+#[derive(Debug, Clone)]
+pub struct OrbitRig {
+    pub(super) bodies: Vec<BodyInfo>,
+    pub(super) field: CentralField,
+    pub(super) initial: Vec<OrbitState>,
+    pub(super) sensors: Vec<Sensors>,
+    pub(super) filter: FilterDesign<2>,
+    pub(super) initial_guess: Vector2<f64>,
+    /// None where no body is driven.
+    pub(super) controller: Option<ControllerDesign>,
+    pub(super) aim: Aim,
+    pub(super) limits: Limits,
+    pub(super) tick_s: f64,
+}
+
+/// The law of the driven bodies.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ControllerDesign {
+    pub(super) gains: OrbitGains,
+    pub(super) law: OrbitHold,
+    /// From so many ticks after its measurement on a command acts.
+    pub(super) delay_ticks: u64,
+    pub(super) predict: bool,
+}
+
+/// What a body's sensors add to (r, θ, Vr, Vθ).
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Sensors {
+    pub(super) noise: Noise<4>,
+    pub(super) deviation: [f64; 4],
+    pub(super) bias: [f64; 4],
+}
