@@ -2,14 +2,11 @@
 //! lost; it never hangs, never panics, and leaves nothing behind.
 
 use crate::common::{Bench, Done, Running, await_some, send_signal, shipped};
-use serde_json::Value;
+use libc::{SIGCONT, SIGSTOP};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::Command;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
-
-const SIGSTOP: i32 = 19;
-const SIGCONT: i32 = 18;
 
 /// For tests that need their processes to be served, or that keep others from it: one at a time.
 static CORES: Mutex<()> = Mutex::new(());
@@ -166,9 +163,8 @@ fn two_lost_seconds_are_counted_and_nobody_is_blamed() {
     everybody.iter().for_each(|pid| send_signal(*pid, SIGSTOP));
     std::thread::sleep(Duration::from_secs(2));
     everybody.iter().for_each(|pid| send_signal(*pid, SIGCONT));
-    let done = running.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = running.wait().succeeded();
+    let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
     for role in ["leader", "follower"] {
@@ -192,9 +188,8 @@ fn a_short_standstill_is_bridged_by_the_plant_s_expiry() {
     send_signal(controller, SIGSTOP);
     std::thread::sleep(Duration::from_millis(300));
     send_signal(controller, SIGCONT);
-    let done = running.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = running.wait().succeeded();
+    let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
     let (follower, controller) = (&summary["books"]["roles"]["follower"], &summary["books"]["roles"]["controller"]);
     assert!(controller["missed"].as_u64().unwrap() > 250, "{controller}");
@@ -219,7 +214,7 @@ fn a_core_that_is_lost_to_a_busy_neighbour_costs_ticks_and_nothing_else() {
     let done = running.wait();
     await_some(|| hog.try_wait().unwrap());
     assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
     assert!(summary["score"]["metrics"][0]["last"].as_f64().unwrap() < 2.0, "{:#}", summary["score"]);
     bench.assert_clean(&[]);

@@ -304,7 +304,7 @@ fn every_fault_is_the_same_in_lockstep_and_in_process() {
             let sets = ["--set", "accept={}", "--set", "watchdog.from_s=0"];
             let done = bench.run(&[&arguments[..], &sets].concat());
             assert_eq!(done.code, Some(0), "{case}: {done:?}");
-            serde_json::from_str(&done.stdout).unwrap()
+            done.json()
         };
         let (one, many) = (summary("in-process"), summary("lockstep"));
         assert_eq!(one["state"], many["state"], "{case}");
@@ -332,7 +332,7 @@ fn real_time_has_the_same_faults_and_balances_its_books() {
         let sets = ["--set", "accept={}", "--set", "watchdog.from_s=0", "--clock", "realtime"];
         let done = bench.run(&[&arguments[..], &sets].concat());
         assert_eq!(done.code, Some(0), "{case}: {done:?}");
-        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         assert_eq!(summary["books"]["balanced"], true, "{case}: {}", summary["books"]["problems"]);
         let injected = summary["books"]["injected_faults"].as_u64().unwrap();
         let missed = summary["books"]["missed_ticks"].as_u64().unwrap();
@@ -363,8 +363,8 @@ fn hash_after(case: &str, overrides: &[&str], ticks: u64) -> String {
     std::fs::write(&file, text(case)).unwrap();
     let sets: Vec<&str> = overrides.iter().flat_map(|set| ["--set", set]).collect();
     let out = bench.path("out");
-    let done = bench.run(&[&["run", file.to_str().unwrap(), "--out", out.to_str().unwrap()], &sets[..]].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
+
+    bench.run(&[&["run", file.to_str().unwrap(), "--out", out.to_str().unwrap()], &sets[..]].concat()).succeeded();
     let run = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
     let directory = if run.is_dir() { run } else { out };
     let hashes = std::fs::read_to_string(directory.join("hashes.txt")).unwrap();
@@ -505,9 +505,9 @@ fn a_plant_is_safe_after_exactly_as_many_missing_commands_as_it_was_told() {
         std::fs::write(bench.path("silence.toml"), text + fault).unwrap();
         let timeout_key = format!("actuator.command_timeout_ticks={timeout}");
         for clock in ["in-process", "lockstep"] {
-            let done = bench.run(&["run", "silence.toml", "--json", "--clock", clock, "--set", &timeout_key]);
-            assert_eq!(done.code, Some(0), "{done:?}");
-            let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+            let done =
+                bench.run(&["run", "silence.toml", "--json", "--clock", clock, "--set", &timeout_key]).succeeded();
+            let summary = done.json();
             let follower = &summary["books"]["roles"]["follower"];
             let counts = (follower["starved"].as_u64(), follower["safe"].as_u64());
             assert_eq!(counts, (Some(50), Some(50 - timeout + 1)), "{clock}, {timeout} ticks: {follower}");
@@ -526,9 +526,8 @@ fn a_tick_from_the_future_does_not_blind_the_scorer() {
     let faults = fault("observer", 300) + &fault("controller", 350);
     std::fs::write(bench.path("future.toml"), text + &faults).unwrap();
     let run = ["run", "future.toml", "--json", "--out=out", "--duration=2", "--set=accept={}", "--clock=realtime"];
-    let done = bench.run(&run);
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = bench.run(&run).succeeded();
+    let summary = done.json();
     let missed = summary["books"]["missed_ticks"].as_u64().unwrap();
     let unscored = summary["score"]["unscored_ticks"].as_u64().unwrap();
     assert!((1..=missed + 2).contains(&unscored), "{unscored} unscored, {missed} missed: {:#}", summary["books"]);

@@ -5,6 +5,7 @@
 //! system call's sequence; `COROTATE_INJECT=run:openat:EMFILE:120,...` runs these cells and prints what was said.
 
 use crate::common::{self, Bench, Done, Running, WATCHDOG, await_some, send_signal};
+use libc::{SIGCONT, SIGKILL, SIGSTOP, SIGTERM};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::Path;
@@ -175,8 +176,8 @@ impl Target {
         let beside = beside.map(|beside| {
             // Until it has ended, or is in its loop and will not.
             let calls = || std::fs::read_to_string(&log).unwrap_or_default().matches("clock_nanosleep").count();
-            await_some(|| (target.ended() || (self != Self::Watch && calls() > LOOP_CALLS)).then_some(()));
-            beside.signal(libc::SIGTERM);
+            await_some(|| (target.has_ended() || (self != Self::Watch && calls() > LOOP_CALLS)).then_some(()));
+            beside.signal(SIGTERM);
             beside.wait()
         });
         let done = target.wait();
@@ -318,7 +319,7 @@ impl Watchdog {
             let end = Instant::now() + WATCHDOG / 4;
             while !told.load(Ordering::Relaxed) {
                 if Instant::now() > end {
-                    common::processes_marked(&mark).into_iter().for_each(|pid| send_signal(pid, libc::SIGKILL));
+                    common::processes_marked(&mark).into_iter().for_each(|pid| send_signal(pid, SIGKILL));
                 }
                 std::thread::sleep(Duration::from_millis(20));
             }
@@ -440,11 +441,10 @@ fn a_watcher_that_cannot_look_at_a_run_removes_nothing() {
     let fails = ["-o", "/dev/null", "-P", lock.to_str().unwrap(), "-e", "inject=statx:error=EACCES:when=4+"];
     let done =
         bench.start_program(Path::new("strace"), &[&fails[..], &[PROGRAM, "watch", domain, "--once", "1"]].concat());
-    let done = done.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    done.wait().succeeded();
     assert!(lock.exists());
-    run.signal(libc::SIGTERM);
-    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    run.signal(SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + SIGTERM));
     bench.assert_clean(&domains);
 }
 
@@ -456,9 +456,9 @@ fn a_stopped_janitor_holds_no_run_up() {
     let run = bench.start(&scenario.iter().map(String::as_str).collect::<Vec<_>>());
     bench.await_role("controller");
     let domains = bench.domains();
-    send_signal(bench.await_role("janitor"), libc::SIGSTOP);
-    run.signal(libc::SIGTERM);
-    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    send_signal(bench.await_role("janitor"), SIGSTOP);
+    run.signal(SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + SIGTERM));
     assert!(bench.path("out/summary.json").exists());
     bench.assert_clean(&domains);
 }
@@ -486,8 +486,8 @@ fn a_full_stderr_ends_no_run() {
     let run = bench.start_program(Path::new("/bin/sh"), &["-c", &format!("exec {PROGRAM} {scenario} 2>/dev/full")]);
     bench.await_role("controller");
     let domains = bench.domains();
-    run.signal(libc::SIGTERM);
-    assert_eq!(run.wait().code, Some(128 + libc::SIGTERM));
+    run.signal(SIGTERM);
+    assert_eq!(run.wait().code, Some(128 + SIGTERM));
     bench.assert_clean(&domains);
 }
 
@@ -502,13 +502,12 @@ fn a_death_after_the_last_tick_is_noted_and_costs_nothing() {
     let domains = bench.domains();
     // The recording is begun when the ticks are. While the launcher stands still, nobody lets the roles go.
     await_some(|| std::fs::metadata(bench.path("out/run.mcap")).ok().filter(|file| file.len() > 0));
-    run.signal(libc::SIGSTOP);
+    run.signal(SIGSTOP);
     let report = domains[0].join("controller.report.json");
     await_some(|| report.exists().then_some(()));
-    send_signal(controller, libc::SIGKILL);
-    run.signal(libc::SIGCONT);
-    let done = run.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    send_signal(controller, SIGKILL);
+    run.signal(SIGCONT);
+    run.wait().succeeded();
     let summary = std::fs::read_to_string(bench.path("out/summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary["incidents"][0]["action"], "noted", "{}", summary["incidents"]);

@@ -5,10 +5,10 @@
 //! kinds below (half an hour), else some of each. Nothing is judged by the machine's speed: a role that stood still is one
 //! that its launcher missed for `STILL_S` of its own attention, and in lockstep no tick may be missed at all.
 
-use crate::common::{Bench, Done, Running, await_some, catches, send_signal, shipped, status_of};
+use crate::common::{Bench, Done, Running, await_some, catches, python, root, send_signal, shipped, status_of};
+use libc::{SIGKILL, SIGTERM};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 const CALLS: [&str; 5] = ["openat", "ftruncate", "mmap", "rename", "futex"];
@@ -16,8 +16,6 @@ const CALLS: [&str; 5] = ["openat", "ftruncate", "mmap", "rename", "futex"];
 const FEW: usize = 3;
 /// For so long no role may stand still, s.
 const STILL_S: &str = "1";
-const SIGKILL: i32 = 9;
-const SIGTERM: i32 = 15;
 
 /// How a joiner is started, but for strace; `n` tells one from another.
 struct Joiner {
@@ -153,7 +151,7 @@ fn joiners_may_die(joiner: &Joiner, clock: &str, more: &[&str]) {
     let done = run.wait();
     println!("{}, {clock}: {killed} deaths; the run ended {:?} after it was told", joiner.name, told.elapsed());
     assert_eq!(done.code, Some(128 + SIGTERM), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     assert_eq!((&summary["incidents"], &summary["books"]["balanced"]), (&Value::Array(vec![]), &Value::Bool(true)));
     if clock == "lockstep" {
         assert_eq!(summary["books"]["missed_ticks"], 0);
@@ -190,22 +188,19 @@ fn foxglove_may_die_anywhere() {
 
 /// A run that waits for the foreign follower, and the seat.
 fn start_waiting(bench: &Bench) -> (Running, PathBuf, PathBuf) {
-    let scenario = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/pair.toml");
+    let scenario = root().join("tests/hil/pair.toml");
     let run = ["run", scenario.to_str().unwrap(), "--clock=lockstep", "--duration=0.2", "--set=accept={}"];
     let running = bench.start(&run);
-    let is_seat =
-        |domain: PathBuf| Some((domain.join("follower.seat.json"), domain)).filter(|(seat, _)| seat.is_file());
-    let (seat, domain) = await_some(|| bench.domains().pop().and_then(is_seat));
+    let seat = bench.await_seat("follower");
+    let domain = seat.parent().unwrap().to_owned();
     (running, seat, domain)
 }
 
 /// The seat of an external role can be taken again wherever its holder died.
 #[test]
 fn the_foreign_follower_may_die_anywhere() {
-    let made = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/venv")).output().unwrap();
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let python = String::from_utf8(made.stdout).unwrap().trim().to_owned();
-    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil/follower.py");
+    let python = python("hil").to_str().unwrap().to_owned();
+    let program = root().join("tests/hil/follower.py");
     let command = |seat: &Path| words(&[&python, program.to_str().unwrap(), seat.to_str().unwrap()]);
 
     let bench = Bench::new();

@@ -267,7 +267,7 @@ fn undisturbed(scenario: &'static str) -> Value {
         let arguments = case.arguments();
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let done = bench(scenario).run(&arguments);
-        serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("{done:?}"))
+        done.json()
     };
     known.entry(scenario).or_insert_with(run).clone()
 }

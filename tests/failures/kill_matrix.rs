@@ -27,14 +27,10 @@ fn start(bench: &Bench, role: &str, place: &str, signal: &str, more: &[&str]) ->
     Running::new(&mut command)
 }
 
-fn summary(done: &Done) -> Value {
-    serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("no summary: {done:?}"))
-}
-
 /// What holds after every failure that a run survives: nobody hung, the role is named, the books balance, nothing is left.
 fn assert_survived(bench: &Bench, done: &Done, role: &str, case: &str) -> Value {
     assert_eq!(done.code, Some(0), "{case}: {done:?}");
-    let summary = summary(done);
+    let summary = done.json();
     let first = &summary["incidents"][0];
     assert_eq!((first["role"].as_str(), first["action"].as_str()), (Some(role), Some("restarted")), "{case}: {first}");
     assert!(first["outage_s"].as_f64().unwrap() > 0.0, "{case}: {first}");
@@ -129,7 +125,7 @@ fn the_number_of_restarts_is_limited() {
     let more = ["--clock=lockstep", "--set=supervision.restarts_max=0"];
     let done = start(&bench, "controller", "sent 902", "KILL", &more).wait();
     assert_eq!(done.code, Some(4), "{done:?}");
-    let summary = summary(&done);
+    let summary = done.json();
     assert_eq!(summary["incidents"][0]["action"], "stopped");
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
     assert_eq!(summary["books"]["roles"]["controller"]["executed"], 902, "what the dead were committed to counts");

@@ -3,12 +3,12 @@
 
 use crate::common::{Bench, Running, await_some, shipped, skipped};
 use iceoryx2::prelude::*;
+use libc::SIGTERM;
 use serde_json::Value;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 
-const SIGTERM: i32 = 15;
 const LEADER: &str = "corotate/rigid-pair/leader/measurement";
 
 /// The size of a rate measurement, and its name on the wire.
@@ -82,7 +82,7 @@ impl Visit {
         drop(self.node);
         let done = self.run.wait();
         assert_eq!(done.code, Some(128 + SIGTERM), "{done:?}");
-        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
         assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
         assert!(summary["score"]["metrics"][0]["last"].as_f64().unwrap() < 2.0, "{:#}", summary["score"]);

@@ -1,6 +1,7 @@
 //! Where results go, and by which names a run is found again.
 
 use crate::common::{Bench, Done, await_some};
+use libc::SIGTERM;
 use rustix::fs::{CWD, Mode, mkfifoat};
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -13,8 +14,7 @@ fn short(bench: &Bench, out: &str, more: &[&str]) -> Done {
 }
 
 fn run_of(bench: &Bench, out: &str) -> String {
-    let summary: serde_json::Value =
-        serde_json::from_slice(&fs::read(bench.path(out).join("summary.json")).unwrap()).unwrap();
+    let summary = bench.summary_in(out);
     summary["run"].as_str().unwrap().to_owned()
 }
 
@@ -31,8 +31,8 @@ fn a_live_run_keeps_others_out_of_its_directory() {
             let pid = lock.trim().rsplit(' ').next().unwrap();
             assert!(second.code == Some(2) && second.stderr.contains(pid), "{clock} {out}: {second:?}");
         }
-        first.signal(15);
-        assert_eq!(first.wait().code, Some(128 + 15), "{clock}");
+        first.signal(SIGTERM);
+        assert_eq!(first.wait().code, Some(128 + SIGTERM), "{clock}");
         assert!(!bench.path("out/run.lock").exists());
     }
 }
@@ -51,8 +51,7 @@ fn an_earlier_run_is_kept_unless_it_is_to_be_overwritten() {
     // Of a run that was killed there may be no more than its recording.
     fs::remove_file(bench.path("out/summary.json")).unwrap();
     assert_eq!(short(&bench, "out", &[]).code, Some(2));
-    let over = short(&bench, "out", &["--overwrite"]);
-    assert_eq!(over.code, Some(0), "{over:?}");
+    let over = short(&bench, "out", &["--overwrite"]).succeeded();
     assert!(over.stderr.contains("run.mcap") && over.stderr.contains("report.html"), "{over:?}");
     assert!(!bench.path("out/run.mcap").exists() && !bench.path("out/report.html").exists());
     assert_eq!(fs::read(bench.path("out/notes.txt")).unwrap(), b"mine");
@@ -74,9 +73,8 @@ fn a_run_has_the_same_names_for_every_command() {
     assert_eq!(record("again").code, Some(0));
     // The newest run has no recording.
     assert_eq!(short(&bench, "runs/bare", &[]).code, Some(0));
-    let diff = bench.run(&["diff", "runs/pair", "--json"]);
-    assert_eq!(diff.code, Some(0), "{diff:?}");
-    let told: serde_json::Value = serde_json::from_str(&diff.stdout).unwrap();
+    let diff = bench.run(&["diff", "runs/pair", "--json"]).succeeded();
+    let told = diff.json();
     assert_eq!(told["b"], "runs/again/run.mcap");
     let replay = bench.run(&["replay", "latest"]);
     assert!(replay.code == Some(2) && replay.stderr.contains("runs/again"), "{replay:?}");
@@ -100,7 +98,7 @@ fn a_run_has_the_same_names_for_every_command() {
     }
     let over = bench.run(&["bridge", "--serial", "no-such-line", "--role", "follower", "--domain", "runs/bare"]);
     assert!(over.code == Some(2) && over.stderr.contains("corotate report runs/bare"), "{over:?}");
-    running.signal(15);
+    running.signal(SIGTERM);
     running.wait();
 }
 
@@ -135,8 +133,7 @@ fn what_is_no_regular_file_keeps_nothing_waiting() {
     let fifo = |path: &std::path::Path| mkfifoat(CWD, path, Mode::RWXU).unwrap();
     fifo(&base.join("x.lock"));
     fifo(&base.join(format!("{:032x}.lock", 1)));
-    let run = bench.run(&["run", "rigid-pair", "--clock", "lockstep", "--duration=0.1", "--set=accept={}"]);
-    assert_eq!(run.code, Some(0), "{run:?}");
+    bench.run(&["run", "rigid-pair", "--clock", "lockstep", "--duration=0.1", "--set=accept={}"]).succeeded();
     assert!(matches!(bench.run(&["doctor", "--seconds=0", "--clean"]).code, Some(0 | 3)));
     for name in ["run.lock", "summary.json", "run.mcap", "scenario.toml"] {
         let out = bench.path(name);

@@ -2,12 +2,10 @@
 //! limit, and is never empty nor older than the run.
 
 use crate::common::{Bench, Done, Running, send_signal, shipped};
+use libc::{SIGINT, SIGKILL};
 use roxmltree::{Document, Node};
 
-const SIGINT: i32 = 2;
-const SIGKILL: i32 = 9;
-
-fn run(bench: &Bench, arguments: &[&str]) -> Done {
+fn run_for_verdict(bench: &Bench, arguments: &[&str]) -> Done {
     bench.run(&[&["run", shipped("rigid-pair").to_str().unwrap(), "--junit", "verdict.xml"], arguments].concat())
 }
 
@@ -45,8 +43,7 @@ fn troubles(suite: Node<'_, '_>) -> Vec<(String, String, String)> {
 fn an_accepted_run_has_a_case_per_criterion_and_none_that_fails() {
     for clock in ["in-process", "lockstep"] {
         let bench = Bench::new();
-        let done = run(&bench, &["--clock", clock, "--set", "accept.missed_ticks_max=0"]);
-        assert_eq!(done.code, Some(0), "{done:?}");
+        run_for_verdict(&bench, &["--clock", clock, "--set", "accept.missed_ticks_max=0"]).succeeded();
         let text = verdict(&bench);
         let document = Document::parse(&text).unwrap();
         let suite = suite(&document);
@@ -66,7 +63,7 @@ fn an_accepted_run_has_a_case_per_criterion_and_none_that_fails() {
 fn a_criterion_that_does_not_hold_is_a_failure_with_value_and_limit() {
     let bench = Bench::new();
     let short = ["--clock", "in-process", "--duration", "1", "--set", "accept.settled_by_s=0.5"];
-    let done = run(&bench, &[&short[..], &["--set", "accept.step_latency_p99_us_max=50"]].concat());
+    let done = run_for_verdict(&bench, &[&short[..], &["--set", "accept.step_latency_p99_us_max=50"]].concat());
     assert_eq!(done.code, Some(3), "{done:?}");
     let text = verdict(&bench);
     let document = Document::parse(&text).unwrap();
@@ -88,14 +85,14 @@ fn a_criterion_that_does_not_hold_is_a_failure_with_value_and_limit() {
 #[test]
 fn a_run_without_an_end_is_an_error() {
     let bench = Bench::new();
-    assert_eq!(run(&bench, &["--clock", "in-process"]).code, Some(0));
+    assert_eq!(run_for_verdict(&bench, &["--clock", "in-process"]).code, Some(0));
     for (arguments, code, reason) in [
         (&["--set", "tick_herz=1"][..], 2, "did you mean"),
         (&["--external", "nosuch"], 2, "no such role"),
         (&["--clock", "in-process", "--out", "/dev/null/x"], 1, "name another directory with --out"),
         (&["--clock", "realtime", "--set", "realtime.cores=[1023]"], 2, "core 1023"),
     ] {
-        let done = run(&bench, arguments);
+        let done = run_for_verdict(&bench, arguments);
         assert_eq!(done.code, Some(code), "{done:?}");
         let text = verdict(&bench);
         let document = Document::parse(&text).unwrap();
@@ -105,18 +102,6 @@ fn a_run_without_an_end_is_an_error() {
         assert!(troubles[0].2.contains(reason) && done.stderr.contains(reason), "{troubles:?} {done:?}");
     }
     bench.assert_clean(&[]);
-}
-
-/// Starts a run that lasts until it is stopped, and waits until its ticks run.
-fn start_endless(bench: &Bench) -> Running {
-    let file = shipped("rigid-pair");
-    let endless = ["--clock", "lockstep", "--duration", "100000", "--set", "accept={}", "--junit", "verdict.xml"];
-    let stop = ["--set", "supervision.on_failure=stop"];
-    let running = bench.start(&[&["run", file.to_str().unwrap()][..], &endless, &stop].concat());
-    for role in ["observer", "controller"] {
-        bench.await_ticks(role);
-    }
-    running
 }
 
 #[test]
@@ -129,7 +114,8 @@ fn a_run_that_was_cut_short_is_an_error() {
     ];
     for (cut, code, reason) in cuts {
         let bench = Bench::new();
-        let running = start_endless(&bench);
+        let stop = ["--clock", "lockstep", "--junit", "verdict.xml", "--set", "supervision.on_failure=stop"];
+        let running = bench.start_endless(&stop);
         let domains = bench.domains();
         cut(&bench, &running);
         let done = running.wait();
@@ -151,7 +137,7 @@ fn a_file_that_cannot_be_written_is_told_before_anything_runs() {
     assert_eq!(done.code, Some(1), "{done:?}");
     assert!(done.stderr.contains("taken/verdict.xml") && done.stderr.contains("with --junit"), "{done:?}");
     assert!(!bench.path("runs").exists(), "nothing was run");
-    let made = bench.run(&["run", file.to_str().unwrap(), "--clock", "in-process", "--junit", "new/verdict.xml"]);
-    assert_eq!(made.code, Some(0), "{made:?}");
+
+    bench.run(&["run", file.to_str().unwrap(), "--clock", "in-process", "--junit", "new/verdict.xml"]).succeeded();
     assert!(bench.path("new/verdict.xml").is_file());
 }

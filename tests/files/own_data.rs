@@ -1,6 +1,6 @@
 //! Logs that others wrote: `identify` and `estimate` as a user runs them, on throws of a body that was never measured.
 
-use crate::common::{Bench, Done};
+use crate::common::Bench;
 use corotate::model::{Inertia, Noise, RigidBody};
 use nalgebra::{Rotation3, Vector3};
 use serde_json::Value;
@@ -29,16 +29,6 @@ fn throws(count: u64, turn: &Rotation3<f64>) -> String {
     text
 }
 
-fn run(bench: &Bench, arguments: &[&str]) -> Done {
-    let done = bench.run(arguments);
-    assert_eq!(done.code, Some(0), "{arguments:?}: {done:?}");
-    done
-}
-
-fn json(done: &Done) -> Value {
-    serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"))
-}
-
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
 }
@@ -47,8 +37,8 @@ fn numbers(value: &Value) -> Vec<f64> {
 fn a_body_is_identified_and_each_of_its_rates_found_from_the_other_two() {
     let bench = Bench::new();
     std::fs::write(bench.path("throws.csv"), throws(30, &Rotation3::identity())).unwrap();
-    let identified = run(&bench, &["identify", "throws.csv", "--by", "throw", "--json"]);
-    let found = json(&identified);
+    let identified = bench.run(&["identify", "throws.csv", "--by", "throw", "--json"]).succeeded();
+    let found = identified.json();
     assert_eq!(found["schema"], "corotate/identify/v1");
     assert_eq!((&found["motion"]["segments"], &found["logs"][0]["counts"]["rows"]), (&30.into(), &2700.into()));
     for way in ["one_body", "tensor"] {
@@ -79,7 +69,7 @@ fn a_body_is_identified_and_each_of_its_rates_found_from_the_other_two() {
             "table.csv",
             "--json",
         ];
-        let estimated = json(&run(&bench, &arguments));
+        let estimated = bench.run(&arguments).succeeded().json();
         assert_eq!((&estimated["schema"], &estimated["hidden_axis"]), (&"corotate/estimate/v1".into(), &axis.into()));
         assert_eq!(estimated["score"]["segments"], 30, "{estimated}");
         let part = estimated["score"]["part"]["median"].as_f64().unwrap();
@@ -98,12 +88,12 @@ fn a_sensor_that_is_turned_against_the_body_is_no_hindrance() {
     let turn = Rotation3::from_euler_angles(0.3, -0.5, 0.2);
     std::fs::write(bench.path("throws.csv"), throws(30, &turn)).unwrap();
     let log = ["throws.csv", "--by", "throw"];
-    let identified = run(&bench, &[&["identify"], &log[..], &["--method", "tensor", "--json"]].concat());
-    let found = json(&identified);
+    let identified = bench.run(&[&["identify"], &log[..], &["--method", "tensor", "--json"]].concat()).succeeded();
+    let found = identified.json();
     assert!(found["findings"].to_string().contains("give these axes to an estimate"), "{found}");
     std::fs::write(bench.path("body.json"), &identified.stdout).unwrap();
     let hidden = ["--hidden", "z", "--body", "body.json"];
-    let estimated = json(&run(&bench, &[&["estimate"], &log[..], &hidden, &["--json"]].concat()));
+    let estimated = bench.run(&[&["estimate"], &log[..], &hidden, &["--json"]].concat()).succeeded().json();
     let part = estimated["score"]["part"]["median"].as_f64().unwrap();
     assert!(part < 0.02, "{part}");
     // Without its third sensor the principal rates are not known.
@@ -121,7 +111,7 @@ fn a_log_that_lacks_the_rate_is_estimated_without_a_score() {
     std::fs::write(bench.path("two.csv"), two).unwrap();
     let arguments =
         ["estimate", "two.csv", "--by", "throw", "--hidden", "z", "--inertia", "0.93,0.08,1", "--damping", "0.2"];
-    let told = run(&bench, &arguments);
+    let told = bench.run(&arguments).succeeded();
     assert!(told.stdout.contains("no score: the log does not have the rate about z"), "{}", told.stdout);
     assert!(told.stdout.contains("that rate is chosen"), "{}", told.stdout);
 }
@@ -169,7 +159,7 @@ fn what_cannot_be_done_is_refused_with_place_reason_and_remedy() {
     let empty = bench.run(&["identify", "good.csv"]);
     assert_eq!(empty.code, Some(1), "{empty:?}");
     assert!(empty.stderr.contains("tells of no body"), "{empty:?}");
-    assert_eq!(run(&bench, &[&["estimate", "good.csv", "--hidden", "z"], &body[..]].concat()).code, Some(0));
+    assert_eq!(bench.run(&[&["estimate", "good.csv", "--hidden", "z"], &body[..]].concat()).succeeded().code, Some(0));
 }
 
 fn hash(summary: &Value) -> &Value {
@@ -184,7 +174,7 @@ fn a_leader_repeats_a_log_under_every_clock_with_the_same_bits() {
     assert_eq!(one["verdict"], "accepted", "{one:#}");
     let lockstep = bench.summary("recorded-leader", &["--clock", "lockstep", "--record", "--out", "lockstep"]);
     assert_eq!((hash(&lockstep), &lockstep["score"]), (hash(&one), &one["score"]));
-    run(&bench, &["replay", "lockstep"]);
+    bench.run(&["replay", "lockstep"]).succeeded();
     let live = bench.summary("recorded-leader", &["--clock", "realtime", "--set", "accept={}", "--out", "live"]);
     let hashes = |directory: &str| std::fs::read_to_string(bench.path(directory).join("hashes.txt")).unwrap();
     let clean = live["state"]["clean_ticks"].as_u64().unwrap() as usize;
@@ -194,14 +184,14 @@ fn a_leader_repeats_a_log_under_every_clock_with_the_same_bits() {
     // What was resolved names the log for good.
     let again = bench.path("one/scenario.toml");
     let again = bench.run(&["run", again.to_str().unwrap(), "--json"]);
-    assert_eq!(hash(&json(&again)), hash(&one), "{again:?}");
+    assert_eq!(hash(&again.json()), hash(&one), "{again:?}");
 }
 
 #[test]
 fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
     let bench = Bench::new();
     std::fs::write(bench.path("throws.csv"), throws(3, &Rotation3::identity())).unwrap();
-    let template = run(&bench, &["init", "recorded-leader"]).stdout;
+    let template = bench.run(&["init", "recorded-leader"]).succeeded().stdout;
     let scenario =
         template.replace("tumbling-throw.csv", "throws.csv").replace("at_end = \"repeat\"", "at_end = \"refuse\"");
     std::fs::create_dir(bench.path("bench")).unwrap();
@@ -230,10 +220,9 @@ fn a_log_of_ones_own_leads_and_what_it_cannot_is_refused_with_its_place() {
         assert_eq!(refused.code, Some(2), "{more:?}: {refused:?}");
         assert!(refused.stderr.contains(&words), "{more:?}: {words}: {}", refused.stderr);
     }
-    let once = with(&[&segment[..], &["--duration=0.8", "--out=once"]].concat());
-    assert_eq!(once.code, Some(0), "{once:?}");
+    with(&[&segment[..], &["--duration=0.8", "--out=once"]].concat()).succeeded();
     let repeated = with(&[&segment[..], &["--set=leader.playback.at_end=repeat", "--duration=3"]].concat());
-    assert_eq!((repeated.code, &json(&repeated)["books"]["missed_ticks"]), (Some(0), &0.into()), "{repeated:?}");
+    assert_eq!((repeated.code, &repeated.json()["books"]["missed_ticks"]), (Some(0), &0.into()), "{repeated:?}");
     // Whoever changes the log is told by what was resolved before.
     let log = std::fs::read_to_string(bench.path("bench/throws.csv")).unwrap();
     std::fs::write(bench.path("bench/throws.csv"), log.replace("t1,10,", "t1,11,")).unwrap();
@@ -248,8 +237,8 @@ fn a_recording_of_ours_is_read_as_a_log() {
     bench.summary("rigid-pair", &["--clock", "in-process", "--record", "--out", "run"]);
     let about = ["estimate", "run/run.mcap", "--hidden", "z", "--inertia", "1,2,2.5", "--json", "--topic"];
     let [truth, measured] = ["leader/truth", "leader/measurement"].map(|topic| {
-        let done = run(&bench, &[&about[..], &[topic]].concat());
-        json(&done)
+        let done = bench.run(&[&about[..], &[topic]].concat()).succeeded();
+        done.json()
     });
     assert_eq!((&truth["log"]["counts"]["used"], &truth["segments"][0]["samples"]), (&10_001.into(), &10_001.into()));
     let error = truth["score"]["error_rad_s"]["median"].as_f64().unwrap();
@@ -266,7 +255,7 @@ fn a_table_as_parquet_says_what_the_one_as_csv_says() {
     std::fs::write(bench.path("throws.csv"), throws(3, &Rotation3::identity())).unwrap();
     let arguments = ["estimate", "throws.csv", "--by", "throw", "--hidden", "z", "--inertia", "0.93,0.08,1", "--table"];
     for table in ["z.csv", "z.parquet"] {
-        run(&bench, &[&arguments[..], &[table]].concat());
+        bench.run(&[&arguments[..], &[table]].concat()).succeeded();
     }
     use parquet::file::reader::{FileReader, SerializedFileReader};
     let reader = SerializedFileReader::new(std::fs::File::open(bench.path("z.parquet")).unwrap()).unwrap();

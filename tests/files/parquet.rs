@@ -1,6 +1,6 @@
 //! Recordings as Parquet, read by a library that shares no code with ours, beside the recordings themselves and the CSV.
 
-use crate::common::{Bench, Done, python, rewrite, shipped};
+use crate::common::{Bench, Done, python, rewrite, root, shipped};
 use corotate::record::{Recording, Track};
 use corotate::sample::FieldKind;
 use serde_json::Value;
@@ -23,15 +23,12 @@ const HARD: [u64; 9] = [
 fn record(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
     let file = shipped(scenario);
     let fixed = ["run", file.to_str().unwrap(), "--record", "--out", scenario, "--overwrite", "--set", "accept={}"];
-    let done = bench.run(&[&fixed, options].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&[&fixed, options].concat()).succeeded();
     bench.path(scenario).join("run.mcap")
 }
 
 fn export(bench: &Bench, file: &Path, options: &[&str]) -> Done {
-    let done = bench.run(&[&["export", file.to_str().unwrap()], options].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
-    done
+    bench.run(&[&["export", file.to_str().unwrap()], options].concat()).succeeded()
 }
 
 /// A table as somebody else reads it: names and types of the columns, and their bits.
@@ -65,9 +62,8 @@ fn read(path: &Path) -> (Table, Value) {
 
 /// Has all Parquet files of a directory read, and asserts that they are the recording; gives what else is known of each.
 fn assert_as_recorded(bench: &Bench, tables: &str, file: &Path) -> Vec<Value> {
-    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/parquet.py");
-    let done = bench.start_program(&python(), &[program.to_str().unwrap(), tables]).wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let program = root().join("tests/readers/parquet.py");
+    bench.start_program(&python("readers"), &[program.to_str().unwrap(), tables]).wait().succeeded();
     let recording = Recording::open(file).unwrap();
     let tracks = recording.tracks(|_| true).unwrap();
     assert!(tracks.len() >= 5, "{}", tracks.len());

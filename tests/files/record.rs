@@ -1,6 +1,6 @@
 //! Recordings: what is in them beside what was published, read by programs that share no code with ours; replayed; cut off.
 
-use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, send_signal, shipped, skipped};
+use crate::common::{Bench, Done, await_some, python, rewrite, rewrite_metadata, root, send_signal, shipped, skipped};
 use corotate::bus::Reader;
 use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
@@ -13,23 +13,15 @@ use corotate::scenario::Scenario;
 use corotate::scenario::build;
 use corotate::telemetry::Ledger;
 use corotate::watch::Session;
-use serde_json::Value;
+use libc::{SIGCONT, SIGKILL, SIGSTOP};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-const SIGKILL: i32 = 9;
-const SIGCONT: i32 = 18;
-const SIGSTOP: i32 = 19;
 
 /// Runs a shipped scenario with a recording; gives the run's end and the recording.
 fn record(bench: &Bench, scenario: &str, out: &str, arguments: &[&str]) -> (Done, PathBuf) {
     let file = shipped(scenario);
     let common = ["run", file.to_str().unwrap(), "--record", "--overwrite", "--out", out, "--set", "accept={}"];
     (bench.run(&[&common, arguments].concat()), bench.path(out).join("run.mcap"))
-}
-
-fn summary(bench: &Bench, out: &str) -> Value {
-    serde_json::from_slice(&std::fs::read(bench.path(out).join("summary.json")).unwrap()).unwrap()
 }
 
 fn replay(bench: &Bench, file: &Path, options: &[&str]) -> Done {
@@ -66,7 +58,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
 
 #[test]
 fn foreign_readers_decode_every_field_of_every_sample_as_it_was_published() {
-    let (bench, python) = (Bench::new(), python());
+    let (bench, python) = (Bench::new(), python("readers"));
     for (scenario, clock) in [("rigid-pair", "lockstep"), ("orbit-rendezvous", "in-process"), ("gyro-loss", "lockstep")]
     {
         let overrides = [format!("clock={clock}"), "duration_s=1".to_owned(), "accept={}".to_owned()];
@@ -75,10 +67,9 @@ fn foreign_readers_decode_every_field_of_every_sample_as_it_was_published() {
         assert_eq!(done.code, Some(0), "{done:?}");
         let decoded = bench.path(&format!("{scenario}.decoded"));
         std::fs::create_dir(&decoded).unwrap();
-        let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/decode.py");
+        let program = root().join("tests/readers/decode.py");
         let arguments = [program.to_str().unwrap(), file.to_str().unwrap(), decoded.to_str().unwrap()];
-        let done = bench.start_program(&python, &arguments).wait();
-        assert_eq!(done.code, Some(0), "{done:?}");
+        bench.start_program(&python, &arguments).wait().succeeded();
         assert!(published.len() >= 5, "{}", published.len());
         for (service, bytes) in &published {
             for reader in ["mcap", "rosbags"] {
@@ -96,7 +87,7 @@ fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
     for clock in ["in-process", "lockstep", "realtime"] {
         let (done, file) = record(&bench, "rigid-pair", clock, &["--clock", clock, "--duration", "1"]);
         assert_eq!(done.code, Some(0), "{done:?}");
-        let recording = &summary(&bench, clock)["recording"];
+        let recording = &bench.summary_in(clock)["recording"];
         assert_eq!(recording["complete"], true, "{recording}");
         for signal in recording["signals"].as_array().unwrap() {
             assert_eq!(signal["recorded"], signal["published"], "{signal}");
@@ -108,8 +99,7 @@ fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
         }
     }
     let [one, other] = ["in-process", "lockstep"].map(|clock| bench.path(clock).join("run.mcap"));
-    let done = bench.run(&["diff", one.to_str().unwrap(), other.to_str().unwrap()]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&["diff", one.to_str().unwrap(), other.to_str().unwrap()]).succeeded();
     let recording = Recording::open(&one).unwrap();
     assert_eq!((recording.signals().len(), recording.damage()), (6, None));
     assert_eq!((recording.info().seed, recording.info().whole), (1, true));
@@ -117,8 +107,7 @@ fn every_clock_is_recorded_completely_and_replayed_to_the_last_bit() {
     assert_eq!(track.ticks(), (0..=1000).collect::<Vec<_>>());
     assert_eq!(track.column("omega_rad_s", 0).unwrap()[0], 0.6);
     assert!(track.column("omega_rad_s", 3).is_none());
-    let done = bench.run(&["export", one.to_str().unwrap(), "--csv", "tables"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&["export", one.to_str().unwrap(), "--csv", "tables"]).succeeded();
     let table = std::fs::read_to_string(bench.path("tables/leader.estimate.csv")).unwrap();
     let row: Vec<&str> = table.lines().nth(501).unwrap().split(',').collect();
     let value: f64 = row[8].parse().unwrap();
@@ -257,7 +246,7 @@ fn without_room_the_recording_ends_readable_and_the_loop_goes_on() {
         let done = bench.start_program(Path::new("bash"), &["-c", &script]).wait();
         assert_eq!(done.code, Some(1), "{done:?}");
         assert!(done.stderr.contains("the recording is not complete") && done.stderr.contains("run.mcap"), "{done:?}");
-        let summary = summary(&bench, clock);
+        let summary = bench.summary_in(clock);
         assert_eq!(summary["score"]["scored_ticks"], 6001);
         assert_eq!(summary["recording"]["complete"], false);
         let signal = &summary["recording"]["signals"][0];
@@ -317,8 +306,7 @@ fn what_a_recording_that_ended_early_has_not_is_no_difference() {
             entries.insert("problem".to_owned(), "the disk is full".to_owned());
         }
     });
-    let done = replay(&bench, &ended, &["--accept-incomplete"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = replay(&bench, &ended, &["--accept-incomplete"]).succeeded();
     assert!(done.stdout.contains("from tick 1000 on nothing can be compared: the recording ended there"), "{done:?}");
 }
 
@@ -343,7 +331,7 @@ fn a_recorder_that_dies_or_hangs_holds_nobody_up_and_leaves_what_it_had() {
         let done = running.wait();
         assert_eq!(done.code, Some(1), "{out}: {done:?}");
         assert!(done.stderr.contains("recorder failed"), "{out}: {done:?}");
-        let summary = summary(&bench, &out);
+        let summary = bench.summary_in(&out);
         let scored = &summary["score"];
         assert_eq!(scored["scored_ticks"].as_u64().unwrap() + scored["unscored_ticks"].as_u64().unwrap(), ticks + 1);
         assert_eq!(summary["recording"]["complete"], false);
@@ -370,7 +358,7 @@ fn a_recorder_that_is_long_about_its_end_is_waited_for() {
     send_signal(recorder, SIGCONT);
     let done = running.wait();
     // What it could not take while it stood still is lost and told; what it had is in the file, with its end.
-    let recording = &summary(&bench, "out")["recording"];
+    let recording = &bench.summary_in("out")["recording"];
     assert!(recording["messages"].as_u64().unwrap() > 0, "{recording}: {done:?}");
     assert!(recording["bytes"].as_u64().unwrap() > 0, "{recording}: {done:?}");
     bench.assert_clean(&[domain]);

@@ -3,13 +3,13 @@
 //!
 //! Every run is the pure part of the crate with measurements exact to rounding.
 
+use crate::common::cases;
 use corotate::model::{Inertia, RigidBody};
 use corotate::observe::{
     Axisymmetric, Hurwitz, HurwitzError, Identification, InertiaRatios, InertiaRelation, InvariantFilter, RateSample,
 };
 use nalgebra::{Matrix3, Rotation3, Vector1, Vector3};
 use proptest::prelude::*;
-use proptest::test_runner::RngSeed;
 use std::iter::repeat_n;
 
 /// Below this mean of |ω1 ω2 ω3| a step does not excite, (rad/s)³.
@@ -438,16 +438,6 @@ fn a_body_that_does_not_spin_about_its_axis_of_symmetry_is_refused() {
         for (from, to, step) in motion.samples() {
             assert_eq!(relation.observe(&from, &to, step), Identification::Unexcited);
         }
-    }
-}
-
-/// The same cases in every run, and nothing written when one fails.
-fn cases(cases: u32) -> ProptestConfig {
-    ProptestConfig {
-        cases,
-        failure_persistence: None,
-        rng_seed: RngSeed::Fixed(0x0c0e_7a7e),
-        ..ProptestConfig::default()
     }
 }
 

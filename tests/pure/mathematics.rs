@@ -3,12 +3,12 @@
 //!
 //! Every run here is the pure part of the crate: no clock, no processes, the measurements exact to rounding.
 
+use crate::common::cases;
 use corotate::control::{Certificate, Condition};
 use corotate::model::{Inertia, InertiaError, RigidBody};
 use corotate::observe::{Conic, HiddenRate, InvariantFilter, Observation, RateSample};
 use nalgebra::{Vector1, Vector3};
 use proptest::prelude::*;
-use proptest::test_runner::RngSeed;
 use std::f64::consts::PI;
 
 /// Below this the measured components count as carrying no information, rad/s; no motion here comes near it.
@@ -376,16 +376,6 @@ impl Case {
             prop_assert!((error - decayed).abs() <= allowed, "{error:e} for {decayed:e} ± {allowed:e} at {time} s");
         }
         Ok(())
-    }
-}
-
-/// The same cases in every run, and nothing written when one fails.
-fn cases(cases: u32) -> ProptestConfig {
-    ProptestConfig {
-        cases,
-        failure_persistence: None,
-        rng_seed: RngSeed::Fixed(0x0c0e_7a7e),
-        ..ProptestConfig::default()
     }
 }
 

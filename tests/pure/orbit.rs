@@ -1,7 +1,7 @@
 //! Holds the third paper's system to its word: the motion against an independent reference, the observer's floor, decay and
 //! order, the loop with and without a measured velocity, the clocks against each other, faults, and what is refused.
 
-use crate::common::{Bench, WITHOUT_TICK_LIMITS, reference, shipped};
+use crate::common::{Bench, WITHOUT_TICK_LIMITS, cases, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::control::{OrbitGains, OrbitHold};
@@ -13,7 +13,6 @@ use corotate::scenario::Scenario;
 use corotate::scenario::build;
 use nalgebra::{Vector2, Vector4};
 use proptest::prelude::*;
-use proptest::test_runner::RngSeed;
 use serde_json::Value;
 
 /// The paper's −L, 1/s.
@@ -318,7 +317,7 @@ fn a_body_that_hits_or_leaves_fails_the_run() {
             let done = bench.run(&run);
             assert_eq!(done.code, Some(3), "{done:?}");
             assert!(done.stderr.contains("faulted_ticks_max"), "{done:?}");
-            let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+            let summary = done.json();
             let faulted = summary["score"]["faulted_ticks"].as_u64().unwrap();
             assert!(faulted > 500 && faulted < 1001, "{faulted}");
             assert_eq!(summary["score"]["metrics"][0]["last"], Value::Null, "infinite");
@@ -380,16 +379,6 @@ fn what_makes_no_sense_is_refused_with_key_and_remedy() {
     // A hyperbolic start is a start like any other.
     let set = "spacecraft.initial_velocity_du_s=[0.5, 1.6]";
     assert_eq!(bench.run(&["check", shipped("orbit-hold").to_str().unwrap(), "--set", set]).code, Some(0));
-}
-
-/// The same cases in every run, and nothing written when one fails.
-fn cases(cases: u32) -> ProptestConfig {
-    ProptestConfig {
-        cases,
-        failure_persistence: None,
-        rng_seed: RngSeed::Fixed(0x0c0e_7a7e),
-        ..ProptestConfig::default()
-    }
 }
 
 /// An orbit that keeps between 0.5 and 5 du, anywhere on it.

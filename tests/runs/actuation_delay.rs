@@ -32,7 +32,7 @@ fn run_program(bench: &Bench, scenario: &str, clock: &str, further: &[String]) -
     let sets: Vec<&str> = further.iter().flat_map(|set| ["--set", set]).collect();
     let done = bench.run(&[&arguments[..], &sets].concat());
     assert_eq!(done.code, Some(0), "{further:?}: {done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     assert_eq!(summary["books"]["balanced"], true, "{further:?}: {}", summary["books"]["problems"]);
     summary
 }

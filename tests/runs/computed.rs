@@ -117,8 +117,7 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
         });
         let laws = Laws::of(&scenario("rigid-pair", &[]));
         run_computed(&seat, Box::new(laws), &AtomicBool::new(false)).unwrap();
-        let done = running.wait();
-        assert_eq!(done.code, Some(0), "{done:?}");
+        let done = running.wait().succeeded();
         let (own, built_in) = (told(&done.stdout), told(&alone.stdout));
         if own["state"]["first_disturbed_tick"].is_null() {
             assert_eq!(own["state"]["hash"], built_in["state"]["hash"], "{clock}");
@@ -135,8 +134,7 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
 fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleSeat) {
     let waits = ["run", "rigid-pair", "--external", "controller", "--set", "accept={}", "--json"];
     let running = bench.start(&[&waits[..], options].concat());
-    let domain = await_some(|| bench.domains().pop());
-    await_some(|| domain.join("controller.seat.json").exists().then_some(()));
+    let domain = bench.await_seat("controller").parent().unwrap().to_owned();
     (running, RoleSeat { domain, role: "controller".to_owned() })
 }
 
@@ -158,7 +156,7 @@ fn a_function_that_fails_ends_the_run_in_order() {
         assert_eq!(error.to_string(), "it cannot divide by zero");
         let done = running.wait();
         assert_eq!(done.code, Some(4), "{done:?}");
-        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         let incident = &summary["incidents"][0];
         assert_eq!(incident["last_words"], "it cannot divide by zero", "{incident}");
         // In real time the ticks before may have been missed, and are counted with the next that is executed.
@@ -189,7 +187,7 @@ fn a_function_that_is_slow_is_waited_for_in_lockstep() {
         let served = run_computed(&seat, Box::new(Slow), &AtomicBool::new(false));
         let done = running.wait();
         assert_eq!(done.code, Some(exit), "{done:?}");
-        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         if exit == 0 {
             served.unwrap();
             assert_eq!(summary["incidents"], serde_json::json!([]));

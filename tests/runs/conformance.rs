@@ -173,7 +173,7 @@ fn every_shipped_scenario_is_told_what_may_be_claimed_of_it() {
     for (name, _) in SHIPPED {
         let done = bench.run(&["check", "--json", shipped(name).to_str().unwrap()]);
         assert_eq!(done.code, Some(0), "{name}: {done:?}");
-        let told: Value = serde_json::from_str(&done.stdout).unwrap();
+        let told = done.json();
         assert_eq!((told["schema"].as_str(), told["scenario"].as_str()), (Some("corotate/check/v1"), Some(name)));
         let followers = told["followers"].as_array().unwrap();
         assert_eq!(followers.is_empty(), name.starts_with("inertia"), "{name}: only these drive no body");

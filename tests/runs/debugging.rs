@@ -1,6 +1,7 @@
 //! Roles that stand still because a signal or a debugger has stopped them.
 
 use crate::common::{self, Bench, Done, await_some, send_signal};
+use libc::SIGINT;
 use serde_json::Value;
 use std::process::{Child, Stdio};
 use std::time::Duration;
@@ -22,13 +23,9 @@ const LOCKSTEP: [&str; 9] = [
 /// Longer than the limit on silence.
 const STOPPED: Duration = Duration::from_millis(1500);
 
-fn json(text: &str) -> Value {
-    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
-}
-
 /// Returns the summary of a run that ended with an exit code, without an incident.
 fn undisturbed(done: &Done, code: i32) -> Value {
-    let told = json(&done.stdout);
+    let told = done.json();
     assert_eq!((done.code, &told["incidents"]), (Some(code), &serde_json::json!([])), "{}", done.stderr);
     told
 }
@@ -46,7 +43,7 @@ fn a_stopped_role_is_waited_for_in_lockstep() {
         send_signal(pid, CONT);
         let done = run.wait();
         let told = undisturbed(&done, 0);
-        assert_eq!(told["state"]["hash"], json(&plain.stdout)["state"]["hash"]);
+        assert_eq!(told["state"]["hash"], plain.json()["state"]["hash"]);
         let lines = |words: &str| done.stderr.lines().filter(|line| line.contains(words)).count();
         assert_eq!((lines("stopped by a signal"), lines("goes on after")), (1, 1), "{}", done.stderr);
     }
@@ -62,9 +59,9 @@ fn in_real_time_a_stop_is_the_cause() {
     let pid = bench.await_ticks("controller");
     send_signal(pid, STOP);
     await_some(|| bench.role("controller").filter(|other| *other != pid));
-    run.signal(2);
+    run.signal(SIGINT);
     let done = run.wait();
-    let told = json(&done.stdout);
+    let told = done.json();
     let cause = told["incidents"][0]["cause"].as_str().unwrap_or_default();
     assert!(done.code == Some(130) && cause.contains("stopped by a signal"), "{done:?}");
     bench.assert_clean(&[]);
@@ -77,7 +74,7 @@ fn ctrl_c_ends_a_run_with_a_stopped_role_in_order() {
     let pid = bench.await_ticks("controller");
     send_signal(pid, STOP);
     std::thread::sleep(STOPPED);
-    run.signal(2);
+    run.signal(SIGINT);
     let done = run.wait();
     assert_eq!(undisturbed(&done, 130)["books"]["balanced"], true);
     bench.assert_clean(&[]);
@@ -133,7 +130,7 @@ fn a_role_that_a_debugger_holds_is_waited_for_and_ctrl_c_ends_the_run() {
     await_some(|| held(pid).then_some(()));
     std::thread::sleep(STOPPED);
     assert_eq!(bench.role("controller"), Some(pid), "it is not killed");
-    run.signal(2);
+    run.signal(SIGINT);
     let done = run.wait();
     undisturbed(&done, 130);
     assert!(done.stderr.contains("stopped by a debugger"), "{}", done.stderr);

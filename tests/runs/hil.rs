@@ -1,7 +1,7 @@
 //! Hardware in the loop: a follower that shares no code with ours (tests/hil/follower.py) in a seat of a run, against our
 //! leader, observer and controller. The verdict is read as a CI reads it, from the JUnit file.
 
-use crate::common::{Bench, Done, Running, await_some};
+use crate::common::{Bench, Done, Running, await_some, python, root};
 use corotate::bus::domain::{Domain, OwnedDomain};
 use corotate::bus::iox::IoxBus;
 use corotate::bus::memory::MemoryBus;
@@ -14,12 +14,12 @@ use corotate::sample::{
 };
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
-use corotate::seat::{describe_seat, seat_path};
+use corotate::seat::describe_seat;
+use libc::{SIGINT, SIGKILL};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -29,27 +29,14 @@ use std::time::Duration;
 /// second, times the gain of 6/s in a command. Ten times what that comes to.
 const TOLERANCE: f64 = 1e-14;
 
-const SIGINT: i32 = 2;
-const SIGKILL: i32 = 9;
-
 fn file(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hil").join(name)
-}
-
-/// The interpreter that has the foreign follower's requirements; made by the script that says what is missing if it fails.
-fn python() -> &'static Path {
-    static PYTHON: OnceLock<PathBuf> = OnceLock::new();
-    PYTHON.get_or_init(|| {
-        let made = Command::new(file("venv")).output().unwrap();
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
-    })
+    root().join("tests/hil").join(name)
 }
 
 /// Starts the foreign follower in a seat.
 fn start_follower(bench: &Bench, seat: &Path, options: &[&str]) -> Running {
     let program = file("follower.py");
-    bench.start_program(python(), &[&[program.to_str().unwrap(), seat.to_str().unwrap()], options].concat())
+    bench.start_program(&python("hil"), &[&[program.to_str().unwrap(), seat.to_str().unwrap()], options].concat())
 }
 
 /// Beside other tests nobody is to be taken for dead who is only served late; a test of that sets its own limit after it.
@@ -58,17 +45,12 @@ const PATIENT: [&str; 2] = ["--set", "supervision.heartbeat_timeout_s=30"];
 /// Makes the foreign follower leave what it published and received.
 const RECORD: [&str; 2] = ["--record", "record"];
 
-/// The seat that a run of this bench leaves while it waits.
-fn await_seat(bench: &Bench, role: &str) -> PathBuf {
-    await_some(|| bench.domains().iter().map(|domain| seat_path(domain, role)).find(|seat| seat.is_file()))
-}
-
 /// Starts a run that waits for the foreign follower, and returns the seat that it leaves.
 fn start_waiting(bench: &Bench, arguments: &[&str]) -> (Running, PathBuf) {
     let scenario = file("pair.toml");
     let common = ["run", scenario.to_str().unwrap(), "--json", "--junit", "verdict.xml", "--out", "out", "--overwrite"];
     let running = bench.start(&[&common[..], &PATIENT, arguments].concat());
-    let seat = await_seat(bench, "follower");
+    let seat = bench.await_seat("follower");
     (running, seat)
 }
 
@@ -104,7 +86,7 @@ fn assert_accepted(bench: &Bench) {
 }
 
 fn tell(clock: &str, run: &Done) -> Value {
-    let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+    let summary = run.json();
     let (metrics, missed) = (&summary["score"]["metrics"], &summary["books"]["missed_ticks"]);
     println!("{clock}: {metrics}, {missed} ticks missed or starved");
     summary
@@ -292,8 +274,7 @@ fn the_foreign_follower_treats_its_commands_as_ours_does() {
         std::fs::write(&seat, describe_seat(&scenario, role, Some(domain.domain())).to_json()).unwrap();
         let follower = start_follower(&bench, &seat, &RECORD);
         conduct(&scenario, &domain);
-        let follower = follower.wait();
-        assert_eq!(follower.code, Some(0), "{follower:?}");
+        follower.wait().succeeded();
         let (seen, expected) = (record::<RateTruth>(&bench, "truth"), built_in_under_commands(&scenario));
         let worst = deviation(&seen, &expected);
         println!("{rearm}: truth deviates by at most {worst:e}");
@@ -379,7 +360,7 @@ fn a_silent_follower_that_misses_its_last_ticks_is_done() {
     let done = running.wait();
     drop(partner);
     assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 0, "{summary:#}");
     assert_eq!(summary["books"]["unbooked"], serde_json::json!(["follower"]));
     bench.assert_clean(&domains);
@@ -410,7 +391,7 @@ fn a_follower_that_is_killed_ends_the_run() {
         assert!(died.contains("the run ends"), "{clock} {options:?}: {died}");
         let (name, trouble) = cases_of(&bench).remove(0);
         assert!(name == "run" && trouble.is_some_and(|trouble| trouble.contains(cause)), "{clock} {options:?}");
-        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         assert_eq!((&summary["books"]["balanced"], &summary["accepted"]), (&true.into(), &false.into()), "{summary:#}");
         bench.assert_clean(&domains);
     }
@@ -526,7 +507,7 @@ fn a_partner_that_keeps_the_run_waiting_is_named_with_what_came_instead() {
         }
         assert!(!done.stderr.contains("every tick undisturbed"), "{done:?}");
         assert!(done.stderr.contains(" of 10001 ticks)"), "{done:?}");
-        let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         let incident = &summary["incidents"][0];
         let told = (incident["role"].as_str(), incident["tick"].as_u64(), incident["cause"].as_str());
         assert_eq!(told, (Some("follower"), Some(tick), Some(&*cause)), "{incident}");
@@ -565,7 +546,7 @@ fn a_partner_that_never_connects_is_named_and_waited_for_as_long_as_allowed() {
     assert!(done.stderr.contains("waiting for follower (external) for 5 s: it has not connected"), "{done:?}");
     let cause = "follower failed at tick 0: it kept the run waiting for 8 s: it has not connected";
     assert!(done.stderr.contains(cause), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{summary:#}");
     assert!(cases_of(&bench)[0].1.as_ref().is_some_and(|trouble| trouble.contains(cause)));
     bench.assert_clean(&domains);
@@ -586,7 +567,7 @@ fn what_a_partner_without_books_sends_is_counted_where_it_is_read() {
     let done = running.wait();
     drop(partner);
     assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let summary = done.json();
     let links = summary["books"]["links"].as_array().unwrap();
     let link = links.iter().find(|link| link["service"] == "corotate/hil-pair/follower/measurement").unwrap();
     let expected = serde_json::json!({

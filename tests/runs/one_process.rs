@@ -1,19 +1,13 @@
 //! Roles that share a process (`launch.processes`), any of them: the same bits and the same books under every clock, one life
 //! for all of them, and no room for anybody else.
 
-use crate::common::{ANY_TICKS, Bench, Done, Running, await_some, send_signal, shipped};
-use serde_json::Value;
+use crate::common::{ANY_TICKS, Bench, Running, await_some, send_signal, shipped};
+use libc::{SIGKILL, SIGTERM};
 
 const BOTH: [&str; 2] = ["--set", "launch.processes=[['observer','controller']]"];
 const ALL: [&str; 2] = ["--set", "launch.processes=[['leader','follower','observer','controller']]"];
 const CROSSED: [&str; 2] = ["--set", "launch.processes=[['leader','controller'],['follower','observer']]"];
 const HALVES: [&str; 2] = ["--set", "launch.processes=[['leader','follower'],['observer','controller']]"];
-const SIGKILL: i32 = 9;
-const SIGTERM: i32 = 15;
-
-fn summary(done: &Done) -> Value {
-    serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("no summary: {done:?}"))
-}
 
 /// The hash after every tick.
 fn checkpoints(bench: &Bench, directory: &str) -> Vec<String> {
@@ -136,7 +130,7 @@ fn whoever_kills_the_process_kills_both_and_both_come_back() {
         let done = running.wait();
         assert_eq!(done.code, Some(if clock == "lockstep" { 128 + SIGTERM } else { 0 }), "{clock}: {done:?}");
         assert!(done.stderr.contains("controller, and observer with it, died at tick "), "{clock}: {done:?}");
-        let summary = summary(&done);
+        let summary = done.json();
         let incident = &summary["incidents"][0];
         assert_eq!((&incident["role"], &incident["with"][0]), (&"controller".into(), &"observer".into()), "{clock}");
         assert_eq!(incident["action"], "restarted", "{clock}");
@@ -164,7 +158,7 @@ fn the_stricter_of_both_policies_holds() {
     let policy = "--set=supervision.on_failure={observer=\"stop\"}";
     let done = killed(&bench, &["--clock=realtime", "--duration=1000", "--set=accept={}", policy]).wait();
     assert_eq!(done.code, Some(4), "{done:?}");
-    let summary = summary(&done);
+    let summary = done.json();
     assert_eq!(summary["incidents"][0]["action"], "stopped");
     assert_eq!(summary["books"]["balanced"], true, "{:#}", summary["books"]);
     assert!(
@@ -199,7 +193,7 @@ fn in_lockstep_all_may_die_anywhere_in_a_tick() {
         command.env("COROTATE_HOOK", format!("observer {place} KILL"));
         let done = Running::new(&mut command).wait();
         assert_eq!(done.code, Some(0), "{place}: {done:?}");
-        let summary = summary(&done);
+        let summary = done.json();
         assert_eq!(summary["incidents"].as_array().unwrap().len(), 1, "{place}: {done:?}");
         assert_eq!(summary["books"]["balanced"], true, "{place}: {:#}", summary["books"]);
         assert_eq!(summary["books"]["missed_ticks"], 0, "{place}");
@@ -257,6 +251,6 @@ fn a_follower_by_hand_still_joins_and_an_observer_does_not() {
     let follower = bench.run(&["plant", "--body", "follower", "--domain", domain]);
     let done = running.wait();
     assert_eq!((follower.code, done.code), (Some(0), Some(0)), "{follower:?} {done:?}");
-    assert_eq!(summary(&done)["books"]["balanced"], true);
+    assert_eq!(done.json()["books"]["balanced"], true);
     bench.assert_clean(&domains);
 }

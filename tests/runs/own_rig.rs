@@ -1,16 +1,13 @@
 //! A program of somebody else's, `examples/motor-pair`: with a rig that this crate does not know, everything works.
 
-use crate::common::{self, Bench, Running, await_some};
+use crate::common::{self, Bench, Running, await_some, python, root};
+use libc::SIGKILL;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
 const TICKS: u64 = 10_001;
-
-fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-}
 
 /// The program, built from outside as its author would, but into the same place, where its dependencies are built already.
 fn program() -> &'static Path {
@@ -28,14 +25,10 @@ fn program() -> &'static Path {
     })
 }
 
-fn summary(bench: &Bench, out: &str) -> Value {
-    serde_json::from_str(&std::fs::read_to_string(bench.path(out).join("summary.json")).unwrap()).unwrap()
-}
-
 /// Hash and number of the ticks before the first that was missed.
 fn clean(bench: &Bench, out: &str) -> (Vec<String>, usize) {
     let text = std::fs::read_to_string(bench.path(out).join("hashes.txt")).unwrap();
-    let clean = summary(bench, out)["state"]["clean_ticks"].as_u64().unwrap();
+    let clean = bench.summary_in(out)["state"]["clean_ticks"].as_u64().unwrap();
     let hashes = text.lines().filter(|line| !line.starts_with('#')).map(str::to_owned);
     (hashes.collect(), clean as usize)
 }
@@ -48,8 +41,8 @@ fn three_clocks_give_one_hash() {
         let relaxed = if clock == "realtime" { "accept={}" } else { "seed=1" };
         let done = bench.run(&["run", "--clock", clock, "--out", clock, "--set", relaxed]);
         assert_eq!(done.code, Some(0), "{clock}: {done:?}");
-        assert_eq!(summary(&bench, clock)["state"]["elapsed_ticks"], TICKS, "{clock}");
-        assert_eq!(summary(&bench, clock)["books"]["balanced"], true, "{clock}");
+        assert_eq!(bench.summary_in(clock)["state"]["elapsed_ticks"], TICKS, "{clock}");
+        assert_eq!(bench.summary_in(clock)["books"]["balanced"], true, "{clock}");
     }
     let (one, clean_one) = clean(&bench, "in-process");
     assert_eq!(clean_one as u64, TICKS);
@@ -62,8 +55,7 @@ fn three_clocks_give_one_hash() {
 #[test]
 fn what_a_scenario_gets_wrong_is_told_as_for_any_rig() {
     let bench = Bench::of(program());
-    let shipped = bench.run(&["init", "motor-pair"]);
-    assert_eq!(shipped.code, Some(0), "{shipped:?}");
+    let shipped = bench.run(&["init", "motor-pair"]).succeeded();
     let listed = bench.run(&["init", "--list"]).stdout;
     assert!(listed.starts_with("motor-pair  Two DC motors.") && listed.lines().count() == 1, "{listed}");
     let by_name = bench.run(&["check", "motor-pair"]);
@@ -100,14 +92,13 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
     let run = |out: &str, clock: &str, fault: &str| {
         let junit = format!("{out}.xml");
         let options = ["--clock", clock, "--record", "--out", out, "--junit", &junit, "--set", fault];
-        let done = bench.run(&[&["run"], &options[..]].concat());
-        assert_eq!(done.code, Some(0), "{done:?}");
+        bench.run(&[&["run"], &options[..]].concat()).succeeded();
         assert!(std::fs::read_to_string(bench.path(&junit)).unwrap().contains("load_error_n_m"));
         bench.path(out).join("run.mcap").display().to_string()
     };
     let (one, other) = (run("one", "in-process", fault), run("other", "lockstep", fault));
     let quiet = run("quiet", "in-process", "fault=[]");
-    let told = summary(&bench, "one");
+    let told = bench.summary_in("one");
     assert_eq!(told["books"]["rejected_samples"], 5, "{:#}", told["books"]);
     assert!(told["score"]["statuses"].to_string().contains("holding"), "{:#}", told["score"]["statuses"]);
     assert_eq!(bench.run(&["replay", &one]).code, Some(0));
@@ -115,13 +106,11 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
     assert_eq!(bench.run(&["diff", &one, &other]).code, Some(0));
     let differs = bench.run(&["diff", &one, &quiet]);
     assert!(differs.code == Some(3) && differs.stdout.contains("speed_rad_s"), "{differs:?}");
-    let exported = bench.run(&["export", &quiet, "--csv", "tables"]);
-    assert_eq!(exported.code, Some(0), "{exported:?}");
+    bench.run(&["export", &quiet, "--csv", "tables"]).succeeded();
     let tables = std::fs::read_dir(bench.path("tables")).unwrap().map(|entry| entry.unwrap().path());
     let tables: Vec<String> = tables.map(|path| std::fs::read_to_string(path).unwrap()).collect();
     assert!(tables.iter().any(|table| table.contains("rise_rad_s2")), "{}", tables.len());
-    let page = bench.run(&["report", bench.path("one").to_str().unwrap(), "--out", "page.html"]);
-    assert_eq!(page.code, Some(0), "{page:?}");
+    bench.run(&["report", bench.path("one").to_str().unwrap(), "--out", "page.html"]).succeeded();
     let html = std::fs::read_to_string(bench.path("page.html")).unwrap();
     for drawn in ["speed, rad/s", "load, N m", "current, A", "speed_error_rad_s"] {
         assert!(html.contains(drawn), "{drawn}");
@@ -139,8 +128,7 @@ fn a_run_is_recorded_replayed_compared_exported_and_drawn() {
 #[test]
 fn a_killed_role_is_started_anew_and_the_run_is_watched() {
     let bench = Bench::of(program());
-    let whole = bench.run(&["run", "--clock", "in-process", "--duration", "1000", "--out", "whole"]);
-    assert_eq!(whole.code, Some(0), "{whole:?}");
+    bench.run(&["run", "--clock", "in-process", "--duration", "1000", "--out", "whole"]).succeeded();
     let running = bench.start(&["run", "--clock", "lockstep", "--duration", "1000", "--out", "killed"]);
     // The tick that the screen shows, once there is one.
     let screen = await_some(|| {
@@ -149,11 +137,10 @@ fn a_killed_role_is_started_anew_and_the_run_is_watched() {
             screen.stdout.split("tick ").nth(1).and_then(|rest| rest.split('/').next()?.trim().parse::<u64>().ok());
         tick.is_some_and(|tick| tick > 0).then_some(screen)
     });
-    common::send_signal(bench.await_role("controller"), 9);
-    let done = running.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    common::send_signal(bench.await_role("controller"), SIGKILL);
+    running.wait().succeeded();
     assert!(screen.code == Some(0) && screen.stdout.contains("speed_error_rad_s"), "{screen:?}");
-    assert!(!summary(&bench, "killed")["incidents"].as_array().unwrap().is_empty());
+    assert!(!bench.summary_in("killed")["incidents"].as_array().unwrap().is_empty());
     assert_eq!(clean(&bench, "killed"), clean(&bench, "whole"));
 }
 
@@ -164,25 +151,22 @@ fn the_seat_of_a_motor_is_taken_by_a_program_in_python() {
     let described = bench.run(&["seat", "motor-pair.toml", "follower"]);
     assert_eq!(described.code, Some(2), "there is no such file here: {described:?}");
     let running = bench.start(&["run", "--clock", "lockstep", "--external", "follower", "--out", "out", "--json"]);
-    let seat = || bench.domains().first().map(|domain| domain.join("follower.seat.json")).filter(|seat| seat.is_file());
-    let (seat, motor) = (await_some(seat), root().join("tests/hil/motor.py"));
-    let venv = Command::new(root().join("tests/hil/venv")).output().unwrap();
-    assert!(venv.status.success(), "{}", String::from_utf8_lossy(&venv.stderr));
-    let interpreter = PathBuf::from(String::from_utf8(venv.stdout).unwrap().trim());
-    let follower = bench.start_program(&interpreter, &[motor.to_str().unwrap(), seat.to_str().unwrap()]);
+    let (seat, motor) = (bench.await_seat("follower"), root().join("tests/hil/motor.py"));
+    let follower = bench.start_program(&python("hil"), &[motor.to_str().unwrap(), seat.to_str().unwrap()]);
     let (done, follower) = (running.wait(), follower.wait());
     assert_eq!((done.code, follower.code), (Some(0), Some(0)), "{done:?} {follower:?}");
-    assert_eq!(summary(&bench, "out")["books"]["balanced"], true);
+    assert_eq!(bench.summary_in("out")["books"]["balanced"], true);
 }
 
 /// The rows that need a run are of the program's own scenario, and say what they do not judge.
 #[test]
 fn its_own_loop_is_measured() {
     let bench = Bench::of(program());
-    let done = bench.run(&["bench", "chain", "tick", "lockstep", "overhead", "--quick", "--json", "--out", "results"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = bench
+        .run(&["bench", "chain", "tick", "lockstep", "overhead", "--quick", "--json", "--out", "results"])
+        .succeeded();
     bench.assert_clean(&[]);
-    let results: Value = serde_json::from_str(&done.stdout).unwrap();
+    let results = done.json();
     assert_eq!(results["scenario"], "motor-pair");
     let figures = results["figures"].as_array().unwrap();
     for (row, name) in [
@@ -211,8 +195,7 @@ fn its_own_loop_is_measured() {
 #[test]
 fn a_new_crate_is_the_example_under_its_name() {
     let bench = Bench::new();
-    let done = bench.run(&["new", "two-motors"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&["new", "two-motors"]).succeeded();
     for (file, original) in
         [("src/main.rs", "src/main.rs"), ("two-motors.toml", "motor-pair.toml"), ("tests/clocks.rs", "tests/clocks.rs")]
     {
@@ -321,7 +304,7 @@ fn a_law_that_panics_is_told_by_its_message_and_place() {
             assert!(!done.stderr.contains("defect"), "{out}: {done:?}");
             let first = done.stderr.lines().find(|line| line.contains("panicked at")).unwrap();
             assert!(first.contains("src/main.rs:"), "{out}: {done:?}");
-            let told = summary(&bench, &out);
+            let told = bench.summary_in(&out);
             let incidents = told["incidents"].as_array().unwrap();
             assert_eq!(incidents.len(), starts, "{out}: {incidents:#?}");
             for (index, incident) in incidents.iter().enumerate() {

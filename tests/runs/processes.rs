@@ -2,23 +2,12 @@
 //! After each of them nothing may be left: no process, no file.
 
 use crate::common::{Bench, Running, await_some, send_signal, shipped, skipped};
-use serde_json::Value;
+use libc::{SIGINT, SIGKILL, SIGSTOP, SIGTERM};
 use std::io::Write;
 use std::path::PathBuf;
 
-const SIGINT: i32 = 2;
-const SIGKILL: i32 = 9;
-const SIGTERM: i32 = 15;
-const SIGSTOP: i32 = 19;
-
-/// Starts a run that lasts until it is stopped, and waits until its ticks run.
 fn start_endless(bench: &Bench, arguments: &[&str]) -> (Running, Vec<PathBuf>) {
-    let file = shipped("rigid-pair");
-    let common = ["run", file.to_str().unwrap(), "--duration", "100000", "--out", "out", "--set", "accept={}"];
-    let running = bench.start(&[&common[..], arguments].concat());
-    for role in ["leader", "follower", "observer", "controller"] {
-        bench.await_ticks(role);
-    }
+    let running = bench.start_endless(arguments);
     let domains = bench.domains();
     assert_eq!(domains.len(), 1);
     (running, domains)
@@ -33,7 +22,7 @@ fn a_signal_ends_a_run_in_order_with_its_results_written() {
         let done = running.wait();
         assert_eq!(done.code, Some(128 + signal), "{done:?}");
         assert!(done.stderr.contains("ended in order by signal"), "{done:?}");
-        let summary: Value = serde_json::from_slice(&std::fs::read(bench.path("out/summary.json")).unwrap()).unwrap();
+        let summary = bench.summary_in("out");
         assert_eq!(summary["signal"], signal);
         assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
         for role in ["leader", "follower", "observer", "controller"] {
@@ -67,7 +56,7 @@ fn a_killed_role_ends_the_run_by_name_and_cause() {
         assert_eq!(done.code, Some(4), "{done:?}");
         assert!(done.stderr.contains(&format!("{role} died at tick ")), "{done:?}");
         assert!(done.stderr.contains("it was killed by SIGKILL; the run ends"), "{done:?}");
-        let summary: Value = serde_json::from_slice(&std::fs::read(bench.path("out/summary.json")).unwrap()).unwrap();
+        let summary = bench.summary_in("out");
         assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
         assert_eq!(summary["incidents"][0]["role"], role);
         bench.assert_clean(&domains);
@@ -118,7 +107,7 @@ fn a_janitor_that_stands_still_keeps_nobody() {
             running.signal(SIGTERM);
             let done = running.wait();
             assert_eq!(done.code, Some(128 + SIGTERM), "{clock} {kills}: {done:?}");
-            let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+            let summary = done.json();
             assert_eq!(summary["incidents"].as_array().unwrap().len(), usize::from(kills), "{clock}: {done:?}");
             bench.assert_clean(&domains);
         }
@@ -137,7 +126,7 @@ fn two_runs_at_once_do_not_meet() {
         let summaries = [start("a"), start("b")].map(|run| {
             let done = run.wait();
             assert_eq!(done.code, Some(0), "{clock}: {done:?}");
-            serde_json::from_str::<Value>(&done.stdout).unwrap()
+            done.json()
         });
         assert_ne!(summaries[0]["domain"], summaries[1]["domain"]);
         assert!(summaries.iter().all(|summary| summary["books"]["balanced"] == true), "{clock}");
@@ -174,7 +163,7 @@ fn a_role_can_be_started_by_hand() {
     let (run, role) = (running.wait(), by_hand.wait());
     assert_eq!((run.code, role.code), (Some(0), Some(0)), "{run:?} {role:?}");
     assert!(run.stderr.contains("corotate observer --domain"), "{run:?}");
-    let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+    let summary = run.json();
     assert_eq!(summary["books"]["roles"]["observer"]["executed"], 10_001);
     assert_eq!(summary["state"]["hash"], bench.summary("rigid-pair", &["--clock", "in-process"])["state"]["hash"]);
     bench.assert_clean(&[domain]);
@@ -207,7 +196,7 @@ fn a_role_by_hand_that_is_replaced_is_told_each_time() {
         run.signal(SIGTERM);
         let (run, _) = (run.wait(), last.map(Running::wait));
         assert_eq!(run.code, Some(128 + SIGTERM), "{clock}: {run:?}");
-        let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+        let summary = run.json();
         let incidents = summary["incidents"].as_array().unwrap();
         let by: Vec<_> = incidents.iter().map(|one| one["replaced_by"]["pid"].as_u64().unwrap()).collect();
         assert_eq!(by, pids[1..], "{clock}: {incidents:?}");
@@ -261,8 +250,7 @@ fn who_joins_a_run_that_ends_ends_too() {
             let done = joiner.wait();
             assert!(done.signal.is_none(), "{done:?}");
         }
-        let done = run.wait();
-        assert_eq!(done.code, Some(0), "{done:?}");
+        run.wait().succeeded();
     }
     bench.assert_clean(&[]);
 }
@@ -272,9 +260,8 @@ fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it
     let bench = Bench::unprivileged();
     let words = ["run", "rigid-pair", "--duration", "0.2", "--set", "accept={}", "--clock", "realtime", "--json"];
     let run = |more: &[&str]| bench.run(&[&words[..], &UNGRANTABLE, more].concat());
-    let done = run(&[]);
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = run(&[]).succeeded();
+    let summary = done.json();
     let denied = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["granted"] == false);
     let fifo = denied.clone().filter(|grant| grant["privilege"] == "SCHED_FIFO").count();
     if fifo == 0 {
@@ -389,7 +376,7 @@ fn the_resolved_scenario_repeats_the_run() {
     let first = bench.summary("rigid-trio", &["--clock", "lockstep", "--out", "first"]);
     let again = bench.path("first/scenario.toml");
     let done = bench.run(&["run", again.to_str().unwrap(), "--clock", "in-process", "--json"]);
-    let again: Value = serde_json::from_str(&done.stdout).unwrap();
+    let again = done.json();
     assert_eq!(first["state"]["hash"], again["state"]["hash"]);
 }
 

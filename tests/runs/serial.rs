@@ -14,6 +14,7 @@ use corotate::serial::{
     Reason, Refuse, Seat, Welcome, encode, parse, write,
 };
 use corotate::with_shipped_rig;
+use libc::{SIGINT, SIGKILL};
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 use rustix::fd::OwnedFd;
@@ -254,11 +255,6 @@ fn bridge_of(bench: &Bench, roles: &str, path: &Path, domain: &Path, arguments: 
     bench.start(&[&common[..], arguments].concat())
 }
 
-fn summary(run: &Done) -> Value {
-    assert_eq!(run.code, Some(0), "{run:?}");
-    serde_json::from_str(&run.stdout).unwrap()
-}
-
 /// Runs a shipped scenario with the device at `path` in the follower's seat.
 fn run_with(bench: &Bench, scenario: &str, path: &Path, arguments: &[&str]) -> Value {
     let (run, domain) = start(bench, &shipped(scenario), arguments);
@@ -271,7 +267,8 @@ fn run_with(bench: &Bench, scenario: &str, path: &Path, arguments: &[&str]) -> V
 
 /// The summary of a run. A machine that withholds the processor from a device for long makes it absent; then both ends tell.
 fn served(run: &Done, bridge: &Done) -> Value {
-    let summary = summary(run);
+    let summary = run.json();
+    assert_eq!(run.code, Some(0), "{run:?}");
     let absent = incidents(&summary, "continued").iter().any(|incident| incident["replaced_by"].is_null());
     assert_eq!(bridge.code, Some(if absent { 4 } else { 0 }), "{bridge:?} {run:?}");
     assert!(!absent || summary["clock"] == "realtime", "{summary:#}");
@@ -519,12 +516,12 @@ fn a_killed_bridge_of_a_flight_computer_can_be_started_again() {
     let (run, domain) = start_without(&bench, &shipped("rigid-pair"), &["observer", "controller"], &arguments);
     let first = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
     cable.await_ticks();
-    first.signal(9);
-    assert_eq!(first.wait().signal, Some(9));
+    first.signal(SIGKILL);
+    assert_eq!(first.wait().signal, Some(SIGKILL));
     let second = bridge_of(&bench, "observer,controller", &cable.host.path, &domain, &[]);
     let (run, second) = (run.wait(), second.wait());
     assert_eq!(second.code, Some(0), "{second:?} {run:?}");
-    let with_device = summary(&run);
+    let with_device = run.succeeded().json();
     assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
     bench.assert_clean(&[domain]);
 }
@@ -627,7 +624,7 @@ fn a_device_that_is_unplugged_and_plugged_in_again_goes_on() {
     let (run, bridge) = (run.wait(), bridge.wait());
     // A command lasts 50 ms, and the cable was out for longer.
     assert_eq!(bridge.code, Some(4), "{bridge:?} {run:?}");
-    let summary = summary(&run);
+    let summary = run.succeeded().json();
     let absent = incidents(&summary, "continued");
     let cut = absent.iter().find(|incident| incident["cause"].as_str().unwrap().contains("was cut"));
     let cut = cut.unwrap_or_else(|| panic!("{absent:?}"));
@@ -654,7 +651,7 @@ fn a_device_that_does_not_come_back_ends_the_bridge_with_the_reason() {
     let bridge = bridge.wait();
     assert_eq!(bridge.code, Some(4), "{bridge:?}");
     assert!(bridge.stderr.contains("has not answered for") && bridge.stderr.contains("plugged in"), "{bridge:?}");
-    run.signal(2);
+    run.signal(SIGINT);
     run.wait();
 }
 
@@ -671,8 +668,8 @@ fn a_controller_whose_line_stays_cut_is_an_incident_with_tick_and_time() {
     drop(adapter);
     let (run, bridge) = (run.wait(), bridge.wait());
     assert_eq!(bridge.code, Some(4), "{bridge:?} {run:?}");
-    let told: Value = serde_json::from_str(&bridge.stdout).unwrap();
-    let summary = serde_json::from_str(&run.stdout).unwrap();
+    let told = bridge.json();
+    let summary = run.json();
     let absent = incidents(&summary, "continued");
     let last = absent.last().unwrap_or_else(|| panic!("{summary:#}"));
     assert_eq!((&last["role"], &last["outage_s"]), (&Value::from("controller"), &Value::Null), "{last}");
@@ -699,7 +696,7 @@ fn another_device_on_the_line_is_refused_or_told() {
         let _other = Powered::of_rig(&cable.device.path, scenario, "follower");
         let (run, bridge) = (run.wait(), bridge.wait());
         assert_eq!((bridge.code, run.code), (Some(code), Some(code)), "{bridge:?} {run:?}");
-        let summary: Value = serde_json::from_str(&run.stdout).unwrap();
+        let summary = run.json();
         let told = incidents(&summary, if code == 0 { "continued" } else { "stopped" });
         let words = |incident: &Value| format!("{} {}", incident["cause"], incident["last_words"]);
         assert!(told.len() == 1 && words(&told[0]).contains("any"), "{told:?}");
@@ -738,7 +735,7 @@ fn refused(device: impl FnOnce(&Path) -> Option<Powered>, arguments: &[&str], co
     for word in words {
         assert!(done.stderr.contains(word), "{word}: {done:?}");
     }
-    run.signal(2);
+    run.signal(SIGINT);
     run.wait();
     bench.assert_clean(&[domain]);
 }
@@ -835,7 +832,7 @@ fn what_is_no_seat_or_no_line_is_refused_with_a_remedy() {
     assert!(ask(&port.path, "follower", &bench.path("none")).contains("not the domain of a run"));
     let _held = Line::open(&port.path, None).unwrap();
     assert!(ask(&port.path, "follower", &domain).contains("in use by another program"));
-    run.signal(2);
+    run.signal(SIGINT);
     run.wait();
 }
 
@@ -850,7 +847,7 @@ fn a_run_whose_commands_act_later_than_at_the_next_tick_is_no_run_for_a_device_t
     for word in ["actuation_delay_ticks = 2", "give 1", "simulated plant"] {
         assert!(done.stderr.contains(word), "{word}: {done:?}");
     }
-    run.signal(2);
+    run.signal(SIGINT);
     run.wait();
     bench.assert_clean(&[domain]);
 }
@@ -865,12 +862,12 @@ fn a_bridge_that_was_killed_can_be_started_again() {
     let (run, domain) = start(&bench, &shipped("rigid-pair"), &arguments);
     let first = bridge(&bench, &cable.host.path, &domain, &[]);
     cable.await_ticks();
-    first.signal(9);
-    assert_eq!(first.wait().signal, Some(9));
+    first.signal(SIGKILL);
+    assert_eq!(first.wait().signal, Some(SIGKILL));
     let second = bridge(&bench, &cable.host.path, &domain, &[]);
     let (run, second) = (run.wait(), second.wait());
     assert_eq!(second.code, Some(0), "{second:?} {run:?}");
-    let with_device = summary(&run);
+    let with_device = run.succeeded().json();
     assert_eq!(with_device["state"]["hash"], bench.summary("rigid-pair", &arguments)["state"]["hash"]);
     assert_eq!(number(&with_device["books"]["roles"]["follower"]["executed"]), 6001);
     bench.assert_clean(&[domain]);
@@ -894,7 +891,7 @@ fn a_device_that_was_restarted_is_told_as_that() {
     for text in [&bridge.stderr, &run.stderr] {
         assert!(text.contains(told) && !text.contains("no fault"), "{text}");
     }
-    let summary = summary(&run);
+    let summary = run.succeeded().json();
     let lost = incidents(&summary, "continued");
     assert!(lost.len() == 1 && lost[0]["cause"].as_str().unwrap().contains("had lost the run"), "{lost:?}");
     let line = &summary["lines"]["follower"];
@@ -930,10 +927,9 @@ fn a_bridge_that_is_interrupted_leaves_its_device_safe() {
     let (run, domain) = start(&bench, &shipped("rigid-pair"), &["--clock", "lockstep", "--duration", "100000"]);
     let bridge = bridge(&bench, &cable.host.path, &domain, &[]);
     await_some(|| (!safe.load(Ordering::Relaxed)).then_some(()));
-    bridge.signal(2);
-    let done = bridge.wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bridge.signal(SIGINT);
+    bridge.wait().succeeded();
     await_some(|| safe.load(Ordering::Relaxed).then_some(()));
-    run.signal(2);
+    run.signal(SIGINT);
     run.wait();
 }

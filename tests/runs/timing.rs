@@ -41,11 +41,10 @@ fn cases() -> Vec<String> {
     ]
 }
 
-fn run(bench: &Bench, file: &str, clock: &str, further: &[&str]) -> Value {
+fn run_recorded(bench: &Bench, file: &str, clock: &str, further: &[&str]) -> Value {
     let arguments = ["run", file, "--json", "--clock", clock, "--out", clock, "--overwrite", "--set=duration_s=0.75"];
-    let done = bench.run(&[&arguments[..], &["--set=accept={}", "--set=record=true"], further].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = bench.run(&[&arguments[..], &["--set=accept={}", "--set=record=true"], further].concat()).succeeded();
+    let summary = done.json();
     assert_eq!(summary["books"]["balanced"], true, "{}", summary["books"]["problems"]);
     summary
 }
@@ -55,7 +54,7 @@ fn timing_is_the_same_in_one_thread_among_processes_and_in_every_replay() {
     for case in cases() {
         let bench = Bench::new();
         let file = scenario(&bench, "case", &case);
-        let [one, many] = ["in-process", "lockstep"].map(|clock| run(&bench, &file, clock, &[]));
+        let [one, many] = ["in-process", "lockstep"].map(|clock| run_recorded(&bench, &file, clock, &[]));
         assert_eq!(one["state"], many["state"], "{case}");
         assert_eq!(one["books"], many["books"], "{case}");
         let acted = one["books"]["injected_faults"].as_u64().unwrap();
@@ -82,7 +81,7 @@ fn a_role_that_misses_every_nth_tick_is_counted_so() {
         ("follower", ["follower", "controller follower"]),
     ] {
         let file = scenario(&bench, role, &fault("miss", role, "every = 10"));
-        let summary = run(&bench, &file, "in-process", &[]);
+        let summary = run_recorded(&bench, &file, "in-process", &[]);
         let of = |other: &str, counter: &str| summary["books"]["roles"][other][counter].as_u64().unwrap();
         for other in ["leader", "follower", "observer", "controller"] {
             let expected = |roles: &str| if roles.contains(other) { 50 } else { 0 };
@@ -102,7 +101,7 @@ fn a_plant_that_misses_ticks_protects_itself() {
     let file = scenario(&bench, "stalled", &fault);
     let safe = |timeout: u64| {
         let timeout = format!("--set=actuator.command_timeout_ticks={timeout}");
-        let summary = run(&bench, &file, "in-process", &[&timeout]);
+        let summary = run_recorded(&bench, &file, "in-process", &[&timeout]);
         (summary["score"]["statuses"]["follower/truth"].clone(), summary["state"]["hash"].clone())
     };
     // At the first tick that it executes again it has no command either: of the tick before there was no measurement.
@@ -118,13 +117,13 @@ fn a_kill_amid_bad_timing_costs_no_bit() {
     let case = all.last().unwrap();
     for role in ["leader", "follower", "observer", "controller"] {
         let bench = Bench::new();
-        let whole = run(&bench, &scenario(&bench, "whole", case), "lockstep", &[]);
+        let whole = run_recorded(&bench, &scenario(&bench, "whole", case), "lockstep", &[]);
         // At a tick that it executes, and at one that it misses.
         for tick in [301, 305, 342] {
             let kill = format!("[[fault]]\nkind = \"kill\"\nrole = \"{role}\"\nfrom_tick = {tick}\n");
             let file = scenario(&bench, "killed", &(case.clone() + &kill));
             for clock in ["lockstep", "in-process"] {
-                let killed = run(&bench, &file, clock, &[]);
+                let killed = run_recorded(&bench, &file, clock, &[]);
                 assert_eq!(killed["incidents"].as_array().unwrap().len(), 1, "{role} {tick} {clock}");
                 assert_eq!(killed["state"]["hash"], whole["state"]["hash"], "{role} {tick} {clock}");
                 let ticks = |summary: &Value| summary["books"]["roles"].clone();
@@ -143,7 +142,7 @@ fn in_real_time_bad_timing_has_the_same_bits() {
         let case = case.replace("from_tick = 100\nticks = 500", "from_tick = 5\nticks = 80");
         let file = scenario(&bench, "case", &case);
         let slow = ["--set=tick_hz=50", "--set=duration_s=1.2"];
-        let expected = run(&bench, &file, "lockstep", &slow);
+        let expected = run_recorded(&bench, &file, "lockstep", &slow);
         let missed = |summary: &Value, counter: &str| {
             let roles = summary["books"]["roles"].as_object().unwrap();
             roles.values().map(|role| role[counter].as_u64().unwrap()).sum::<u64>()
@@ -151,7 +150,7 @@ fn in_real_time_bad_timing_has_the_same_bits() {
         let undisturbed = |summary: &Value| {
             ["missed", "starved", "scripted"].iter().all(|of| missed(summary, of) == missed(&expected, of))
         };
-        let mut runs = (0..ATTEMPTS).map(|_| run(&bench, &file, "realtime", &slow));
+        let mut runs = (0..ATTEMPTS).map(|_| run_recorded(&bench, &file, "realtime", &slow));
         let clean = runs
             .find(undisturbed)
             .unwrap_or_else(|| panic!("{case}: in none of {ATTEMPTS} runs was nothing else missed"));

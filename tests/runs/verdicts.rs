@@ -4,15 +4,8 @@
 use crate::common::{ANY_TICKS, Bench, Done, await_some, send_signal};
 use corotate::config::SHIPPED;
 use corotate::scenario::Scenario;
+use libc::{SIGCONT, SIGKILL, SIGSTOP};
 use serde_json::Value;
-
-const SIGKILL: i32 = 9;
-const SIGCONT: i32 = 18;
-const SIGSTOP: i32 = 19;
-
-fn summary(done: &Done) -> Value {
-    serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"))
-}
 
 fn criterion<'a>(summary: &'a Value, name: &str) -> &'a Value {
     let mut criteria = summary["criteria"].as_array().unwrap().iter();
@@ -51,7 +44,7 @@ fn a_number_counts_every_tick_and_a_share_grants_what_faults_take() {
     ] {
         let done = with_misses(&format!("{settled}{limits}"));
         assert_eq!(done.code, Some(code), "{limits}: {done:?}");
-        let summary = summary(&done);
+        let summary = done.json();
         let found = criterion(&summary, name);
         assert_eq!((&found["value"], &found["limit"]), (&(value as f64).into(), &(limit as f64).into()), "{limits}");
         assert_eq!(found["default"], if limits.is_empty() { true.into() } else { Value::Null }, "{limits}");
@@ -64,7 +57,7 @@ fn a_number_counts_every_tick_and_a_share_grants_what_faults_take() {
 #[test]
 fn without_criteria_the_last_line_names_what_was_missed() {
     let done = with_misses("");
-    assert_eq!((done.code, &summary(&done)["criteria"]), (Some(0), &Value::Array(Vec::new())), "{done:?}");
+    assert_eq!((done.code, &done.json()["criteria"]), (Some(0), &Value::Array(Vec::new())), "{done:?}");
     let expected =
         "NOT JUDGED: the scenario has no criteria; missed: controller 100; starved: follower 100; safe: follower 81";
     assert_eq!(last_line(&done), expected);
@@ -84,7 +77,7 @@ fn a_run_whose_external_controller_is_killed_is_not_accepted() {
     send_signal(controller.pid(), SIGKILL);
     controller.wait();
     let done = running.wait();
-    let summary = summary(&done);
+    let summary = done.json();
     assert!([Some(3), Some(4)].contains(&done.code), "{done:?}");
     assert_eq!(summary["accepted"], false, "{summary:#}");
     assert!(last_line(&done).starts_with("FAIL: ") && last_line(&done).contains("starved: follower"), "{done:?}");
@@ -105,7 +98,7 @@ fn ticks_that_were_not_scored_leave_a_peak_unjudged() {
     bench.await_commits("leader", 150 + 800);
     running.signal(SIGCONT);
     let done = running.wait();
-    let summary = summary(&done);
+    let summary = done.json();
     assert_eq!((done.code, &summary["accepted"]), (Some(0), &Value::Null), "{done:?}");
     let peak = criterion(&summary, "sync_error_rad_s_peak");
     assert!(peak["holds"].is_null() && peak["value"].is_number(), "{peak}");
@@ -135,7 +128,7 @@ fn a_run_that_ends_before_it_is_judged_runs_and_says_so() {
         ];
         let done = bench.run(&short);
         assert_eq!(done.code, Some(0), "{name}: {done:?}");
-        let summary = summary(&done);
+        let summary = done.json();
         assert_eq!(summary["accepted"], Value::Null, "{name}");
         assert!(last_line(&done).starts_with("NOT JUDGED: ends before settled_by_s"), "{name}: {done:?}");
         for criterion in summary["criteria"].as_array().unwrap() {
@@ -149,7 +142,7 @@ fn a_run_that_ends_before_it_is_judged_runs_and_says_so() {
         let verdict = std::fs::read_to_string(bench.path("v.xml")).unwrap();
         assert!(verdict.contains("<skipped") && !verdict.contains("<failure"), "{verdict}");
         let checked = bench.run(&["check", name, "--set=duration_s=0.3", "--json"]);
-        let warnings = serde_json::from_str::<Value>(&checked.stdout).unwrap()["warnings"].to_string();
+        let warnings = checked.json()["warnings"].to_string();
         assert!(checked.code == Some(0) && warnings.contains("accept.settled_by_s"), "{name}: {checked:?}");
     }
 }

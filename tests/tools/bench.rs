@@ -3,12 +3,13 @@
 
 use crate::common::{Bench, Done, Running, await_some};
 use corotate::bench::ROWS;
+use libc::SIGINT;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Runs a command to its end, and finds out which domains it used.
-fn run(bench: &Bench, arguments: &[&str]) -> (Done, Vec<PathBuf>) {
+fn run_listing_domains(bench: &Bench, arguments: &[&str]) -> (Done, Vec<PathBuf>) {
     let running = bench.start(arguments);
     let pid = running.pid();
     let waiting = std::thread::spawn(move || running.wait());
@@ -21,13 +22,14 @@ fn run(bench: &Bench, arguments: &[&str]) -> (Done, Vec<PathBuf>) {
 }
 
 fn measure(bench: &Bench, rows: &[&str]) -> Value {
-    let (done, domains) = run(bench, &[&["bench", "--quick", "--json", "--out", "results"], rows].concat());
+    let (done, domains) =
+        run_listing_domains(bench, &[&["bench", "--quick", "--json", "--out", "results"], rows].concat());
     assert_eq!(done.code, Some(0), "{done:?}");
     bench.assert_clean(&domains);
     assert!(done.stderr.contains("a smoke run") && done.stderr.contains("granted: "), "{}", done.stderr);
     assert_eq!(done.stderr.contains("a debug build"), cfg!(debug_assertions), "{}", done.stderr);
     assert!(!done.stderr.contains("NOT MET"), "{}", done.stderr);
-    let printed: Value = serde_json::from_str(&done.stdout).unwrap();
+    let printed = done.json();
     let written = std::fs::read_to_string(bench.path("results/bench.json")).unwrap();
     assert_eq!(printed, serde_json::from_str::<Value>(&written).unwrap());
     assert!(done.stderr.contains(&std::fs::read_to_string(bench.path("results/bench.txt")).unwrap()));
@@ -136,7 +138,7 @@ fn ctrl_c_ends_it_and_leaves_nothing() {
     await_some(|| (bench.processes().len() > 2).then_some(()));
     let domains = bench.domains();
     assert_eq!(domains.len(), 1);
-    running.signal(2);
+    running.signal(SIGINT);
     let done = running.wait();
     assert_eq!(done.code, Some(130), "{done:?}");
     bench.assert_clean(&domains);

@@ -1,15 +1,13 @@
 //! `corotate sweep` as it is used: interrupted, killed, spread over shards, and held against an exact solution.
 
-use crate::common::{self, Bench, Done, await_some};
+use crate::common::{self, Bench, Done, await_some, root};
 use corotate::campaign::{Campaign, End, Entry, Row, Table};
 use corotate::config::ClockKind;
+use libc::{SIGINT, SIGKILL};
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicUsize;
-
-const SIGINT: i32 = 2;
-const SIGKILL: i32 = 9;
 
 /// Ten gains, two rates of the observer; short, so that a debug build is quick.
 const MAP: &str = r#"
@@ -43,9 +41,7 @@ fn bench(campaign: &str) -> Bench {
 }
 
 fn sweep(bench: &Bench, arguments: &[&str]) -> Done {
-    let done = bench.run(&[&["sweep", "map.toml"], arguments].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
-    done
+    bench.run(&[&["sweep", "map.toml"], arguments].concat()).succeeded()
 }
 
 /// The files of results that are the same for the same campaign.
@@ -133,8 +129,7 @@ fn shards_put_together_are_the_whole() {
     let missing = bench.run(&["sweep", "merge", "part-0", "part-2", "--out", "few"]);
     assert_eq!(missing.code, Some(2), "{missing:?}");
     assert!(missing.stderr.contains("7 of 22 cases and points of margins are missing, number 1 first"), "{missing:?}");
-    let merged = bench.run(&["sweep", "merge", "part-2", "part-0", "part-1", "--out", "merged"]);
-    assert_eq!(merged.code, Some(0), "{merged:?}");
+    bench.run(&["sweep", "merge", "part-2", "part-0", "part-1", "--out", "merged"]).succeeded();
     assert_same(&bench, "merged", "whole");
     let shard = bench.run(&["sweep", "map.toml", "--out", "part-0", "--shard", "1/3"]);
     assert!(shard.code == Some(2) && shard.stderr.contains("holds shard 0/3 of campaign `map`"), "{shard:?}");
@@ -181,9 +176,8 @@ fn ctrl_c_ends_in_order_and_says_how_to_go_on() {
     let rows = Table::read(directory).unwrap().rows.len();
     assert!((2..400).contains(&rows), "{rows}");
     // The newest is found, and none of another campaign.
-    let done = bench.run(&["sweep", "map.toml", "--resume", "--json"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+    let done = bench.run(&["sweep", "map.toml", "--resume", "--json"]).succeeded();
+    let summary = done.json();
     assert_eq!((&summary["counts"]["rows"], &summary["cases"]), (&400.into(), &400.into()));
     assert_eq!(
         summary["directory"].as_str().map(|path| bench.path(path)),
@@ -215,7 +209,7 @@ fn a_case_is_reproduced_under_other_clocks() {
             "--overwrite",
         ]);
         assert!(matches!(done.code, Some(0 | 3)), "{done:?}");
-        let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap();
+        let summary = done.json();
         let row = &table.rows[case];
         assert_eq!(summary["state"]["hash"].as_str(), Some(&*row.hash), "case {case}");
         assert_eq!(summary["accepted"].as_bool(), row.accepted);
@@ -313,10 +307,9 @@ fn shipped_campaigns_go_by_name() {
     let list = bench.run(&["init", "--list"]);
     for name in ["timing-map", "inertia-error", "noise-filter", "start"] {
         assert!(list.stdout.contains(&format!("{name} ")), "{list:?}");
-        let text = bench.run(&["init", name]);
-        assert_eq!(text.code, Some(0), "{text:?}");
+        bench.run(&["init", name]).succeeded();
         let checked = bench.run(&["check", name, "--json"]);
-        let told: serde_json::Value = serde_json::from_str(&checked.stdout).unwrap();
+        let told = checked.json();
         assert!(told["campaign"] == name && told["cases"].as_u64() > Some(60), "{told}");
     }
     let run = bench.run(&["run", "timing-map"]);
@@ -389,7 +382,7 @@ fn the_slurm_script_runs_shards_and_puts_them_together() {
     let programs = bench.path("programs");
     fs::create_dir(&programs).unwrap();
     std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_corotate"), programs.join("corotate")).unwrap();
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/slurm-array.sh");
+    let script = root().join("docs/slurm-array.sh");
     let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
     let task = |index: u32| {
         let mut command: Command = bench.command_of("bash".as_ref());
@@ -399,12 +392,10 @@ fn the_slurm_script_runs_shards_and_puts_them_together() {
     };
     let tasks: Vec<_> = (0..3).map(task).collect();
     for task in tasks {
-        let done = task.wait();
-        assert_eq!(done.code, Some(0), "{done:?}");
+        task.wait().succeeded();
     }
     let mut merge = bench.command_of("bash".as_ref());
     merge.arg(&script).args(["merge", "results"]).env("PATH", &path);
-    let done = common::Running::new(&mut merge).wait();
-    assert_eq!(done.code, Some(0), "{done:?}");
+    common::Running::new(&mut merge).wait().succeeded();
     assert_same(&bench, "results/whole", "whole");
 }

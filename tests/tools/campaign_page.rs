@@ -125,7 +125,7 @@ fn a_campaign_that_was_run_is_shown_as_its_table_has_it() {
     let command: Vec<&str> = worst[1][1].split(' ').collect();
     assert_eq!(command[..2], ["corotate", "run"]);
     let done = bench.run(&[&command[1..], &["--json"]].concat());
-    let summary: serde_json::Value = serde_json::from_str(&done.stdout).unwrap_or_else(|_| panic!("{done:?}"));
+    let summary = done.json();
     let row = table.rows.iter().find(|row| row.case.to_string() == worst[1][0]).unwrap();
     assert_eq!((summary["accepted"].as_bool(), row.accepted), (Some(false), Some(false)), "{row:?}");
     let metric = summary["score"]["metrics"].as_array().unwrap().iter().find(|m| m["name"] == "sync_error_rad_s");

@@ -1,7 +1,8 @@
 //! The command line: scenarios by name, the last line of a run, the newest run, help that fits a screen, what is for shells and
 //! programs.
 
-use crate::common::{self, Bench, Done, WITHOUT_TICK_LIMITS, await_some, shipped};
+use crate::common::{self, Bench, Done, WITHOUT_TICK_LIMITS, await_some, root, shipped};
+use libc::SIGINT;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use serde_json::Value;
 use std::fs::{self, File};
@@ -15,9 +16,10 @@ const RUN: [&str; 6] = ["run", "inertia", "--clock", "in-process", "--duration",
 /// Nothing to judge.
 const UNJUDGED: [&str; 2] = ["--set", "accept={}"];
 
-fn json(done: &Done) -> Value {
+/// The one line of JSON that a command prints.
+fn one_line(done: &Done) -> Value {
     assert_eq!(done.stdout.lines().count(), 1, "{done:?}");
-    serde_json::from_str(&done.stdout).unwrap()
+    done.json()
 }
 
 /// The commands that help tells of.
@@ -99,10 +101,10 @@ fn a_name_is_a_shipped_scenario_and_a_path_is_a_file() {
     }
     // Wherever a scenario is taken.
     let run = bench.run(&[&RUN[..], &["--json"], &UNJUDGED].concat());
-    assert_eq!((run.code, json(&run)["scenario"].as_str()), (Some(0), Some("inertia")));
+    assert_eq!((run.code, one_line(&run)["scenario"].as_str()), (Some(0), Some("inertia")));
     assert!(bench.run(&["seat", "inertia", "leader"]).stdout.contains("inertia"));
     let doctor = bench.run(&["doctor", "inertia", "--seconds", "0", "--json"]);
-    assert_eq!(json(&doctor)["scenario"], "inertia");
+    assert_eq!(one_line(&doctor)["scenario"], "inertia");
     for command in
         [&["run", "rigid-tro"][..], &["check", "rigid-tro"], &["seat", "rigid-tro", "leader"], &["init", "rigid-tro"]]
     {
@@ -140,7 +142,7 @@ fn a_scenario_comes_from_standard_input() {
 fn init_lists_what_ships() {
     let bench = Bench::new();
     let list = bench.run(&["init", "--list"]).stdout;
-    let told = json(&bench.run(&["init", "--list", "--json"]));
+    let told = one_line(&bench.run(&["init", "--list", "--json"]));
     assert_eq!(told["schema"], "corotate/scenarios/v1");
     let shipped = corotate::config::SHIPPED.into_iter().chain(corotate::campaign::SHIPPED);
     let entries = ["scenarios", "campaigns"].into_iter().flat_map(|kind| told[kind].as_array().unwrap());
@@ -191,7 +193,7 @@ fn the_last_line_is_the_verdict() {
         // One object on stdout, everything else on stderr.
         let object = bench.run(&[arguments, &["--json"]].concat());
         assert_eq!((object.code, object.stderr.lines().last()), (Some(code), Some(last)), "{object:?}");
-        let accepted = json(&object)["accepted"].as_bool();
+        let accepted = one_line(&object)["accepted"].as_bool();
         assert_eq!(
             accepted,
             [("PASS", Some(true)), ("FAIL", Some(false)), ("NOT ", None)]
@@ -221,12 +223,11 @@ fn a_run_that_is_stopped_is_not_judged() {
     let recorder = bench.start(&["record", "--out", "part.mcap", "--json"]);
     await_some(|| fs::metadata(bench.path("part.mcap")).ok());
     std::thread::sleep(std::time::Duration::from_millis(500));
-    recorder.signal(2);
-    let recorded = recorder.wait();
-    assert_eq!(recorded.code, Some(0), "{recorded:?}");
-    assert_eq!(json(&recorded)["schema"], "corotate/record/v1");
-    assert!(json(&recorded)["recording"]["messages"].as_u64().unwrap() > 0, "{recorded:?}");
-    run.signal(2);
+    recorder.signal(SIGINT);
+    let recorded = recorder.wait().succeeded();
+    assert_eq!(one_line(&recorded)["schema"], "corotate/record/v1");
+    assert!(one_line(&recorded)["recording"]["messages"].as_u64().unwrap() > 0, "{recorded:?}");
+    run.signal(SIGINT);
     let done = run.wait();
     // Ticks that were missed by then are named, too.
     let last = done.stdout.lines().last().unwrap_or_default();
@@ -302,7 +303,7 @@ fn the_newest_run_is_what_commands_take() {
     assert_eq!(bench.run(&["run", "--set", "tick_hz=0"]).code, Some(2));
     assert_eq!(fs::read_link(bench.path("runs/latest")).unwrap(), Path::new("named"));
 
-    let report = json(&bench.run(&["report", "--json"]));
+    let report = one_line(&bench.run(&["report", "--json"]));
     assert_eq!((&report["schema"], &report["page"]), (&"corotate/report/v1".into(), &"runs/named/report.html".into()));
     assert!(bench.path("runs/named/report.html").exists());
     let over = bench.run(&["watch", "runs/named"]);
@@ -312,13 +313,12 @@ fn the_newest_run_is_what_commands_take() {
     for arguments in
         [&["replay", "--json"][..], &["replay", directory, "--json"], &["replay", file.to_str().unwrap(), "--json"]]
     {
-        let replay = json(&bench.run(arguments));
+        let replay = one_line(&bench.run(arguments));
         assert_eq!((&replay["schema"], &replay["same"]), (&"corotate/replay/v1".into(), &true.into()), "{replay}");
         assert_eq!(replay["roles"].as_array().unwrap().len(), 2, "{replay}");
     }
-    let diff = bench.run(&["diff", directory, "--json"]);
-    assert_eq!(diff.code, Some(0), "{diff:?}");
-    let diff = json(&diff);
+    let diff = bench.run(&["diff", directory, "--json"]).succeeded();
+    let diff = one_line(&diff);
     assert_eq!(
         (&diff["schema"], &diff["same"], &diff["b"]),
         (&"corotate/diff/v1".into(), &true.into(), &"runs/named/run.mcap".into())
@@ -327,10 +327,10 @@ fn the_newest_run_is_what_commands_take() {
     assert_eq!(bench.run(&[&record[..], &["--set", "leader.initial_rate_rad_s=[1,2,3]"]].concat()).code, Some(0));
     let other = bench.run(&["diff", directory, "--json"]);
     assert_eq!(other.code, Some(3), "{other:?}");
-    let first_of = &json(&other)["signals"][0]["first"];
-    assert!(json(&other)["same"] == false && first_of["a"].is_number() && first_of["tick"] == 0, "{other:?}");
+    let first_of = &one_line(&other)["signals"][0]["first"];
+    assert!(one_line(&other)["same"] == false && first_of["a"].is_number() && first_of["tick"] == 0, "{other:?}");
     let export = bench.run(&["export", "--csv", "tables", "--json"]);
-    let tables = json(&export)["tables"].as_array().unwrap().clone();
+    let tables = one_line(&export)["tables"].as_array().unwrap().clone();
     assert!(
         !tables.is_empty() && tables.iter().all(|table| bench.path(table.as_str().unwrap()).exists()),
         "{export:?}"
@@ -348,8 +348,7 @@ fn what_is_no_link_of_ours_is_left_alone() {
     fs::create_dir_all(bench.path("runs/latest")).unwrap();
     fs::write(bench.path("runs/latest/notes"), "mine").unwrap();
     let run = [&RUN[..], &UNJUDGED].concat();
-    let done = bench.run(&run);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = bench.run(&run).succeeded();
     assert!(
         done.stderr.contains("runs/latest does not lead to this run: latest is there and is not a link"),
         "{done:?}"
@@ -383,8 +382,7 @@ fn a_page_is_opened_where_there_is_something_to_open_it_with() {
         fs::set_permissions(&opener, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
         common::Running::new(bench.command().args(["report", "--open"]).env("PATH", bench.path("bin"))).wait()
     };
-    let opened = open("echo \"$1\" > opened");
-    assert_eq!(opened.code, Some(0), "{opened:?}");
+    open("echo \"$1\" > opened").succeeded();
     let page = fs::read_to_string(bench.path("opened")).unwrap();
     assert!(page.starts_with('/') && page.trim_end().ends_with("report.html"), "{page}");
     assert_eq!(open("exit 3").code, Some(1));
@@ -401,8 +399,7 @@ fn a_run_in_real_time_tells_what_is_not_granted() {
         );
         bench.start_program(Path::new("bash"), &["-c", &script]).wait()
     };
-    let done = run("--clock realtime --set realtime.low_latency_idle=false");
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = run("--clock realtime --set realtime.low_latency_idle=false").succeeded();
     let line = "corotate: not granted: SCHED_FIFO 80, locked memory; this shell is granted it by \
                 `sudo prlimit --pid $$ --rtprio=99 --memlock=unlimited`\n";
     assert_eq!(done.stderr, line, "{done:?}");
@@ -420,8 +417,7 @@ fn a_run_in_real_time_tells_what_is_not_granted() {
 fn completions_are_for_every_shell_and_complete_what_there_is() {
     let bench = Bench::new();
     for shell in ["bash", "zsh", "fish", "elvish", "powershell"] {
-        let done = bench.run(&["completions", shell]);
-        assert_eq!(done.code, Some(0), "{done:?}");
+        let done = bench.run(&["completions", shell]).succeeded();
         assert!(!done.stdout.contains("janitor") && !done.stdout.contains("bench-peer"), "{shell}");
         assert!(["run", "clock", "completions"].iter().all(|word| done.stdout.contains(word)), "{shell}");
     }
@@ -436,8 +432,7 @@ fn completions_are_for_every_shell_and_complete_what_there_is() {
 #[test]
 fn every_command_has_a_manual_page() {
     let bench = Bench::new();
-    let done = bench.run(&["man", "pages/man1"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = bench.run(&["man", "pages/man1"]).succeeded();
     let known = commands(&bench);
     assert_eq!(done.stdout.lines().count(), 1 + known.len(), "{done:?}");
     for name in &known {
@@ -502,8 +497,8 @@ fn the_schema_holds_of_every_shipped_scenario_and_of_no_wrong_one() {
         assert_eq!(bench.run(&["check", &file]).code, Some(2), "{to} is refused by the program too");
         files.push((file, Some(told)));
     }
-    let reader = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/schema.py");
-    let mut command = bench.command_of(&common::python());
+    let reader = root().join("tests/readers/schema.py");
+    let mut command = bench.command_of(&common::python("readers"));
     command.arg(reader).arg("schema.json").args(files.iter().map(|(file, _)| file));
     let judged = common::Running::new(&mut command).wait();
     assert_eq!((judged.code, judged.stdout.lines().count()), (Some(0), files.len()), "{judged:?}");

@@ -1,10 +1,8 @@
 //! `corotate doctor` as a user runs it: on this machine, whatever that is.
 
 use crate::common::{self, Bench, await_some};
+use libc::{SIGKILL, SIGSTOP, SIGTERM};
 use serde_json::Value;
-
-const SIGKILL: i32 = 9;
-const SIGSTOP: i32 = 19;
 
 fn checks(report: &Value) -> Vec<(&str, &str)> {
     let text = |check: &'static str, of: &Value| of[check].as_str().unwrap().to_owned();
@@ -18,7 +16,7 @@ fn checks(report: &Value) -> Vec<(&str, &str)> {
 fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
     let bench = Bench::new();
     let done = bench.run(&["doctor", "--seconds", "1", "--json"]);
-    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let report = done.json();
     let checks = checks(&report);
     let bad = checks.iter().any(|(_, verdict)| *verdict == "bad");
     assert_eq!((report["fit"].as_bool(), done.code), (Some(!bad), Some(if bad { 3 } else { 0 })), "{done:?}");
@@ -57,7 +55,7 @@ fn every_line_has_a_verdict_and_the_exit_code_is_theirs() {
 fn fit_has_a_number_behind_it() {
     let bench = Bench::new();
     let done = bench.run(&["doctor", "--seconds", "0", "--json"]);
-    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let report = done.json();
     let bad = checks(&report).iter().any(|(_, verdict)| *verdict == "bad");
     assert_eq!(report["fit"].as_bool(), bad.then_some(false), "{report}");
     assert!(report["trial"].is_null() && done.code == Some(if bad { 3 } else { 0 }), "{done:?}");
@@ -67,7 +65,7 @@ fn fit_has_a_number_behind_it() {
     let text = shipped.lines().map(|line| if line.starts_with("tick_hz") { "tick_hz = 100000.0" } else { line });
     std::fs::write(&file, text.collect::<Vec<_>>().join("\n")).unwrap();
     let done = bench.run(&["doctor", file.to_str().unwrap(), "--seconds", "1", "--json"]);
-    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let report = done.json();
     let verdict = checks(&report).into_iter().find(|(name, _)| *name == "ticks").map(|(_, verdict)| verdict);
     assert_eq!((verdict, report["fit"].as_bool(), done.code), (Some("bad"), Some(false), Some(3)), "{report}");
     bench.assert_clean(&[]);
@@ -77,7 +75,7 @@ fn fit_has_a_number_behind_it() {
 fn an_ordinary_user_is_told_too() {
     let bench = Bench::unprivileged();
     let done = bench.run(&["doctor", "--seconds", "0", "--json"]);
-    let report: Value = serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let report = done.json();
     assert!(checks(&report).len() > 10 && matches!(done.code, Some(0 | 3)), "{done:?}");
 }
 
@@ -106,7 +104,7 @@ fn what_a_killed_run_left_is_told_and_removed_on_demand() {
     let alive = domain(&bench);
     let told = bench.run(&["doctor", "--seconds", "0", "--clean"]);
     assert!(told.stdout.contains("none (1 running)") && alive.exists(), "{told:?}");
-    running.signal(15);
+    running.signal(SIGTERM);
     running.wait();
     bench.assert_clean(&[dead, alive]);
 }

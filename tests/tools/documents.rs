@@ -3,7 +3,7 @@
 //! What is not run here is listed with its reason; a command that is in neither place fails the test. The synopses of
 //! `docs/commands.md` are held against the program's own help.
 
-use crate::common::{Bench, Done, Running};
+use crate::common::{Bench, Done, Running, root};
 use corotate::record::{Recording, SignalInfo};
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -114,7 +114,7 @@ struct Page {
 impl Page {
     fn new() -> Self {
         let bench = Bench::new();
-        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let root = root();
         for directory in ["config", "tests"] {
             symlink(root.join(directory), bench.path(directory)).unwrap();
         }
@@ -173,7 +173,7 @@ fn throws(root: &Path) -> String {
 
 /// Runs a page's commands, and gives what failed, by line.
 fn check(name: &str) -> Vec<String> {
-    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap();
+    let text = fs::read_to_string(root().join(name)).unwrap();
     // The synopses are no commands.
     let first = if name == SYNOPSES { text.lines().position(|line| line.starts_with('|')).unwrap() } else { 0 };
     let page = Page::new();
@@ -257,7 +257,7 @@ pages! {
 
 #[test]
 fn every_page_is_tried() {
-    let pages = fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")).unwrap();
+    let pages = fs::read_dir(root().join("docs")).unwrap();
     let names =
         pages.map(|entry| entry.unwrap().file_name().into_string().unwrap()).filter(|name| name.ends_with(".md"));
     for name in names.filter(|name| !["SUMMARY.md", "glossary.md"].contains(&name.as_str())) {
@@ -269,7 +269,7 @@ fn every_page_is_tried() {
 #[test]
 fn the_synopses_agree_with_the_help() {
     let bench = Bench::new();
-    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(SYNOPSES)).unwrap();
+    let text = fs::read_to_string(root().join(SYNOPSES)).unwrap();
     let mut command = String::new();
     let mut checked = 0;
     for line in text.lines().take_while(|line| !line.starts_with('|')).filter(|line| line.starts_with("    ")) {
@@ -295,8 +295,7 @@ fn the_synopses_agree_with_the_help() {
 #[test]
 fn the_layouts_name_what_is_recorded() {
     let bench = Bench::new();
-    let done = bench.run(&["run", "rigid-pair", "--clock", "in-process", "--record", "--out", "run"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&["run", "rigid-pair", "--clock", "in-process", "--record", "--out", "run"]).succeeded();
     let recording = Recording::open(&bench.path("run/run.mcap")).unwrap();
     let fields = |between: char| -> Vec<String> {
         let of = |signal: &SignalInfo| {
@@ -307,8 +306,7 @@ fn the_layouts_name_what_is_recorded() {
         recording.signals().iter().flat_map(of).collect()
     };
     for (file, between) in [("foxglove.json", '.'), ("plotjuggler.xml", '/')] {
-        let text =
-            fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("packaging/layouts").join(file)).unwrap();
+        let text = fs::read_to_string(root().join("packaging/layouts").join(file)).unwrap();
         let named: Vec<&str> = text.split('"').filter(|word| word.starts_with("/corotate/")).collect();
         let known = fields(between);
         assert!(

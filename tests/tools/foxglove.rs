@@ -1,13 +1,12 @@
 //! A run on a Foxglove WebSocket, seen by a client that shares no code with ours; clients and servers that go wrong.
 
-use crate::common::{Bench, Running, await_some, python, send_signal, shipped};
+use crate::common::{Bench, Running, await_some, python, root, send_signal, shipped};
+use libc::{SIGINT, SIGKILL};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::Path;
 
-const SIGINT: i32 = 2;
-const SIGKILL: i32 = 9;
 /// More bytes than this do not wait for one who reads.
 const ROOM: usize = 256 << 10;
 const ANY_PORT: &str = "127.0.0.1:0";
@@ -42,10 +41,10 @@ fn url(bench: &Bench, errors: &str) -> String {
 
 /// Starts a client and waits until it has subscribed.
 fn client(bench: &Bench, url: &str, directory: &str, options: &[&str]) -> Running {
-    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers/foxglove.py");
+    let program = root().join("tests/readers/foxglove.py");
     let directory = bench.path(directory);
     let fixed = [program.to_str().unwrap(), url, directory.to_str().unwrap()];
-    let client = bench.start_program(&python(), &[&fixed, options].concat());
+    let client = bench.start_program(&python("readers"), &[&fixed, options].concat());
     await_some(|| directory.join("channels.json").exists().then_some(()));
     client
 }
@@ -95,7 +94,7 @@ fn await_messages(bench: &Bench, directory: &str) {
 fn assert_ended_in_order(bench: &Bench, running: Running, out: &str) {
     let done = running.wait();
     assert_eq!(done.code, Some(128 + SIGINT), "{done:?}");
-    let summary: Value = serde_json::from_slice(&std::fs::read(bench.path(out).join("summary.json")).unwrap()).unwrap();
+    let summary = bench.summary_in(out);
     assert_eq!(summary["books"]["balanced"], true, "{summary:#}");
 }
 

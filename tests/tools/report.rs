@@ -1,6 +1,6 @@
 //! Reports of real runs: whole, well-formed, alone on the network, true to the summary; and what they say to bad input.
 
-use crate::common::{self, Bench, Done, shipped};
+use crate::common::{self, Bench, Done, shipped, summary_in};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Signal, Write};
 use corotate::record::Recorder;
@@ -11,7 +11,7 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// Runs a shipped scenario in one thread with a recording.
-fn run(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
+fn run_recorded(bench: &Bench, scenario: &str, options: &[&str]) -> PathBuf {
     let file = shipped(scenario);
     let common = ["run", file.to_str().unwrap(), "--clock", "in-process", "--record", "--overwrite", "--out", scenario];
     let done = bench.run(&[&common, options].concat());
@@ -51,10 +51,6 @@ fn text(node: Node<'_, '_>) -> String {
 fn rows(section: Node<'_, '_>) -> Vec<Vec<String>> {
     let rows = section.descendants().filter(|node| node.has_tag_name("tr"));
     rows.map(|row| row.children().filter(Node::is_element).map(text).collect()).collect()
-}
-
-fn summary(directory: &Path) -> Value {
-    serde_json::from_slice(&std::fs::read(directory.join("summary.json")).unwrap()).unwrap()
 }
 
 /// The page needs nothing beside it, and every picture is one.
@@ -124,11 +120,11 @@ fn relabel(from: &Path, to: &Path, old: &str, new: &str) {
 #[test]
 fn a_recorded_run_of_bodies_is_shown_whole() {
     let bench = Bench::new();
-    let directory = run(&bench, "rigid-pair", &[]);
+    let directory = run_recorded(&bench, "rigid-pair", &[]);
     let html = page(&bench, &directory);
     check_page(&html);
     assert!(!html.contains("cripted fault"), "the scenario scripts none");
-    let (page, summary) = (parse(&html), summary(&directory));
+    let (page, summary) = (parse(&html), summary_in(&directory));
     let expected = ["verdict", "motion", "errors", "lyapunov", "lateness", "events", "books", "certificate", "machine"];
     assert_eq!(sections(&page), expected);
     check_verdict(&page, &summary);
@@ -149,11 +145,11 @@ fn a_recorded_run_of_bodies_is_shown_whole() {
 #[test]
 fn an_orbit_is_shown_beside_its_motion_with_full_state() {
     let bench = Bench::new();
-    let directory = run(&bench, "orbit-hold", &[]);
+    let directory = run_recorded(&bench, "orbit-hold", &[]);
     let html = page(&bench, &directory);
     check_page(&html);
     let page = parse(&html);
-    check_verdict(&page, &summary(&directory));
+    check_verdict(&page, &summary_in(&directory));
     let motion = section(&page, "motion");
     let labels: Vec<String> =
         motion.descendants().filter_map(|node| node.attribute("aria-label")).map(str::to_owned).collect();
@@ -176,10 +172,10 @@ fn an_orbit_is_shown_beside_its_motion_with_full_state() {
 fn faults_and_incidents_are_marked_on_every_time_axis() {
     let bench = Bench::new();
     let kill = r#"fault.0={kind="kill",role="observer",from_tick=5000}"#;
-    let directory = run(&bench, "faults", &["--set", kill]);
+    let directory = run_recorded(&bench, "faults", &["--set", kill]);
     let html = page(&bench, &directory);
     check_page(&html);
-    let (page, summary) = (parse(&html), summary(&directory));
+    let (page, summary) = (parse(&html), summary_in(&directory));
     check_verdict(&page, &summary);
     let by_id = |id: &str| page.descendants().find(|node| node.attribute("id") == Some(id)).unwrap();
     let marks = by_id("marks-half");
@@ -215,10 +211,10 @@ fn faults_and_incidents_are_marked_on_every_time_axis() {
 #[test]
 fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
     let bench = Bench::new();
-    let directory = run(&bench, "gyro-loss", &[]);
+    let directory = run_recorded(&bench, "gyro-loss", &[]);
     let html = page(&bench, &directory);
     check_page(&html);
-    let (document, summary) = (parse(&html), summary(&directory));
+    let (document, summary) = (parse(&html), summary_in(&directory));
     let marks = document.descendants().find(|node| node.attribute("id") == Some("marks-half")).unwrap();
     let bands = marks.descendants().filter(|node| node.attribute("class") == Some("unseen"));
     let widths: Vec<f64> = bands.map(|band| band.attribute("width").unwrap().parse().unwrap()).collect();
@@ -230,7 +226,7 @@ fn what_the_observer_did_not_see_is_marked_on_every_time_axis() {
     assert!(events.iter().any(|row| row[..2] == ["axis_lost".to_owned(), lost.clone()]), "{lost}: {events:?}");
     // A run that saw everything has no such band, and no word of it.
     let other = Bench::new();
-    let whole = page(&other, &run(&other, "rigid-pair", &["--duration", "2", "--set", "accept={}"]));
+    let whole = page(&other, &run_recorded(&other, "rigid-pair", &["--duration", "2", "--set", "accept={}"]));
     assert!(!whole.contains("class=\"unseen\"") && !whole.contains("grey band"));
 }
 
@@ -239,7 +235,7 @@ fn every_shipped_scenario_has_a_report() {
     for (scenario, _) in corotate::config::SHIPPED {
         let bench = Bench::new();
         let plain = ["accept={}", "fault=[]", "watchdog={}"].map(|table| ["--set", table]).concat();
-        let directory = run(&bench, scenario, &[&["--duration", "0.3"], plain.as_slice()].concat());
+        let directory = run_recorded(&bench, scenario, &[&["--duration", "0.3"], plain.as_slice()].concat());
         let html = page(&bench, &directory);
         check_page(&html);
         let page = parse(&html);
@@ -253,11 +249,10 @@ fn latencies_are_drawn_from_the_histograms_of_the_run() {
     let bench = Bench::new();
     let file = shipped("rigid-pair");
     let options = ["--tick-hz", "200", "--duration", "1", "--set", "accept={}", "--record", "--out", "out"];
-    let done = bench.run(&[&["run", file.to_str().unwrap()][..], &options].concat());
-    assert_eq!(done.code, Some(0), "{done:?}");
+    bench.run(&[&["run", file.to_str().unwrap()][..], &options].concat()).succeeded();
     let html = page(&bench, &bench.path("out"));
     check_page(&html);
-    let (page, summary) = (parse(&html), summary(&bench.path("out")));
+    let (page, summary) = (parse(&html), summary_in(&bench.path("out")));
     let latency = section(&page, "latency");
     let shown = latency.descendants().filter(|node| node.has_tag_name("figure")).count();
     assert!(shown >= 4, "lateness, hop, step, age: {shown}");
@@ -288,7 +283,7 @@ fn files(directory: &Path) -> Vec<PathBuf> {
 }
 
 fn run_id(directory: &Path) -> String {
-    summary(directory)["run"].as_str().unwrap().to_owned()
+    summary_in(directory)["run"].as_str().unwrap().to_owned()
 }
 
 /// A run of half a second in real time, which has every kind of file.
@@ -304,8 +299,7 @@ fn a_directory_holds_one_run_whose_files_name_it() {
     let bench = Bench::new();
     let out = bench.path("out");
     let verdict = out.join("verdict.xml");
-    let done = realtime(&bench, "out", &["--record", "--junit", verdict.to_str().unwrap()]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    realtime(&bench, "out", &["--record", "--junit", verdict.to_str().unwrap()]).succeeded();
     assert_eq!(report(&bench, &out, &[]).code, Some(0));
     let first = run_id(&out);
     let names = |run: &str| {
@@ -329,8 +323,7 @@ fn a_directory_holds_one_run_whose_files_name_it() {
     let refused = bench.run(&again);
     assert!(refused.code == Some(2) && refused.stderr.contains("run.mcap"), "{refused:?}");
     assert_eq!(run_id(&out), first);
-    let again = bench.run(&[&again[..], &["--overwrite"]].concat());
-    assert_eq!(again.code, Some(0), "{again:?}");
+    let again = bench.run(&[&again[..], &["--overwrite"]].concat()).succeeded();
     assert!(again.stderr.contains("run.mcap") && again.stderr.contains("report.html"), "{again:?}");
     let second = run_id(&out);
     assert_ne!(first, second);
@@ -384,7 +377,7 @@ fn a_directory_with_a_file_of_somebody_else_is_refused() {
 #[test]
 fn what_is_missing_is_said_with_the_way_to_get_it() {
     let bench = Bench::new();
-    let directory = run(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
+    let directory = run_recorded(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
     let done = report(&bench, &directory.join("run.mcap"), &["--out", "alone.html"]);
     assert!(done.code == Some(0) && done.stderr.contains("summary.json"), "{done:?}");
     let html = std::fs::read_to_string(bench.path("alone.html")).unwrap();
@@ -403,8 +396,8 @@ fn what_is_missing_is_said_with_the_way_to_get_it() {
 #[test]
 fn nothing_of_a_file_is_read_as_markup() {
     let bench = Bench::new();
-    let directory = run(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]);
-    let mut told = summary(&directory);
+    let directory = run_recorded(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]);
+    let mut told = summary_in(&directory);
     let evil = "</td><script>alert('\"&amp;')</script>\u{1b}";
     for key in ["scenario", "started_utc", "clock"] {
         told[key] = evil.into();
@@ -422,7 +415,7 @@ fn nothing_of_a_file_is_read_as_markup() {
 #[test]
 fn bad_input_is_told_and_never_a_panic() {
     let bench = Bench::new();
-    let directory = run(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
+    let directory = run_recorded(&bench, "rigid-pair", &["--duration", "2", "--set", "accept={}"]);
     let recording = std::fs::read(directory.join("run.mcap")).unwrap();
     let told = |source: &Path, code: i32, words: &[&str]| {
         let done = report(&bench, source, &[]);
@@ -449,7 +442,7 @@ fn bad_input_is_told_and_never_a_panic() {
         assert!(refused || (done.code == Some(0) && done.stderr.contains("is not complete")), "{part} %: {done:?}");
         assert!(!done.stderr.contains("panicked"), "{done:?}");
     }
-    let schema = summary(&directory).to_string().replace("summary/v1", "summary/v9");
+    let schema = summary_in(&directory).to_string().replace("summary/v1", "summary/v9");
     for (text, word) in
         [(schema.as_str(), "summary/v9"), ("{", "EOF"), ("{\"schema\":\"corotate/summary/v1\"}", "missing")]
     {
@@ -521,11 +514,11 @@ fn coefficients_measurements_and_fields_on_demand_are_drawn() {
         let page = parse(html);
         page.descendants().filter_map(|node| node.attribute("aria-label")).map(str::to_owned).collect()
     };
-    let learner = page(&bench, &run(&bench, "inertia", &["--duration", "1", "--set", "accept={}"]));
+    let learner = page(&bench, &run_recorded(&bench, "inertia", &["--duration", "1", "--set", "accept={}"]));
     assert_eq!(labels(&learner).iter().filter(|label| label.starts_with("coefficient a")).count(), 3, "{learner}");
-    let known = page(&bench, &run(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]));
+    let known = page(&bench, &run_recorded(&bench, "rigid-pair", &["--duration", "1", "--set", "accept={}"]));
     assert!(!labels(&known).iter().any(|label| label.starts_with("coefficient")) && !known.contains(">measured<"));
-    let noisy = run(&bench, "noisy-pair", &["--duration", "1", "--set", "accept={}"]);
+    let noisy = run_recorded(&bench, "noisy-pair", &["--duration", "1", "--set", "accept={}"]);
     // Two of the three axes have a gyro.
     assert_eq!(page(&bench, &noisy).matches("data-label=\"measured\"").count(), 2);
     let shown = ["--show", "follower/command.acceleration_rad_s2", "--show", "leader/estimate.omega_rad_s[2]"];
@@ -546,7 +539,7 @@ fn coefficients_measurements_and_fields_on_demand_are_drawn() {
 #[test]
 fn two_runs_are_shown_over_each_other() {
     let bench = Bench::new();
-    let (plain, faulted) = (run(&bench, "rigid-pair", &[]), bench.path("other"));
+    let (plain, faulted) = (run_recorded(&bench, "rigid-pair", &[]), bench.path("other"));
     let other = ["run", "rigid-pair", "--clock", "in-process", "--record", "--out", faulted.to_str().unwrap()];
     let fault = ["--set", r#"fault=[{kind="drop",role="observer",from_tick=4000,ticks=5}]"#];
     assert!(matches!(bench.run(&[&other[..], &fault].concat()).code, Some(0 | 3)));
@@ -560,7 +553,7 @@ fn two_runs_are_shown_over_each_other() {
     let page = parse(&html);
     assert_eq!(sections(&page), ["verdict", "scenarios", "differences", "fields", "errors", "motion"]);
     let done = bench.run(&["diff", plain.to_str().unwrap(), faulted.to_str().unwrap(), "--json"]);
-    let differences: Value = serde_json::from_str(&done.stdout).unwrap();
+    let differences = done.json();
     let firsts = differences["signals"].as_array().unwrap().iter().filter_map(|s| s["first"]["tick"].as_u64());
     let first = firsts.min().unwrap();
     let words = text(section(&page, "differences"));
@@ -583,13 +576,12 @@ fn two_runs_are_shown_over_each_other() {
     let bare = pair_without_fields(&bench, &plain, &bench.path("bare"));
     assert!(bare.contains("Samples are compared where both runs were recorded"), "{bare}");
     // Another rig has other signals.
-    let orbit = run(&bench, "orbit-hold", &[]);
+    let orbit = run_recorded(&bench, "orbit-hold", &[]);
     assert!(pair_without_fields(&bench, &plain, &orbit).contains("orbit-hold"));
 }
 
 fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
-    let done = report(bench, a, &[b.to_str().unwrap(), "--out", "pair.html"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    report(bench, a, &[b.to_str().unwrap(), "--out", "pair.html"]).succeeded();
     std::fs::read_to_string(bench.path("pair.html")).unwrap()
 }
 
@@ -597,9 +589,8 @@ fn pair_without_fields(bench: &Bench, a: &Path, b: &Path) -> String {
 #[test]
 fn every_figure_is_a_picture_of_its_own() {
     let bench = Bench::new();
-    let directory = run(&bench, "faults", &[]);
-    let done = report(&bench, &directory, &["--figures", "figures"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let directory = run_recorded(&bench, "faults", &[]);
+    report(&bench, &directory, &["--figures", "figures"]).succeeded();
     let html = std::fs::read_to_string(directory.join("report.html")).unwrap();
     let figures = files(&bench.path("figures"));
     assert_eq!(figures.len(), html.matches("<figure>").count());
@@ -665,7 +656,8 @@ addEventListener("load", () => {
 #[test]
 fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
     let bench = Bench::new();
-    let (faulted, plain) = (run(&bench, "faults", &[]), run(&bench, "rigid-pair", &["--duration", "9"]));
+    let (faulted, plain) =
+        (run_recorded(&bench, "faults", &[]), run_recorded(&bench, "rigid-pair", &["--duration", "9"]));
     let campaign = "name = \"map\"\nbase = \"rigid-pair\"\nset = { duration_s = 0.5, accept = {} }\n\
                     axis = [{ key = \"tick_hz\", values = [100.0, 200.0] }, { key = \"controller.gain_per_s\", values = [2.0, 4.0] }]\n";
     std::fs::write(bench.path("map.toml"), campaign).unwrap();
@@ -706,7 +698,7 @@ fn in_a_browser_every_page_has_room_on_a_phone_and_on_a_screen() {
 #[test]
 fn in_a_browser_pictures_over_time_tell_their_values_and_are_looked_at_closely() {
     let bench = Bench::new();
-    let html = page(&bench, &run(&bench, "rigid-pair", &[]));
+    let html = page(&bench, &run_recorded(&bench, "rigid-pair", &[]));
     let Some(dom) = in_browser(&bench, &html.replace("</body>", READER)) else {
         return common::skipped("the page in a browser", "there is no chromium (Debian: apt install chromium)");
     };

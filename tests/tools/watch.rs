@@ -1,6 +1,7 @@
 //! `corotate watch` in a real terminal, tmux, beside a running loop.
 
 use crate::common::{self, Bench, WATCHDOG, await_some};
+use libc::{SIGINT, SIGKILL, SIGTERM};
 use std::process::Command;
 use std::time::Instant;
 
@@ -156,10 +157,9 @@ fn the_screen_tells_of_the_loop_and_gives_the_terminal_back() {
     terminal.enter("echo code=$?");
 
     // The loop has not noticed: it ends in order, with books that balance.
-    run.signal(2);
+    run.signal(SIGINT);
     let done = run.wait();
-    let summary: serde_json::Value =
-        serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"));
+    let summary = done.json();
     assert_eq!((done.code, summary["books"]["balanced"].as_bool()), (Some(130), Some(true)), "{}", done.stderr);
     drop(terminal);
     bench.assert_clean(&[domain]);
@@ -177,14 +177,14 @@ fn a_signal_gives_the_terminal_back_and_the_end_of_the_run_is_told() {
         .await_screen("running roles", |screen| line(screen, "leader").get(1).is_some_and(|state| state == "running"));
     let watchers =
         || bench.processes().into_iter().filter(|pid| arguments(*pid).get(1).is_some_and(|word| word == "watch"));
-    watchers().for_each(|pid| common::send_signal(pid, 15));
+    watchers().for_each(|pid| common::send_signal(pid, SIGTERM));
     terminal.await_text("code=143");
     terminal.assert_restored();
 
     terminal.enter(&format!("clear; {program} watch; echo code=$?"));
     terminal
         .await_screen("running roles", |screen| line(screen, "leader").get(1).is_some_and(|state| state == "running"));
-    run.signal(15);
+    run.signal(SIGTERM);
     assert_eq!(run.wait().code, Some(143));
     let ended = terminal.await_text("ended");
     assert!(tick(&ended, "controller").is_some_and(|tick| tick > 0), "what was last seen stays: {ended}");
@@ -208,7 +208,7 @@ fn a_watcher_ends_with_its_terminal() {
     assert!(bench.processes().iter().any(watches));
     drop(terminal);
     await_some(|| (!bench.processes().iter().any(watches)).then_some(()));
-    run.signal(15);
+    run.signal(SIGTERM);
     assert_eq!(run.wait().code, Some(143));
     bench.assert_clean(&[domain]);
 }
@@ -223,9 +223,9 @@ fn a_killed_watcher_leaves_nothing() {
     let watcher = bench.start(&["watch", "--once", "60"]);
     let node = || std::fs::read_dir("/proc/self/fd").is_ok() && maps(watcher.pid()).contains("corotate_");
     await_some(|| node().then_some(()));
-    watcher.signal(9);
+    watcher.signal(SIGKILL);
     watcher.wait();
-    run.signal(15);
+    run.signal(SIGTERM);
     assert_eq!(run.wait().code, Some(143));
     bench.assert_clean(&[domain]);
 }
@@ -243,13 +243,13 @@ fn a_watcher_that_waits_for_a_run_ends_when_it_is_told() {
     let watcher = bench.start(&["watch", domain.to_str().unwrap(), "--once", "1"]);
     await_some(|| common::catches(watcher.pid(), 15).then_some(()));
     let told = Instant::now();
-    watcher.signal(15);
+    watcher.signal(SIGTERM);
     let done = watcher.wait();
     assert_eq!(done.code, Some(143), "{done:?}");
     assert!(done.stdout.is_empty() && done.stderr.is_empty(), "{done:?}");
     println!("ended after {:.1} s", told.elapsed().as_secs_f64());
     std::fs::rename(&aside, &there).unwrap();
-    run.signal(15);
+    run.signal(SIGTERM);
     run.wait();
     bench.assert_clean(&[domain]);
 }
@@ -259,13 +259,12 @@ fn one_screen_can_be_had_without_a_terminal() {
     let bench = Bench::new();
     let run = bench.start(&["run", "--duration", "60", "--clock", "realtime", "--tick-hz", "200"]);
     let domain = await_some(|| bench.domains().pop());
-    let done = bench.run(&["watch", domain.to_str().unwrap(), "--once", "3"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
+    let done = bench.run(&["watch", domain.to_str().unwrap(), "--once", "3"]).succeeded();
     assert_eq!(done.stdout.lines().count(), 24);
     assert_eq!(line(&done.stdout, "observer")[1], "running", "{}", done.stdout);
     let refused = bench.run(&["watch", domain.to_str().unwrap()]);
     assert!(refused.code == Some(2) && refused.stderr.contains("--once"), "{refused:?}");
-    run.signal(15);
+    run.signal(SIGTERM);
     run.wait();
     bench.assert_clean(&[domain]);
 }
@@ -283,7 +282,7 @@ fn a_run_is_found_by_the_directory_of_its_results() {
         // It may not be there yet.
         let told: serde_json::Value = await_some(|| {
             let done = bench.run(&["watch", out, "--once", "0.5", "--json"]);
-            (done.code == Some(0)).then(|| serde_json::from_str(&done.stdout).unwrap())
+            (done.code == Some(0)).then(|| done.json())
         });
         assert_eq!((&told["schema"], &told["last_tick"]), (&"corotate/watch/v1".into(), &ticks.into()), "{told}");
         let (roles, errors) = (told["roles"].as_array().unwrap(), told["errors"].as_object().unwrap());
@@ -291,8 +290,8 @@ fn a_run_is_found_by_the_directory_of_its_results() {
         assert!(errors.contains_key("sync_error_rad_s") && !told["signals"].as_object().unwrap().is_empty(), "{told}");
     }
     for run in runs {
-        run.signal(15);
-        assert_eq!(run.wait().code, Some(128 + 15));
+        run.signal(SIGTERM);
+        assert_eq!(run.wait().code, Some(128 + SIGTERM));
     }
     let over = bench.run(&["watch", "slow"]);
     assert!(over.code == Some(2) && over.stderr.contains("corotate report slow"), "{over:?}");

@@ -5,6 +5,7 @@ mod proxy;
 mod sites;
 
 use crate::common::{self, Done, await_some, shipped};
+use libc::{SIGKILL, SIGTERM};
 use proxy::{Impairment, Proxy};
 use serde_json::Value;
 use sites::{APART_S, Site, apart, free_port, sites};
@@ -57,7 +58,7 @@ impl Run {
     fn alone(&self, arguments: &[&str]) -> Value {
         let done =
             self.sites[0].bench.run(&[&["run", self.file(), "--clock", "in-process", "--json"], arguments].concat());
-        summary(&done)
+        done.json()
     }
 
     fn launch(&self, carrier: &str, arguments: &[&str]) -> common::Running {
@@ -91,8 +92,8 @@ impl Run {
 
     /// Ends such a run.
     fn end(&self, [launched, joined]: [common::Running; 2]) {
-        launched.signal(libc::SIGTERM);
-        assert_eq!((launched.wait().code, joined.wait().code), (Some(128 + libc::SIGTERM), Some(0)));
+        launched.signal(SIGTERM);
+        assert_eq!((launched.wait().code, joined.wait().code), (Some(128 + SIGTERM), Some(0)));
         self.assert_clean();
     }
 
@@ -121,15 +122,10 @@ impl Run {
 
 /// Waits for both; whoever joined ends first, and must have been let in.
 fn finish(launched: common::Running, joined: common::Running) -> (Done, Value) {
-    let joined = joined.wait();
-    assert_eq!(joined.code, Some(0), "{joined:?}");
+    joined.wait().succeeded();
     let done = launched.wait();
-    let over = summary(&done);
+    let over = done.json();
     (done, over)
-}
-
-fn summary(done: &Done) -> Value {
-    serde_json::from_str(&done.stdout).unwrap_or_else(|error| panic!("{error}: {done:?}"))
 }
 
 /// One tick is 5 ms, and a command has two of them.
@@ -154,7 +150,7 @@ fn lockstep_gives_the_bits_of_one_thread() {
             run.launch("tcp", &[&arguments[..], &["--clock", "lockstep", "--record", "--out", "over"]].concat());
         let joined: Vec<_> = (1..hosts.len()).map(|number| run.join(number, "tcp", None)).collect();
         let done = launched.wait();
-        let over = summary(&done);
+        let over = done.json();
         assert_eq!(done.code, Some(0), "{done:?}");
         joined.into_iter().for_each(|joined| assert_eq!(joined.wait().code, Some(0)));
         let alone = run.alone(&[&arguments[..], &["--record", "--out", "alone"]].concat());
@@ -250,14 +246,13 @@ fn a_host_that_joined_and_left_before_the_ticks_ends_the_run() {
     let joined = run.join(1, "tcp", None);
     await_some(|| (!run.sites[1].bench.domains().is_empty()).then_some(()));
     run.sites[1].cut_power();
-    assert_eq!(joined.wait().signal, Some(libc::SIGKILL));
+    assert_eq!(joined.wait().signal, Some(SIGKILL));
     let done = launched.wait();
     assert_eq!(done.code, Some(4), "{done:?}");
     assert!(done.stderr.contains("the host sky") && done.stderr.contains("for 4 s"), "{done:?}");
     // The next run there removes what a power cut leaves.
     let next = ["run", "rigid-pair", "--clock", "lockstep", "--duration", "0.1", UNJUDGED[0], UNJUDGED[1]];
-    let next = run.sites[1].bench.run(&next);
-    assert_eq!(next.code, Some(0), "{next:?}");
+    run.sites[1].bench.run(&next).succeeded();
     run.assert_clean();
 }
 
@@ -335,7 +330,7 @@ fn losses_are_counted_and_the_bound_holds() {
 fn a_cut_of_a_second_is_told_and_outlived() {
     let run = Run::new(&TWO, KEYS, "");
     let (done, joined) = cut(&run, std::time::Duration::from_secs(1), &[]);
-    let over = summary(&done);
+    let over = done.json();
     assert_eq!((done.code, joined.code), (Some(0), Some(0)), "{done:?} {joined:?}");
     let silences = over["hosts"]["hosts"][0]["silences"].as_array().unwrap();
     assert!(silences.iter().all(|silence| silence["of"] == "flight" && silence["healed"] == true), "{silences:?}");
@@ -353,7 +348,7 @@ fn a_cut_beyond_the_limit_ends_the_run_in_order() {
     let run = Run::new(&TWO, KEYS, "[network]\nsilence_timeout_s = 2.0\n");
     let (done, joined) = cut(&run, std::time::Duration::from_secs(10), &[]);
     assert_eq!((done.code, joined.code), (Some(4), Some(4)), "{done:?} {joined:?}");
-    let over = summary(&done);
+    let over = done.json();
     let cause = over["incidents"][0]["cause"].as_str().unwrap();
     assert!(cause.contains("the host flight for 2 s"), "{cause}");
     assert!(joined.stderr.contains("nothing was heard of the host bench for 2 s"), "{}", joined.stderr);
@@ -366,7 +361,7 @@ fn a_cut_within_the_limit_heals() {
     let run = Run::new(&TWO, KEYS, "[network]\nsilence_timeout_s = 60.0\n");
     let (done, joined) = cut(&run, std::time::Duration::from_secs(10), &["--duration", "20"]);
     assert_eq!((done.code, joined.code), (Some(0), Some(0)), "{done:?} {joined:?}");
-    let over = summary(&done);
+    let over = done.json();
     let silences = over["hosts"]["hosts"][0]["silences"].as_array().unwrap();
     assert!(silences.iter().any(|silence| silence["seconds"].as_f64().unwrap() >= 9.0), "{silences:?}");
     let hold = over["books"]["roles"]["follower"]["safe"].as_u64().unwrap();
@@ -399,26 +394,19 @@ fn a_host_that_vanishes_ends_the_run_of_the_others() {
         run.sites[vanishing].cut_power();
         let (launched, joined) = (launched.wait(), joined.wait());
         if vanishing == 1 {
-            let cause = summary(&launched)["incidents"][0]["cause"].as_str().unwrap().to_owned();
+            let cause = launched.json()["incidents"][0]["cause"].as_str().unwrap().to_owned();
             assert!(cause.contains("nothing was heard of it and the host flight for 1.5 s"), "{cause}");
-            assert_eq!((launched.code, joined.signal), (Some(4), Some(libc::SIGKILL)));
+            assert_eq!((launched.code, joined.signal), (Some(4), Some(SIGKILL)));
         } else {
-            assert_eq!((launched.signal, joined.code), (Some(libc::SIGKILL), Some(4)), "{joined:?}");
+            assert_eq!((launched.signal, joined.code), (Some(SIGKILL), Some(4)), "{joined:?}");
             assert!(joined.stderr.contains("nothing was heard of the host bench for 1.5 s"), "{}", joined.stderr);
         }
         run.sites[1 - vanishing].bench.assert_clean(&[]);
         // The next run there removes what a power cut leaves.
-        let next = run.sites[vanishing].bench.run(&[
-            "run",
-            "rigid-pair",
-            "--clock",
-            "lockstep",
-            "--duration",
-            "0.1",
-            UNJUDGED[0],
-            UNJUDGED[1],
-        ]);
-        assert_eq!(next.code, Some(0), "{next:?}");
+        run.sites[vanishing]
+            .bench
+            .run(&["run", "rigid-pair", "--clock", "lockstep", "--duration", "0.1", UNJUDGED[0], UNJUDGED[1]])
+            .succeeded();
         run.assert_clean();
     }
 }
@@ -434,7 +422,7 @@ fn a_role_that_dies_on_any_host_costs_nothing_in_lockstep() {
     let dead = [(1, "controller"), (1, "observer"), (0, "follower"), (0, "leader")];
     for (site, role) in dead {
         let bench = &run.sites[site].bench;
-        common::send_signal(bench.await_role(role), libc::SIGKILL);
+        common::send_signal(bench.await_role(role), SIGKILL);
         // The next one while this is being brought back would be another test.
         let before = bench.commits(role);
         bench.await_commits(role, before + 100);
@@ -457,10 +445,10 @@ fn a_relay_that_dies_ends_the_run_in_order() {
         let launched = run.launch("tcp", &[&CALM[..], &["--duration", "60"], &UNJUDGED].concat());
         let joined = run.join(1, "tcp", None);
         run.sites[1].bench.await_commits("controller", 100);
-        common::send_signal(run.sites[side].bench.await_role("relay"), libc::SIGKILL);
+        common::send_signal(run.sites[side].bench.await_role("relay"), SIGKILL);
         let (launched, joined) = (launched.wait(), joined.wait());
         assert_eq!((launched.code, joined.code), (Some(4), Some(4)), "{launched:?} {joined:?}");
-        let causes = summary(&launched)["incidents"].to_string();
+        let causes = launched.json()["incidents"].to_string();
         let expected = if side == 0 { "relay" } else { "the host flight" };
         assert!(causes.contains(expected), "{causes}");
         run.assert_clean();
@@ -495,7 +483,7 @@ fn who_does_not_belong_is_told_why() {
     let hub = run.sites[1].start(&["join", &address, "--host", "bench", "--insecure"]).wait();
     assert!(hub.stderr.contains("no host `bench` joins this run"), "{}", hub.stderr);
     let probe = run.sites[1].start(&["doctor", "--link", &address, "--insecure", "--seconds", "1", "--json"]).wait();
-    let probe = summary(&probe);
+    let probe = probe.json();
     let truth_ns = if apart() { -APART_S * 1_000_000_000 } else { 0 };
     let wrong_us = (probe["offset_ns"].as_i64().unwrap() - truth_ns).abs() as f64 / 1e3;
     assert!(wrong_us <= probe["error_us"].as_f64().unwrap(), "wrong by {wrong_us} us: {probe}");

@@ -2,6 +2,7 @@
 //! elsewhere all on loopback, with one clock.
 
 use crate::common::{Bench, Running, skipped};
+use libc::SIGKILL;
 use std::fs::File;
 use std::process::{Child, Command, Stdio};
 
@@ -79,7 +80,7 @@ impl Site {
 
     /// Kills every process there, as a power cut does.
     pub fn cut_power(&self) {
-        self.bench.processes().into_iter().for_each(|pid| crate::common::send_signal(pid, libc::SIGKILL));
+        self.bench.processes().into_iter().for_each(|pid| crate::common::send_signal(pid, SIGKILL));
     }
 }
 
