@@ -1,6 +1,6 @@
 //! The part of a scenario that every rig shares, as typed: the serde mirror of the file with its defaults.
 //!
-//! Must not judge values; [`super::scenario`] does.
+//! Must not judge values; [`crate::scenario`] does.
 
 use super::fault::RawFault;
 use super::hosts::{Host, Network};

@@ -23,8 +23,9 @@ use std::rc::Rc;
 /// A run that is stepped.
 ///
 /// ```
-/// use corotate::config::{SHIPPED, Scenario};
+/// use corotate::config::SHIPPED;
 /// use corotate::launch::Steps;
+/// use corotate::scenario::Scenario;
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// let overrides = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);

@@ -34,9 +34,10 @@ const RECORD_HEAD: usize = 9;
 /// A recording that was opened.
 ///
 /// ```
-/// use corotate::config::{SHIPPED, Scenario};
+/// use corotate::config::SHIPPED;
 /// use corotate::launch::{Launch, run};
 /// use corotate::record::Recording;
+/// use corotate::scenario::Scenario;
 /// use std::sync::atomic::AtomicUsize;
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {

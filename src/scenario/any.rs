@@ -49,14 +49,14 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     /// # Errors
     /// [`BusError::Open`].
     fn scorer(&self, settings: &Settings, bus: AnyBus<'_>) -> Result<Box<dyn Scorer>, BusError>;
-    /// Runs the roles one after the other in this thread, on samples that stay in place: see [`direct::run_rig`].
+    /// Runs the roles one after the other in this thread, on samples that stay in place; none if the nodes must run them.
     fn direct(
         &self,
         settings: &Settings,
         checkpoints: bool,
         proceed: &mut dyn FnMut(u64, f64) -> bool,
     ) -> Option<(Vec<RoleReport>, Score)>;
-    /// Returns the ticks per second of the roles' mathematics alone: see [`arithmetic_alone`].
+    /// Returns the ticks per second of the roles' mathematics alone; none for other rigs than a leader with one follower.
     fn arithmetic(&self, settings: &Settings, hashed: bool) -> Option<f64>;
 }
 

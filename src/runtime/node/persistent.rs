@@ -8,7 +8,8 @@ use crate::telemetry::{Ledger, LedgerError};
 pub(super) trait Persistent {
     /// Where it is kept.
     fn ledger(&self) -> &Ledger;
-    /// Passes the counters, and what is committed to be sent. Of any role in the order of its [`Ports`]: see [`report`].
+    /// Passes the counters, and what is committed to be sent, in the order of the role's [`Ports`](super::Ports); see
+    /// [`report`](crate::runtime::report).
     fn counters<W: Words>(&mut self, words: &mut W);
     /// Passes everything else.
     fn state<W: Words>(&mut self, words: &mut W);
