@@ -3,7 +3,7 @@
 //!
 //! `tests/kill-campaign N` makes N kills; without a number it is a short run. Needs the feature `hooks`.
 
-use crate::common::{Bench, Done, Running, send_signal};
+use crate::common::{Bench, Done, Running, send_signal, skipped};
 use corotate::config::SHIPPED;
 use corotate::runtime::RoleId;
 use corotate::scenario::Scenario;
@@ -305,7 +305,7 @@ fn random_kills_lose_nothing_in_lockstep_and_balance_in_real_time() {
     let (kills, seed) = (of("COROTATE_KILLS", 40), of("COROTATE_SEED", 1));
     let traced = Command::new("strace").arg("-V").stdout(Stdio::null()).status().is_ok();
     if !traced {
-        eprintln!("SKIPPED: kills at system calls, because strace is missing");
+        skipped("kills at system calls", "strace is missing (Debian: apt install strace)");
     }
     let (next, hit) = (AtomicU64::new(0), AtomicU64::new(0));
     let wrong = Mutex::new(Vec::new());

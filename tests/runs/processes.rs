@@ -3,7 +3,6 @@
 
 use crate::common::{Bench, Running, await_some, send_signal, shipped, skipped};
 use libc::{SIGINT, SIGKILL, SIGSTOP, SIGTERM};
-use std::io::Write;
 use std::path::PathBuf;
 
 fn start_endless(bench: &Bench, arguments: &[&str]) -> (Running, Vec<PathBuf>) {
@@ -265,8 +264,7 @@ fn a_privilege_that_is_not_granted_is_told_and_only_fails_a_run_that_requires_it
     let denied = summary["privileges"].as_array().unwrap().iter().filter(|grant| grant["granted"] == false);
     let fifo = denied.clone().filter(|grant| grant["privilege"] == "SCHED_FIFO").count();
     if fifo == 0 {
-        let _ = writeln!(std::io::stderr(), "SKIPPED: this user has real-time priority 99");
-        return;
+        return skipped("a privilege that is not granted", "this user has real-time priority 99");
     }
     assert!(denied.clone().all(|grant| !grant["reason"].as_str().unwrap().is_empty()));
     let done = run(&["--require-rt"]);
