@@ -461,6 +461,7 @@ fn at<B: Bus, S: Carried + ?Sized, G: Guard<S>>(input: &Input<B, S, G>, tick: u6
 }
 
 impl MetricScore {
+    #[inline]
     fn take(&mut self, tick: u64, value: f64, accept: &Accept, time_s: f64) {
         if value.is_nan() {
             self.settled_blank += u64::from(time_s >= accept.settled_by_s);

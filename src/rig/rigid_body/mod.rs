@@ -359,7 +359,7 @@ impl Rig for RigidBodyRig {
             _ => distance(estimate.map(|estimate| estimate.coefficients.into()), Some(self.inertia.coefficients())),
         };
         let (first, end) = self.scored();
-        out.iter_mut().zip(first..end).for_each(|(out, metric)| *out = value(metric));
+        (first..end).for_each(|metric| out[metric - first] = value(metric));
     }
 
     fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
