@@ -31,10 +31,12 @@ const ATTEMPTS: u32 = 100;
 const OVERFLOW_USER: u32 = 65_534;
 
 /// Why a directory is not this user's alone.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum PrivacyError {
     /// It is somebody else's.
     #[error("{} belongs to {owner}, not to {}; unset XDG_RUNTIME_DIR or set it to a directory of your own", path.display(), user_name(user()))]
+    #[strum(serialize = "foreign-directory")]
     Foreign {
         /// The directory.
         path: PathBuf,
@@ -43,6 +45,7 @@ pub enum PrivacyError {
     },
     /// Others can read it or write to it.
     #[error("{} is open to other users (mode {:03o}); take it from them with `chmod 700`, or remove it", path.display(), mode & 0o7777)]
+    #[strum(serialize = "open-directory")]
     Open {
         /// The directory.
         path: PathBuf,
@@ -51,6 +54,7 @@ pub enum PrivacyError {
     },
     /// Others can put something else in its place.
     #[error("{} lies in {}, where {who} can put another in its place; set XDG_RUNTIME_DIR to a directory of your own", path.display(), ancestor.display())]
+    #[strum(serialize = "exposed-directory")]
     Exposed {
         /// The directory.
         path: PathBuf,
@@ -67,6 +71,7 @@ pub enum PrivacyError {
     },
     /// It cannot be looked at.
     #[error("cannot look at {}: {source}; set XDG_RUNTIME_DIR to a directory of your own", path.display())]
+    #[strum(serialize = "cannot-examine")]
     System {
         /// The directory, or one that it lies in.
         path: PathBuf,

@@ -44,25 +44,31 @@ pub struct FoxgloveSeat {
 }
 
 /// Why a run could not be shown.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum FoxgloveError {
     /// The run could not be joined.
     #[error(transparent)]
+    #[strum(transparent)]
     Run(#[from] RoleError),
     /// The run's seats for readers are taken.
     #[error("{source}; a run has room for few watchers, and of a fleet for one")]
+    #[strum(serialize = "cannot-join")]
     Join {
         /// The signal, and why.
         source: BusError,
     },
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// A sample could not be taken.
     #[error(transparent)]
+    #[strum(transparent)]
     Sample(#[from] RecordError),
     /// The address cannot be had.
     #[error("cannot listen on {address}: {reason}; name another address, or port 0 for any that is free")]
+    #[strum(serialize = "cannot-listen")]
     Listen {
         /// The address.
         address: SocketAddr,
@@ -71,6 +77,7 @@ pub enum FoxgloveError {
     },
     /// The address could not be told.
     #[error("cannot write {}: {source}", path.display())]
+    #[strum(serialize = "cannot-write")]
     Tell {
         /// The file.
         path: PathBuf,

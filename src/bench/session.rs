@@ -46,7 +46,8 @@ pub struct Bench<'a> {
 }
 
 /// Why a benchmark run failed. Whatever had been started is gone.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum BenchError {
     /// A signal asked for the end.
     #[error("ended by signal {0} before everything was measured")]
@@ -56,21 +57,27 @@ pub enum BenchError {
     NoScenario,
     /// A scenario cannot be run as a row has to run it.
     #[error(transparent)]
+    #[strum(serialize = "refused-scenario")]
     Scenario(#[from] ConfigError),
     /// A domain could not be made.
     #[error(transparent)]
+    #[strum(transparent)]
     Domain(#[from] DomainError),
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// A run of the product failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Launch(#[from] LaunchError),
     /// A peer process could not be started, or left.
     #[error("the measuring peer failed: {0}; its own error is above")]
+    #[strum(serialize = "peer-failed")]
     Peer(String),
     /// The operating system refused something.
     #[error("cannot {what}: {source}")]
+    #[strum(serialize = "system-refused")]
     System {
         /// What was asked for.
         what: &'static str,

@@ -61,25 +61,30 @@ pub struct OwnedDomain {
 }
 
 /// Why a domain could not be made or joined.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum DomainError {
     /// A directory is not this user's alone.
     #[error(transparent)]
+    #[strum(transparent)]
     Privacy(#[from] PrivacyError),
     /// Another user made what is the domain's to make, again and again.
     #[error("{} was there before this run could make it, in {DOMAINS_MAX} domains one after the other; remove it, or have its owner stopped", path.display())]
+    #[strum(serialize = "domain-taken")]
     Taken {
         /// What he made.
         path: PathBuf,
     },
     /// An identifier that can be guessed is none.
     #[error("the system gives no random numbers: {source}; a sandbox may forbid getrandom: allow it")]
+    #[strum(serialize = "no-random-numbers")]
     Random {
         /// The system's reason.
         source: io::Error,
     },
     /// A directory or file could not be made.
     #[error("cannot make {}: {source}; {}", path.display(), remedy_at(path, source))]
+    #[strum(serialize = "cannot-create")]
     Create {
         /// What could not be made.
         path: PathBuf,
@@ -88,6 +93,7 @@ pub enum DomainError {
     },
     /// A domain cannot be locked, so nobody could tell whether its run is alive.
     #[error("cannot lock {}: {source}; {}, or set XDG_RUNTIME_DIR to a directory of a local file system", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-lock")]
     Lock {
         /// The lock file.
         path: PathBuf,
@@ -96,12 +102,14 @@ pub enum DomainError {
     },
     /// Every name that was tried was taken, or taken away.
     #[error("cannot make a domain in {} in {ATTEMPTS} attempts; end whatever removes files there", path.display())]
+    #[strum(serialize = "domain-contended")]
     Contended {
         /// The directory of all domains.
         path: PathBuf,
     },
     /// There is too little shared memory. Found out later it would kill whoever touches the missing page.
     #[error("/dev/shm has {} KiB free and the run may take {}; free some, or mount it larger", free >> 10, needed >> 10)]
+    #[strum(serialize = "no-shared-memory")]
     NoRoom {
         /// Bytes free.
         free: u64,
@@ -120,6 +128,7 @@ pub enum DomainError {
     },
     /// The directory's path is too long for the transport's files.
     #[error("{} is longer than {MAX_ROOT_LENGTH} bytes, too long for the transport's files; set XDG_RUNTIME_DIR to a shorter one", path.display())]
+    #[strum(serialize = "path-too-long")]
     TooLong {
         /// The path.
         path: PathBuf,
@@ -129,6 +138,7 @@ pub enum DomainError {
     NoRun,
     /// The directory has the results of a run that is over.
     #[error("{} has the results of a run that is over; `corotate report {}` shows it", path.display(), path.display())]
+    #[strum(serialize = "run-over")]
     Over {
         /// The path as given.
         path: PathBuf,

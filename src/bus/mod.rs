@@ -21,10 +21,12 @@ pub use words::{AnyBus, Ends, ReadWords, WordReader, WordWriter, WriteWords};
 use crate::sample::{FleetLayout, FleetSample, Sample};
 
 /// Why a link failed. The run cannot go on without it.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum BusError {
     /// The shared-memory domain could not be entered.
     #[error("cannot enter the shared-memory domain {domain}: {reason}")]
+    #[strum(serialize = "cannot-enter-domain")]
     Domain {
         /// Where.
         domain: String,
@@ -33,6 +35,7 @@ pub enum BusError {
     },
     /// A signal could not be opened.
     #[error("cannot open {service} as {end}: {reason}")]
+    #[strum(serialize = "cannot-open-link")]
     Open {
         /// The service's name.
         service: String,
@@ -43,6 +46,7 @@ pub enum BusError {
     },
     /// A sample could not be sent.
     #[error("cannot send on {service}: {reason}")]
+    #[strum(serialize = "cannot-send")]
     Send {
         /// The service's name.
         service: String,
@@ -51,6 +55,7 @@ pub enum BusError {
     },
     /// A sample could not be received.
     #[error("cannot receive on {service}: {reason}")]
+    #[strum(serialize = "cannot-receive")]
     Receive {
         /// The service's name.
         service: String,

@@ -3,7 +3,7 @@
 //! Must not know which case it belongs to.
 
 use super::axis;
-use crate::config::{ConfigError, Document};
+use crate::config::{ConfigError, Document, Place};
 use toml::Value;
 
 /// How a key ends that is every number of a table.
@@ -30,7 +30,7 @@ pub(super) fn put(
     key: &str,
     factor: bool,
     value: &Value,
-    place: &str,
+    place: &Place,
 ) -> Result<(), ConfigError> {
     if let (Some(table), true) = (key.strip_suffix(EVERY), factor) {
         let keys = document.get(table).and_then(Value::as_table).map(|table| table.keys().cloned().collect::<Vec<_>>());
@@ -41,11 +41,10 @@ pub(super) fn put(
     }
     let there = document.get(key);
     let put = match (there, factor) {
-        (there, true) => there.and_then(|there| times(there, value)).ok_or_else(|| ConfigError::Value {
-            place: place.to_owned(),
-            key: key.to_owned(),
-            reason: "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]"
-                .into(),
+        (there, true) => there.and_then(|there| times(there, value)).ok_or_else(|| {
+            let reason =
+                "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]";
+            ConfigError::of(place.clone(), key, "not-a-factor", reason)
         })?,
         (Some(Value::Array(list)), false) if axis::number(value).is_some() && list.iter().all(is_number) => {
             Value::Array(vec![value.clone(); list.len()])

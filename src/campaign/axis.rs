@@ -4,7 +4,7 @@
 
 use super::draw;
 use super::table::{Axis, AxisKind, Parameter};
-use crate::config::{Checks, Document};
+use crate::config::{Checks, Document, Place};
 use serde::{Deserialize, Serialize};
 use toml::Value;
 
@@ -62,7 +62,7 @@ pub(super) struct Varied {
     /// Whether its values are factors of what the scenario has.
     pub factor: bool,
     /// Where the campaign names it.
-    pub place: String,
+    pub place: Place,
     spread: Spread,
 }
 
@@ -99,9 +99,10 @@ impl Varied {
         let at = format!("axis[{index}]");
         let given = [raw.values.is_some(), raw.range.is_some(), raw.random.is_some()];
         let one = given.iter().filter(|given| **given).count() == 1;
-        checks
-            .require(one, &at, || "takes its values from one of values, range and random; give one of them".to_owned());
-        checks.require(!raw.key.trim().is_empty(), &format!("{at}.key"), || {
+        checks.require(one, &at, "conflicting-keys", || {
+            "takes its values from one of values, range and random; give one of them".to_owned()
+        });
+        checks.require(!raw.key.trim().is_empty(), &format!("{at}.key"), "empty-key", || {
             "is empty; name a key of the scenario, as --set does".to_owned()
         });
         let spread = match (&raw.values, &raw.range, &raw.random) {
@@ -110,7 +111,7 @@ impl Varied {
             (_, Some(range), _) => Spread::range(range, &format!("{at}.range"), checks)?,
             (.., random) => Spread::random(random.as_ref()?, &format!("{at}.random"), checks)?,
         };
-        checks.require(raw.names.is_none() || raw.values.is_some(), &format!("{at}.names"), || {
+        checks.require(raw.names.is_none() || raw.values.is_some(), &format!("{at}.names"), "unused-key", || {
             "are names of values, and there is no list of these; remove it".to_owned()
         });
         let mut varied = Self {
@@ -125,7 +126,7 @@ impl Varied {
             spread,
         };
         let numbers = (0..varied.points().unwrap_or(0)).all(|point| number(&varied.at(point)).is_some());
-        checks.require(!raw.factor || numbers, &format!("{at}.factor"), || {
+        checks.require(!raw.factor || numbers, &format!("{at}.factor"), "not-a-number", || {
             "factors are numbers, and some value is none; give numbers, or remove it".to_owned()
         });
         let named = |point: u64| match raw.names.as_ref().and_then(|names| names.get(point as usize)) {
@@ -205,24 +206,35 @@ impl Spread {
 
     fn values(values: &[Value], names: Option<&[String]>, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
         let enough = (1..=MAX_POINTS as usize).contains(&values.len());
-        checks.require(enough, &format!("{at}.values"), || {
+        checks.require(enough, &format!("{at}.values"), "out-of-range", || {
             format!("{} values are no axis; give 1 to {MAX_POINTS}", values.len())
         });
-        checks.require(names.is_none_or(|names| names.len() == values.len()), &format!("{at}.names"), || {
-            format!("{} names are not one for each of {} values", names.map_or(0, <[_]>::len), values.len())
-        });
+        checks.require(
+            names.is_none_or(|names| names.len() == values.len()),
+            &format!("{at}.names"),
+            "wrong-length",
+            || format!("{} names are not one for each of {} values", names.map_or(0, <[_]>::len), values.len()),
+        );
         enough.then(|| Self::Values(values.to_vec()))
     }
 
     fn range(raw: &RawRange, at: &str, checks: &mut Checks<'_>) -> Option<Self> {
         let (ends, whole) = ends([&raw.from, &raw.to], at, raw.log, checks)?;
         let points = raw.points;
-        checks.require(points.is_none_or(|points| (2..=MAX_POINTS).contains(&points)), &format!("{at}.points"), || {
-            format!("{} is no number of points from one end to the other; give 2 to {MAX_POINTS}", points.unwrap_or(0))
-        });
+        checks.require(
+            points.is_none_or(|points| (2..=MAX_POINTS).contains(&points)),
+            &format!("{at}.points"),
+            "out-of-range",
+            || {
+                format!(
+                    "{} is no number of points from one end to the other; give 2 to {MAX_POINTS}",
+                    points.unwrap_or(0)
+                )
+            },
+        );
         let steps = points.unwrap_or(2).saturating_sub(1).max(1) as f64;
         let even = !whole || raw.log || points.is_none() || ((ends[1] - ends[0]) / steps).fract() == 0.0;
-        checks.require(even, &format!("{at}.points"), || {
+        checks.require(even, &format!("{at}.points"), "uneven-steps", || {
             "whole numbers are not so many even steps apart; give another number of points, or numbers as 1.0"
                 .to_owned()
         });
@@ -242,14 +254,18 @@ impl Spread {
             (None, None, Some(normal)) => {
                 let at = format!("{at}.normal");
                 let [Some((mean, whole)), Some((deviation, also))] = [number(&normal[0]), number(&normal[1])] else {
-                    checks.refuse(&at, "takes two numbers; give mean and standard deviation");
+                    checks.refuse(&at, "wrong-length", "takes two numbers; give mean and standard deviation");
                     return None;
                 };
                 checks.positive(&at, deviation);
                 Some(Self::Normal { mean, deviation, whole: whole && also })
             }
             _ => {
-                checks.refuse(at, "follows one distribution; give one of uniform, log_uniform and normal");
+                checks.refuse(
+                    at,
+                    "conflicting-keys",
+                    "follows one distribution; give one of uniform, log_uniform and normal",
+                );
                 None
             }
         }
@@ -259,11 +275,13 @@ impl Spread {
 /// The ends of a range, and whether they are whole numbers.
 pub(super) fn ends(given: [&Value; 2], at: &str, log: bool, checks: &mut Checks<'_>) -> Option<([f64; 2], bool)> {
     let [Some((from, whole)), Some((to, also))] = given.map(number) else {
-        checks.refuse(at, "goes from a number to a number; give two");
+        checks.refuse(at, "wrong-length", "goes from a number to a number; give two");
         return None;
     };
-    checks.require(from < to, at, || format!("{from} is not below {to}; give the lower end first"));
-    checks.require(!log || from > 0.0, at, || format!("no factor leads from {from} upwards; give ends above zero"));
+    checks.require(from < to, at, "wrong-order", || format!("{from} is not below {to}; give the lower end first"));
+    checks.require(!log || from > 0.0, at, "not-positive", || {
+        format!("no factor leads from {from} upwards; give ends above zero")
+    });
     Some(([from, to], whole && also)).filter(|_| from < to && (!log || from > 0.0))
 }
 

@@ -26,7 +26,7 @@ pub(super) const SEED_BITS: u32 = 53;
 /// The table of a campaign that has its scenario in it.
 const SCENARIO: &str = "scenario";
 /// Gives the text of a shipped scenario by its name, or says that there is none.
-pub type Shipped<'a> = &'a dyn Fn(&str) -> Result<Cow<'static, str>, String>;
+pub type Shipped<'a> = &'a dyn Fn(&str) -> Result<Cow<'static, str>, ConfigError>;
 
 /// A campaign: a scenario, what is varied of it, and how.
 #[derive(Debug, Clone)]
@@ -138,7 +138,7 @@ impl Campaign {
         for (index, axis) in axes.iter().enumerate() {
             let drawn = axis.as_ref().is_some_and(|axis| axis.points().is_none());
             let asked = raw.samples.is_some() || raw.axis[index].range.is_none();
-            checks.require(!drawn || asked, &format!("axis[{index}].range.points"), || {
+            checks.require(!drawn || asked, &format!("axis[{index}].range.points"), "missing-key", || {
                 "is missing; add it, or draw from the range with samples = N".to_owned()
             });
         }
@@ -148,7 +148,7 @@ impl Campaign {
         let mut points = resolved.iter().map(|axis| axis.points().unwrap_or(1));
         let points = raw.samples.or_else(|| points.try_fold(1_u64, u64::checked_mul));
         let cases = points.and_then(|points| points.checked_mul(raw.repeats)).filter(|cases| *cases <= MAX_CASES);
-        checks.require(cases.is_some(), "name", || {
+        checks.require(cases.is_some(), "name", "too-many-cases", || {
             format!("has more than {MAX_CASES} cases; take fewer values, or samples = N of them")
         });
         let cases = checks.finish(cases)?;
@@ -316,7 +316,7 @@ impl Campaign {
     ) -> Result<Document, ConfigError> {
         let mut document = self.document.clone();
         let seed = i64::try_from(case.seed).expect("a seed has few bits");
-        document.put("seed", Value::Integer(seed), "the case's seed")?;
+        document.put("seed", Value::Integer(seed), &"the case's seed".into())?;
         for (index, (axis, value)) in self.axes.iter().zip(&case.values).enumerate() {
             if moved.is_none_or(|(searched, _)| searched.axis != Some(index)) {
                 put(&mut document, &axis.axis.key, axis.factor, value, &axis.place)?;
@@ -345,20 +345,22 @@ impl Campaign {
 
 /// The scenario of a document under a clock, whatever its own is; nothing is recorded.
 pub(super) fn resolved(mut document: Document, clock: ClockKind) -> Result<Scenario, ConfigError> {
-    document.put("clock", clock.name().into(), "a campaign's clock")?;
-    document.put("record", false.into(), "a campaign records nothing")?;
+    document.put("clock", clock.name().into(), &"a campaign's clock".into())?;
+    document.put("record", false.into(), &"a campaign records nothing".into())?;
     Scenario::of(document)
 }
 
 /// The scenario that a campaign varies.
 fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, ConfigError> {
-    let refuse = |reason: String| ConfigError::Value { place: file.place("base"), key: "base".to_owned(), reason };
+    let refuse = |code, reason: String| ConfigError::of(file.place("base"), "base", code, reason);
     if is_name(name) {
-        return Document::parse(&shipped(name).map_err(refuse)?, &format!("{name}.toml"));
+        let text = shipped(name).map_err(|error| refuse("unknown-scenario", error.to_string()))?;
+        return Document::parse(&text, &format!("{name}.toml"));
     }
     let path = file.directory().join(name);
-    let text =
-        File::open(&path).map_err(|error| refuse(format!("{}: {error}; name a scenario file", path.display())))?;
+    let text = File::open(&path).map_err(|error| {
+        refuse("cannot-read-scenario", format!("{}: {error}; name a scenario file", path.display()))
+    })?;
     Document::parse(&read_text(text, &path)?, &path.display().to_string())
 }
 
@@ -399,25 +401,27 @@ fn metrics(scenario: &Scenario) -> Vec<Metric> {
 fn check(raw: &Raw, checks: &mut Checks<'_>) {
     let named = (1..=32).contains(&raw.name.len())
         && raw.name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-    checks.require(named, "name", || format!("`{}` cannot name files; use 1 to 32 of a-z, 0-9 and -", raw.name));
-    checks.require((1..=MAX_CASES).contains(&raw.repeats), "repeats", || {
+    checks.require(named, "name", "bad-name", || {
+        format!("`{}` cannot name files; use 1 to 32 of a-z, 0-9 and -", raw.name)
+    });
+    checks.require((1..=MAX_CASES).contains(&raw.repeats), "repeats", "out-of-range", || {
         format!("{} is no number of runs of one point; give 1 to {MAX_CASES}", raw.repeats)
     });
     let samples = raw.samples.unwrap_or(1);
-    checks.require((1..=MAX_CASES).contains(&samples), "samples", || {
+    checks.require((1..=MAX_CASES).contains(&samples), "samples", "out-of-range", || {
         format!("{samples} are no samples; give 1 to {MAX_CASES}, or leave it out for all combinations")
     });
-    checks.require(raw.sampling.is_none() || raw.samples.is_some(), "sampling", || {
+    checks.require(raw.sampling.is_none() || raw.samples.is_some(), "sampling", "unused-key", || {
         "says how samples are drawn, and all combinations are run; add samples = N, or remove it".to_owned()
     });
     if raw.sampling == Some(Sampling::Sobol) {
-        checks.require(raw.axis.len() <= SOBOL_AXES, "sampling", || {
+        checks.require(raw.axis.len() <= SOBOL_AXES, "sampling", "too-many-axes", || {
             format!(
                 "Sobol's sequence has {SOBOL_AXES} axes here, and there are {}; take latin-hypercube",
                 raw.axis.len()
             )
         });
-        checks.require(samples <= SOBOL_POINTS, "samples", || format!("give at most {SOBOL_POINTS}"));
+        checks.require(samples <= SOBOL_POINTS, "samples", "out-of-range", || format!("give at most {SOBOL_POINTS}"));
     }
 }
 
@@ -427,10 +431,14 @@ fn check_keys(raw: &Raw, checks: &mut Checks<'_>) {
         let covers = |other: &&RawAxis| format!("{}.", other.key.trim()).starts_with(&format!("{}.", axis.key.trim()));
         let key = format!("axis[{index}].key");
         if let Some(other) = raw.axis[..index].iter().find(covers) {
-            checks.refuse(&key, format!("`{}` is varied already, by an axis before it; vary it after this", other.key));
+            checks.refuse(
+                &key,
+                "varied-twice",
+                format!("`{}` is varied already, by an axis before it; vary it after this", other.key),
+            );
         }
         let every = axis.key.trim().ends_with(EVERY);
-        checks.require(!every || axis.factor, &key, || {
+        checks.require(!every || axis.factor, &key, "not-a-factor", || {
             format!("`{}` is every number of a table, which have a factor in common; add factor = true", axis.key)
         });
     }

@@ -22,10 +22,12 @@ const SCHEMA: &str = "corotate/campaign/v1";
 const HASH: usize = 17;
 
 /// Why the results of a campaign cannot be read.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum JournalError {
     /// There is none, or it cannot be read.
     #[error("{}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-read")]
     Read {
         /// The file.
         path: PathBuf,
@@ -34,6 +36,7 @@ pub enum JournalError {
     },
     /// It cannot be written.
     #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The file.
         path: PathBuf,
@@ -42,12 +45,14 @@ pub enum JournalError {
     },
     /// Somebody else writes it.
     #[error("{}: another sweep is at work there; wait for its end, or name another directory with --out", path.display())]
+    #[strum(serialize = "campaign-busy")]
     Busy {
         /// The file.
         path: PathBuf,
     },
     /// It is another campaign's.
     #[error("{}: holds {theirs}, and this is {ours}; name another directory with --out", path.display())]
+    #[strum(serialize = "other-campaign")]
     Other {
         /// The file.
         path: PathBuf,
@@ -58,6 +63,7 @@ pub enum JournalError {
     },
     /// It does not begin as a journal does.
     #[error("{}: is no campaign's journal, or of another version; name a directory that `corotate sweep` made", path.display())]
+    #[strum(serialize = "not-a-journal")]
     Foreign {
         /// The file.
         path: PathBuf,

@@ -6,7 +6,7 @@
 use super::axis::{self, Varied};
 use super::table::{Axis, Find, Margin, MarginPoint, Parameter, Row};
 use crate::analysis::{digits, to_tolerance};
-use crate::config::{Checks, Document};
+use crate::config::{Checks, Document, Place};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use toml::Value;
@@ -62,7 +62,7 @@ pub(super) struct Searched {
     /// The axis of its key, if that is one.
     pub axis: Option<usize>,
     /// Where the campaign names it.
-    pub place: String,
+    pub place: Place,
     whole: bool,
 }
 
@@ -120,7 +120,7 @@ impl Searched {
     ) -> Option<Self> {
         let at = format!("margin[{index}]");
         let key = raw.key.trim().replace('[', ".").replace(']', "");
-        checks.require(!key.is_empty(), &format!("{at}.key"), || {
+        checks.require(!key.is_empty(), &format!("{at}.key"), "empty-key", || {
             "is empty; name a key of the scenario, as --set does".to_owned()
         });
         checks.positive(&format!("{at}.tolerance"), raw.tolerance);
@@ -176,7 +176,7 @@ mod tests {
     fn searched(find: Find, range: [f64; 2], tolerance: f64, whole: bool) -> Searched {
         let margin =
             Margin { key: "k".into(), find, such_that: "accepted".into(), range, tolerance, points: Vec::new() };
-        Searched { margin, such_that: SuchThat::Accepted, axis: None, place: String::new(), whole }
+        Searched { margin, such_that: SuchThat::Accepted, axis: None, place: "".into(), whole }
     }
 
     proptest! {

@@ -8,7 +8,7 @@ use super::file::Campaign;
 use super::journal::{Entry, FILE, Head, Journal, Reader};
 use super::results::{self, CAMPAIGN, Counts};
 use super::table::{MarginPoint, Row};
-use crate::config::ClockKind;
+use crate::config::{ClockKind, ConfigError};
 use crate::files;
 use std::fs;
 use std::io;
@@ -163,7 +163,10 @@ pub fn merge(directories: &[PathBuf], out: &Path) -> Result<Swept, SweepError> {
     let Some(first) = directories.first() else { return Ok(Swept { done: 0, all: 0, counts: None }) };
     let head = Reader::open(first)?.head().of_all();
     // It names no other file.
-    let unknown = |name: &str| Err(format!("the campaign has its scenario in it, and names `{name}`"));
+    let unknown = |name: &str| {
+        let text = format!("the campaign has its scenario in it, and names `{name}`");
+        Err(ConfigError::Unknown { code: "unknown-scenario", text })
+    };
     let mut whole = Campaign::load(&first.join(CAMPAIGN), &[], &unknown)?.collect(out)?;
     for directory in directories {
         let mut reader = Reader::open(directory)?;

@@ -3,15 +3,18 @@
 use super::axis::Varied;
 use super::file::{Raw, SEED_BITS};
 use super::*;
-use crate::config::{self, Checks, Document};
+use crate::config::{self, Checks, ConfigError, Document};
 use proptest::prelude::*;
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use toml::Value;
 
-fn shipped(name: &str) -> Result<Cow<'static, str>, String> {
+fn shipped(name: &str) -> Result<Cow<'static, str>, ConfigError> {
     let found = config::SHIPPED.iter().find(|(known, _)| *known == name);
-    found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| format!("there is no `{name}`; take another"))
+    found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| {
+        let text = format!("there is no `{name}`; take another");
+        ConfigError::Unknown { code: "unknown-scenario", text }
+    })
 }
 
 fn campaign(text: &str) -> Campaign {
@@ -95,7 +98,7 @@ fn a_margin_has_a_point_for_every_case_without_its_axis() {
 fn the_campaign_as_resolved_is_the_same_campaign() {
     for (name, text) in SHIPPED.into_iter().chain([("map", COMBINED)]) {
         let campaign = campaign(text);
-        let nothing = |name: &str| Err(format!("there is no `{name}`"));
+        let nothing = |name: &str| Err(ConfigError::Unknown { code: "unknown-scenario", text: name.to_owned() });
         let again = Campaign::parse(campaign.to_toml(), "again.toml", &[], &nothing).unwrap();
         assert_eq!((again.identity(), again.cases()), (campaign.identity(), campaign.cases()), "{name}");
         for number in 0..campaign.cases().min(40) {

@@ -123,6 +123,7 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
         Some(TickLimit::All(amount)) => accept.unscored_ticks_max = Some(amount),
         Some(TickLimit::ByRole(_)) => checks.refuse(
             "accept.unscored_ticks_max",
+            "one-limit",
             "ticks are scored for all roles together; give a number, or a share such as \"1 %\"",
         ),
         None => {}
@@ -132,8 +133,10 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
         let Some(metrics) = setting.metrics else { continue };
         let number = value.as_float().or_else(|| value.as_integer().map(|count| count as f64));
         match (limit_of(&mut accept, key, metrics), number) {
-            (None, _) => checks.refuse(&path, format!("unknown criterion; {}", known(key, metrics))),
-            (Some(_), None) => checks.refuse(&path, format!("got {value}; give a number")),
+            (None, _) => {
+                checks.refuse(&path, "unknown-criterion", format!("unknown criterion; {}", known(key, metrics)))
+            }
+            (Some(_), None) => checks.refuse(&path, "wrong-type", format!("got {value}; give a number")),
             (Some((limits, metric)), Some(number)) => {
                 not_negative(&path, number, checks);
                 limits.insert(metric.to_owned(), number);
@@ -141,14 +144,22 @@ pub(crate) fn resolve(raw: &Raw, metrics: &toml::Table, setting: &Setting<'_>, c
         }
     }
     let peaks = !accept.metric_peak.is_empty();
-    checks.require(peaks || setting.metrics.is_none() || raw.peak_from_s.is_none(), "accept.peak_from_s", || {
-        "is from when on peaks count, and no criterion is a peak; add one that ends in _peak, or remove it".to_owned()
-    });
+    checks.require(
+        peaks || setting.metrics.is_none() || raw.peak_from_s.is_none(),
+        "accept.peak_from_s",
+        "unused-key",
+        || {
+            "is from when on peaks count, and no criterion is a peak; add one that ends in _peak, or remove it"
+                .to_owned()
+        },
+    );
     accept
 }
 
 fn not_negative(path: &str, value: f64, checks: &mut Checks<'_>) {
-    checks.require(value >= 0.0, path, || format!("{value} is below zero, which no result can be; give 0 or more"));
+    checks.require(value >= 0.0, path, "negative", || {
+        format!("{value} is below zero, which no result can be; give 0 or more")
+    });
 }
 
 fn instant(key: &str, value: Option<f64>, setting: &Setting<'_>, checks: &mut Checks<'_>) -> f64 {
@@ -175,7 +186,7 @@ fn limit(key: &str, raw: Option<&RawTicks>, roles: Option<&[&str]>, checks: &mut
                 let path = format!("{path}.{role}");
                 let amount = amount(&path, raw, checks);
                 if let Some(roles) = roles {
-                    checks.require(roles.contains(&role.as_str()), &path, || {
+                    checks.require(roles.contains(&role.as_str()), &path, "unknown-role", || {
                         format!("there is no such role to count ticks of; {}", nearest(role, roles))
                     });
                 }
@@ -191,7 +202,7 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
     match raw {
         RawTicks::Count(count) => {
             not_negative(path, *count, checks);
-            checks.require(count.fract() == 0.0, path, || {
+            checks.require(count.fract() == 0.0, path, "not-whole", || {
                 format!("{count} is no count of ticks; give a whole number, or a share such as \"1 %\"")
             });
             Some(TickAmount::Count(*count as u64))
@@ -199,13 +210,13 @@ fn amount(path: &str, raw: &RawTicks, checks: &mut Checks<'_>) -> Option<TickAmo
         RawTicks::Share(text) => {
             let percent = text.strip_suffix('%').and_then(|number| number.trim().parse::<f64>().ok());
             let percent = percent.filter(|percent| (0.0..=100.0).contains(percent));
-            checks.require(percent.is_some(), path, || {
+            checks.require(percent.is_some(), path, "out-of-range", || {
                 format!("`{text}` is no share of ticks; give one from \"0 %\" to \"100 %\", or a number of ticks")
             });
             percent.map(|percent| TickAmount::Share(percent / 100.0))
         }
         RawTicks::ByRole(_) => {
-            checks.refuse(path, "a role has one limit; give a number, or a share such as \"1 %\"");
+            checks.refuse(path, "one-limit", "a role has one limit; give a number, or a share such as \"1 %\"");
             None
         }
     }

@@ -17,10 +17,9 @@ impl<'a> Checks<'a> {
         Self { document, problems: Vec::new(), warnings: Vec::new(), files: RefCell::default() }
     }
 
-    /// Notes that the value at `key` makes no sense.
-    pub fn refuse(&mut self, key: &str, reason: impl Into<String>) {
-        let place = self.document.place(key);
-        self.problems.push(Problem { place, key: key.to_owned(), reason: reason.into() });
+    /// Notes that the value at `key` makes no sense. The code names the kind of mistake, in lower case with hyphens.
+    pub fn refuse(&mut self, key: &str, code: &'static str, reason: impl Into<String>) {
+        self.problems.push(Problem::new(self.document.place(key), key, code, reason));
     }
 
     /// Notes that the value at `key` has no effect: the scenario is valid all the same.
@@ -30,27 +29,30 @@ impl<'a> Checks<'a> {
 
     /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
     pub fn file(&self, key: &str, name: &str) -> PathBuf {
-        let here = self.document.place(key).starts_with("--set");
+        let here = self.document.place(key).line.is_none();
         let path = if here { name.into() } else { self.document.directory().join(name) };
         self.files.borrow_mut().push((key.to_owned(), path.clone()));
         path
     }
 
     /// Notes it unless `holds`.
-    pub fn require(&mut self, holds: bool, key: &str, reason: impl FnOnce() -> String) {
+    pub fn require(&mut self, holds: bool, key: &str, code: &'static str, reason: impl FnOnce() -> String) {
         if !holds {
-            self.refuse(key, reason());
+            self.refuse(key, code, reason());
         }
     }
 
     /// Notes a number that is not positive. Non-finite numbers never get so far.
     pub fn positive(&mut self, key: &str, value: f64) {
-        self.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
+        self.require(value > 0.0, key, "not-positive", || format!("{value} is not above zero; give a positive number"));
     }
 
-    /// Takes the value, or notes why there is none.
-    pub fn accept<T>(&mut self, key: &str, value: Result<T, impl std::fmt::Display>) -> Option<T> {
-        value.map_err(|error| self.refuse(key, error.to_string())).ok()
+    /// Takes the value, or notes why there is none, with the error's code.
+    pub fn accept<T, E: std::fmt::Display>(&mut self, key: &str, value: Result<T, E>) -> Option<T>
+    where
+        for<'e> &'e E: Into<&'static str>,
+    {
+        value.map_err(|error| self.refuse(key, (&error).into(), error.to_string())).ok()
     }
 
     /// Takes the files that values name, and the warnings.

@@ -2,7 +2,7 @@
 //!
 //! Must not know what any key means.
 
-use super::{ConfigError, Document};
+use super::{ConfigError, Document, Place};
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
@@ -30,13 +30,12 @@ impl Document {
     /// Puts a value at a path, as an override does; `place` stands for the key's place in error messages.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] where the path leads nowhere, or where the value is no quantity.
-    pub(crate) fn put(&mut self, path: &str, value: Value, place: &str) -> Result<(), ConfigError> {
+    /// [`ConfigError::Invalid`] where the path leads nowhere, or where the value is no quantity.
+    pub(crate) fn put(&mut self, path: &str, value: Value, place: &Place) -> Result<(), ConfigError> {
         let judged = value.clone();
-        self.put_value(path, value, place.to_owned()).map_err(|reason| ConfigError::Value {
-            place: place.to_owned(),
-            key: path.to_owned(),
-            reason: format!("{reason}; name a key of the scenario, as --set does"),
+        self.put_value(path, value, place.clone()).map_err(|error| {
+            let reason = format!("{error}; name a key of the scenario, as --set does");
+            ConfigError::of(place.clone(), path, (&error).into(), reason)
         })?;
         self.refuse_absurd_value(&judged, path.to_owned())
     }
@@ -46,7 +45,7 @@ impl Document {
         let Some(Value::Table(_)) = self.table.get(key) else { return None };
         let Some(Value::Table(table)) = self.table.remove(key) else { return None };
         let prefix = format!("{key}.");
-        let inner = |(path, place): (&String, &String)| Some((path.strip_prefix(&prefix)?.to_owned(), place.clone()));
+        let inner = |(path, place): (&String, &Place)| Some((path.strip_prefix(&prefix)?.to_owned(), place.clone()));
         let places = self.places.iter().filter_map(inner).collect();
         let mut taken = self.part(table);
         taken.places = places;
@@ -104,12 +103,12 @@ mod tests {
         let mut document = parse("[[fault]]\na = 1\n", "base.toml");
         let mut other = parse("x = 1\n[[fault]]\nb = 2\n[[fault]]\nc = [3]\n", "other.toml");
         document.append("fault", &mut other);
-        assert_eq!(document.place("fault[2].c[0]"), "other.toml:5");
+        assert_eq!(document.place("fault[2].c[0]"), Place::line("other.toml", 5));
         assert_eq!(document.get("fault.2.c.0"), Some(&Value::Integer(3)));
         assert!(other.has("x") && !other.has("fault"));
         document.remove_element("fault", 1);
-        assert_eq!(document.place("fault[1].c[0]"), "other.toml:5");
-        assert_eq!(document.place("fault[0].a"), "base.toml:2");
+        assert_eq!(document.place("fault[1].c[0]"), Place::line("other.toml", 5));
+        assert_eq!(document.place("fault[0].a"), Place::line("base.toml", 2));
         assert_eq!(document.get("fault.1.c.0"), Some(&Value::Integer(3)));
         assert_eq!(document.get("fault.2"), None);
     }
@@ -118,22 +117,24 @@ mod tests {
     fn a_table_that_is_taken_out_knows_its_lines() {
         let mut document = parse("x = 1\n[scenario]\na = 1\n[scenario.b]\nc = 2\n", "file.toml");
         let inner = document.take("scenario").unwrap();
-        assert_eq!((inner.place("b.c"), inner.get("b.c")), ("file.toml:5".to_owned(), Some(&Value::Integer(2))));
+        assert_eq!((inner.place("b.c"), inner.get("b.c")), (Place::line("file.toml", 5), Some(&Value::Integer(2))));
         assert!(document.take("scenario").is_none() && document.take("x").is_none() && document.has("x"));
     }
 
     #[test]
     fn a_value_goes_where_an_override_would_put_it() {
         let mut document = parse("a = [1.0, 2.0]\n[b]\nc = 1\n", "file.toml");
-        document.put("a.1", Value::Float(5.0), "map.toml:7").unwrap();
-        assert_eq!((document.get("a.1"), document.place("a[1]")), (Some(&Value::Float(5.0)), "map.toml:7".to_owned()));
-        for (path, value, expected) in [
-            ("a.9", 1.0, "map.toml:8: a.9: `a` has 2 entries, counted from 0: no 9; name a key"),
-            ("b.c.d", 1.0, "map.toml:8: b.c.d: `b.c` is a plain value"),
-            ("b.c", f64::NAN, "map.toml:8: b.c: NaN is not a finite number"),
-        ] {
-            let error = document.clone().put(path, Value::Float(value), "map.toml:8").unwrap_err().to_string();
-            assert!(error.starts_with(expected), "{error}");
+        document.put("a.1", Value::Float(5.0), &Place::line("map.toml", 7)).unwrap();
+        assert_eq!(
+            (document.get("a.1"), document.place("a[1]")),
+            (Some(&Value::Float(5.0)), Place::line("map.toml", 7))
+        );
+        for (path, value, expected) in
+            [("a.9", 1.0, "no-element"), ("b.c.d", 1.0, "plain-value"), ("b.c", f64::NAN, "not-finite")]
+        {
+            let error = document.clone().put(path, Value::Float(value), &Place::line("map.toml", 8)).unwrap_err();
+            let (text, code) = &error.mistakes()[0];
+            assert!(text.starts_with(&format!("map.toml:8: {path}: ")) && *code == expected, "{error}");
         }
     }
 }

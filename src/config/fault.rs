@@ -48,7 +48,7 @@ pub(crate) struct Setting<'a> {
 
 /// Checks all faults of a scenario. What is refused is noted and left out.
 pub(crate) fn resolve(raw: &[RawFault], setting: &Setting<'_>, checks: &mut Checks<'_>) -> Vec<ScriptedFault> {
-    checks.require(raw.len() <= MAX_FAULTS, "fault", || {
+    checks.require(raw.len() <= MAX_FAULTS, "fault", "too-many", || {
         format!(
             "{} are more than a run takes; give at most {MAX_FAULTS}, with longer ticks or a probability",
             raw.len()
@@ -71,9 +71,9 @@ impl One<'_, '_, '_> {
         format!("fault[{}].{name}", self.number)
     }
 
-    fn require(&mut self, holds: bool, name: &str, reason: impl FnOnce() -> String) -> Option<()> {
+    fn require(&mut self, holds: bool, name: &str, code: &'static str, reason: impl FnOnce() -> String) -> Option<()> {
         let key = self.key(name);
-        self.checks.require(holds, &key, reason);
+        self.checks.require(holds, &key, code, reason);
         holds.then_some(())
     }
 
@@ -120,16 +120,18 @@ impl One<'_, '_, '_> {
             ("spread_ticks", raw.spread_ticks.is_some(), of(&[Delay]), false),
             ("stall_ms", raw.stall_ms.is_some(), of(&[Stall]), of(&[Stall])),
         ] {
-            self.require(wanted || !given, name, || "has no meaning for this kind; remove it".to_owned());
-            self.require(given || !needed, name, || "is missing for this kind; add it".to_owned());
+            self.require(wanted || !given, name, "unused-key", || "has no meaning for this kind; remove it".to_owned());
+            self.require(given || !needed, name, "missing-key", || "is missing for this kind; add it".to_owned());
         }
     }
 
     fn check_time(&mut self) {
         let raw = self.raw;
-        self.require(raw.ticks >= 1, "ticks", || "0 ticks are none; give at least 1, or remove the fault".to_owned());
+        self.require(raw.ticks >= 1, "ticks", "out-of-range", || {
+            "0 ticks are none; give at least 1, or remove the fault".to_owned()
+        });
         if raw.kind == Kind::Freeze {
-            self.require(raw.from_tick >= 1, "from_tick", || {
+            self.require(raw.from_tick >= 1, "from_tick", "out-of-range", || {
                 "at tick 0 there is nothing to stay at; give 1 or more".into()
             });
         }
@@ -140,7 +142,7 @@ impl One<'_, '_, '_> {
         let (raw, bodies) = (self.raw, self.setting.bodies);
         let driven: Vec<&str> = bodies.iter().filter(|body| body.driven).map(|body| &*body.name).collect();
         let roles = role_names(bodies);
-        self.require(roles.contains(&&*raw.role), "role", || {
+        self.require(roles.contains(&&*raw.role), "role", "unknown-role", || {
             format!("there is no role `{}` in this scenario; {}", raw.role, nearest(&raw.role, &roles))
         })?;
         if self.of_role() {
@@ -148,14 +150,14 @@ impl One<'_, '_, '_> {
         }
         if raw.role == "controller" {
             if let Some(body) = &raw.body {
-                self.require(driven.contains(&&**body), "body", || {
+                self.require(driven.contains(&&**body), "body", "unknown-body", || {
                     format!("the controller drives no `{body}`; {}", nearest(body, &driven))
                 })?;
             }
             let wanted = |body: &&&str| raw.body.as_ref().is_none_or(|wanted| wanted == **body);
             return Some(driven.iter().filter(wanted).map(|body| Some((*body).to_owned())).collect());
         }
-        self.require(raw.body.is_none(), "body", || {
+        self.require(raw.body.is_none(), "body", "unused-key", || {
             "is for the controller, which has a command for each driven body; remove it".to_owned()
         })?;
         let body = if raw.role == "observer" { &*bodies[0].name } else { &*raw.role };
@@ -171,7 +173,7 @@ impl One<'_, '_, '_> {
             Kind::Delay => Action::Transport(Transport::Delay(self.delay()?)),
             Kind::Stall => {
                 let ms = raw.stall_ms?;
-                self.require(ms > 0.0 && ms <= MAX_STALL_MS, "stall_ms", || {
+                self.require(ms > 0.0 && ms <= MAX_STALL_MS, "stall_ms", "out-of-range", || {
                     format!("{ms} ms is no stall; give a number above 0, up to {MAX_STALL_MS}")
                 })?;
                 Action::Role(Interruption::Stall { ns: (ms * 1e6) as u64 })
@@ -209,10 +211,10 @@ impl One<'_, '_, '_> {
         let (words, kind) = self.words(fields)?;
         let number = !matches!(raw.kind, Kind::Freeze | Kind::BitFlip);
         let stamp = words.first < fields.content.first;
-        self.require(!stamp || raw.kind == Kind::BitFlip, "field", || {
+        self.require(!stamp || raw.kind == Kind::BitFlip, "field", "wrong-field", || {
             "belongs to the stamp, of which only bits can flip; use kind = \"bit-flip\" or another field".to_owned()
         })?;
-        self.require(!number || kind == FieldKind::F64, "field", || {
+        self.require(!number || kind == FieldKind::F64, "field", "wrong-field", || {
             "is a word of bits and holds no number; use kind = \"bit-flip\" or \"freeze\", or another field".to_owned()
         })?;
         let change = match raw.kind {
@@ -227,7 +229,7 @@ impl One<'_, '_, '_> {
                 Change::Noise(deviation)
             }
             _ => {
-                self.require(raw.bit.is_none_or(|bit| bit < 64), "bit", || {
+                self.require(raw.bit.is_none_or(|bit| bit < 64), "bit", "out-of-range", || {
                     "a word has 64 bits; give 0 (the least significant) to 63".to_owned()
                 })?;
                 Change::Flip(raw.bit.map(|bit| bit as u32))
@@ -242,12 +244,12 @@ impl One<'_, '_, '_> {
         let names: Vec<&str> = fields.all.iter().map(|(name, ..)| *name).collect();
         let name = raw.field.as_deref().unwrap_or(fields.first);
         let found = fields.all.iter().find(|(known, ..)| *known == name);
-        self.require(found.is_some(), "field", || {
+        self.require(found.is_some(), "field", "unknown-field", || {
             format!("the sample has no field `{name}`; {}", nearest(name, &names))
         })?;
         let (_, words, kind) = *found?;
         let Some(component) = raw.component else { return Some((words, kind)) };
-        self.require((1..=words.count).contains(&component), "component", || match words.count {
+        self.require((1..=words.count).contains(&component), "component", "no-such-component", || match words.count {
             1 => format!("`{name}` has one component; give 1 or leave it out"),
             count => format!("`{name}` has no component {component}; give 1 to {count}"),
         })?;
@@ -257,12 +259,12 @@ impl One<'_, '_, '_> {
     fn lost_axis(&mut self, fields: &Fields) -> Option<Tamper> {
         let component = self.raw.component?;
         let valid = fields.all.iter().find(|(name, ..)| *name == VALID);
-        self.require(valid.is_some(), "kind", || {
+        self.require(valid.is_some(), "kind", "wrong-signal", || {
             "takes an axis out of what is measured or estimated, and this signal is neither; name a body or the observer"
                 .to_owned()
         })?;
         let (_, valid, _) = *valid?;
-        self.require((1..=fields.axes).contains(&component), "component", || {
+        self.require((1..=fields.axes).contains(&component), "component", "no-such-component", || {
             format!("there is no axis {component} to lose; give 1 to {}", fields.axes)
         })?;
         let words = Words { first: fields.content.first + component - 1, count: 1 };

@@ -128,21 +128,25 @@ pub(crate) fn check(hosts: &Hosts, bodies: &[(&str, bool)], roles: &[&str], dela
         for (position, role) in host.roles.iter().enumerate() {
             let key = format!("{}[{position}]", key("roles"));
             if !roles.contains(&role.as_str()) {
-                checks.refuse(&key, format!("there is no role `{role}`; this scenario has: {}", roles.join(", ")));
+                checks.refuse(
+                    &key,
+                    "unknown-role",
+                    format!("there is no role `{role}`; this scenario has: {}", roles.join(", ")),
+                );
             } else if taken.contains(&role.as_str()) {
-                checks.refuse(&key, format!("the {role} cannot be on two hosts; name it once"));
+                checks.refuse(&key, "role-twice", format!("the {role} cannot be on two hosts; name it once"));
             }
             taken.push(role);
         }
     }
     let homeless: Vec<&str> = roles.iter().copied().filter(|role| !taken.contains(role)).collect();
-    checks.require(hosts.hosts.is_empty() || homeless.is_empty(), "host", || {
+    checks.require(hosts.hosts.is_empty() || homeless.is_empty(), "host", "role-without-host", || {
         format!("no host has the role {}; name every role once", homeless.join(", "))
     });
     let lag = hosts.lag_ticks("controller", bodies.iter().copied());
     for (body, _) in bodies.iter().filter(|(_, driven)| *driven) {
         let needed = lag + hosts.way("controller", body);
-        checks.require(needed <= delay_ticks, "actuation_delay_ticks", || {
+        checks.require(needed <= delay_ticks, "actuation_delay_ticks", "budget-too-long", || {
             format!(
                 "the budgets on the way from the measurements by the controller to {body} come to {needed} ticks, and a command \
                  acts after {delay_ticks}; give {needed} or more, or lower those of [network]"
@@ -157,26 +161,28 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
     for (index, host) in hosts.hosts.iter().enumerate() {
         let (name, key) = (host.name.as_str(), format!("host[{index}].name"));
         let letters = name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-        checks.require(letters && (1..=32).contains(&name.len()), &key, || {
+        checks.require(letters && (1..=32).contains(&name.len()), &key, "bad-name", || {
             format!("`{name}` cannot name files; use 1 to 32 of a-z, 0-9 and -")
         });
-        checks.require(!names.contains(&name), &key, || format!("there are two hosts `{name}`; name each once"));
-        checks.require(!host.roles.is_empty(), &format!("host[{index}].roles"), || {
+        checks.require(!names.contains(&name), &key, "taken-name", || {
+            format!("there are two hosts `{name}`; name each once")
+        });
+        checks.require(!host.roles.is_empty(), &format!("host[{index}].roles"), "empty-list", || {
             "a host without roles has no part in a run; give it one, or leave it out".to_owned()
         });
         names.push(name);
     }
-    checks.require(hosts.hosts.is_empty() || hosts.hosts.len() <= 16, "host", || {
+    checks.require(hosts.hosts.is_empty() || hosts.hosts.len() <= 16, "host", "too-many", || {
         format!("{} hosts are more than a run can have; give 16 at the most", hosts.hosts.len())
     });
     for (index, roles) in processes.iter().enumerate() {
         let apart = roles.iter().any(|role| hosts.of(role) != hosts.of(&roles[0]));
-        checks.require(!apart, &format!("launch.processes[{index}]"), || {
+        checks.require(!apart, &format!("launch.processes[{index}]"), "roles-apart", || {
             format!("{} are on different hosts and cannot share a process; take them apart", roles.join(", "))
         });
     }
     for (index, role) in external.iter().enumerate() {
-        checks.require(hosts.hosts.is_empty(), &format!("launch.external[{index}]"), || {
+        checks.require(hosts.hosts.is_empty(), &format!("launch.external[{index}]"), "external-with-hosts", || {
             format!("somebody else's {role} has no part in a run over several hosts; leave it out, or the hosts")
         });
     }
@@ -186,22 +192,25 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
         .enumerate()
         .map(|(index, link)| (format!("network.link[{index}].budget_ticks"), link.budget_ticks));
     for (key, ticks) in budgets.chain([("network.budget_ticks".to_owned(), *budget_ticks)]) {
-        checks.require((1..=BUDGET_MAX).contains(&ticks), &key, || {
+        checks.require((1..=BUDGET_MAX).contains(&ticks), &key, "out-of-range", || {
             format!("no way takes {ticks} ticks; give 1 to {BUDGET_MAX}")
         });
     }
     for (index, LinkBudget { from, to, .. }) in links.iter().enumerate() {
         for (part, name) in [("from", from), ("to", to)] {
-            checks.require(names.contains(&name.as_str()), &format!("network.link[{index}].{part}"), || {
-                format!("there is no host `{name}`; this scenario has: {}", names.join(", "))
-            });
+            checks.require(
+                names.contains(&name.as_str()),
+                &format!("network.link[{index}].{part}"),
+                "unknown-host",
+                || format!("there is no host `{name}`; this scenario has: {}", names.join(", ")),
+            );
         }
         let again = links[..index].iter().any(|other| (&other.from, &other.to) == (from, to));
-        checks.require(from != to && !again, &format!("network.link[{index}].to"), || {
+        checks.require(from != to && !again, &format!("network.link[{index}].to"), "no-such-link", || {
             format!("{from} to {to} is no way, or has its budget already; name each way between two hosts once")
         });
     }
-    checks.require((0.1..=3600.0).contains(silence_timeout_s), "network.silence_timeout_s", || {
+    checks.require((0.1..=3600.0).contains(silence_timeout_s), "network.silence_timeout_s", "out-of-range", || {
         format!("{silence_timeout_s} s is no time to wait for a host that speaks every 0.02 s; give 0.1 to 3600")
     });
 }

@@ -22,17 +22,16 @@ pub use accept::{Accept, TickAmount, TickLimit};
 pub use body::{BodyInfo, role_names};
 pub use checks::Checks;
 pub use document::{Document, read_text};
-pub use error::{ConfigError, Problem};
+pub use error::{ConfigError, PathError, Place, Problem};
 pub use fault::ScriptedFault;
 pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
 pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
 pub(crate) use reader::keys_of;
 pub use run_id::{NoRunId, RunId};
-pub use settings::Settings;
-pub(crate) use settings::{debugged_and_external, shared_with_external};
+pub use settings::{NotExternal, Settings};
 pub(crate) use shape::{Key, Shape};
 
-pub(crate) use document::nearest;
+pub(crate) use error::nearest;
 
 /// Whether a text names what ships with the program; otherwise it is a file's path.
 pub(crate) fn is_name(text: &str) -> bool {

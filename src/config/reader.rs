@@ -3,11 +3,13 @@
 //!
 //! Must not know what any key means.
 
-use serde::de::value::Error;
+use super::error::nearest;
 use serde::de::{
-    DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer, MapAccess, SeqAccess, Visitor,
+    DeserializeOwned, DeserializeSeed, Deserializer, Error, Expected, IntoDeserializer, MapAccess, SeqAccess,
+    Unexpected, Visitor,
 };
 use std::cell::RefCell;
+use std::fmt::Display;
 use std::iter::Enumerate;
 use std::slice;
 use toml::{Table, Value, map};
@@ -38,11 +40,100 @@ pub(super) enum Asked {
     Table(&'static [&'static str]),
 }
 
+/// Why a type refuses what it is given, in words for an author of scenarios.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(super) enum Refusal {
+    #[error("unknown key `{key}`")]
+    UnknownKey { key: String, known: &'static [&'static str] },
+    #[error("`{0}` is missing")]
+    MissingKey(&'static str),
+    #[error("there is no choice `{word}`; {}", nearest(word, known))]
+    UnknownChoice { word: String, known: &'static [&'static str] },
+    #[error("got {given}; give {wanted}")]
+    WrongType { given: String, wanted: String },
+    #[error("got {given} values; give {wanted}")]
+    WrongLength { given: usize, wanted: String },
+    /// In the type's own words.
+    #[error("{0}")]
+    Other(String),
+}
+
+impl Refusal {
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::UnknownKey { .. } => super::error::UNKNOWN_KEY,
+            Self::MissingKey(_) => super::error::MISSING_KEY,
+            Self::UnknownChoice { .. } => "unknown-choice",
+            Self::WrongType { .. } => "wrong-type",
+            Self::WrongLength { .. } => "wrong-length",
+            Self::Other(_) => "no-such-value",
+        }
+    }
+}
+
+impl Error for Refusal {
+    fn custom<T: Display>(message: T) -> Self {
+        Self::Other(message.to_string().replace('\n', ", "))
+    }
+
+    fn invalid_type(given: Unexpected<'_>, wanted: &dyn Expected) -> Self {
+        let (given, wanted) = match given {
+            Unexpected::Map => ("a table".to_owned(), wanted.to_string()),
+            Unexpected::Seq => ("a list".to_owned(), wanted.to_string()),
+            Unexpected::UnitVariant => ("another kind of value".to_owned(), wanted.to_string()),
+            given => (given.to_string(), wanted.to_string()),
+        };
+        let lists = given == "a table" && wanted == "a sequence";
+        let wanted =
+            if lists { "a list of tables, each under its name in double brackets".to_owned() } else { plain(wanted) };
+        Self::WrongType { given, wanted }
+    }
+
+    fn invalid_value(given: Unexpected<'_>, wanted: &dyn Expected) -> Self {
+        Self::invalid_type(given, wanted)
+    }
+
+    fn invalid_length(given: usize, wanted: &dyn Expected) -> Self {
+        Self::WrongLength { given, wanted: plain(wanted.to_string()) }
+    }
+
+    fn unknown_variant(word: &str, known: &'static [&'static str]) -> Self {
+        Self::UnknownChoice { word: word.to_owned(), known }
+    }
+
+    fn unknown_field(key: &str, known: &'static [&'static str]) -> Self {
+        Self::UnknownKey { key: key.to_owned(), known }
+    }
+
+    fn missing_field(key: &'static str) -> Self {
+        Self::MissingKey(key)
+    }
+}
+
+/// What a type expects, in words for an author of scenarios. Types name it in serde's words, and in no other way.
+fn plain(wanted: String) -> String {
+    let words = match wanted.as_str() {
+        "f64" => "a number",
+        "i32" | "i64" => "a whole number",
+        "u64" | "usize" => "a whole number, not below 0",
+        "a boolean" => "true or false",
+        text if text == "a string" || text.starts_with("enum ") => "a text in quotes",
+        "a sequence" => "a list",
+        "fewer elements in array" => "fewer values",
+        table if table == "a map" || table.starts_with("struct ") => "a table",
+        other => {
+            let numbers = other.strip_prefix("an array of length ").map(|length| format!("a list of {length} numbers"));
+            return numbers.unwrap_or(wanted);
+        }
+    };
+    words.to_owned()
+}
+
 /// Reads a table into a type; otherwise the key of what the type refuses, as `a.b[0]`, and why.
-pub(super) fn read<T: DeserializeOwned>(table: &Table) -> Result<T, (String, String)> {
+pub(super) fn read<T: DeserializeOwned>(table: &Table) -> Result<T, (String, Refusal)> {
     let notes = Notes::default();
     let reader = Reader { source: Source::Table(table), notes: &notes, depth: 0 };
-    T::deserialize(reader).map_err(|error| (notes.path(), error.to_string()))
+    T::deserialize(reader).map_err(|refusal| (notes.path(), refusal))
 }
 
 /// What a type asks for at the end of a way.
@@ -62,10 +153,10 @@ pub(crate) fn keys_of<T: DeserializeOwned>() -> &'static [&'static str] {
 }
 
 /// Why a type refuses a value at the end of a way, if it does. What it misses around the value is no refusal of it.
-pub(super) fn refusal<T: DeserializeOwned>(way: &[Step], value: &Value) -> Option<String> {
+pub(super) fn refusal<T: DeserializeOwned>(way: &[Step], value: &Value) -> Option<Refusal> {
     let notes = Notes::default();
     let error = T::deserialize(Reader { source: Source::at_end(way, Some(value)), notes: &notes, depth: 0 }).err()?;
-    (notes.steps.borrow().len() >= way.len()).then(|| error.to_string())
+    (notes.steps.borrow().len() >= way.len()).then_some(error)
 }
 
 /// What is noted while a type reads.
@@ -124,7 +215,7 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     /// Reads what there is; notes what is asked for if that is nothing.
-    fn give<'de, V: Visitor<'de>>(self, asked: Asked, visitor: V) -> Result<V::Value, Error> {
+    fn give<'de, V: Visitor<'de>>(self, asked: Asked, visitor: V) -> Result<V::Value, Refusal> {
         let (rest, length) = match self.source {
             Source::Table(table) => (Rest::Table(table.iter()), None),
             Source::List(list) => (Rest::List(list.iter().enumerate()), Some(list.len())),
@@ -134,7 +225,7 @@ impl Reader<'_> {
                     (Step::Key(name), Asked::Table(_)) => (one(name), None),
                     (Step::Entry, Asked::Map) => (one("element"), None),
                     (Step::Element, Asked::List | Asked::Array(_)) => (one("element"), Some(1)),
-                    _ => return Err(Error::custom("the way does not lead on")),
+                    _ => return Err(Refusal::custom("the way does not lead on")),
                 }
             }
             Source::Plain(Value::String(text)) => return visitor.visit_str(text),
@@ -145,14 +236,14 @@ impl Reader<'_> {
             Source::Plain(date) => return visitor.visit_str(&date.to_string()),
             Source::Nothing => {
                 self.notes.asked.replace(Some(asked));
-                return Err(Error::custom("there is only what is asked"));
+                return Err(Refusal::custom("there is only what is asked"));
             }
         };
         let mut entries = Entries { rest, value: None, notes: self.notes, depth: self.depth };
         let Some(length) = length else { return visitor.visit_map(entries) };
         let read = visitor.visit_seq(&mut entries)?;
         match entries.rest.next() {
-            Some(_) => Err(Error::invalid_length(length, &"fewer elements in array")),
+            Some(_) => Err(Refusal::invalid_length(length, &"fewer elements in array")),
             None => Ok(read),
         }
     }
@@ -160,14 +251,14 @@ impl Reader<'_> {
 
 macro_rules! plain {
     ($($method:ident: $asked:ident)*) => {$(
-        fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+        fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Refusal> {
             self.give(Asked::$asked, visitor)
         }
     )*};
 }
 
 impl<'de> Deserializer<'de> for Reader<'_> {
-    type Error = Error;
+    type Error = Refusal;
 
     plain! {
         deserialize_any: Any deserialize_ignored_any: Any deserialize_unit: Any deserialize_bytes: Any
@@ -178,23 +269,23 @@ impl<'de> Deserializer<'de> for Reader<'_> {
         deserialize_char: Text deserialize_str: Text deserialize_string: Text deserialize_identifier: Text
     }
 
-    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Refusal> {
         visitor.visit_some(self)
     }
 
-    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_unit_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Refusal> {
         self.give(Asked::Any, visitor)
     }
 
-    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_newtype_struct<V: Visitor<'de>>(self, _name: &'static str, visitor: V) -> Result<V::Value, Refusal> {
         visitor.visit_newtype_struct(self)
     }
 
-    fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Refusal> {
         self.give(Asked::List, visitor)
     }
 
-    fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_tuple<V: Visitor<'de>>(self, length: usize, visitor: V) -> Result<V::Value, Refusal> {
         self.give(Asked::Array(length), visitor)
     }
 
@@ -203,11 +294,11 @@ impl<'de> Deserializer<'de> for Reader<'_> {
         _name: &'static str,
         length: usize,
         visitor: V,
-    ) -> Result<V::Value, Error> {
+    ) -> Result<V::Value, Refusal> {
         self.deserialize_tuple(length, visitor)
     }
 
-    fn deserialize_map<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Error> {
+    fn deserialize_map<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Refusal> {
         self.give(Asked::Map, visitor)
     }
 
@@ -216,7 +307,7 @@ impl<'de> Deserializer<'de> for Reader<'_> {
         _name: &'static str,
         names: &'static [&'static str],
         visitor: V,
-    ) -> Result<V::Value, Error> {
+    ) -> Result<V::Value, Refusal> {
         self.give(Asked::Table(names), visitor)
     }
 
@@ -226,7 +317,7 @@ impl<'de> Deserializer<'de> for Reader<'_> {
         _name: &'static str,
         names: &'static [&'static str],
         visitor: V,
-    ) -> Result<V::Value, Error> {
+    ) -> Result<V::Value, Refusal> {
         match self.source {
             Source::Plain(Value::String(word)) => visitor.visit_enum(word.as_str().into_deserializer()),
             _ => self.give(Asked::Choice(names), visitor),
@@ -275,7 +366,7 @@ impl<'a> Entries<'a> {
         step: String,
         source: Source<'_>,
         seed: S,
-    ) -> Result<S::Value, Error> {
+    ) -> Result<S::Value, Refusal> {
         self.notes.steps.borrow_mut().push(step);
         let read = seed.deserialize(Reader { source, notes: self.notes, depth: self.depth + 1 })?;
         self.notes.steps.borrow_mut().truncate(self.depth);
@@ -284,25 +375,25 @@ impl<'a> Entries<'a> {
 }
 
 impl<'de> MapAccess<'de> for Entries<'_> {
-    type Error = Error;
+    type Error = Refusal;
 
-    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Error> {
+    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, Refusal> {
         let Some((key, step, source)) = self.next() else { return Ok(None) };
         self.value = Some((step, source));
-        let key: serde::de::value::StrDeserializer<'_, Error> = key.into_deserializer();
+        let key: serde::de::value::StrDeserializer<'_, Refusal> = key.into_deserializer();
         seed.deserialize(key).map(Some)
     }
 
-    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Error> {
-        let (step, source) = self.value.take().ok_or_else(|| Error::custom("a key comes before its value"))?;
+    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, Refusal> {
+        let (step, source) = self.value.take().ok_or_else(|| Refusal::custom("a key comes before its value"))?;
         self.enter(step, source, seed)
     }
 }
 
 impl<'de> SeqAccess<'de> for &mut Entries<'_> {
-    type Error = Error;
+    type Error = Refusal;
 
-    fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Error> {
+    fn next_element_seed<T: DeserializeSeed<'de>>(&mut self, seed: T) -> Result<Option<T::Value>, Refusal> {
         let Some((_, step, source)) = self.next() else { return Ok(None) };
         self.enter(step, source, seed).map(Some)
     }
@@ -348,7 +439,7 @@ mod tests {
     const TEXT: &str = "name = 'a'\ncount = 3\nlimits = { x = 1 }\n\
         inner = [{ kind = 'one-way', either = [[1, 2.5], [3, 4]] }, { kind = 'one-way', either = 'w', pair = [1, 2] }]";
 
-    fn read_text(text: &str) -> Result<Outer, (String, String)> {
+    fn read_text(text: &str) -> Result<Outer, (String, Refusal)> {
         read(&toml::from_str(text).unwrap())
     }
 
@@ -364,45 +455,32 @@ mod tests {
 
     #[test]
     fn tells_where_and_why_it_refuses() {
-        for (from, to, path, reason) in [
-            ("count = 3", "count = -3", "count", "invalid value: integer `-3`, expected u64"),
-            ("count = 3", "count = 1979-05-27", "count", "invalid type: string \"1979-05-27\", expected u64"),
-            (
-                "count = 3",
-                "counts = 3",
-                "",
-                "unknown field `counts`, expected one of `name`, `count`, `inner`, `limits`",
-            ),
-            ("count = 3\n", "", "", "missing field `count`"),
-            ("x = 1", "x = 'a'", "limits.x", "invalid type: string \"a\", expected f64"),
-            ("'w'", "1", "inner[1].either", "data did not match any variant of untagged enum Either"),
+        let kind =
+            |given: &str, wanted: &str| Refusal::WrongType { given: given.to_owned(), wanted: wanted.to_owned() };
+        let length = |given, wanted: &str| Refusal::WrongLength { given, wanted: wanted.to_owned() };
+        let unknown = |key: &str, known| Refusal::UnknownKey { key: key.to_owned(), known };
+        let choice = |word: &str, known| Refusal::UnknownChoice { word: word.to_owned(), known };
+        let variants = "data did not match any variant of untagged enum Either".to_owned();
+        let whole = "a whole number, not below 0";
+        for (from, to, path, refusal) in [
+            ("count = 3", "count = -3", "count", kind("integer `-3`", whole)),
+            ("count = 3", "count = 1979-05-27", "count", kind("string \"1979-05-27\"", whole)),
+            ("count = 3", "counts = 3", "", unknown("counts", &["name", "count", "inner", "limits"])),
+            ("count = 3\n", "", "", Refusal::MissingKey("count")),
+            ("x = 1", "x = 'a'", "limits.x", kind("string \"a\"", "a number")),
+            ("'w'", "1", "inner[1].either", Refusal::Other(variants)),
             // What one variant refused is not where the next field is.
-            ("pair = [1, 2]", "pair = [1, true]", "inner[1].pair[1]", "invalid type: boolean `true`, expected f64"),
-            (
-                "pair = [1, 2]",
-                "pair = [1, 2, 3]",
-                "inner[1].pair",
-                "invalid length 3, expected fewer elements in array",
-            ),
-            ("pair = [1, 2]", "pair = [1]", "inner[1].pair", "invalid length 1, expected an array of length 2"),
-            ("pair = [1, 2]", "pear = 1", "inner[1]", "unknown field `pear`, expected one of `kind`, `either`, `pair`"),
-            (
-                "'one-way', either = 'w'",
-                "'way', either = 'w'",
-                "inner[1].kind",
-                "unknown variant `way`, expected `one-way`",
-            ),
-            (
-                "'one-way', either = 'w'",
-                "2, either = 'w'",
-                "inner[1].kind",
-                "invalid type: integer `2`, expected enum Kind",
-            ),
-            ("inner = [", "inner = [2, ", "inner[0]", "invalid type: integer `2`, expected struct Inner"),
+            ("pair = [1, 2]", "pair = [1, true]", "inner[1].pair[1]", kind("boolean `true`", "a number")),
+            ("pair = [1, 2]", "pair = [1, 2, 3]", "inner[1].pair", length(3, "fewer values")),
+            ("pair = [1, 2]", "pair = [1]", "inner[1].pair", length(1, "a list of 2 numbers")),
+            ("pair = [1, 2]", "pear = 1", "inner[1]", unknown("pear", &["kind", "either", "pair"])),
+            ("'one-way', either = 'w'", "'way', either = 'w'", "inner[1].kind", choice("way", &["one-way"])),
+            ("'one-way', either = 'w'", "2, either = 'w'", "inner[1].kind", kind("integer `2`", "a text in quotes")),
+            ("inner = [", "inner = [2, ", "inner[0]", kind("integer `2`", "a table")),
         ] {
             assert!(TEXT.contains(from), "{from}");
             let refused = read_text(&TEXT.replace(from, to)).unwrap_err();
-            assert_eq!(refused, (path.to_owned(), reason.to_owned()), "{to}");
+            assert_eq!(refused, (path.to_owned(), refusal), "{to}");
         }
     }
 }

@@ -75,19 +75,19 @@ impl Settings {
     ///
     /// # Errors
     /// The reason, with what to do.
-    pub fn check_external(&self, role: &str) -> Result<(), String> {
+    pub fn check_external(&self, role: &str) -> Result<(), NotExternal> {
         let roles = self.roles();
         if self.clock == ClockKind::InProcess {
-            return Err("one process has no room for another's role; give --clock realtime or lockstep".to_owned());
+            return Err(NotExternal::OneProcess);
         }
         if !roles.contains(&role) {
-            return Err(format!("there is no such role; this scenario has: {}", roles.join(", ")));
+            return Err(NotExternal::UnknownRole { known: roles.join(", ") });
         }
         if self.debug.iter().any(|debugged| debugged == role) {
-            return Err(debugged_and_external(role));
+            return Err(NotExternal::DebuggedAndExternal { role: role.to_owned() });
         }
         let shared = self.processes.iter().any(|roles| roles.iter().any(|other| other == role));
-        if shared { Err(shared_with_external(role)) } else { Ok(()) }
+        if shared { Err(NotExternal::SharedAndExternal { role: role.to_owned() }) } else { Ok(()) }
     }
 
     /// How many ticks after its tick a role may still wait for what crosses hosts on the way to it.
@@ -119,14 +119,31 @@ impl Settings {
     }
 }
 
-/// Why a run cannot wait for a debugger of a role that another program takes.
-pub(crate) fn debugged_and_external(role: &str) -> String {
-    format!(
+/// Why a role cannot be another program's.
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
+pub enum NotExternal {
+    /// The run has one process.
+    #[error("one process has no room for another's role; give --clock realtime or lockstep")]
+    OneProcess,
+    /// The scenario has no such role.
+    #[error("there is no such role; this scenario has: {known}")]
+    UnknownRole {
+        /// The roles that it has.
+        known: String,
+    },
+    /// The run waits for a debugger of this role.
+    #[error(
         "another program takes the {role}: start that in a debugger, as `gdb --args …`, and take it out of launch.debug"
-    )
-}
-
-/// Why a role that shares a process of ours cannot be somebody else's.
-pub(crate) fn shared_with_external(role: &str) -> String {
-    format!("launch.processes has the {role} in a process of ours, so nobody else can be it; take it out there")
+    )]
+    DebuggedAndExternal {
+        /// The role.
+        role: String,
+    },
+    /// The role shares a process of ours.
+    #[error("launch.processes has the {role} in a process of ours, so nobody else can be it; take it out there")]
+    SharedAndExternal {
+        /// The role.
+        role: String,
+    },
 }

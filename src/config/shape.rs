@@ -2,7 +2,7 @@
 //!
 //! Must not know what any key means, nor need a word from the type beyond that it can be deserialized.
 
-use super::reader::{Asked, Step, asked, refusal};
+use super::reader::{Asked, Refusal, Step, asked, refusal};
 use serde::de::DeserializeOwned;
 use toml::Value;
 
@@ -115,28 +115,22 @@ fn table<T: DeserializeOwned>(way: &mut Vec<Step>, names: &'static [&'static str
     let mut keys: Vec<Key> = names.iter().map(|name| key(*name)).collect();
     let mut given = toml::Table::new();
     // One after the other: only the first that is missing is complained of.
-    while let Some(name) = refusal::<T>(way, &Value::Table(given.clone())).as_deref().and_then(missing) {
+    while let Some(Refusal::MissingKey(name)) = refusal::<T>(way, &Value::Table(given.clone())) {
         let Some(key) = keys.iter_mut().find(|key| key.name == name && !key.required) else { break };
         key.required = true;
         let Some(example) = key.shape.example() else { break };
         given.insert(name.to_owned(), example);
     }
     let stranger = toml::Table::from_iter([("?".to_owned(), Value::Integer(0))]);
-    let closed = refusal::<T>(way, &Value::Table(stranger)).is_some_and(|reason| reason.contains("unknown field"));
+    let closed = matches!(refusal::<T>(way, &Value::Table(stranger)), Some(Refusal::UnknownKey { .. }));
     Shape::Table { keys, closed }
-}
-
-/// The key in a message as "missing field `a`".
-fn missing(reason: &str) -> Option<&str> {
-    reason.split_once("missing field `")?.1.split_once('`').map(|(name, _)| name)
 }
 
 /// What a type that takes several kinds of values says to one that it does not take.
 fn choices<T: DeserializeOwned>(way: &[Step]) -> Option<String> {
-    refusal::<T>(way, &Value::Boolean(true))?
-        .split_once("; ")
-        .map(|(_, remedy)| remedy.to_owned())
-        .filter(|remedy| remedy.starts_with("give "))
+    let Some(Refusal::Other(words)) = refusal::<T>(way, &Value::Boolean(true)) else { return None };
+    let (_, remedy) = words.split_once("; ")?;
+    remedy.starts_with("give ").then(|| remedy.to_owned())
 }
 
 #[cfg(test)]

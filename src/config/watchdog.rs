@@ -25,17 +25,17 @@ pub(crate) fn resolve(
             let known: Vec<&str> = keys.iter().map(String::as_str).collect();
             let remedy =
                 if known.is_empty() { "this rig tells nothing to watch".to_owned() } else { nearest(name, &known) };
-            checks.refuse(&key, format!("there is no such quantity; {remedy}"));
+            checks.refuse(&key, "unknown-quantity", format!("there is no such quantity; {remedy}"));
             continue;
         };
         checks.positive(&key, *max);
         if let Some(reason) = monitors[index].1 {
-            checks.refuse(&key, format!("{reason}; remove it"));
+            checks.refuse(&key, "unused-key", format!("{reason}; remove it"));
         }
         bounds.max[index] = *max;
     }
     let from_s = raw.from_s;
-    checks.require(from_s >= 0.0, "watchdog.from_s", || {
+    checks.require(from_s >= 0.0, "watchdog.from_s", "negative", || {
         format!("{from_s} s is before the run; give an instant from 0 on, before its end at {duration_s} s")
     });
     if from_s >= duration_s {
@@ -44,13 +44,13 @@ pub(crate) fn resolve(
     }
     let watches = bounds != WatchBounds { from_tick: bounds.from_tick, ..WatchBounds::NONE };
     let safe = raw.on_breach == OnBreach::Safe;
-    checks.require(watches || !safe, "watchdog.on_breach", || {
+    checks.require(watches || !safe, "watchdog.on_breach", "no-effect", || {
         "has nothing to follow from: no bound is given; add one".to_owned()
     });
-    checks.require(safe || raw.latch_after_ticks.is_none(), "watchdog.latch_after_ticks", || {
+    checks.require(safe || raw.latch_after_ticks.is_none(), "watchdog.latch_after_ticks", "unused-key", || {
         "is for on_breach = \"safe\"; set that, or remove it".to_owned()
     });
-    checks.require(raw.latch_after_ticks != Some(0), "watchdog.latch_after_ticks", || {
+    checks.require(raw.latch_after_ticks != Some(0), "watchdog.latch_after_ticks", "out-of-range", || {
         "0 would latch without a breach; give 1 or more".to_owned()
     });
     bounds.latch_after_ticks = safe.then_some(raw.latch_after_ticks.unwrap_or(1));

@@ -58,25 +58,30 @@ pub struct Request {
 }
 
 /// Why there is no estimate.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum EstimateError {
     /// The log cannot be read.
     #[error(transparent)]
+    #[strum(transparent)]
     Data(#[from] DataError),
     /// What was asked for is impossible.
     #[error(transparent)]
+    #[strum(serialize = "impossible-estimate")]
     Setup(#[from] ReconstructionError),
     /// The axes are none.
     #[error(
         "the axes are no rotation: their columns must be of length 1, at right angles, and right-handed; take them from \
          `corotate identify --json`"
     )]
+    #[strum(serialize = "no-rotation")]
     Axes,
     /// The principal axes are turned, and a sensor is missing.
     #[error(
         "the principal axes are turned against the sensor's, and the log has no column of the rate about {axis}: it takes all \
          three to know two rates about principal axes; leave the axes out if the sensor is nearly aligned"
     )]
+    #[strum(serialize = "mixed-axes")]
     Mixed {
         /// The letter of the axis.
         axis: &'static str,
@@ -89,6 +94,7 @@ pub enum EstimateError {
     },
     /// Somebody who was given the rows failed.
     #[error(transparent)]
+    #[strum(serialize = "cannot-write")]
     Sink(std::io::Error),
 }
 

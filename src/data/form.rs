@@ -63,10 +63,12 @@ impl Default for Options {
 }
 
 /// Why a log cannot be read.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum DataError {
     /// The system says no.
     #[error("cannot read {}: {source}; name a file that can be read", path.display())]
+    #[strum(serialize = "cannot-read")]
     Read {
         /// The file.
         path: PathBuf,
@@ -75,12 +77,14 @@ pub enum DataError {
     },
     /// There is not one row of numbers.
     #[error("{}: it has no row of numbers; give it at least one below its header", path.display())]
+    #[strum(serialize = "no-rows")]
     Empty {
         /// The file.
         path: PathBuf,
     },
     /// A column is not there, or it is not clear which one is meant.
     #[error("{}: {reason}; {remedy}. Its columns: {columns}", path.display())]
+    #[strum(serialize = "no-such-column")]
     Column {
         /// The file.
         path: PathBuf,
@@ -93,6 +97,7 @@ pub enum DataError {
     },
     /// What stands in a cell is no number.
     #[error("{}:{line}: column {column}: `{text}` {reason}", path.display())]
+    #[strum(serialize = "not-a-number")]
     Cell {
         /// The file.
         path: PathBuf,
@@ -110,6 +115,7 @@ pub enum DataError {
         "{}:{line}: the row has {found} cells, the first one has {expected}; mend it, or if its numbers have a decimal comma \
          write them with a point", path.display()
     )]
+    #[strum(serialize = "row-length")]
     Cells {
         /// The file.
         path: PathBuf,
@@ -122,6 +128,7 @@ pub enum DataError {
     },
     /// The file is no text of lines.
     #[error("{}:{line}: {reason}", path.display())]
+    #[strum(serialize = "not-a-log")]
     Form {
         /// The file.
         path: PathBuf,
@@ -135,6 +142,7 @@ pub enum DataError {
         "{}: the usual interval is {interval_s} s if the stamps are in {unit}, as assumed; say what they are in with a unit of \
          time (s, ms, us, ns)", path.display()
     )]
+    #[strum(serialize = "implausible-unit")]
     Unit {
         /// The file.
         path: PathBuf,
@@ -145,6 +153,7 @@ pub enum DataError {
     },
     /// An option is no possible one.
     #[error("{name}: {reason}")]
+    #[strum(serialize = "impossible-option")]
     Option {
         /// The option.
         name: &'static str,

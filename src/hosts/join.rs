@@ -53,13 +53,16 @@ struct Answer {
 }
 
 /// Why a host does not take part.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum JoinError {
     /// The run does not want it.
     #[error("{0}")]
+    #[strum(serialize = "join-refused")]
     Refused(String),
     /// It is another version.
     #[error("the run is of version {theirs} and this program of {ours}; install the same on all hosts")]
+    #[strum(serialize = "other-version")]
     Version {
         /// The version there.
         theirs: String,
@@ -70,6 +73,7 @@ pub enum JoinError {
     #[error(
         "{service} is `{theirs}` there and `{ours}` here; install the same program, with the same rigs, on all hosts"
     )]
+    #[strum(serialize = "other-layout")]
     Layout {
         /// The signal.
         service: String,
@@ -83,9 +87,11 @@ pub enum JoinError {
     NoAnswer,
     /// The scenario is refused here.
     #[error(transparent)]
+    #[strum(serialize = "refused-scenario")]
     Config(#[from] ConfigError),
     /// A file that the scenario names cannot be kept.
     #[error("cannot write {}: {source}; {}", path.display(), crate::system::remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The file.
         path: PathBuf,

@@ -46,10 +46,12 @@ pub fn patience(endpoint: &Endpoint) -> Duration {
 }
 
 /// Why hosts cannot talk.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum NetError {
     /// Nobody can be reached, or nobody be listened for.
     #[error("{address}: {reason}; {remedy}")]
+    #[strum(serialize = "cannot-connect")]
     Open {
         /// The address.
         address: String,
@@ -60,6 +62,7 @@ pub enum NetError {
     },
     /// A key file cannot be read.
     #[error("cannot read {}: {reason}; docs/hosts.md tells how to make keys", path.display())]
+    #[strum(serialize = "unreadable-key")]
     Key {
         /// The file.
         path: std::path::PathBuf,
@@ -68,12 +71,14 @@ pub enum NetError {
     },
     /// There is somebody, but no answer.
     #[error("{address} does not answer; is `corotate run --listen` waiting there?")]
+    #[strum(serialize = "host-silent")]
     Silent {
         /// The address.
         address: String,
     },
     /// The engine failed.
     #[error("a message cannot be sent: {0}; is the network down?")]
+    #[strum(serialize = "network-failed")]
     Engine(String),
 }
 

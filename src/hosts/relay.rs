@@ -70,27 +70,33 @@ pub struct RelaySeat {
 }
 
 /// Why a relay ended.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum RelayError {
     /// The domain is none.
     #[error(transparent)]
+    #[strum(transparent)]
     Role(#[from] RoleError),
     /// The scenario has no such hosts.
     #[error("the scenario has no hosts `{0}` and `{1}`, or not every role has one")]
+    #[strum(serialize = "no-such-host")]
     NoHost(String, String),
     /// The others cannot be reached.
     #[error(transparent)]
+    #[strum(transparent)]
     Net(#[from] NetError),
     /// The time of the run cannot be had.
     #[error("no answer about the time for {0} s; is the network slower than that?")]
     NoTime(u64),
     /// The clock is of no use.
     #[error(transparent)]
+    #[strum(transparent)]
     Clock(#[from] ClockRefused),
     /// A host has joined and gone before any tick.
     #[error(
         "the host {host} joined, and nothing has been heard of it for {limit_s} s: look at what its `join` printed, and start both again"
     )]
+    #[strum(serialize = "host-lost")]
     Lost {
         /// The host.
         host: String,
@@ -99,9 +105,11 @@ pub enum RelayError {
     },
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// A file could not be written.
     #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The file.
         path: PathBuf,

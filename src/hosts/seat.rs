@@ -30,22 +30,27 @@ pub struct Address {
 }
 
 /// Why an address, or the way to use it, is refused.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum AddressError {
     /// It has not the form.
     #[error("`{0}` is no address; write quic/HOST:PORT, tcp/HOST:PORT or udp/HOST:PORT")]
+    #[strum(serialize = "not-an-address")]
     Form(String),
     /// Anybody could join.
     #[error(
         "{0} is open to everybody who reaches it; take quic/HOST:PORT with --tls-ca, --tls-cert and --tls-key, or say --insecure if \
          only friends do"
     )]
+    #[strum(serialize = "open-address")]
     Open(Address),
     /// Keys are missing.
     #[error("{0} needs --tls-ca, --tls-cert and --tls-key, all three; docs/hosts.md tells how to make them")]
+    #[strum(serialize = "missing-keys")]
     Keys(Address),
     /// Keys are of no use.
     #[error("{0} uses no keys; take quic/HOST:PORT, or leave --tls-ca, --tls-cert and --tls-key out")]
+    #[strum(serialize = "unused-keys")]
     NoKeys(Address),
 }
 

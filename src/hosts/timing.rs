@@ -23,13 +23,15 @@ const TRACK_NS: u64 = 1_000_000_000;
 const TRACK_LINES: usize = 3600;
 
 /// Why a host's clock is of no use to a run.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ClockRefused {
     /// The way takes too long.
     #[error(
         "a message takes {way_us:.0} us to the host that launched, and its time is known to {error_us:.0} us; together that is more than \
          {part_us:.0} us, the part of a budget of {ticks} ticks up to the cutoff; raise the budget in [network], or take a faster network"
     )]
+    #[strum(serialize = "clock-budget")]
     Budget {
         /// Half the fastest way there and back, µs.
         way_us: f64,
@@ -45,6 +47,7 @@ pub enum ClockRefused {
         "CLOCK_TAI of this host and of the one that launched are {apart_us:.0} us apart, as the network shows to {error_us:.0} us; start \
          ptp4l and phc2sys on both, or take network.clock_source = \"estimated\""
     )]
+    #[strum(serialize = "clock-tai")]
     Tai {
         /// The difference, µs.
         apart_us: f64,

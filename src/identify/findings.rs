@@ -139,6 +139,27 @@ pub enum Finding {
     },
 }
 
+impl From<&Finding> for &'static str {
+    /// Returns the stable name of the finding.
+    fn from(finding: &Finding) -> Self {
+        match finding {
+            Finding::Scale => "scale-unknown",
+            Finding::Short { .. } => "log-too-short",
+            Finding::FewPieces { .. } => "few-pieces",
+            Finding::Still { .. } => "hardly-a-motion",
+            Finding::Unexcited { .. } => "unexcited",
+            Finding::Sphere => "sphere",
+            Finding::Symmetric { .. } => "symmetric",
+            Finding::Damped { .. } => "damped",
+            Finding::Driven { .. } => "driven",
+            Finding::Unexplained { .. } => "unexplained",
+            Finding::Open { .. } => "not-closed",
+            Finding::Tilted { .. } => "tilted",
+            Finding::Indistinct { .. } => "indistinct",
+        }
+    }
+}
+
 impl Finding {
     /// Whether it leaves no body about the sensor's axes.
     pub fn forbids_axes(&self) -> bool {

@@ -118,12 +118,12 @@ impl RoleProcess {
         if let Some(failure) = self.panic().filter(|_| panicked) {
             return failure;
         }
-        let cause = match (status.code(), status.signal()) {
-            (Some(code), _) => format!("it exited with code {code}"),
-            (None, Some(signal)) => format!("it was killed by {}", signal_name(signal)),
-            (None, None) => "it ended".to_owned(),
+        let (code, cause) = match (status.code(), status.signal()) {
+            (Some(code), _) => ("exited", format!("it exited with code {code}")),
+            (None, Some(signal)) => ("killed", format!("it was killed by {}", signal_name(signal))),
+            (None, None) => ("ended", "it ended".to_owned()),
         };
-        Failure::new(cause, self.last_words())
+        Failure::new(code, cause, self.last_words())
     }
 
     /// An error if the process has ended before the ticks run.

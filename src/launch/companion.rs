@@ -70,7 +70,7 @@ impl Companion {
             }
             None => return None,
         };
-        tell(format_args!("corotate: {} failed: {cause}; the run goes on without", self.name));
+        tell(format_args!("corotate: {} failed: {cause}; the run goes on without [companion-lost]", self.name));
         janitor.clear_dead();
         Some(cause)
     }

@@ -11,7 +11,8 @@ use std::io;
 use std::path::PathBuf;
 
 /// Why a run failed. Whatever had been started is gone.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum LaunchError {
     /// The run cannot be stepped.
     #[error("the scenario cannot be stepped: {reason}; run it")]
@@ -21,24 +22,30 @@ pub enum LaunchError {
     },
     /// The scenario names cores that this process cannot be bound to.
     #[error("realtime.cores: this run cannot be bound to {}: not online, or not in its cpuset; name other cores, or \"auto\"", cores.iter().map(|core| format!("core {core}")).collect::<Vec<_>>().join(", "))]
+    #[strum(serialize = "no-such-core")]
     Cores {
         /// The cores.
         cores: Vec<usize>,
     },
     /// The domain could not be made.
     #[error(transparent)]
+    #[strum(transparent)]
     Domain(#[from] DomainError),
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// A role cannot go on.
     #[error(transparent)]
+    #[strum(transparent)]
     Node(#[from] NodeError),
     /// The roles' counters could not be opened.
     #[error(transparent)]
+    #[strum(transparent)]
     Ledger(#[from] LedgerError),
     /// There are too few descriptors. Found out later it would fail in the midst of the transport.
     #[error("the limit on open files is {limit} and this run may need {needed}; raise it with `ulimit -n {needed}`")]
+    #[strum(serialize = "too-few-descriptors")]
     Descriptors {
         /// The limit.
         limit: u64,
@@ -47,6 +54,7 @@ pub enum LaunchError {
     },
     /// A file of the domain could not be written.
     #[error("cannot write {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The file.
         path: PathBuf,
@@ -55,6 +63,7 @@ pub enum LaunchError {
     },
     /// A process could not be started.
     #[error("cannot start {role}: {source}; {}", remedy(source))]
+    #[strum(serialize = "cannot-start")]
     Spawn {
         /// The role.
         role: String,
@@ -63,6 +72,7 @@ pub enum LaunchError {
     },
     /// A role failed before the ticks ran.
     #[error("{role} died: {cause}{}", if last_words.is_empty() { String::new() } else { format!("; it said: {last_words}") })]
+    #[strum(serialize = "role-died")]
     Died {
         /// The role.
         role: String,
@@ -73,12 +83,14 @@ pub enum LaunchError {
     },
     /// The rig's score, or its other parts in the launcher, panicked.
     #[error("the rig failed outside of its roles: {panic}")]
+    #[strum(serialize = "rig-panicked")]
     Panicked {
         /// The panic.
         panic: Panic,
     },
     /// Roles were not ready in time.
     #[error("not ready within {limit_s} s: {roles}; on a slow machine raise launch.startup_timeout_s")]
+    #[strum(serialize = "not-ready")]
     StartUp {
         /// The limit.
         limit_s: f64,
@@ -95,9 +107,11 @@ pub enum LaunchError {
     },
     /// The recording could not be begun, or not be written where nobody else does.
     #[error(transparent)]
+    #[strum(transparent)]
     Record(#[from] RecordError),
     /// A privilege was required and not granted.
     #[error("required and not granted: {}", denied.iter().map(|(role, grant)| format!("{role}: {} {} ({})", grant.privilege, grant.asked, grant.reason)).collect::<Vec<_>>().join("; "))]
+    #[strum(serialize = "privilege-denied")]
     Privileges {
         /// Role and privilege.
         denied: Vec<(String, Grant)>,

@@ -26,6 +26,9 @@ pub struct Incident {
     /// The time of that tick, s from the first one.
     #[serde(default)]
     pub time_s: f64,
+    /// The stable name of the cause.
+    #[serde(default)]
+    pub code: String,
     /// The cause.
     pub cause: String,
     /// The end of its error output.
@@ -98,14 +101,15 @@ impl fmt::Display for Incident {
         if !self.last_words.is_empty() {
             write!(f, "; it said: {}", self.last_words)?;
         }
-        f.write_str(match self.action {
+        let end = match self.action {
             Action::Restarted if self.begins_anew => "; it is started anew, without the state that it had inherited",
             Action::Restarted => "; it is started anew",
             Action::Stopped if self.repeated => "; as before, so it is not started anew; the run ends",
             Action::Stopped => "; the run ends",
             Action::Noted => " after its last tick; its results are complete",
             Action::Continued => "; the run goes on",
-        })
+        };
+        write!(f, "{end} [{}]", self.code)
     }
 }
 
@@ -120,6 +124,7 @@ impl Incident {
             generation: 1,
             tick,
             time_s: 0.0,
+            code: failure.code,
             cause: failure.cause,
             last_words: failure.last_words,
             panic: failure.panic,
@@ -134,7 +139,7 @@ impl Incident {
 
     /// An absence of the device in a role's seat.
     pub(super) fn of_device(role: &str, outage: &Outage) -> Self {
-        let failure = Failure::new(outage.cause.clone(), String::new());
+        let failure = Failure::new(outage.code.clone(), outage.cause.clone(), String::new());
         Self {
             external: true,
             outage_s: outage.back_at_tick.map(|_| outage.seconds),
@@ -181,8 +186,10 @@ impl Incidents {
     }
 }
 
-/// The failure of a role, in words.
+/// The failure of a role.
 pub(super) struct Failure {
+    /// The stable name of the cause.
+    pub code: String,
     pub cause: String,
     pub last_words: String,
     /// The panic that ended its process, if one did.
@@ -191,12 +198,12 @@ pub(super) struct Failure {
 
 impl Failure {
     /// A failure of a process that did not panic.
-    pub fn new(cause: String, last_words: String) -> Self {
-        Self { cause, last_words, panic: None }
+    pub fn new(code: impl Into<String>, cause: String, last_words: String) -> Self {
+        Self { code: code.into(), cause, last_words, panic: None }
     }
 
     /// A panic. Of the error output, which ends with a backtrace, it keeps the message alone.
     pub fn of(panic: Panic) -> Self {
-        Self { cause: panic.to_string(), last_words: String::new(), panic: Some(panic) }
+        Self { panic: Some(panic.clone()), ..Self::new("panicked", panic.to_string(), String::new()) }
     }
 }

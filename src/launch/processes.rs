@@ -500,7 +500,7 @@ impl<'a> Supervisor<'a> {
             match waiting {
                 Waiting::Say(words) => (launch.progress)(&Progress::External(&words)),
                 Waiting::TooLong { member, tick, cause } => {
-                    let failure = Failure::new(cause, String::new());
+                    let failure = Failure::new("waited-too-long", cause, String::new());
                     let incident = self.members[member].fail(failure, self.scenario, monotonic_ns());
                     let incident = Incident { tick, ..incident };
                     let incident = self.incidents.add(incident, &mut |id, tick| scorer.incident(id, tick));

@@ -125,8 +125,18 @@ impl RecorderWatch {
         let mut report: RecordingReport = report.unwrap_or_else(|| {
             let how = if late { "it had not ended its file when it was ended" } else { "it left no report" };
             let problem = self.problem.unwrap_or_else(|| how.to_owned());
+            let code = Some("recorder-lost".to_owned());
             let (messages, bytes, signals) = (0, 0, Vec::new());
-            RecordingReport { file, complete: false, whole: true, problem: Some(problem), messages, bytes, signals }
+            RecordingReport {
+                file,
+                complete: false,
+                whole: true,
+                problem: Some(problem),
+                code,
+                messages,
+                bytes,
+                signals,
+            }
         });
         report.reconcile(roles, &|service| hosts.map_or(0, |hosts| hosts.lost(service)));
         Some(report)

@@ -84,7 +84,12 @@ impl RelayWatch {
             incidents.push(stopped.cloned().unwrap_or_else(|| {
                 let cause = end.failed.unwrap_or_else(|| "it ended before the run did".to_owned());
                 let cause = format!("the host {host} left: {cause}");
-                incident(roles.next().unwrap_or_default(), roles.collect(), tick, Failure::new(cause, String::new()))
+                incident(
+                    roles.next().unwrap_or_default(),
+                    roles.collect(),
+                    tick,
+                    Failure::new("host-left", cause, String::new()),
+                )
             }));
         }
         incidents

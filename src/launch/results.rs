@@ -43,19 +43,22 @@ const RECORDING_LIBRARY: &[u8] = b"corotate ";
 type IsOurs = fn(&[u8]) -> bool;
 
 /// Why a directory cannot take a run's results.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ResultsError {
     /// A file that a run would write is there, and is none of an older run.
     #[error(
         "{} is there and is not known to be an older run's of this program; name another directory with --out, or remove it",
         path.display()
     )]
+    #[strum(serialize = "foreign-file")]
     Foreign {
         /// The file.
         path: PathBuf,
     },
     /// Another run writes to the directory.
     #[error("{} takes the results of another run that is under way{holder}; wait for its end, or name another directory with --out", path.display())]
+    #[strum(serialize = "directory-busy")]
     Busy {
         /// The directory.
         path: PathBuf,
@@ -64,6 +67,7 @@ pub enum ResultsError {
     },
     /// The directory has the results of an earlier run.
     #[error("{} has files of an earlier run: {}; name another directory with --out, or give --overwrite to remove them", path.display(), names(files))]
+    #[strum(serialize = "earlier-run")]
     Finished {
         /// The directory.
         path: PathBuf,
@@ -72,12 +76,14 @@ pub enum ResultsError {
     },
     /// The directory is a campaign's.
     #[error("{} has the results of a campaign; name another directory with --out", path.display())]
+    #[strum(serialize = "campaign-directory")]
     Campaign {
         /// The directory.
         path: PathBuf,
     },
     /// The directory cannot be made, looked at, or cleared.
     #[error("{}: {source}; name another directory with --out", path.display())]
+    #[strum(serialize = "cannot-use-directory")]
     Directory {
         /// The directory, or the file in it.
         path: PathBuf,

@@ -318,7 +318,12 @@ impl Member {
             generation: self.generation,
             replaced_by: Some(Replacement { pid, tick }),
             outage_s: Some(outage_s),
-            ..Incident::new(self.name.clone(), left.tick, Failure::new(cause, String::new()), Action::Continued)
+            ..Incident::new(
+                self.name.clone(),
+                left.tick,
+                Failure::new("seat-taken-over", cause, String::new()),
+                Action::Continued,
+            )
         })
     }
 
@@ -367,15 +372,15 @@ impl Member {
         if let Some(failure) = process.panic() {
             return Some(failure);
         }
-        let (said, limit) = match heard {
-            true => ("said nothing", "supervision.heartbeat_timeout_s"),
-            false => ("was not ready", "launch.startup_timeout_s"),
+        let (code, said, limit) = match heard {
+            true => ("silent", "said nothing", "supervision.heartbeat_timeout_s"),
+            false => ("not-ready", "was not ready", "launch.startup_timeout_s"),
         };
-        let cause = match held {
+        let cause = match &held {
             Some(held) => format!("it was {held}, {said} for {limit_s} s and was killed; in lockstep it is waited for"),
             None => format!("it {said} for {limit_s} s and was killed; on a slow machine raise {limit}"),
         };
-        Some(Failure::new(cause, process.last_words()))
+        Some(Failure::new(if held.is_some() { "stopped" } else { code }, cause, process.last_words()))
     }
 
     /// Returns how an external role has failed: it left its last words, it is gone, or it is silent in real time. In lockstep a
@@ -385,10 +390,10 @@ impl Member {
     fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
         let (state, tells) = (self.state(), self.health.written());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
-        let left = || "it left before its last tick".to_owned();
+        let left = || ("left", "it left before its last tick".to_owned());
         let panic = panic_path(janitor.root(), &self.name);
-        let fail = |cause: String, last_words: String| {
-            Some(Panic::take(&panic).map_or_else(|| Failure::new(cause, last_words), Failure::of))
+        let fail = |(code, cause): (&str, String), last_words: String| {
+            Some(Panic::take(&panic).map_or_else(|| Failure::new(code, cause, last_words), Failure::of))
         };
         if state != RoleState::Done
             && let Ok(last_words) = std::fs::read_to_string(words_path(janitor.root(), &self.name))
@@ -396,7 +401,7 @@ impl Member {
             return fail(left(), last_words);
         }
         let words = device_words_path(janitor.root(), &self.name);
-        let fail = |cause: String| fail(cause, std::fs::read_to_string(&words).unwrap_or_default());
+        let fail = |cause: (&str, String)| fail(cause, std::fs::read_to_string(&words).unwrap_or_default());
         let timeout_s = match &self.host {
             Some(_) => scenario.host_silence_s(state >= RoleState::Running),
             None => scenario.supervision.heartbeat_timeout_s,
@@ -414,14 +419,14 @@ impl Member {
             janitor.clear_dead();
         }
         if let (true, Some(host)) = (tells, &self.host) {
-            return fail(format!("nothing was heard of it and the host {host} for {limit_s} s"));
+            return fail(("host-silent", format!("nothing was heard of it and the host {host} for {limit_s} s")));
         }
         let held = || self.standstill().map_or(String::new(), |held| format!(" and was {held}"));
         match (tells, state, scenario.clock) {
             (true, _, ClockKind::Realtime) => {
                 let limit_s = scenario.external_timeout_s.map_or(limit_s, |external_s| external_s.max(limit_s));
                 let silent = self.silent_ns as f64 > limit_s * 1e9;
-                silent.then(|| fail(format!("it said nothing for {limit_s} s{}", held()))).flatten()
+                silent.then(|| fail(("silent", format!("it said nothing for {limit_s} s{}", held())))).flatten()
             }
             (false, RoleState::Running, ClockKind::Realtime) if self.over => {
                 if self.silent_ns as f64 > 2.0 * limit_s * 1e9 {
@@ -430,7 +435,7 @@ impl Member {
                 None
             }
             (false, RoleState::Running, ClockKind::Realtime) => {
-                fail(format!("it sent nothing for {limit_s} s{}", held()))
+                fail(("no-samples", format!("it sent nothing for {limit_s} s{}", held())))
             }
             _ => None,
         }
@@ -446,7 +451,7 @@ impl Member {
                 process.kill();
                 let limit_s = END_LIMIT.as_secs();
                 let cause = format!("it did not end within {limit_s} s of being told to and was killed");
-                Some(Failure::new(cause, process.last_words()))
+                Some(Failure::new("did-not-end", cause, process.last_words()))
             }
         }
     }

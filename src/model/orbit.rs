@@ -76,6 +76,16 @@ pub enum CentralFieldError {
     },
 }
 
+impl From<&CentralFieldError> for &'static str {
+    /// Returns the stable name of the mistake.
+    fn from(error: &CentralFieldError) -> Self {
+        match error {
+            CentralFieldError::NotAttracting { .. } => "not-attracting",
+            CentralFieldError::EmptyRegion { .. } => "empty-region",
+        }
+    }
+}
+
 /// Where a body was when the model ended.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum OrbitFault {

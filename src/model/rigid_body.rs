@@ -43,6 +43,16 @@ pub enum InertiaError {
     },
 }
 
+impl From<&InertiaError> for &'static str {
+    /// Returns the stable name of the mistake.
+    fn from(error: &InertiaError) -> Self {
+        match error {
+            InertiaError::NotPositive { .. } => "no-such-inertia",
+            InertiaError::Triangle { .. } => "triangle-inequality",
+        }
+    }
+}
+
 impl Inertia {
     /// Checks three principal moments, kg m²: positive, and each at most the sum of the others (equal for a flat plate).
     ///

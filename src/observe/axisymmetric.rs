@@ -26,6 +26,15 @@ pub enum AxisymmetricError {
     },
 }
 
+impl From<&AxisymmetricError> for &'static str {
+    /// Returns the stable name of the mistake.
+    fn from(error: &AxisymmetricError) -> Self {
+        match error {
+            AxisymmetricError::NoSuchAxis { .. } => "no-such-axis",
+        }
+    }
+}
+
 /// The relation for a = (I_j − I_k)/I_i of a body that is symmetric about axis k: ρ = |ω_k|, rad/s, g = 0. Its filter's rate
 /// is per radian of spin. The ratio of the moments is I_k/I_i = 1 − a.
 #[derive(Debug, Clone, Copy, PartialEq)]

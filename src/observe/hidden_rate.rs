@@ -47,6 +47,16 @@ pub enum HiddenRateError {
     },
 }
 
+impl From<&HiddenRateError> for &'static str {
+    /// Returns the stable name of the mistake.
+    fn from(error: &HiddenRateError) -> Self {
+        match error {
+            HiddenRateError::NoSuchAxis { .. } => "no-such-axis",
+            HiddenRateError::Sphere { .. } => "spherical-body",
+        }
+    }
+}
+
 /// The coefficients of two measured axes: one below the rounding of the other changes φ by less than rounding does and counts
 /// as zero, a parabola. Both below the rounding of the moments that they are made of are a sphere's.
 const ROUNDING: f64 = f64::EPSILON;

@@ -81,6 +81,17 @@ pub enum HurwitzError<const N: usize> {
     NoEigenvalues,
 }
 
+impl<const N: usize> From<&HurwitzError<N>> for &'static str {
+    /// Returns the stable name of the mistake.
+    fn from(error: &HurwitzError<N>) -> Self {
+        match error {
+            HurwitzError::NotFinite { .. } => "not-finite",
+            HurwitzError::NotHurwitz { .. } => "not-hurwitz",
+            HurwitzError::NoEigenvalues => "no-eigenvalues",
+        }
+    }
+}
+
 /// A real N×N matrix 𝒜 all of whose eigenvalues have a negative real part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hurwitz<const N: usize> {

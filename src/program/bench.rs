@@ -1,6 +1,6 @@
 //! `corotate bench`: the benchmark, from the rows asked for to a table, JSON and histograms.
 
-use super::output::{Exit, fail, print};
+use super::output::{Exit, Failure, fail, print};
 use super::scenario::load;
 use super::shipped::scenarios;
 use super::signals::catch_signals;
@@ -58,19 +58,20 @@ pub fn bench(arguments: &Arguments, rows: &[Row]) -> Exit {
     match attempt(arguments, rows) {
         Ok(results) if arguments.check && !results.met() => Exit::NotAccepted,
         Ok(_) => Exit::Ok,
-        Err((exit, reason)) => fail(exit, &reason),
+        Err((exit, reason)) => fail(exit, reason),
     }
 }
 
-fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, String)> {
-    let broken = |reason: String| (Exit::Failure, reason);
+fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, Failure)> {
+    let broken = |code, reason: String| (Exit::Failure, Failure::new(code, reason));
     let known = rows.iter().map(|row| row.name).collect::<Vec<_>>();
     if let Some(name) = arguments.rows.iter().find(|name| !known.contains(&name.as_str())) {
-        return Err((Exit::Usage, format!("there is no row `{name}`; there are {}", known.join(", "))));
+        let text = format!("there is no row `{name}`; there are {}", known.join(", "));
+        return Err((Exit::Usage, Failure::new("unknown-row", text)));
     }
     let asked = |row: &&Row| arguments.rows.is_empty() || arguments.rows.iter().any(|name| name == row.name);
     let started = SystemTime::now();
-    let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
+    let signal = catch_signals().map_err(|error| (Exit::Failure, error))?;
     // Drawn on stderr, and only if that is a terminal.
     let spinner = ProgressBar::new_spinner();
     let last = RefCell::new(String::new());
@@ -84,21 +85,22 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, String
             last.replace(what.to_owned());
         },
     };
-    bench.scenario(&[]).map_err(|error| (Exit::Usage, error.to_string()))?;
+    bench.scenario(&[]).map_err(|error| (Exit::Usage, error.into()))?;
     if let (true, Some(reason)) = (arguments.check, bench.unjudged().first()) {
-        return Err((Exit::Usage, format!("--check has nothing to judge: {reason}")));
+        return Err((Exit::Usage, Failure::new("nothing-to-judge", format!("--check has nothing to judge: {reason}"))));
     }
     let directory = make_directory(arguments.out.as_deref(), "bench", started)
-        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+        .map_err(|error| broken("cannot-write", format!("{error}; name another directory with --out")))?;
     spinner.enable_steady_tick(Duration::from_millis(200));
     let measured = run(&mut bench);
     spinner.finish_and_clear();
     let (board, privileges) = measured.map_err(|error| match error {
-        BenchError::Interrupted(signal) => (Exit::Signal(signal), error.to_string()),
-        error => broken(format!("{}: {error}", last.borrow())),
+        BenchError::Interrupted(signal) => (Exit::Signal(signal), error.into()),
+        error => (Exit::Failure, Failure::of(last.borrow(), error)),
     })?;
     let results = Results::new(&bench, board, privileges, started);
-    write_results(&directory, &results).map_err(|error| broken(format!("cannot write the results: {error}")))?;
+    write_results(&directory, &results)
+        .map_err(|error| broken("cannot-write", format!("cannot write the results: {error}")))?;
     let text = format!("{}results in {}\n", table(&results), directory.display());
     let printed = if arguments.json {
         crate::system::tell(text.trim_end());
@@ -106,7 +108,7 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, String
     } else {
         print(&text)
     };
-    printed.map_err(broken)?;
+    printed.map_err(|failure| (Exit::Failure, failure))?;
     Ok(results)
 }
 
@@ -116,8 +118,11 @@ pub fn peer(arguments: &PeerArguments) -> Exit {
         return exit;
     }
     let PeerArguments { domain, observer, .. } = arguments;
-    match load(None, []).and_then(|scenario| serve_peer(domain, &scenario, *observer)) {
+    let served = load(None, []).and_then(|scenario| {
+        serve_peer(domain, &scenario, *observer).map_err(|reason| Failure::new("peer-failed", reason))
+    });
+    match served {
         Ok(()) => Exit::Ok,
-        Err(reason) => fail(Exit::Failure, &reason),
+        Err(failure) => fail(Exit::Failure, failure),
     }
 }

@@ -1,6 +1,6 @@
 //! `corotate bridge`: a device behind a serial line, in a role's seat.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
 use crate::runtime::{DeviceError, DeviceSeat, NodeError};
@@ -65,7 +65,7 @@ pub fn bridge(arguments: &Arguments) -> Ended {
     };
     let role = seat.roles.join(",");
     let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
-    let served = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), &error))?;
+    let served = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
     let Some(Served { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {
         let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });
@@ -73,7 +73,7 @@ pub fn bridge(arguments: &Arguments) -> Ended {
     } else {
         tell(line_words(&role, &counters));
     }
-    Ok(lost.map_or(Exit::Ok, |lost| fail(Exit::ProcessLost, &format!("{role}: {lost}"))))
+    Ok(lost.map_or(Exit::Ok, |lost| fail(Exit::ProcessLost, Failure::new("device-lost", format!("{role}: {lost}")))))
 }
 
 fn exit_of(error: &RoleError) -> Exit {

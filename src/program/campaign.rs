@@ -2,15 +2,16 @@
 //!
 //! Must not judge what it reads: [`crate::campaign`] does.
 
+use super::output::Failure;
 use super::scenario::{quoting, text, unknown};
 use super::shipped::{campaigns, scenarios};
 use crate::campaign::{Campaign, is_campaign};
-use crate::config::{Document, is_name, nearest};
+use crate::config::{ConfigError, Document, is_name, nearest};
 use std::borrow::Cow;
 use std::path::Path;
 
 /// The campaign that is meant, with changes of its scenario.
-pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, String> {
+pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, Failure> {
     let (text, origin) = text(given, &|name| {
         let found = campaigns().iter().find(|(known, _)| *known == name);
         found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| no_campaign(name))
@@ -20,15 +21,17 @@ pub fn load(given: &Path, overrides: &[String]) -> Result<Campaign, String> {
         found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| unknown(name))
     };
     let campaign = Campaign::parse(&text, &origin, overrides, &base);
-    campaign.map_err(|error| quoting(&error.to_string(), &origin, &text))
+    campaign.map_err(|error| quoting(error, &origin, &text))
 }
 
 /// The scenario of a case.
-pub fn case(campaign: &Campaign, number: u64) -> Result<Document, String> {
+pub fn case(campaign: &Campaign, number: u64) -> Result<Document, Failure> {
     let cases = campaign.cases();
     let case = campaign.case(number);
-    let case = case.ok_or_else(|| format!("--case {number}: `{}` has cases 0 to {}", campaign.name(), cases - 1))?;
-    campaign.document(&case).map_err(|error| error.to_string())
+    let case = case.ok_or_else(|| {
+        Failure::new("no-such-case", format!("--case {number}: `{}` has cases 0 to {}", campaign.name(), cases - 1))
+    })?;
+    Ok(campaign.document(&case)?)
 }
 
 /// Whether a name or a file is a campaign's.
@@ -39,12 +42,15 @@ pub fn is_meant(given: &Path) -> bool {
     }
 }
 
-fn no_campaign(name: &str) -> String {
+fn no_campaign(name: &str) -> ConfigError {
     if scenarios().iter().any(|(known, _)| *known == name) {
-        return format!("`{name}` is a scenario and no campaign; run it with `corotate run {name}`");
+        let text = format!("`{name}` is a scenario and no campaign; run it with `corotate run {name}`");
+        return ConfigError::Unknown { code: "is-scenario", text };
     }
     let known: Vec<&str> = campaigns().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
     let end = if remedy.ends_with('?') { "" } else { "." };
-    format!("there is no campaign `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml")
+    let text =
+        format!("there is no campaign `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml");
+    ConfigError::Unknown { code: "unknown-campaign", text }
 }

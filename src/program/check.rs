@@ -1,7 +1,7 @@
 //! `corotate check`: validate scenarios and tell what may be claimed of their loops.
 
 use super::campaign;
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use crate::analysis::{Claim, apart, digits};
 use crate::campaign::Campaign;
@@ -44,14 +44,14 @@ pub fn check(arguments: &Arguments) -> Ended {
     for path in &arguments.files {
         match checked(arguments, path) {
             Ok(text) => drop(say(&text)?),
-            Err(error) => exit = fail(Exit::Usage, &error),
+            Err(error) => exit = fail(Exit::Usage, error),
         }
     }
     Ok(exit)
 }
 
 /// What there is to say of a scenario, or of a campaign.
-fn checked(arguments: &Arguments, path: &Path) -> Result<String, String> {
+fn checked(arguments: &Arguments, path: &Path) -> Result<String, Failure> {
     if campaign::is_meant(path) {
         let campaign = campaign::load(path, &arguments.set)?;
         if arguments.json {
@@ -61,7 +61,7 @@ fn checked(arguments: &Arguments, path: &Path) -> Result<String, String> {
         return Ok(if arguments.resolved { resolved(&told, campaign.to_toml()) } else { told });
     }
     let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
-    check_cores(&scenario).map_err(|error| format!("{}: {error}", path.display()))?;
+    check_cores(&scenario).map_err(|error| Failure::of(path.display(), error))?;
     if arguments.json {
         return Ok(json(path, &scenario));
     }

@@ -1,6 +1,6 @@
 //! `corotate diff`: two recordings beside each other.
 
-use super::output::{Ended, Exit, fail, harmless, remark, say};
+use super::output::{Ended, Exit, Failure, fail, harmless, remark, say};
 use super::record::{exit_of, exit_with, open};
 use super::runs;
 use crate::record::{Comparison, SignalDiff, Tolerances, ValueDiff, diff as compare};
@@ -48,10 +48,10 @@ pub fn diff(arguments: &Arguments) -> Ended {
         .into_iter()
         .find(|(_, x)| !(0.0..).contains(x));
     if let Some((name, value)) = bad {
-        return Err(fail(Exit::Usage, &format!("--{name} {value}: a tolerance is 0 or more")));
+        return Err(fail(Exit::Usage, Failure::new("negative", format!("--{name} {value}: a tolerance is 0 or more"))));
     }
-    let files = files(arguments).map_err(|reason| fail(Exit::Usage, &reason))?;
-    let failed = |error| fail(exit_of(&error), &error);
+    let files = files(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
+    let failed = |error| fail(exit_of(&error), error);
     let open = |file| open(file, arguments.accept_incomplete).map_err(failed);
     let (a, b) = (open(&files[0])?, open(&files[1])?);
     let words = |comparison| if arguments.json { json(&files, comparison) } else { harmless(&table(comparison)) };
@@ -62,12 +62,13 @@ pub fn diff(arguments: &Arguments) -> Ended {
 }
 
 /// The two recordings. Without a second name it is the newest other recording in `runs/`.
-fn files(arguments: &Arguments) -> Result<[PathBuf; 2], String> {
+fn files(arguments: &Arguments) -> Result<[PathBuf; 2], Failure> {
     let a = runs::recording(Some(&arguments.a))?;
     if arguments.b.is_some() {
         return Ok([a, runs::recording(arguments.b.as_deref())?]);
     }
-    let b = runs::newest_recording(&a).ok_or("runs/ has no other run with a recording; name the second run")?;
+    let b = runs::newest_recording(&a)
+        .ok_or_else(|| Failure::new("no-other-run", "runs/ has no other run with a recording; name the second run"))?;
     remark(&format!("compared with {}", b.display()));
     Ok([a, b])
 }

@@ -1,7 +1,7 @@
 //! `corotate doctor`: is this machine fit for real time, and what to do about it.
 
 use super::hosts::{self, KeyArguments};
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use super::signals::catch_signals;
 use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
@@ -55,7 +55,7 @@ pub fn doctor(arguments: &Arguments) -> Ended {
     if let Some(address) = &arguments.link {
         return hosts::probe(address, &arguments.keys, f64::from(arguments.seconds), arguments.json);
     }
-    let scenario = load(arguments.file.as_deref(), []).map_err(|error| fail(Exit::Usage, &error))?;
+    let scenario = load(arguments.file.as_deref(), []).map_err(|error| fail(Exit::Usage, error))?;
     // If it cannot be done, the line on what is left says why.
     let cleared = if arguments.clean { remove_dead_domains().map_err(DomainError::from) } else { Ok(Vec::new()) };
     let demand = Demand::of(&scenario);
@@ -97,8 +97,8 @@ fn attempt(arguments: &Arguments) -> Result<Trial, Unmeasured> {
     let overrides =
         ["clock=realtime", &duration, "accept={}", "fault=[]", "watchdog={}", "launch.external=[]", "host=[]"];
     let scenario = load(arguments.file.as_deref(), overrides.map(Change::Set))
-        .map_err(|error| Unmeasured::Failed(Trial::failed(error)))?;
-    let signal = catch_signals().map_err(|error| Unmeasured::Exit(fail(Exit::Failure, &error)))?;
+        .map_err(|error| Unmeasured::Failed(Trial::failed(error.to_string())))?;
+    let signal = catch_signals().map_err(|error| Unmeasured::Exit(fail(Exit::Failure, error)))?;
     let style = ProgressStyle::with_template("{bar:40} running in real time, {eta} left");
     let bar = ProgressBar::new(scenario.last_tick).with_style(style.expect("the template is a constant that parses"));
     let mut show = |progress: &Progress<'_>| {
@@ -108,7 +108,7 @@ fn attempt(arguments: &Arguments) -> Result<Trial, Unmeasured> {
     };
     let outcome = run(&scenario, &mut Launch::new(&signal, &mut show));
     bar.finish_and_clear();
-    let outcome = outcome.map_err(|error| Unmeasured::Failed(Trial::failed(error.to_string())))?;
+    let outcome = outcome.map_err(|error| Unmeasured::Failed(Trial::failed(Failure::from(error).to_string())))?;
     if outcome.signal != 0 {
         return Err(Unmeasured::Exit(Exit::Signal(outcome.signal)));
     }

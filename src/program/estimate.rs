@@ -1,7 +1,7 @@
 //! `corotate estimate`: the rate about one axis of a body from a log of the other two.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, numbers, tell_log};
-use super::output::{Ended, Exit, fail, harmless, say};
+use super::output::{Ended, Exit, Failure, fail, harmless, say};
 use crate::data::{EstimateError, Estimated, Estimation, FilterOrder, Request, estimate_log};
 use crate::estimate::{FilterKind, SegmentScore};
 use crate::files;
@@ -111,9 +111,9 @@ struct Body {
 
 /// Estimates.
 pub fn estimate(arguments: &Arguments) -> Ended {
-    let body = body(arguments).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let body = body(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let inertia = Inertia::new(body.moments.into());
-    let inertia = inertia.map_err(|error| fail(Exit::Usage, &format!("the inertia: {error}")))?;
+    let inertia = inertia.map_err(|error| fail(Exit::Usage, Failure::of("the inertia", error)))?;
     let request = Request {
         axis: arguments.hidden,
         coefficients: inertia.coefficients(),
@@ -132,15 +132,16 @@ pub fn estimate(arguments: &Arguments) -> Ended {
     let outputs = [&arguments.table, &arguments.page];
     if let Some(path) = outputs.into_iter().flatten().find(|path| is_same(path, &arguments.data)) {
         let reason = format!("{}: that is the log; name another file to write to", path.display());
-        return Err(fail(Exit::Usage, &reason));
+        return Err(fail(Exit::Usage, Failure::new("same-file", reason)));
     }
     if cfg!(not(feature = "parquet")) && arguments.table.as_deref().is_some_and(is_parquet) {
         let reason = "--table: this program writes no Parquet; build it with `--features parquet`";
-        return Err(fail(Exit::Usage, &reason));
+        return Err(fail(Exit::Usage, Failure::new("built-without", reason)));
     }
     let unwritten = |path: &Option<PathBuf>, error: io::Error| {
         let path = path.as_deref().unwrap_or(Path::new("")).display();
-        fail(Exit::Failure, &format!("cannot write {path}: {error}; {}, or name another file", remedy(&error)))
+        let reason = format!("cannot write {path}: {error}; {}, or name another file", remedy(&error));
+        fail(Exit::Failure, Failure::new("cannot-write", reason))
     };
     let mut page = arguments.page.is_some().then(HiddenPage::default);
     let table = arguments.table.as_deref().map(Table::begin).transpose();
@@ -154,7 +155,7 @@ pub fn estimate(arguments: &Arguments) -> Ended {
     });
     let estimation = done.map_err(|error| match error {
         EstimateError::Sink(error) => unwritten(&arguments.table, error),
-        error => fail(exit(&error), &error),
+        error => fail(exit(&error), error),
     })?;
     table.map_or(Ok(()), Table::end).map_err(|error| unwritten(&arguments.table, error))?;
     let told = tell(&request, &estimation);
@@ -195,21 +196,22 @@ fn is_same(one: &Path, other: &Path) -> bool {
 }
 
 /// The body as it was given.
-fn body(arguments: &Arguments) -> Result<Body, String> {
+fn body(arguments: &Arguments) -> Result<Body, Failure> {
     let Some(path) = &arguments.body else {
         let moments = arguments.inertia.unwrap_or_else(Vector3::zeros);
         return Ok(Body { moments, damping_per_s: 0.0, axes: None });
     };
     let text = std::fs::read_to_string(path)
-        .map_err(|error| format!("cannot read {}: {error}; name a file that can be read", path.display()))?;
-    read_body(&text).map_err(|reason| {
+        .map_err(|error| format!("cannot read {}: {error}; name a file that can be read", path.display()))
+        .map_err(|reason| Failure::new("cannot-read", reason))?;
+    read_body(&text).map_err(|(code, reason)| {
         let remedy = "give what `corotate identify --json` printed";
-        format!("{}: {reason}; {remedy}", path.display())
+        Failure::new(code, format!("{}: {reason}; {remedy}", path.display()))
     })
 }
 
 /// The body in what `identify` printed.
-fn read_body(text: &str) -> Result<Body, String> {
+fn read_body(text: &str) -> Result<Body, (&'static str, String)> {
     #[derive(serde::Deserialize)]
     struct Found {
         inertia_kg_m2: [f64; 3],
@@ -221,11 +223,12 @@ fn read_body(text: &str) -> Result<Body, String> {
         schema: String,
         body: Option<Found>,
     }
-    let printed: Printed = serde_json::from_str(text).map_err(|error| format!("it has no body ({error})"))?;
+    let printed: Printed =
+        serde_json::from_str(text).map_err(|error| ("not-a-body", format!("it has no body ({error})")))?;
     if printed.schema != "corotate/identify/v1" {
-        return Err(format!("its schema is `{}`", printed.schema));
+        return Err(("other-schema", format!("its schema is `{}`", printed.schema)));
     }
-    let found = printed.body.ok_or("the identification found no body")?;
+    let found = printed.body.ok_or_else(|| ("no-body", "the identification found no body".to_owned()))?;
     let axes = found.axes.map(|rows| Matrix3::from_fn(|row, column| rows[row][column]));
     Ok(Body { moments: found.inertia_kg_m2.into(), damping_per_s: found.damping_per_s, axes })
 }

@@ -1,6 +1,6 @@
 //! `corotate export`: a recording as tables.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use super::record;
 use crate::record::{ExportError, Recording, export_csv};
 use std::path::PathBuf;
@@ -44,10 +44,10 @@ const REFUSAL: &str =
 /// Exports.
 pub fn export(arguments: &Arguments) -> Ended {
     if arguments.parquet.is_some() && !cfg!(feature = "parquet") {
-        return Err(fail(Exit::Usage, &REFUSAL));
+        return Err(fail(Exit::Usage, Failure::new("built-without", REFUSAL)));
     }
     let (file, recording) = record::open_run(arguments.run.as_deref(), arguments.accept_incomplete)?;
-    let files = write(arguments, &recording).map_err(|error| fail(exit_of(&error), &error))?;
+    let files = write(arguments, &recording).map_err(|error| fail(exit_of(&error), error))?;
     let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
     let text = if arguments.json {
         let object = serde_json::json!({ "schema": SCHEMA, "file": file.display().to_string(), "tables": names });

@@ -1,6 +1,6 @@
 //! `corotate foxglove`: a running loop on a Foxglove WebSocket, as `corotate run --foxglove` starts it or by hand.
 
-use super::output::{Ended, Exit, fail};
+use super::output::{Ended, Exit, Failure, fail};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -49,7 +49,7 @@ pub fn refusal() -> Option<&'static str> {
 
 /// Shows a run to its end.
 pub fn foxglove(arguments: &Arguments) -> Ended {
-    refusal().map_or_else(|| serve(arguments), |reason| Err(fail(Exit::Usage, &reason)))
+    refusal().map_or_else(|| serve(arguments), |reason| Err(fail(Exit::Usage, Failure::new("built-without", reason))))
 }
 
 #[cfg(not(feature = "foxglove"))]
@@ -63,7 +63,7 @@ fn serve(Arguments { domain, address, tell, parent }: &Arguments) -> Ended {
     let (domain, terminated) = super::runs::join(*parent, domain.as_deref())?;
     let seat = FoxgloveSeat { domain: Some(domain), address: *address, tell: tell.clone() };
     run_foxglove(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
-        FoxgloveError::Run(_) => fail(Exit::Usage, &error),
-        _ => fail(Exit::Failure, &error),
+        FoxgloveError::Run(_) => fail(Exit::Usage, error),
+        _ => fail(Exit::Failure, error),
     })
 }

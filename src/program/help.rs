@@ -3,7 +3,7 @@
 //! Must not describe a command twice: everything is made of the definition by which the command line is read.
 
 use super::color::When;
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use super::shipped::{name, scenarios, words_given};
 use crate::files;
 use crate::telemetry::Host;
@@ -145,7 +145,9 @@ pub fn completions(arguments: &CompletionsArguments, definition: clap::Command) 
 /// Writes the manual pages.
 pub fn man(arguments: &ManArguments, definition: clap::Command) -> Ended {
     let written = write_pages(arguments, definition);
-    say(&written.map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory")))?)
+    say(&written.map_err(|error| {
+        fail(Exit::Failure, Failure::new("cannot-write", format!("{error}; name another directory")))
+    })?)
 }
 
 fn write_pages(ManArguments { directory }: &ManArguments, definition: clap::Command) -> Result<String, String> {

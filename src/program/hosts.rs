@@ -1,6 +1,6 @@
 //! `corotate join`, the relay that it and `corotate run --listen` start, and the options by which hosts find one another.
 
-use super::output::{Ended, Exit, fail};
+use super::output::{Ended, Exit, Failure, fail};
 use super::signals::die_with;
 use crate::hosts::{Address, Endpoint, Keys};
 use std::path::PathBuf;
@@ -29,14 +29,17 @@ impl KeyArguments {
     }
 
     /// An address with these keys, if that is allowed.
-    pub fn endpoint(&self, address: Address) -> Result<Endpoint, String> {
+    pub fn endpoint(&self, address: Address) -> Result<Endpoint, Failure> {
         let keys = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
             (Some(ca), Some(cert), Some(key)) => Some(Keys { ca: ca.clone(), cert: cert.clone(), key: key.clone() }),
             (None, None, None) => None,
-            _ => return Err("--tls-ca, --tls-cert and --tls-key go together; give all three, or none".to_owned()),
+            _ => {
+                let text = "--tls-ca, --tls-cert and --tls-key go together; give all three, or none";
+                return Err(Failure::new("missing-keys", text));
+            }
         };
         let endpoint = Endpoint { address, keys, insecure: self.insecure };
-        endpoint.check().map_err(|error| error.to_string())?;
+        endpoint.check()?;
         Ok(endpoint)
     }
 
@@ -99,8 +102,8 @@ pub fn refusal() -> Option<&'static str> {
     (!cfg!(feature = "hosts")).then_some("this program was built without hosts; build it with `--features hosts`")
 }
 
-fn unusable(reason: String) -> Exit {
-    fail(Exit::Usage, &reason)
+fn unusable(failure: Failure) -> Exit {
+    fail(Exit::Usage, failure)
 }
 
 /// Takes a host's part in a run, to its end.
@@ -124,15 +127,15 @@ mod with_hosts {
     use super::*;
 
     pub fn join(_arguments: &JoinArguments, _endpoint: Endpoint) -> Ended {
-        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
+        Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 
     pub fn relay(_arguments: &RelayArguments, _endpoint: Endpoint) -> Ended {
-        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
+        Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 
     pub fn probe(_endpoint: &Endpoint, _seconds: f64, _json: bool) -> Ended {
-        Err(fail(Exit::Usage, &refusal().unwrap_or_default()))
+        Err(unusable(Failure::new("built-without", refusal().unwrap_or_default())))
     }
 }
 
@@ -153,19 +156,19 @@ mod with_hosts {
         let seat = HostSeat { host: arguments.host.clone(), endpoint };
         let seat = RelaySeat { domain: arguments.domain.clone(), seat, hub: arguments.hub.clone() };
         run_relay(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
-            RelayError::NoHost(..) | RelayError::Clock(_) => fail(Exit::Usage, &error),
-            _ => fail(Exit::Failure, &error),
+            RelayError::NoHost(..) | RelayError::Clock(_) => fail(Exit::Usage, error),
+            _ => fail(Exit::Failure, error),
         })
     }
 
     pub fn probe(endpoint: &Endpoint, seconds: f64, json: bool) -> Ended {
-        let probe = crate::hosts::probe(endpoint, seconds).map_err(|error| fail(Exit::Failure, &error))?;
+        let probe = crate::hosts::probe(endpoint, seconds).map_err(|error| fail(Exit::Failure, error))?;
         let object = || serde_json::to_string(&probe).expect("figures are JSON") + "\n";
         say(&if json { object() } else { probe.to_string() })
     }
 
     pub fn join(arguments: &JoinArguments, endpoint: Endpoint) -> Ended {
-        let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+        let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
         let part = ask(arguments, &endpoint)?;
         let tells = |words: &str| {
             if !arguments.quiet {
@@ -174,41 +177,42 @@ mod with_hosts {
         };
         tells(&format!("host {} of the run that {} launched", part.host, part.hub));
         // Read twice: how large a domain must be follows from the scenario, and the files that it names lie in the domain.
-        let failed = |error: &dyn std::fmt::Display| fail(Exit::Failure, &format!("cannot join: {error}"));
-        let aside = tempfile::tempdir().map_err(|error| failed(&error))?;
-        let sized = part.scenario(aside.path()).map_err(|error| refused(&error))?;
-        let owned = new_domain(&sized).map_err(|error| fail(exit_of(&error), &error))?;
+        let aside = tempfile::tempdir()
+            .map_err(|error| fail(Exit::Failure, Failure::new("cannot-create", format!("cannot join: {error}"))))?;
+        let sized = part.scenario(aside.path()).map_err(refused)?;
+        let owned = new_domain(&sized).map_err(|error| fail(exit_of(&error), error))?;
         drop(aside);
-        let scenario: Scenario = part.scenario(owned.domain().root()).map_err(|error| refused(&error))?;
+        let scenario: Scenario = part.scenario(owned.domain().root()).map_err(refused)?;
         let seat = HostSeat { host: part.host.clone(), endpoint };
         let mut silent = |_: &crate::launch::Progress<'_>| {};
         let mut launch = Launch::new(&signal, &mut silent);
         let outcome = crate::launch::join(&scenario, owned, &seat, &part.hub, &mut launch);
         let FarOutcome { failed, ticks: (executed, missed), .. } =
-            outcome.map_err(|error| fail(exit_of(&error), &error))?;
+            outcome.map_err(|error| fail(exit_of(&error), error))?;
         tells(&format!("the host {} executed {executed} ticks of its roles, {missed} missed", part.host));
         let signal = signal.load(std::sync::atomic::Ordering::Relaxed);
         Ok(match failed {
             Some(_) if signal != 0 => Exit::Signal(signal),
-            Some(reason) => fail(Exit::ProcessLost, &reason),
+            Some(reason) => fail(Exit::ProcessLost, Failure::new("run-failed", reason)),
             None => Exit::Ok,
         })
     }
 
     /// Asks for a part in the run.
     fn ask(arguments: &JoinArguments, endpoint: &Endpoint) -> Result<Part, Exit> {
-        let token = random_bits().map_err(|error| fail(Exit::Failure, &error))? as u64;
+        let token =
+            random_bits().map_err(|error| fail(Exit::Failure, Failure::new("no-random-numbers", error)))? as u64;
         let request = Request::new(arguments.host.as_deref(), token).encode();
         let answer = ask_to_join(endpoint, &request);
         let answer = answer.map_err(|error| {
             let usage = matches!(error, NetError::Key { .. });
-            fail(if usage { Exit::Usage } else { Exit::Failure }, &error)
+            fail(if usage { Exit::Usage } else { Exit::Failure }, error)
         })?;
-        Part::decode(&answer).map_err(|error| refused(&error))
+        Part::decode(&answer).map_err(refused)
     }
 
-    fn refused(error: &JoinError) -> Exit {
+    fn refused(error: JoinError) -> Exit {
         let exit = if matches!(error, JoinError::Write { .. }) { Exit::Failure } else { Exit::Usage };
-        fail(exit, &format!("cannot join: {error}"))
+        fail(exit, Failure::of("cannot join", error))
     }
 }

@@ -1,7 +1,7 @@
 //! `corotate identify`: a body's inertia from logs of its angular velocity.
 
 use super::data::{AXES, LogArguments, axis, exit_of, log_json, tell_log};
-use super::output::{Ended, Exit, fail, harmless, say};
+use super::output::{Ended, Exit, Failure, fail, harmless, say};
 use crate::data::{Identified, Ways, identify_logs};
 use crate::identify::{AxesFit, Finding, RecursiveFit, TensorFit, nearest_body};
 use crate::observe::InertiaRatios;
@@ -71,22 +71,25 @@ struct Body {
 pub fn identify(arguments: &Arguments) -> Ended {
     let axisymmetric = arguments.method == Method::Axisymmetric;
     if axisymmetric && arguments.symmetry_axis.is_none() {
-        return Err(fail(Exit::Usage, &"--method axisymmetric needs the axis; add --symmetry-axis x, y or z"));
+        return Err(fail(
+            Exit::Usage,
+            Failure::new("missing-axis", "--method axisymmetric needs the axis; add --symmetry-axis x, y or z"),
+        ));
     }
     let ways = Ways { damping: !arguments.no_damping, decay: arguments.decay, symmetry_axis: arguments.symmetry_axis };
     let identified = identify_logs(&arguments.data, &arguments.log.options(), &ways);
-    let identified = identified.map_err(|error| fail(exit_of(&error), &error))?;
+    let identified = identified.map_err(|error| fail(exit_of(&error), error))?;
     let body = body(arguments, &identified);
     let text = match arguments.json {
         true => format!("{}\n", to_json(arguments, &identified, body.as_ref().ok())),
         false => harmless(&tell(arguments, &identified, body.as_ref().ok())),
     };
     say(&text)?;
-    body.map(|_| Exit::Ok).map_err(|reason| fail(Exit::Failure, &reason))
+    body.map(|_| Exit::Ok).map_err(|failure| fail(Exit::Failure, failure))
 }
 
 /// The body of the method that was asked for; why there is none.
-fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> {
+fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure> {
     let forbids = |finding: &&Finding| match arguments.method {
         Method::Tensor => finding.forbids_tensor(),
         Method::Axes | Method::Recursive => finding.forbids_axes(),
@@ -94,10 +97,11 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> 
         Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
     };
     if let Some(finding) = identified.findings.iter().find(forbids) {
-        return Err(format!("the log tells of no body: {finding}"));
+        return Err(Failure::of("the log tells of no body", *finding));
     }
-    let nothing = || "the log tells of no body: it has no motion that can be fitted; see the notes".to_owned();
-    let of_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, String> {
+    let nothing =
+        || Failure::new("no-motion", "the log tells of no body: it has no motion that can be fitted; see the notes");
+    let of_fit = |fit: &Option<TensorFit>, turned: bool| -> Result<Body, Failure> {
         let fit = fit.as_ref().ok_or_else(nothing)?;
         let (moments, deviation) = (fit.moments, fit.deviation);
         Ok(Body { moments, deviation, damping_per_s: fit.damping_per_s, axes: turned.then_some(fit.axes) })
@@ -109,7 +113,8 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> 
         Method::Axes => of_fit(&identified.body, false)?,
         Method::Tensor => of_fit(&identified.tensor, true)?,
         Method::Recursive => {
-            let ratios = InertiaRatios::new(&identified.recursive.coefficients).map_err(|error| error.to_string())?;
+            let ratios = InertiaRatios::new(&identified.recursive.coefficients)
+                .map_err(|error| Failure::new("no-body", error))?;
             known(Vector3::new(1.0, ratios.second, ratios.third))
         }
         Method::Axisymmetric => {
@@ -122,7 +127,7 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, String> 
         }
     };
     let (inertia, flattened) =
-        nearest_body(&found.moments).map_err(|error| format!("the moments that fit best are no body's: {error}"))?;
+        nearest_body(&found.moments).map_err(|error| Failure::of("the moments that fit best are no body's", error))?;
     let moments = if flattened { inertia.moments_kg_m2() } else { found.moments };
     Ok(Body { moments, ..found })
 }

@@ -34,7 +34,7 @@ pub fn init(arguments: &Arguments) -> Ended {
     };
     match scenarios().iter().chain(campaigns()).find(|(known, _)| known == name) {
         Some((_, text)) => say(text),
-        None => Err(fail(Exit::Usage, &unknown(name))),
+        None => Err(fail(Exit::Usage, unknown(name))),
     }
 }
 

@@ -45,7 +45,7 @@ use crate::scenario::{RigKind, register};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use color::When;
 use help::WIDTH;
-use output::{Exit, fail, remark};
+use output::{Exit, Failure, fail, remark};
 use shipped::{CAMPAIGNS, SCENARIOS, WORDS, words_given};
 use std::ffi::OsString;
 use std::fs::File;
@@ -286,15 +286,16 @@ fn obey(command: Option<Command>) -> Exit {
 }
 
 fn janitor(arguments: &JanitorArguments) -> Exit {
-    let limit = Duration::try_from_secs_f64(arguments.limit_s).map_err(|error| error.to_string());
-    let domain = Domain::join(&arguments.domain).map_err(|error| error.to_string());
+    let limit = Duration::try_from_secs_f64(arguments.limit_s).map_err(|error| Failure::new("out-of-range", error));
+    let domain = Domain::join(&arguments.domain).map_err(Failure::from);
     // Without the buffers of the standard streams: what is in one is not seen by whoever waits for input.
-    let line = io::stdin().as_fd().try_clone_to_owned().map(File::from).map_err(|error| error.to_string());
+    let line = io::stdin().as_fd().try_clone_to_owned().map(File::from);
+    let line = line.map_err(|error| Failure::new("no-standard-input", error));
     match (limit, domain, line) {
         (Ok(limit), Ok(domain), Ok(line)) => match crate::launch::janitor(&domain, limit, line, io::stdout()) {
             Ok(()) => Exit::Ok,
-            Err(error) => fail(Exit::Failure, &error),
+            Err(error) => fail(Exit::Failure, Failure::new("janitor-failed", error)),
         },
-        (Err(error), ..) | (_, Err(error), _) | (.., Err(error)) => fail(Exit::Usage, &error),
+        (Err(error), ..) | (_, Err(error), _) | (.., Err(error)) => fail(Exit::Usage, error),
     }
 }

@@ -1,6 +1,6 @@
 //! `corotate new`: a crate of one's own to start from, the one of `examples/motor-pair` under another name.
 
-use super::output::{Ended, Exit, fail, say};
+use super::output::{Ended, Exit, Failure, fail, say};
 use crate::files::{create_directories, write};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -47,17 +47,20 @@ pub fn new(arguments: &Arguments) -> Ended {
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     if !plain || name.ends_with('-') || TAKEN.contains(&&**name) {
         let reason = "cannot name a crate and its scenario; use 2 to 32 of a-z, 0-9 and -, a letter first";
-        return Err(fail(Exit::Usage, &format!("`{name}` {reason}")));
+        return Err(fail(Exit::Usage, Failure::new("bad-name", format!("`{name}` {reason}"))));
     }
     let directory = arguments.path.clone().unwrap_or_else(|| PathBuf::from(name));
     if directory.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         let path = directory.display();
         let reason = format!("{path} is there already and is not empty; name another with --path");
-        return Err(fail(Exit::Usage, &reason));
+        return Err(fail(Exit::Usage, Failure::new("not-empty", reason)));
     }
     match write_all(&directory, name) {
         Ok(()) => say(&told(&directory, arguments.json)),
-        Err(error) => Err(fail(Exit::Failure, &format!("{}: {error}; name another with --path", directory.display()))),
+        Err(error) => {
+            let reason = format!("{}: {error}; name another with --path", directory.display());
+            Err(fail(Exit::Failure, Failure::new("cannot-write", reason)))
+        }
     }
 }
 

@@ -1,7 +1,9 @@
 //! What a command prints, and the exit code that it gives its parent.
 
+use crate::config::ConfigError;
 use crate::launch::LaunchError;
 use crate::system::remedy;
+use std::fmt;
 use std::io::{self, Write};
 
 /// What the process says to its parent.
@@ -30,9 +32,50 @@ impl Exit {
     }
 }
 
+/// An error as it is printed: the text of each mistake, and its code (docs/errors.md).
+pub struct Failure(pub Vec<(String, &'static str)>);
+
+impl Failure {
+    pub fn new(code: &'static str, text: impl ToString) -> Self {
+        Self(vec![(text.to_string(), code)])
+    }
+
+    /// The same about something: an option, or a file.
+    pub fn of(what: impl fmt::Display, error: impl Into<Self>) -> Self {
+        let Self(mistakes) = error.into();
+        Self(mistakes.into_iter().map(|(text, code)| (format!("{what}: {text}"), code)).collect())
+    }
+}
+
+impl<E: fmt::Display> From<E> for Failure
+where
+    for<'e> &'e E: Into<&'static str>,
+{
+    fn from(error: E) -> Self {
+        Self::new((&error).into(), error)
+    }
+}
+
+impl From<ConfigError> for Failure {
+    fn from(error: ConfigError) -> Self {
+        Self(error.mistakes())
+    }
+}
+
+/// The code ends the first line of a mistake; the line of a file that it quotes comes after.
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, (text, code)) in self.0.iter().enumerate() {
+            let (first, others) = text.split_at(text.find('\n').unwrap_or(text.len()));
+            write!(f, "{}{first} [{code}]{others}", if index > 0 { "\n" } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
 /// Prints an error, one paragraph per line of it, and gives the exit code.
-pub fn fail(exit: Exit, error: &dyn std::fmt::Display) -> Exit {
-    remark(error);
+pub fn fail(exit: Exit, error: impl Into<Failure>) -> Exit {
+    remark(&error.into());
     exit
 }
 
@@ -59,11 +102,11 @@ pub fn harmless(text: &str) -> String {
 }
 
 /// Prints to stdout, or says why not. A reader that has had enough and is gone, as `head`, is no error.
-pub fn print(text: &str) -> Result<(), String> {
+pub fn print(text: &str) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-            Err(format!("cannot write to stdout: {error}; {}", remedy(&error)))
+            Err(Failure::new("cannot-print", format!("cannot write to stdout: {error}; {}", remedy(&error))))
         }
         _ => Ok(()),
     }
@@ -74,7 +117,7 @@ pub type Ended = Result<Exit, Exit>;
 
 /// Prints to stdout.
 pub fn say(text: &str) -> Ended {
-    print(text).map(|()| Exit::Ok).map_err(|reason| fail(Exit::Failure, &reason))
+    print(text).map(|()| Exit::Ok).map_err(|reason| fail(Exit::Failure, reason))
 }
 
 /// The exit code of a run, or a replay, that failed.

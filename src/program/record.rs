@@ -1,6 +1,6 @@
 //! `corotate record`: every sample of a running loop to a file, as `corotate run --record` starts it or by hand.
 
-use super::output::{Ended, Exit, fail, remark, say};
+use super::output::{Ended, Exit, Failure, fail, remark, say};
 use super::runs::{self, join};
 use crate::record::{RecordError, RecorderSeat, Recording, RecordingReport, run_recorder};
 use std::io::ErrorKind;
@@ -43,11 +43,12 @@ pub fn record(arguments: &Arguments) -> Ended {
     let is_there = || std::fs::metadata(&arguments.out).is_ok_and(|file| file.is_file() && file.len() > 0);
     if arguments.parent.is_none() && !arguments.overwrite && is_there() {
         let file = arguments.out.display();
-        return Err(fail(Exit::Usage, &format!("{file} is there; name another file with --out, or give --overwrite")));
+        let reason = format!("{file} is there; name another file with --out, or give --overwrite");
+        return Err(fail(Exit::Usage, Failure::new("file-exists", reason)));
     }
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
     let seat = RecorderSeat { domain, file: arguments.out.clone() };
-    let report = run_recorder(&seat, &terminated).map_err(|error| fail(exit_of(&error), &error))?;
+    let report = run_recorder(&seat, &terminated).map_err(|error| fail(exit_of(&error), error))?;
     told(&report, arguments)
 }
 
@@ -62,7 +63,10 @@ fn told(report: &RecordingReport, arguments: &Arguments) -> Ended {
     if arguments.parent.is_none() {
         said?;
     }
-    report.problem.as_ref().map_or(Ok(Exit::Ok), |problem| Err(fail(Exit::Failure, problem)))
+    report
+        .problem
+        .as_ref()
+        .map_or(Ok(Exit::Ok), |problem| Err(fail(Exit::Failure, Failure::new("incomplete-recording", problem))))
 }
 
 /// Opens the recording of a run as [`open`] does. Returns it with its file.
@@ -70,8 +74,8 @@ fn told(report: &RecordingReport, arguments: &Arguments) -> Ended {
 /// # Errors
 /// The exit code, once the reason is printed.
 pub fn open_run(run: Option<&Path>, accept_incomplete: bool) -> Result<(PathBuf, Recording), Exit> {
-    let file = runs::recording(run).map_err(|reason| fail(Exit::Usage, &reason))?;
-    let recording = open(&file, accept_incomplete).map_err(|error| fail(exit_of(&error), &error))?;
+    let file = runs::recording(run).map_err(|failure| fail(Exit::Usage, failure))?;
+    let recording = open(&file, accept_incomplete).map_err(|error| fail(exit_of(&error), error))?;
     Ok((file, recording))
 }
 
@@ -81,10 +85,12 @@ pub fn open(file: &Path, accept_incomplete: bool) -> Result<Recording, RecordErr
     match recording.require_whole() {
         Err(error) if !accept_incomplete => return Err(error),
         Err(RecordError::Damaged { reason, .. }) => {
-            remark(&format!("{} is damaged, and read as far as it can be believed: {reason}", file.display()));
+            let text = format!("{} is damaged, and read as far as it can be believed: {reason}", file.display());
+            remark(&Failure::new("damaged-recording", text));
         }
         Err(RecordError::Incomplete { missing, .. }) => {
-            remark(&format!("{} is not complete, and read as far as it goes: {missing}", file.display()));
+            let text = format!("{} is not complete, and read as far as it goes: {missing}", file.display());
+            remark(&Failure::new("incomplete-recording", text));
         }
         _ => {}
     }
@@ -102,7 +108,7 @@ pub fn exit_of(error: &RecordError) -> Exit {
         RecordError::Run(_) | RecordError::Domain(_) | RecordError::NotOurs { .. } | RecordError::Scenario { .. } => {
             Exit::Usage
         }
-        RecordError::Layout { .. } | RecordError::Missing { .. } => Exit::Usage,
+        RecordError::Layout { .. } | RecordError::NotRecorded { .. } | RecordError::UnknownRole { .. } => Exit::Usage,
         RecordError::Read { source, .. } if source.kind() == ErrorKind::NotFound => Exit::Usage,
         RecordError::Damaged { .. } | RecordError::Incomplete { .. } => Exit::Failure,
         RecordError::Bus(_)

@@ -1,13 +1,14 @@
 //! `corotate replay`: a recording through the live roles.
 
-use super::output::{Ended, Exit, fail, harmless, say};
+use super::output::{Ended, Exit, Failure, fail, harmless, say};
 use super::record::{exit_of, exit_with, open_run};
+use super::signals::catch_signals;
 use crate::launch::{LaunchError, replay_as_process};
 use crate::record::{RecordError, Recording, RoleReplay, replay_in_process};
 use crate::runtime::RoleId;
 use crate::scenario::Scenario;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Options of `corotate replay`.
 #[derive(clap::Args)]
@@ -45,33 +46,42 @@ Examples:
 /// Replays.
 pub fn replay(arguments: &Arguments) -> Ended {
     let (file, recording) = open_run(arguments.run.as_deref(), arguments.accept_incomplete)?;
-    let replays = attempt(arguments, &recording).map_err(|error| match error {
-        LaunchError::Record(error) => fail(exit_of(&error), &error),
-        error => fail(super::output::exit_of(&error), &error),
+    // In one thread a signal ends the process.
+    let signal = arguments.processes.then(catch_signals).transpose().map_err(|error| fail(Exit::Failure, error))?;
+    let replays = attempt(arguments, &recording, signal.as_deref()).map_err(|error| match error {
+        LaunchError::Record(error) => fail(exit_of(&error), error),
+        error => fail(super::output::exit_of(&error), error),
     })?;
+    let number = signal.map_or(0, |signal| signal.load(Ordering::Relaxed));
+    if number != 0 {
+        let text = "ended by a signal before all was replayed";
+        return Err(fail(Exit::Signal(number), Failure::new("interrupted", text)));
+    }
     let words = || harmless(&replays.iter().map(words).collect::<String>());
     say(&if arguments.json { json(&file, &replays) } else { words() })?;
     let differs = replays.iter().any(|replay| replay.difference.is_some());
     Ok(exit_with(&recording, if differs { Exit::NotAccepted } else { Exit::Ok }))
 }
 
-fn attempt(arguments: &Arguments, recording: &Recording) -> Result<Vec<RoleReplay>, LaunchError> {
+fn attempt(
+    arguments: &Arguments,
+    recording: &Recording,
+    signal: Option<&AtomicUsize>,
+) -> Result<Vec<RoleReplay>, LaunchError> {
     let scenario = recording.scenario_for_replay()?;
     recording.check_layouts(&scenario)?;
     let roles = roles(&arguments.role, &scenario)?;
-    if !arguments.processes {
+    let Some(signal) = signal else {
         return Ok(roles
             .into_iter()
             .map(|role| replay_in_process(recording, &scenario, role))
             .collect::<Result<_, _>>()?);
-    }
-    let spawn = |source| LaunchError::Spawn { role: "a role".to_owned(), source };
-    let signal = super::signals::catch_signals().map_err(spawn)?;
+    };
     let mut replays = Vec::new();
     for role in roles {
-        replays.push(replay_as_process(recording, &scenario, role, &signal)?);
+        replays.push(replay_as_process(recording, &scenario, role, signal)?);
         if signal.load(Ordering::Relaxed) != 0 {
-            return Err(RecordError::Missing { reason: "ended by a signal before all was replayed".to_owned() }.into());
+            break;
         }
     }
     Ok(replays)
@@ -83,9 +93,7 @@ fn roles(name: &str, scenario: &Scenario) -> Result<Vec<RoleId>, RecordError> {
     }
     RoleId::named(scenario, name).map(|role| vec![role]).ok_or_else(|| {
         let known = scenario.rig.roles().join(", ");
-        RecordError::Missing {
-            reason: format!("--role {name}: there is no such role; this recording has: {known}, all"),
-        }
+        RecordError::UnknownRole { role: name.to_owned(), known }
     })
 }
 

@@ -1,6 +1,6 @@
 //! `corotate report`: a run, a recording, or a campaign as one page; or two runs over each other.
 
-use super::output::{Ended, Exit, fail, remark, say};
+use super::output::{Ended, Exit, Failure, fail, remark, say};
 use super::record;
 use super::runs;
 use crate::campaign::JournalError;
@@ -58,7 +58,7 @@ Examples:
 
 /// Makes the page.
 pub fn report(arguments: &Arguments) -> Ended {
-    let source = runs::results(arguments.run.as_deref()).map_err(|reason| fail(Exit::Usage, &reason))?;
+    let source = runs::results(arguments.run.as_deref()).map_err(|failure| fail(Exit::Usage, failure))?;
     let directory = if source.is_dir() { &source } else { source.parent().unwrap_or(Path::new("")) };
     let page = if arguments.other.is_some() { "comparison.html".into() } else { directory.join("report.html") };
     let out = arguments.out.clone().unwrap_or(page);
@@ -75,7 +75,7 @@ pub fn report(arguments: &Arguments) -> Ended {
         arguments.figures.iter().try_for_each(|directory| report.write_figures(directory))?;
         report.write(&out).map(|()| if report.is_damaged() { Exit::Failure } else { Exit::Ok })
     });
-    let exit = written.map_err(|error| fail(exit_of(&error), &error))?;
+    let exit = written.map_err(|error| fail(exit_of(&error), error))?;
     say(&words(arguments.json, &out))?;
     show(arguments.open, &out).map(|()| exit)
 }
@@ -105,7 +105,10 @@ fn show(wanted: bool, page: &Path) -> Result<(), Exit> {
         }
         Ok(())
     };
-    let failed = |error| fail(Exit::Failure, &format!("xdg-open: {error}; open {} in a browser", page.display()));
+    let failed = |error| {
+        let reason = format!("xdg-open: {error}; open {} in a browser", page.display());
+        fail(Exit::Failure, Failure::new("no-browser", reason))
+    };
     if wanted { open().map_err(failed) } else { Ok(()) }
 }
 

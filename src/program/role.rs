@@ -39,8 +39,8 @@ pub fn role(name: &str, arguments: &Arguments) -> Ended {
     let seat = RoleSeat { domain, role: name.to_owned() };
     run_role(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. } => {
-            fail(Exit::Usage, &error)
+            fail(Exit::Usage, error)
         }
-        _ => fail(Exit::Failure, &error),
+        _ => fail(Exit::Failure, error),
     })
 }

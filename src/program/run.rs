@@ -4,7 +4,7 @@ use super::campaign;
 use super::color::{Color, paint};
 use super::foxglove;
 use super::hosts::{self, KeyArguments};
-use super::output::{Exit, exit_of, fail, print, remark};
+use super::output::{Exit, Failure, exit_of, fail, print, remark};
 use super::scenario::{Change, changed, load, stem};
 use super::shipped::name;
 use super::signals::catch_signals;
@@ -134,34 +134,37 @@ impl Arguments {
         self.set.iter().map(|argument| Change::Set(argument)).chain(named).chain(record)
     }
 
-    fn scenario(&self) -> Result<Scenario, Failure> {
+    fn scenario(&self) -> Result<Scenario, Failed> {
         let loaded = match (self.case, &self.file) {
             (Some(case), Some(file)) => campaign::load(file, &[]).and_then(|campaign| {
                 let document = campaign::case(&campaign, case)?;
-                changed(document, self.changes()).map_err(|error| error.to_string())
+                Ok(changed(document, self.changes())?)
             }),
             _ => load(self.file.as_deref(), self.changes()),
         };
-        let scenario = loaded.map_err(|error| Failure::new(Exit::Usage, error))?;
+        let unusable = |failure| Failed { exit: Exit::Usage, failure };
+        let scenario = loaded.map_err(unusable)?;
         self.check_external(&scenario)
             .and_then(|()| self.check_foxglove(&scenario))
             .and_then(|()| self.check_host(&scenario))
-            .and_then(|()| check_cores(&scenario).map_err(|error| error.to_string()))
-            .map_err(|reason| Failure { exit: Exit::Usage, reason })?;
+            .and_then(|()| Ok(check_cores(&scenario)?))
+            .map_err(unusable)?;
         Ok(scenario)
     }
 
-    fn check_foxglove(&self, scenario: &Scenario) -> Result<(), String> {
+    fn check_foxglove(&self, scenario: &Scenario) -> Result<(), Failure> {
         let in_thread = "a run in one thread has nothing that another process could show; take --clock lockstep";
-        let reason = foxglove::refusal().or((scenario.clock == ClockKind::InProcess).then_some(in_thread));
-        reason.filter(|_| self.foxglove.is_some()).map_or(Ok(()), |reason| Err(format!("--foxglove: {reason}")))
+        let in_thread = (scenario.clock == ClockKind::InProcess).then_some(("one-process", in_thread));
+        let refused = foxglove::refusal().map(|reason| ("built-without", reason)).or(in_thread);
+        let refused = refused.filter(|_| self.foxglove.is_some());
+        refused.map_or(Ok(()), |(code, reason)| Err(Failure::new(code, format!("--foxglove: {reason}"))))
     }
 
     /// This host's part in a run over several.
-    fn seat(&self) -> Result<Option<HostSeat>, String> {
+    fn seat(&self) -> Result<Option<HostSeat>, Failure> {
         let (Some(host), Some(address)) = (&self.host, &self.listen) else {
             return if self.keys.any() {
-                Err("--tls-… and --insecure are for --listen".to_owned())
+                Err(Failure::new("unused-keys", "--tls-… and --insecure are for --listen"))
             } else {
                 Ok(None)
             };
@@ -170,35 +173,36 @@ impl Arguments {
         Ok(Some(HostSeat { host: host.clone(), endpoint }))
     }
 
-    fn check_host(&self, scenario: &Scenario) -> Result<(), String> {
+    fn check_host(&self, scenario: &Scenario) -> Result<(), Failure> {
         let Some(HostSeat { host, .. }) = self.seat()? else { return Ok(()) };
-        hosts::refusal().map_or(Ok(()), |reason| Err(format!("--host {host}: {reason}")))?;
+        let refuse = |code, reason: String| Err(Failure::new(code, format!("--host {host}: {reason}")));
+        hosts::refusal().map_or(Ok(()), |reason| refuse("built-without", reason.to_owned()))?;
         let names: Vec<&str> = scenario.hosts.hosts.iter().map(|host| &*host.name).collect();
         if scenario.clock == ClockKind::InProcess {
-            return Err(format!("--host {host}: one thread has one host; give --clock realtime or lockstep"));
+            return refuse("one-process", "one thread has one host; give --clock realtime or lockstep".to_owned());
         }
         if !self.external.is_empty() {
-            return Err(format!(
-                "--external: somebody else's role has no part in a run over several hosts; leave out --host {host}, or it"
-            ));
+            let reason = "somebody else's role has no part in a run over several hosts; leave it out, or --external";
+            return refuse("external-with-hosts", reason.to_owned());
         }
         if let Some(role) = scenario.debug.iter().find(|role| scenario.hosts.of(role) != Some(&host)) {
-            return Err(format!(
-                "--host {host}: the {role} of launch.debug is on another host; debug the roles of this one"
-            ));
+            let reason = format!("the {role} of launch.debug is on another host; debug the roles of this one");
+            return refuse("debugged-elsewhere", reason);
         }
         match names.contains(&host.as_str()) {
             true => Ok(()),
             false if names.is_empty() => {
-                Err(format!("--host {host}: the scenario has no [[host]]; name hosts and their roles there"))
+                refuse("no-hosts", "the scenario has no [[host]]; name hosts and their roles there".to_owned())
             }
-            false => Err(format!("--host {host}: the scenario has no such host; it has: {}", names.join(", "))),
+            false => refuse("no-such-host", format!("the scenario has no such host; it has: {}", names.join(", "))),
         }
     }
 
-    fn check_external(&self, scenario: &Scenario) -> Result<(), String> {
-        let check =
-            |role: &String| scenario.check_external(role).map_err(|reason| format!("--external {role}: {reason}"));
+    fn check_external(&self, scenario: &Scenario) -> Result<(), Failure> {
+        let check = |role: &String| {
+            let checked = scenario.check_external(role);
+            checked.map_err(|error| Failure::of(format_args!("--external {role}"), error))
+        };
         self.external.iter().try_for_each(check)
     }
 }
@@ -210,14 +214,14 @@ fn role_list(names: &str) -> Result<String, std::convert::Infallible> {
 }
 
 /// Why a run has no verdict.
-struct Failure {
+struct Failed {
     exit: Exit,
-    reason: String,
+    failure: Failure,
 }
 
-impl Failure {
-    fn new(exit: Exit, reason: impl ToString) -> Self {
-        Self { exit, reason: reason.to_string() }
+impl Failed {
+    fn new(exit: Exit, error: impl Into<Failure>) -> Self {
+        Self { exit, failure: error.into() }
     }
 }
 
@@ -227,7 +231,8 @@ pub fn run(arguments: &Arguments) -> Exit {
         Ok(run) => run,
         Err(error) => {
             let reason = "a sandbox may forbid getrandom: allow it";
-            return fail(Exit::Failure, &format!("the run gets no identifier: no random numbers: {error}; {reason}"));
+            let reason = format!("the run gets no identifier: no random numbers: {error}; {reason}");
+            return fail(Exit::Failure, Failure::new("no-random-numbers", reason));
         }
     };
     let loaded = arguments.scenario().map(|mut scenario| {
@@ -242,13 +247,14 @@ pub fn run(arguments: &Arguments) -> Exit {
     }
     let ended = loaded.and_then(|scenario| attempt(arguments, &scenario));
     let told = ended.as_ref().map(|(summary, _)| summary);
-    let written = write_verdict(told.map_err(|failure| failure.reason.as_str()));
-    let exit = match told {
-        Ok(summary) => {
-            let verdict = Verdict::of(summary);
-            verdict.tell(arguments).map_or_else(|error| fail(Exit::Failure, &error), |()| verdict.exit)
+    let reason = ended.as_ref().err().map(|failed| failed.failure.to_string()).unwrap_or_default();
+    let written = write_verdict(told.map_err(|_| reason.as_str()));
+    let exit = match ended {
+        Ok((summary, _)) => {
+            let verdict = Verdict::of(&summary);
+            verdict.tell(arguments).map_or_else(|error| fail(Exit::Failure, error), |()| verdict.exit)
         }
-        Err(failure) => fail(failure.exit, &failure.reason),
+        Err(Failed { exit, failure }) => fail(exit, failure),
     };
     match (written, exit) {
         (Err(failed), Exit::Ok) => failed,
@@ -260,25 +266,29 @@ fn write_junit(path: &Path, name: &str, run: RunId, ended: Result<&Summary, &str
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let made = directory.map_or(Ok(()), files::create_directories);
     made.and_then(|()| files::write(path, junit(name, run, ended).as_bytes()))
-        .map_err(|error| fail(Exit::Failure, &format!("{}: {error}; name another file with --junit", path.display())))
+        .map_err(|error| format!("{}: {error}; name another file with --junit", path.display()))
+        .map_err(|reason| fail(Exit::Failure, Failure::new("cannot-write", reason)))
 }
 
 /// Runs a scenario, and writes and tells what came of it. The outcome is given too: it holds what is still to be removed.
-fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failure> {
-    let broken = |reason: String| Failure { exit: Exit::Failure, reason };
+fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outcome), Failed> {
+    let broken = |failure: Failure| Failed { exit: Exit::Failure, failure };
+    let unwritten = |error: &dyn std::fmt::Display| {
+        broken(Failure::new("cannot-write", format!("{error}; name another directory with --out")))
+    };
     let started = SystemTime::now();
-    let directory = make_directory(arguments.out.as_deref(), &scenario.name, started)
-        .map_err(|error| broken(format!("{error}; name another directory with --out")))?;
+    let directory =
+        make_directory(arguments.out.as_deref(), &scenario.name, started).map_err(|error| unwritten(&error))?;
     let run = scenario.run.expect("it was given before");
     // Kept to the end: no other run writes to the directory meanwhile.
     let claim = claim(&directory, run, arguments.overwrite).map_err(|error| match error {
-        ResultsError::Directory { .. } => Failure::new(Exit::Failure, error),
-        _ => Failure::new(Exit::Usage, error),
+        ResultsError::Directory { .. } => Failed::new(Exit::Failure, error),
+        _ => Failed::new(Exit::Usage, error),
     })?;
     if let Some(names) = claim.removed_names().filter(|_| !arguments.quiet) {
         remark(&format!("removed from {}: {names}", directory.display()));
     }
-    let signal = catch_signals().map_err(|error| broken(error.to_string()))?;
+    let signal = catch_signals().map_err(broken)?;
     let fleets = scenario.rig.bodies().iter().filter(|body| body.fleet.is_some());
     let fleets = fleets.map(|body| body.name.to_string()).collect();
     let (level, events) = (Level::of(arguments), arguments.events);
@@ -295,7 +305,7 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
             record: scenario.record.then(|| directory.join("run.mcap")),
             results: std::fs::canonicalize(&directory).ok(),
             foxglove: arguments.foxglove,
-            host: arguments.seat().map_err(|reason| Failure { exit: Exit::Usage, reason })?,
+            host: arguments.seat().map_err(|failure| Failed { exit: Exit::Usage, failure })?,
             require_realtime: arguments.require_rt,
             checkpoints: true,
             signal: &signal,
@@ -303,11 +313,11 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
         },
     );
     screen.clear();
-    let outcome = outcome.map_err(|error| Failure::new(exit_of(&error), error))?;
+    let outcome = outcome.map_err(|error| Failed::new(exit_of(&error), error))?;
     let summary = Summary::new(scenario, &outcome, started);
     let written = write_run(&directory, scenario, &summary);
     let reported = report(arguments, &summary, &directory);
-    written.map_err(|error| broken(format!("cannot write the results: {error}; name another directory with --out")))?;
+    written.map_err(|error| unwritten(&format_args!("cannot write the results: {error}")))?;
     if let Err(error) = make_latest(&directory) {
         remark(&format!("runs/latest does not lead to this run: {error}; name {} instead", directory.display()));
     }
@@ -319,16 +329,17 @@ fn attempt(arguments: &Arguments, scenario: &Scenario) -> Result<(Summary, Outco
 /// missed for it.
 fn tell_ungranted(scenario: &Scenario) {
     if let Some((lacking, command)) = Machine::at(Path::new("/")).ungranted(&scenario.realtime) {
-        remark(&format!("not granted: {lacking}; this shell is granted it by `{command}`"));
+        let text = format!("not granted: {lacking}; this shell is granted it by `{command}`");
+        remark(&Failure::new("not-granted", text));
     } else if scenario.realtime.priority > 0
         && let Some(error) = refused_priority(scenario.realtime.priority)
     {
         let (priority, remedy) = (scenario.realtime.priority, priority_remedy(Path::new("/")));
-        remark(&format!("not granted: SCHED_FIFO {priority}: {error}; {remedy}"));
+        remark(&Failure::new("not-granted", format!("not granted: SCHED_FIFO {priority}: {error}; {remedy}")));
     }
 }
 
-fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), String> {
+fn report(arguments: &Arguments, summary: &Summary, directory: &Path) -> Result<(), Failure> {
     let text =
         if arguments.quiet { String::new() } else { format!("{}results in {}\n", table(summary), directory.display()) };
     if arguments.events {
@@ -367,7 +378,10 @@ impl Verdict {
 
     fn without_ticks(summary: &Summary) -> Self {
         if !summary.books.balanced {
-            let exit = fail(Exit::Failure, &"the counters do not balance: samples or ticks are unaccounted for");
+            let exit = fail(
+                Exit::Failure,
+                Failure::new("unbalanced", "the counters do not balance: samples or ticks are unaccounted for"),
+            );
             return Self::new(exit, FAIL, "the counters do not balance");
         }
         if let Some(stopped) = summary.incidents.iter().find(|incident| incident.action == Action::Stopped) {
@@ -379,17 +393,21 @@ impl Verdict {
             return Self::new(Exit::ProcessLost, FAIL, format!("the {} was lost{why}", stopped.role));
         }
         if let Some(problem) = summary.recording.as_ref().and_then(|recording| recording.problem.as_ref()) {
-            let exit = fail(Exit::Failure, &format!("the recording is not complete: {problem}"));
+            let exit = fail(
+                Exit::Failure,
+                Failure::new("incomplete-recording", format!("the recording is not complete: {problem}")),
+            );
             return Self::new(exit, FAIL, "the recording is not complete");
         }
         let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
         for criterion in &broken {
             let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
             let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
-            remark(&format!("accept.{}: {role}{value}, limit {:e}", criterion.name, criterion.limit));
+            let text = format!("accept.{}: {role}{value}, limit {:e}", criterion.name, criterion.limit);
+            remark(&Failure::new("not-met", text));
         }
         let ended = (summary.signal != 0).then(|| format!("ended in order by signal {}", summary.signal));
-        ended.iter().for_each(|ended| remark(ended));
+        ended.iter().for_each(|ended| remark(&Failure::new("interrupted", ended)));
         let signal = (summary.signal != 0).then_some(Exit::Signal(summary.signal));
         match summary.accepted {
             Some(true) => {
@@ -412,7 +430,7 @@ impl Verdict {
     }
 
     /// Prints the last line where the table is.
-    fn tell(&self, arguments: &Arguments) -> Result<(), String> {
+    fn tell(&self, arguments: &Arguments) -> Result<(), Failure> {
         let (word, color) = self.word;
         if arguments.events {
             event("verdict", serde_json::json!({ "word": word, "reason": self.reason, "exit": self.exit.code() }))?;
@@ -436,7 +454,7 @@ fn counted(count: usize, one: &str, many: &str) -> String {
 }
 
 /// Tells programs of one thing that happened: a line of JSON.
-fn event(what: &str, mut about: serde_json::Value) -> Result<(), String> {
+fn event(what: &str, mut about: serde_json::Value) -> Result<(), Failure> {
     about["schema"] = "corotate/event/v1".into();
     about["event"] = what.into();
     print(&format!("{about}\n"))

@@ -2,7 +2,7 @@
 //!
 //! Must not follow a link of another user.
 
-use super::output::{Exit, fail};
+use super::output::{Exit, Failure, fail};
 use super::shipped::name;
 use super::signals::{die_with, terminated_by_signals};
 use crate::bus::domain::Domain;
@@ -22,7 +22,7 @@ use std::sync::atomic::AtomicBool;
 ///
 /// # Errors
 /// Why there are none, and what to do.
-pub fn results(given: Option<&Path>) -> Result<PathBuf, String> {
+pub fn results(given: Option<&Path>) -> Result<PathBuf, Failure> {
     match given.filter(|given| *given != Path::new(LATEST)) {
         None => newest(),
         Some(given) => Ok(Domain::join(given).ok().and_then(|domain| results_of(&domain)).unwrap_or(given.to_owned())),
@@ -36,16 +36,16 @@ fn results_of(domain: &Domain) -> Option<PathBuf> {
 }
 
 /// The directory of the newest run.
-fn newest() -> Result<PathBuf, String> {
+fn newest() -> Result<PathBuf, Failure> {
     let link = Path::new(RUNS).join(LATEST);
     match Directory::open(&link) {
         // By its own name, which stays true when the link moves on.
         Ok(_) => Ok(fs::read_link(&link).map_or(link, |run| Path::new(RUNS).join(run))),
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            Err("no run is named, and there is no runs/latest here; run a scenario, or name a run's directory"
-                .to_owned())
+            let text = "no run is named, and there is no runs/latest here; run a scenario, or name a run's directory";
+            Err(Failure::new("no-latest-run", text))
         }
-        Err(error) => Err(format!("{}: {error}; name a run's directory", link.display())),
+        Err(error) => Err(Failure::new("cannot-read", format!("{}: {error}; name a run's directory", link.display()))),
     }
 }
 
@@ -53,7 +53,7 @@ fn newest() -> Result<PathBuf, String> {
 ///
 /// # Errors
 /// As [`results`]; and where the run was not recorded, which one was.
-pub fn recording(given: Option<&Path>) -> Result<PathBuf, String> {
+pub fn recording(given: Option<&Path>) -> Result<PathBuf, Failure> {
     let path = results(given)?;
     if !path.is_dir() {
         return Ok(path);
@@ -66,7 +66,7 @@ pub fn recording(given: Option<&Path>) -> Result<PathBuf, String> {
         Some(other) => format!("the newest run with one is {}", other.parent().unwrap_or(&other).display()),
         None => format!("`{} run SCENARIO --record` keeps the samples of a run", name()),
     };
-    Err(format!("{} has no {RECORDING}; {other}", path.display()))
+    Err(Failure::new("no-recording", format!("{} has no {RECORDING}; {other}", path.display())))
 }
 
 /// The newest recording in `runs/` of another run than the one in this directory, or this file.
@@ -89,7 +89,7 @@ pub fn newest_recording(than: &Path) -> Option<PathBuf> {
 /// The exit code, once the reason is told.
 pub fn domain(given: Option<&Path>) -> Result<PathBuf, Exit> {
     let given = given.filter(|given| *given != Path::new(LATEST));
-    run_under_way(given).map_err(|error| fail(Exit::Usage, &error))
+    run_under_way(given).map_err(|error| fail(Exit::Usage, error))
 }
 
 /// Prepares a process to join a run: it dies with its parent, if one is given, and signals set a flag. Returns the run's domain and

@@ -2,9 +2,10 @@
 //!
 //! Must not judge what it reads: [`crate::config`] does.
 
+use super::output::Failure;
 use super::shipped::{campaigns, name, scenarios};
 use crate::campaign::{Shipped, is_campaign};
-use crate::config::{ConfigError, Document, is_name, nearest, read_text};
+use crate::config::{ConfigError, Document, Problem, is_name, nearest, read_text};
 use crate::scenario::Scenario;
 use std::borrow::Cow;
 use std::fs::File;
@@ -37,27 +38,25 @@ impl Change<'_> {
 }
 
 /// The scenario that is meant, with changes; the program's first where none is named.
-pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'a>>) -> Result<Scenario, String> {
+pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'a>>) -> Result<Scenario, Failure> {
     let shipped = |name: &str| {
         let (_, text) = scenarios().iter().find(|(known, _)| *known == name).ok_or_else(|| unknown(name))?;
         Ok(Cow::Borrowed(*text))
     };
-    let first = || first().ok_or("this program has no scenario of its own; name a scenario file");
+    let none = "this program has no scenario of its own; name a scenario file";
+    let first = || first().ok_or_else(|| Failure::new("no-scenario", none));
     let (text, origin) = match given {
         Some(given) => text(given, &shipped)?,
         None => text(Path::new(first()?), &shipped)?,
     };
     let resolved = Document::parse(&text, &origin).and_then(|document| {
         if is_campaign(&document) {
-            return Err(ConfigError::Value {
-                place: document.place("base"),
-                key: "base".to_owned(),
-                reason: "makes it a campaign; run it with `corotate sweep`, or one case of it with --case N".to_owned(),
-            });
+            let reason = "makes it a campaign; run it with `corotate sweep`, or one case of it with --case N";
+            return Err(ConfigError::of(document.place("base"), "base", "is-campaign", reason));
         }
         changed(document, changes)
     });
-    resolved.map_err(|error| quoting(&error.to_string(), &origin, &text))
+    resolved.map_err(|error| quoting(error, &origin, &text))
 }
 
 /// The scenario of a document with changes.
@@ -70,11 +69,10 @@ pub fn changed<'a>(
 }
 
 /// The text that is meant, by the name under which it is shipped, by its path or from standard input; and what errors call it.
-pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, String), String> {
+pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, String), ConfigError> {
     let shipped = |name: &str| Ok((shipped(name)?, format!("{name}.toml")));
-    let read = |text: Result<String, ConfigError>, origin: &Path| match text {
-        Ok(text) => Ok((Cow::Owned(text), origin.display().to_string())),
-        Err(error) => Err(error.to_string()),
+    let read = |text: Result<String, ConfigError>, origin: &Path| {
+        text.map(|text| (Cow::Owned(text), origin.display().to_string()))
     };
     let refuse = |path: &Path, error: io::Error| ConfigError::Read { path: path.to_owned(), reason: error.to_string() };
     match name_in(given) {
@@ -87,16 +85,19 @@ pub fn text(given: &Path, shipped: Shipped<'_>) -> Result<(Cow<'static, str>, St
     }
 }
 
-/// What errors say, and below each the line of the text that it is about.
-pub fn quoting(errors: &str, origin: &str, text: &str) -> String {
-    let quote = |error: &str| {
-        let (number, _) = error.strip_prefix(origin)?.strip_prefix(':')?.split_once(':')?;
-        let number: usize = number.parse().ok()?;
-        let line: String = text.lines().nth(number.checked_sub(1)?)?.chars().take(MAX_QUOTED).collect();
-        Some(format!("{error}\n{number:>4} | {}", line.trim_end()))
+/// The mistakes, and below each that stands in the text its line there.
+pub fn quoting(error: ConfigError, origin: &str, text: &str) -> Failure {
+    let ConfigError::Invalid { problems } = error else { return error.into() };
+    let quoted = |problem: Problem| {
+        let line = problem.place.line.filter(|_| problem.place.origin == origin);
+        let quote = line.and_then(|number| Some((number, text.lines().nth(number.checked_sub(1)?)?)));
+        let quote = quote.map_or(String::new(), |(number, line)| {
+            let line: String = line.chars().take(MAX_QUOTED).collect();
+            format!("\n{number:>4} | {}", line.trim_end())
+        });
+        (format!("{problem}{quote}"), problem.code)
     };
-    let lines = errors.lines().map(|error| quote(error).unwrap_or_else(|| error.to_owned()));
-    lines.collect::<Vec<_>>().join("\n")
+    Failure(problems.into_iter().map(quoted).collect())
 }
 
 /// What is given, unless it is a file's path: a file of a shipped scenario's name must not change what that name means.
@@ -118,14 +119,17 @@ pub fn stem(given: Option<&Path>) -> String {
 }
 
 /// What to say of a name that no scenario has.
-pub fn unknown(name: &str) -> String {
+pub fn unknown(name: &str) -> ConfigError {
     if campaigns().iter().any(|(known, _)| *known == name) {
-        return format!("`{name}` is a campaign; run it with `corotate sweep {name}`, or one case of it with --case N");
+        let remedy = format!("run it with `corotate sweep {name}`, or one case of it with --case N");
+        return ConfigError::Unknown { code: "is-campaign", text: format!("`{name}` is a campaign; {remedy}") };
     }
     let known: Vec<&str> = scenarios().iter().map(|(name, _)| *name).collect();
     let remedy = nearest(name, &known);
     let end = if remedy.ends_with('?') { "" } else { "." };
-    format!("there is no scenario `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml")
+    let text =
+        format!("there is no scenario `{name}`; {remedy}{end} A file is given by its path, as ./{name} or {name}.toml");
+    ConfigError::Unknown { code: "unknown-scenario", text }
 }
 
 /// What a scenario is, in a line: the first of its text, if that is a comment.
@@ -136,14 +140,17 @@ pub fn title(text: &str) -> &str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Place;
 
     #[test]
     fn the_line_that_an_error_is_about_is_quoted() {
         let text = "a = 1\nb = 2   \n";
-        let told =
-            quoting("x.toml:2: b: wrong\n--set c=1: c: wrong\nx.toml:1:5: bad\nx.toml: d: is missing", "x.toml", text);
-        let expected = "x.toml:2: b: wrong\n   2 | b = 2\n--set c=1: c: wrong\nx.toml:1:5: bad\n   1 | a = 1\nx.toml: d: is missing";
-        assert_eq!(told, expected);
-        assert_eq!(quoting("x.toml:99: b", "x.toml", text), "x.toml:99: b");
+        let quote = |place: Place| quoting(ConfigError::of(place, "b", "code", "wrong"), "x.toml", text).to_string();
+        let line = |number| Place { line: Some(number), ..Place::from("x.toml") };
+        assert_eq!(quote(line(2)), "x.toml:2: b: wrong [code]\n   2 | b = 2");
+        assert_eq!(quote(line(99)), "x.toml:99: b: wrong [code]");
+        assert_eq!(quote("x.toml".into()), "x.toml: b: wrong [code]");
+        assert_eq!(quote("--set b=1".into()), "--set b=1: b: wrong [code]");
+        assert_eq!(quote(Place { line: Some(1), ..Place::from("base.toml") }), "base.toml:1: b: wrong [code]");
     }
 }

@@ -3,7 +3,7 @@
 use super::output::{Ended, Exit, fail, say};
 use super::runs;
 use super::scenario::{Change, load};
-use crate::config::ClockKind;
+use crate::config::{ClockKind, NotExternal};
 use crate::runtime::RoleId;
 use crate::seat::{RoleError, describe_seat, join_run};
 use crate::system::tell;
@@ -38,18 +38,18 @@ Example:
 pub fn seat(arguments: &Arguments) -> Ended {
     let clock = arguments.clock.iter().map(|clock| Change::Option("--clock", "clock", clock));
     let changes = arguments.set.iter().map(|argument| Change::Set(argument)).chain(clock);
-    let scenario = load(Some(&arguments.file), changes).map_err(|error| fail(Exit::Usage, &error))?;
+    let scenario = load(Some(&arguments.file), changes).map_err(|error| fail(Exit::Usage, error))?;
     if scenario.clock == ClockKind::InProcess {
-        return Err(fail(Exit::Usage, &"one process has no seats for others; give --clock realtime or lockstep"));
+        return Err(fail(Exit::Usage, NotExternal::OneProcess));
     }
     let role = RoleId::named(&scenario, &arguments.role).ok_or_else(|| {
         let (role, known) = (arguments.role.clone(), scenario.rig.roles().join(", "));
-        fail(Exit::Usage, &RoleError::NoSuchRole { role, known })
+        fail(Exit::Usage, RoleError::NoSuchRole { role, known })
     })?;
-    scenario.check_external(&arguments.role).map_err(|reason| fail(Exit::Usage, &reason))?;
+    scenario.check_external(&arguments.role).map_err(|error| fail(Exit::Usage, error))?;
     let root = arguments.domain.as_deref().map(|given| runs::domain(Some(given))).transpose()?;
     let domain = root.map(|root| join_run(&scenario, &root)).transpose();
-    let domain = domain.map_err(|error| fail(Exit::Usage, &error))?;
+    let domain = domain.map_err(|error| fail(Exit::Usage, error))?;
     if domain.is_none() {
         let name = &arguments.role;
         tell(format_args!(

@@ -1,19 +1,18 @@
 //! Signals that ask a process to end, and the parent whose death ends it.
 
-use super::output::{Exit, fail};
+use super::output::{Exit, Failure, fail};
 use crate::system::remedy;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 
-/// A signal cannot be caught: the system's error with what to do.
-pub fn not_caught(error: io::Error) -> io::Error {
-    io::Error::new(error.kind(), format!("cannot catch signals: {error}; {}", remedy(&error)))
+fn not_caught(error: io::Error) -> Failure {
+    Failure::new("no-signals", format!("cannot catch signals: {error}; {}", remedy(&error)))
 }
 
 /// The number of the signal that asked for the end, once one has.
-pub fn catch_signals() -> io::Result<Arc<AtomicUsize>> {
+pub fn catch_signals() -> Result<Arc<AtomicUsize>, Failure> {
     let signal = Arc::new(AtomicUsize::new(0));
     for number in [SIGINT, SIGTERM, SIGHUP] {
         signal_hook::flag::register_usize(number, signal.clone(), number as usize).map_err(not_caught)?;
@@ -26,7 +25,7 @@ pub fn terminated_by_signals() -> Result<Arc<AtomicBool>, Exit> {
     let terminated = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
         signal_hook::flag::register(signal, terminated.clone())
-            .map_err(|error| fail(Exit::Failure, &not_caught(error)))?;
+            .map_err(|error| fail(Exit::Failure, not_caught(error)))?;
     }
     Ok(terminated)
 }
@@ -36,11 +35,12 @@ pub fn die_with(parent: i32) -> Result<(), Exit> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
     set_parent_process_death_signal(Some(Signal::KILL)).map_err(|error| {
         let error = io::Error::from(error);
-        fail(Exit::Failure, &format!("cannot be bound to the launcher's life: {error}; {}", remedy(&error)))
+        let text = format!("cannot be bound to the launcher's life: {error}; {}", remedy(&error));
+        fail(Exit::Failure, Failure::new("not-bound", text))
     })?;
     // The parent may have died before the request.
     match getppid() {
         Some(pid) if pid.as_raw_nonzero().get() == parent => Ok(()),
-        _ => Err(fail(Exit::Failure, &"the launcher is gone; start the run again")),
+        _ => Err(fail(Exit::Failure, Failure::new("launcher-gone", "the launcher is gone; start the run again"))),
     }
 }

@@ -1,7 +1,7 @@
 //! `corotate sweep`: a campaign from file to table.
 
 use super::campaign;
-use super::output::{Ended, Exit, fail, print, remark};
+use super::output::{Ended, Exit, Failure, fail, print, remark};
 use super::signals::catch_signals;
 use crate::campaign::{
     Axis, Campaign, Case, Counts, JournalError, Margin, Shard, Sweep, SweepError, Swept, Table, merge, worst,
@@ -106,24 +106,24 @@ pub fn sweep(arguments: &Arguments) -> Ended {
     match (&arguments.merge, &arguments.file) {
         (Some(Merge::Merge(given)), _) => put_together(given),
         (None, Some(file)) => run(arguments, file),
-        (None, None) => Err(fail(Exit::Usage, &"name a campaign")),
+        (None, None) => Err(fail(Exit::Usage, Failure::new("no-campaign", "name a campaign"))),
     }
 }
 
 fn put_together(given: &MergeArguments) -> Ended {
     let telling = Telling { json: given.json, quiet: given.quiet };
-    let swept = merge(&given.directories, &given.out).map_err(|error| fail(exit_of(&error), &error))?;
+    let swept = merge(&given.directories, &given.out).map_err(|error| fail(exit_of(&error), error))?;
     let head = format!("{} directories put together", given.directories.len());
     tell(telling, &given.out, &head, &swept.counts.unwrap_or_default()).map(|()| Exit::Ok)
 }
 
 fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
-    let campaign = campaign::load(file, &arguments.set).map_err(|error| fail(Exit::Usage, &error))?;
+    let campaign = campaign::load(file, &arguments.set).map_err(|error| fail(Exit::Usage, error))?;
     let directory = directory(arguments, &campaign)?;
     if cfg!(debug_assertions) && !arguments.quiet {
         remark(&"this is a debug build, about 50 times as slow as a release build: `cargo build --release`");
     }
-    let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+    let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
     let threads = arguments.threads.map(usize::from);
     let threads = threads.or_else(|| std::thread::available_parallelism().ok().map(usize::from)).unwrap_or(1);
     let began = Instant::now();
@@ -147,7 +147,7 @@ fn run(arguments: &Arguments, file: &Path) -> Result<Exit, Exit> {
         },
     );
     bar.finish_and_clear();
-    let swept = swept.map_err(|error| fail(exit_of(&error), &error))?;
+    let swept = swept.map_err(|error| fail(exit_of(&error), error))?;
     let Some(counts) = &swept.counts else {
         return Ok(interrupted(arguments, &campaign, &directory, &swept, &signal));
     };
@@ -167,11 +167,14 @@ fn directory(arguments: &Arguments, campaign: &Campaign) -> Result<PathBuf, Exit
         let found = newest(campaign);
         return found.ok_or_else(|| {
             let name = campaign.name();
-            fail(Exit::Usage, &format!("--resume: {RUNS}/ has no results of this campaign `{name}`; begin without it"))
+            let text = format!("--resume: {RUNS}/ has no results of this campaign `{name}`; begin without it");
+            fail(Exit::Usage, Failure::new("nothing-to-resume", text))
         });
     }
     let made = make_directory(None, campaign.name(), SystemTime::now());
-    made.map_err(|error| fail(Exit::Failure, &format!("{error}; name another directory with --out")))
+    made.map_err(|error| {
+        fail(Exit::Failure, Failure::new("cannot-write", format!("{error}; name another directory with --out")))
+    })
 }
 
 /// The newest results of a campaign; their names begin with the time.
@@ -214,7 +217,7 @@ fn interrupted(
         pieces(campaign),
         directory.display()
     );
-    fail(Exit::Signal(number), &words)
+    fail(Exit::Signal(number), Failure::new("interrupted", words))
 }
 
 /// The first line: what was done, and how fast.
@@ -238,12 +241,12 @@ fn head(campaign: &Campaign, swept: &Swept, counts: &Counts, done: u64, took: Du
 
 /// Prints what there is.
 fn tell(telling: Telling, directory: &Path, head: &str, counts: &Counts) -> Result<(), Exit> {
-    let failed = |reason: String| fail(Exit::Failure, &reason);
+    let failed = |failure| fail(Exit::Failure, failure);
     let path = directory.join("summary.json");
     let summary: serde_json::Value = fs::read(&path)
         .map_err(|error| error.to_string())
         .and_then(|bytes| serde_json::from_slice(&bytes).map_err(|error| error.to_string()))
-        .map_err(|error| failed(format!("{}: {error}", path.display())))?;
+        .map_err(|error| failed(Failure::new("unreadable-summary", format!("{}: {error}", path.display()))))?;
     if !telling.quiet {
         let axes: Vec<Axis> = serde_json::from_value(summary["axes"].clone()).unwrap_or_default();
         let margins: Vec<Margin> = serde_json::from_value(summary["margins"].clone()).unwrap_or_default();
@@ -302,11 +305,11 @@ fn record_worst(
     if arguments.record == 0 {
         return Ok(());
     }
-    let table = Table::read(directory).map_err(|error| fail(Exit::Failure, &error))?;
+    let table = Table::read(directory).map_err(|error| fail(Exit::Failure, error))?;
     for number in worst(&table, arguments.record) {
         let Some(case) = campaign.case(number) else { continue };
         let path = directory.join(format!("case-{number}"));
-        record(campaign, &case, &path, signal).map_err(|error| fail(Exit::Failure, &error))?;
+        record(campaign, &case, &path, signal).map_err(|error| fail(Exit::Failure, error))?;
         let number = signal.load(std::sync::atomic::Ordering::Relaxed);
         if number != 0 {
             return Err(Exit::Signal(number));
@@ -318,19 +321,20 @@ fn record_worst(
     Ok(())
 }
 
-fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -> Result<(), String> {
-    let mut scenario = campaign.scenario(case).map_err(|error| error.to_string())?;
-    let run = new_run().map_err(|error| format!("no random numbers: {error}"))?;
+fn record(campaign: &Campaign, case: &Case, path: &Path, signal: &AtomicUsize) -> Result<(), Failure> {
+    let mut scenario = campaign.scenario(case)?;
+    let run = new_run().map_err(|error| Failure::new("no-random-numbers", format!("no random numbers: {error}")))?;
     (scenario.run, scenario.record) = (Some(run), true);
     // The samples of a case are the same whenever it runs.
-    let claim = claim(path, run, true).map_err(|error| error.to_string())?;
+    let claim = claim(path, run, true)?;
     if let Some(names) = claim.removed_names() {
         remark(&format!("removed from {}: {names}", path.display()));
     }
     let (started, mut silent) = (SystemTime::now(), |_: &Progress<'_>| {});
     let mut launch = Launch { record: Some(path.join("run.mcap")), ..Launch::new(signal, &mut silent) };
-    let outcome = crate::launch::run(&scenario, &mut launch).map_err(|error| error.to_string())?;
-    write_run(path, &scenario, &Summary::new(&scenario, &outcome, started)).map_err(|error| error.to_string())
+    let outcome = crate::launch::run(&scenario, &mut launch)?;
+    write_run(path, &scenario, &Summary::new(&scenario, &outcome, started))
+        .map_err(|error| Failure::new("cannot-write", format!("{}: {error}", path.display())))
 }
 
 fn exit_of(error: &SweepError) -> Exit {

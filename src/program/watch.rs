@@ -47,9 +47,9 @@ Examples:
 
 /// Watches until it is enough.
 pub fn watch(arguments: &Arguments) -> Ended {
-    let signal = catch_signals().map_err(|error| fail(Exit::Failure, &error))?;
+    let signal = catch_signals().map_err(|error| fail(Exit::Failure, error))?;
     let domain = runs::domain(arguments.domain.as_deref())?;
-    attempt(arguments, &domain, &signal).map_err(|error| fail(exit_of(&error), &error))
+    attempt(arguments, &domain, &signal).map_err(|error| fail(exit_of(&error), error))
 }
 
 fn attempt(arguments: &Arguments, domain: &Path, signal: &AtomicUsize) -> Result<Exit, WatchError> {

@@ -23,13 +23,16 @@ use std::path::{Path, PathBuf};
 use tempfile::TempPath;
 
 /// Why a recording is not exported.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ExportError {
     /// The recording cannot be read.
     #[error(transparent)]
+    #[strum(transparent)]
     Recording(#[from] RecordError),
     /// A table, or the directory for it, cannot be written.
     #[error("cannot write {}: {source}; {}, or name another directory", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The table, or the directory.
         path: PathBuf,
@@ -38,6 +41,7 @@ pub enum ExportError {
     },
     /// A table has more columns than its form bears.
     #[error("{service} has {columns} columns, more than the {most} that readers of Parquet bear; export it with --csv")]
+    #[strum(serialize = "too-many-columns")]
     Wide {
         /// The signal.
         service: String,

@@ -50,22 +50,28 @@ use std::io;
 use std::path::PathBuf;
 
 /// What can go wrong with a recording.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum RecordError {
     /// The run could not be joined.
     #[error(transparent)]
+    #[strum(transparent)]
     Run(#[from] RoleError),
     /// The domain is none.
     #[error(transparent)]
+    #[strum(transparent)]
     Domain(#[from] DomainError),
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// A role cannot go on.
     #[error(transparent)]
+    #[strum(transparent)]
     Node(#[from] NodeError),
     /// There is no room for more.
     #[error("the disk is full: {} ends here, readable ({source}); free some room, or record elsewhere with --out", path.display())]
+    #[strum(serialize = "disk-full")]
     Full {
         /// The recording.
         path: PathBuf,
@@ -74,6 +80,7 @@ pub enum RecordError {
     },
     /// The file cannot be written.
     #[error("cannot write {}: {source}; it ends with its last whole chunk, readable without an index", path.display())]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The recording.
         path: PathBuf,
@@ -82,6 +89,7 @@ pub enum RecordError {
     },
     /// The file cannot be read.
     #[error("cannot read {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-read")]
     Read {
         /// The recording.
         path: PathBuf,
@@ -90,6 +98,7 @@ pub enum RecordError {
     },
     /// The file is none of ours.
     #[error("{} is no recording of corotate: {reason}; `corotate run --record` makes one", path.display())]
+    #[strum(serialize = "not-a-recording")]
     NotOurs {
         /// The file.
         path: PathBuf,
@@ -101,6 +110,7 @@ pub enum RecordError {
         "{} is damaged: {reason}; take another copy of it. --accept-incomplete uses what comes before, and still fails",
         path.display()
     )]
+    #[strum(serialize = "damaged-recording")]
     Damaged {
         /// The recording.
         path: PathBuf,
@@ -109,6 +119,7 @@ pub enum RecordError {
     },
     /// The file has not all of its run.
     #[error("{} is not complete: {missing}; go on with what there is by --accept-incomplete", path.display())]
+    #[strum(serialize = "incomplete-recording")]
     Incomplete {
         /// The recording.
         path: PathBuf,
@@ -117,6 +128,7 @@ pub enum RecordError {
     },
     /// The scenario in the recording is refused.
     #[error("the scenario in {} is refused by this version: {source}", path.display())]
+    #[strum(serialize = "refused-scenario")]
     Scenario {
         /// The recording.
         path: PathBuf,
@@ -127,6 +139,7 @@ pub enum RecordError {
     #[error(
         "{service} was recorded as {recorded}, and this version has {ours}; replay it with the version that made it"
     )]
+    #[strum(serialize = "other-layout")]
     Layout {
         /// The signal.
         service: String,
@@ -135,10 +148,20 @@ pub enum RecordError {
         /// This version's.
         ours: String,
     },
-    /// What is asked for is not in the recording.
-    #[error("{reason}")]
-    Missing {
-        /// What, and what to do.
-        reason: String,
+    /// A signal of the scenario is not in the recording.
+    #[error("{} has no signal {service}; record the run with this version", path.display())]
+    NotRecorded {
+        /// The recording.
+        path: PathBuf,
+        /// The signal.
+        service: String,
+    },
+    /// The recording has no such role.
+    #[error("--role {role}: there is no such role; this recording has: {known}, all")]
+    UnknownRole {
+        /// As given.
+        role: String,
+        /// The roles that it has.
+        known: String,
     },
 }

@@ -316,14 +316,14 @@ impl Recording {
     /// Checks that every signal has the layout that this version gives it.
     ///
     /// # Errors
-    /// [`RecordError::Layout`], [`RecordError::Missing`].
+    /// [`RecordError::Layout`], [`RecordError::NotRecorded`].
     pub fn check_layouts(&self, scenario: &Scenario) -> Result<(), RecordError> {
         for (service, ours) in layouts(scenario) {
-            let recorded = self.signals.iter().find(|signal| signal.service == service).ok_or_else(|| {
-                let reason =
-                    format!("{} has no signal {service}; record the run with this version", self.path.display());
-                RecordError::Missing { reason }
-            })?;
+            let recorded = self
+                .signals
+                .iter()
+                .find(|signal| signal.service == service)
+                .ok_or_else(|| RecordError::NotRecorded { path: self.path.clone(), service: service.clone() })?;
             if recorded.layout != ours {
                 let (recorded, ours) = (recorded.layout.words(), ours.words());
                 return Err(RecordError::Layout { service, recorded, ours });

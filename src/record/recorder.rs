@@ -37,6 +37,9 @@ pub struct RecordingReport {
     pub whole: bool,
     /// What ended it before its time, or kept it from being complete.
     pub problem: Option<String>,
+    /// The stable name of the problem.
+    #[serde(default)]
+    pub code: Option<String>,
     /// Samples written, of all signals.
     pub messages: u64,
     /// The file's length.
@@ -116,6 +119,7 @@ impl RecordingReport {
         let lost: u64 = self.signals.iter().filter_map(|signal| signal.lost).sum();
         // Whoever began in the midst of a run knew that.
         if let (true, None, 1..) = (self.whole, &self.problem, lost) {
+            self.code = Some("samples-lost".to_owned());
             self.problem = Some(format!(
                 "{lost} samples were published and are not in the recording; if it did not keep up, record again with \
                  fewer other programs, or at a lower tick_hz"
@@ -199,6 +203,7 @@ impl Recorder {
             complete: true,
             whole: self.run.get("whole").is_some_and(|whole| whole == "true"),
             problem: problem.map(ToString::to_string),
+            code: problem.map(code),
             messages: 0,
             bytes: 0,
             signals: std::mem::take(&mut self.signals),
@@ -208,6 +213,7 @@ impl Recorder {
         match self.end(&report, roles) {
             Ok(bytes) => report.bytes = bytes,
             Err(error) => {
+                report.code.get_or_insert_with(|| code(&error));
                 report.problem.get_or_insert_with(|| error.to_string());
                 report.complete = false;
             }
@@ -224,6 +230,7 @@ impl Recorder {
         let entries = [
             ("complete", report.complete.to_string()),
             ("problem", report.problem.clone().unwrap_or_default()),
+            ("code", report.code.clone().unwrap_or_default()),
             ("signals", json(&report.signals)),
             ("ticks", json(&ticks)),
             ("privileges", json(&grants)),
@@ -231,6 +238,10 @@ impl Recorder {
         self.writer.metadata(END, entries.map(|(key, value)| (key.to_owned(), value)).into())?;
         self.writer.finish()
     }
+}
+
+fn code(error: &RecordError) -> String {
+    <&str>::from(error).to_owned()
 }
 
 fn json(value: &impl Serialize) -> String {

@@ -7,10 +7,12 @@ use std::io;
 use std::path::PathBuf;
 
 /// Why there is no report.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ReportError {
     /// There is no such file or directory.
     #[error("{} does not exist; give the directory of a run, or its run.mcap", path.display())]
+    #[strum(serialize = "no-such-run")]
     Nothing {
         /// What was given.
         path: PathBuf,
@@ -20,12 +22,14 @@ pub enum ReportError {
         "{} has neither summary.json nor run.mcap; give the directory that `corotate run` named at its end",
         path.display()
     )]
+    #[strum(serialize = "no-results")]
     NoRun {
         /// The directory.
         path: PathBuf,
     },
     /// A file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
+    #[strum(serialize = "cannot-read")]
     Read {
         /// The file.
         path: PathBuf,
@@ -34,6 +38,7 @@ pub enum ReportError {
     },
     /// The summary is none of this version's.
     #[error("{} is no summary that can be shown: {reason}; use the version that wrote it", path.display())]
+    #[strum(serialize = "unreadable-summary")]
     Summary {
         /// The file.
         path: PathBuf,
@@ -42,6 +47,7 @@ pub enum ReportError {
     },
     /// A latency distribution is none.
     #[error("{} is no percentile distribution: {reason}; remove it, or run again", path.display())]
+    #[strum(serialize = "unreadable-latency")]
     Latency {
         /// The file.
         path: PathBuf,
@@ -59,15 +65,19 @@ pub enum ReportError {
     },
     /// The scenario is refused.
     #[error("the run's scenario is refused by this version: {0}")]
+    #[strum(serialize = "refused-scenario")]
     Scenario(#[from] ConfigError),
     /// The recording cannot be used.
     #[error(transparent)]
+    #[strum(transparent)]
     Record(#[from] RecordError),
     /// The results of a campaign cannot be read.
     #[error(transparent)]
+    #[strum(transparent)]
     Campaign(#[from] JournalError),
     /// A campaign has a page of its own.
     #[error("{} holds a campaign, which is shown alone and has no fields; give it without {with}", path.display())]
+    #[strum(serialize = "campaign-alone")]
     CampaignWith {
         /// The directory.
         path: PathBuf,
@@ -76,6 +86,7 @@ pub enum ReportError {
     },
     /// There is no such field.
     #[error("the recording shows no field `{name}`; it has: {known}")]
+    #[strum(serialize = "no-such-field")]
     Field {
         /// As given.
         name: String,
@@ -84,12 +95,14 @@ pub enum ReportError {
     },
     /// The run to compare with failed.
     #[error("the same motion with full state, for comparison, failed: {reason}")]
+    #[strum(serialize = "counterpart-failed")]
     Counterpart {
         /// Why.
         reason: String,
     },
     /// The page cannot be written.
     #[error("cannot write {}: {source}; name another file with --out", path.display())]
+    #[strum(serialize = "cannot-write")]
     Write {
         /// The file.
         path: PathBuf,

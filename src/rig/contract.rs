@@ -233,10 +233,10 @@ pub struct ConditionReport {
 pub(super) fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut taken: impl Iterator<Item = &'a str>) {
     let plain = (1..=32).contains(&name.len())
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-    checks.require(plain, key, || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
+    checks.require(plain, key, "bad-name", || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
     let free =
         !["leader", "observer", "controller", "recorder", "run"].contains(&name) && taken.all(|other| other != name);
-    checks.require(free, key, || format!("`{name}` is taken already; choose another name"));
+    checks.require(free, key, "taken-name", || format!("`{name}` is taken already; choose another name"));
 }
 
 /// What a rig must know of the scenario around it.

@@ -34,7 +34,7 @@ impl<const N: usize> FilterDesign<N> {
         for (key, values) in [(keys[0], &decay), (keys[1], &bandwidth)] {
             values.iter().flatten().for_each(|value| checks.positive(key, *value));
         }
-        checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], || {
+        checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], "negative", || {
             "a density below zero is none; give 0 for a perfect model, or more".to_owned()
         });
         match (decay, bandwidth, density.1) {
@@ -44,13 +44,18 @@ impl<const N: usize> FilterDesign<N> {
             (None, None, None) => {
                 checks.refuse(
                     keys[0],
+                    "missing-key",
                     format!("is missing; add it (first order), or give {} or {} (second)", keys[1], keys[2]),
                 );
                 None
             }
             _ => {
                 let last = if density.1.is_some() { keys[2] } else { keys[1] };
-                checks.refuse(last, format!("does not go with the other choice; give one of {}", keys.join(", ")));
+                checks.refuse(
+                    last,
+                    "conflicting-keys",
+                    format!("does not go with the other choice; give one of {}", keys.join(", ")),
+                );
                 None
             }
         }

@@ -207,10 +207,9 @@ impl<R: SimpleRig> Rig for R {
     ) -> Result<(Option<Self>, toml::Table), ConfigError> {
         let mut rig: R = sections.read_into()?;
         rig.check(context, checks);
-        let table = toml::Table::try_from(&rig).map_err(|error| ConfigError::Value {
-            place: sections.place(""),
-            key: R::NAME.to_owned(),
-            reason: format!("its parameters cannot be written as TOML: {error}"),
+        let table = toml::Table::try_from(&rig).map_err(|error| {
+            let reason = format!("its parameters cannot be written as TOML: {error}");
+            ConfigError::of(sections.place(""), R::NAME, "not-toml", reason)
         })?;
         Ok((Some(rig), table))
     }

@@ -48,7 +48,13 @@ impl Wait {
         if let Some(name) = &self.renamed {
             cause.push_str(&format!("; another device answered: {name}"));
         }
-        Outage { tick: self.tick, back_at_tick: self.back_at_tick, seconds, cause }
+        let code = match self {
+            Self { renamed: Some(_), .. } => "other-device",
+            Self { restarted: true, .. } => "device-restarted",
+            Self { cut: true, .. } => "line-cut",
+            _ => "device-silent",
+        };
+        Outage { tick: self.tick, back_at_tick: self.back_at_tick, seconds, code: code.to_owned(), cause }
     }
 }
 

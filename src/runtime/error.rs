@@ -6,16 +6,19 @@ use crate::serial::{MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, VERSION};
 use std::path::PathBuf;
 
 /// Why there is no device, or none any more.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum DeviceError {
     /// Its line could not be opened.
     #[error(transparent)]
+    #[strum(transparent)]
     Line(#[from] LineError),
     /// It takes too long to say what must be said.
     #[error(
         "at {baud} baud one tick takes {line_us} us on the line, and the run has {tick_us} us for it; give --baud {least} \
          or more, or run with a lower tick_hz"
     )]
+    #[strum(serialize = "line-too-slow")]
     TooSlow {
         /// The speed, bit/s.
         baud: u32,
@@ -31,12 +34,14 @@ pub enum DeviceError {
         "a device applies a command at the tick after it, and the run has actuation_delay_ticks = {ticks}; give 1, or let \
          a simulated plant take part"
     )]
+    #[strum(serialize = "device-delay")]
     Delayed {
         /// The run's delay, ticks.
         ticks: u64,
     },
     /// It does not answer.
     #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
+    #[strum(serialize = "device-silent")]
     Silent {
         /// The line.
         path: PathBuf,
@@ -50,6 +55,7 @@ pub enum DeviceError {
         "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
         path.display()
     )]
+    #[strum(serialize = "device-version")]
     Version {
         /// The line.
         path: PathBuf,
@@ -62,6 +68,7 @@ pub enum DeviceError {
          --allow-other-device",
         path.display()
     )]
+    #[strum(serialize = "other-device")]
     Other {
         /// The line.
         path: PathBuf,
@@ -75,6 +82,7 @@ pub enum DeviceError {
         "`{role}` reads {read} and writes {written} bytes in {samples} samples per tick, and a message holds {MAX_CONTENT} \
          bytes in {MAX_SAMPLES} samples, whose names take {MAX_NAMES} bytes; no device can have this seat: drive fewer bodies"
     )]
+    #[strum(serialize = "seat-too-large")]
     TooLong {
         /// The role.
         role: String,
@@ -87,6 +95,7 @@ pub enum DeviceError {
     },
     /// It refuses to take part.
     #[error("the device on {} refuses to be `{role}`: {reason}", path.display())]
+    #[strum(serialize = "device-refused")]
     Refused {
         /// The line.
         path: PathBuf,
@@ -98,16 +107,20 @@ pub enum DeviceError {
 }
 
 /// Why a node cannot go on.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum NodeError {
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// The device at the end of a serial line is gone for good.
     #[error(transparent)]
+    #[strum(transparent)]
     Device(#[from] DeviceError),
     /// The function that computes a role failed.
     #[error("{reason}")]
+    #[strum(serialize = "computed-role-failed")]
     Computed {
         /// As it says.
         reason: String,

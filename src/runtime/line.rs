@@ -15,10 +15,12 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 /// Why a line could not be opened.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum LineError {
     /// The system refused.
     #[error("cannot open {}: {source}; {remedy}", path.display())]
+    #[strum(serialize = "cannot-open-line")]
     Open {
         /// The device.
         path: PathBuf,
@@ -35,12 +37,14 @@ pub enum LineError {
     },
     /// Somebody else has it.
     #[error("{} is in use by another program; end that first", path.display())]
+    #[strum(serialize = "line-in-use")]
     InUse {
         /// The device.
         path: PathBuf,
     },
     /// It cannot be set up.
     #[error("cannot set {} to raw mode{}: {source}; does it know that speed?", path.display(), baud.map_or(String::new(), |baud| format!(" at {baud} baud")))]
+    #[strum(serialize = "line-setup")]
     Setup {
         /// The device.
         path: PathBuf,

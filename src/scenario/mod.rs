@@ -23,8 +23,8 @@ use crate::config::accept::{self, Accept};
 use crate::config::hosts::{self, Hosts};
 use crate::config::raw::{Launch, Policy, Raw};
 use crate::config::{
-    Checks, ClockKind, ConfigError, Cores, Document, Realtime, Settings, Shape, Supervision, debugged_and_external,
-    fault, nearest, shared_with_external, watchdog,
+    Checks, ClockKind, ConfigError, Cores, Document, NotExternal, Realtime, Settings, Shape, Supervision, fault,
+    nearest, watchdog,
 };
 use crate::control::{ACTUATION_DELAY_MAX, WatchBounds};
 use crate::rig::Context;
@@ -302,35 +302,43 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
     let named = !raw.name.is_empty()
         && raw.name.len() <= 32
         && raw.name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-    checks.require(named, "name", || {
+    checks.require(named, "name", "bad-name", || {
         format!("`{}` cannot name services and files; use 1 to 32 of a-z, 0-9 and -", raw.name)
     });
-    checks.require(tick_possible(raw.tick_hz), "tick_hz", || {
+    checks.require(tick_possible(raw.tick_hz), "tick_hz", "out-of-range", || {
         format!(
             "{} Hz is outside the range of tick rates; give a rate from {MIN_TICK_HZ} to {MAX_TICK_HZ} Hz",
             raw.tick_hz
         )
     });
-    checks.require(length_possible(raw), "duration_s", || {
+    checks.require(length_possible(raw), "duration_s", "out-of-range", || {
         let ticks = raw.duration_s * raw.tick_hz;
         format!("{} s is {ticks} ticks; give a length of 1 to {MAX_TICKS:e} ticks", raw.duration_s)
     });
-    checks.require((1..=ACTUATION_DELAY_MAX).contains(&raw.actuation_delay_ticks), "actuation_delay_ticks", || {
-        format!(
-            "no command acts {} ticks after its measurement; give 1 (the next tick) to {ACTUATION_DELAY_MAX}",
-            raw.actuation_delay_ticks
-        )
-    });
-    checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", || {
+    checks.require(
+        (1..=ACTUATION_DELAY_MAX).contains(&raw.actuation_delay_ticks),
+        "actuation_delay_ticks",
+        "out-of-range",
+        || {
+            format!(
+                "no command acts {} ticks after its measurement; give 1 (the next tick) to {ACTUATION_DELAY_MAX}",
+                raw.actuation_delay_ticks
+            )
+        },
+    );
+    checks.require(raw.actuator.command_timeout_ticks >= 1, "actuator.command_timeout_ticks", "out-of-range", || {
         "0 would make every tick unsafe; give at least 1".to_owned()
     });
     check_realtime(&raw.realtime, checks);
     check_supervision(&raw.supervision, checks);
-    checks.require((0.1..=3600.0).contains(&raw.launch.startup_timeout_s), "launch.startup_timeout_s", || {
-        format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s)
-    });
+    checks.require(
+        (0.1..=3600.0).contains(&raw.launch.startup_timeout_s),
+        "launch.startup_timeout_s",
+        "out-of-range",
+        || format!("{} s is no time to wait for roles; give 0.1 to 3600", raw.launch.startup_timeout_s),
+    );
     if let Some(timeout_s) = raw.launch.external_timeout_s {
-        checks.require((0.1..=604_800.0).contains(&timeout_s), "launch.external_timeout_s", || {
+        checks.require((0.1..=604_800.0).contains(&timeout_s), "launch.external_timeout_s", "out-of-range", || {
             format!("{timeout_s} s is no time to wait for an external role; give 0.1 to 604800, or leave it out")
         });
     }
@@ -338,13 +346,13 @@ fn check_common(raw: &Raw, checks: &mut Checks<'_>) {
 
 fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
     let (heartbeat_s, interval_s) = (supervision.heartbeat_timeout_s, supervision.restart_interval_s);
-    checks.require((0.1..=3600.0).contains(&heartbeat_s), "supervision.heartbeat_timeout_s", || {
+    checks.require((0.1..=3600.0).contains(&heartbeat_s), "supervision.heartbeat_timeout_s", "out-of-range", || {
         format!("{heartbeat_s} s is no time to wait for a word that is due every 0.02 s; give 0.1 to 3600")
     });
-    checks.require((0.0..=3600.0).contains(&interval_s), "supervision.restart_interval_s", || {
+    checks.require((0.0..=3600.0).contains(&interval_s), "supervision.restart_interval_s", "out-of-range", || {
         format!("{interval_s} s is no time between two starts; give 0 to 3600")
     });
-    checks.require(supervision.restarts_max <= 1000, "supervision.restarts_max", || {
+    checks.require(supervision.restarts_max <= 1000, "supervision.restarts_max", "out-of-range", || {
         format!("{} starts of one role will not mend it; give 0 to 1000", supervision.restarts_max)
     });
 }
@@ -352,15 +360,16 @@ fn check_supervision(supervision: &Supervision, checks: &mut Checks<'_>) {
 /// Without a rig, its roles are not known and nothing is said of them.
 fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) {
     let Launch { external, debug, .. } = &raw.launch;
-    checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", || {
+    checks.require(external.is_empty() || raw.clock != ClockKind::InProcess, "launch.external", "one-process", || {
         "one process has no room for another's role; give clock = \"realtime\" or \"lockstep\", or leave it empty"
             .to_owned()
     });
-    checks.require(debug.is_empty() || raw.clock != ClockKind::InProcess, "launch.debug", || {
+    checks.require(debug.is_empty() || raw.clock != ClockKind::InProcess, "launch.debug", "one-process", || {
         "one process has all roles: debug it, as `gdb --args corotate run …`, or give clock = \"lockstep\"".to_owned()
     });
     for (index, role) in debug.iter().enumerate().filter(|(_, role)| external.contains(role)) {
-        checks.refuse(&format!("launch.debug[{index}]"), debugged_and_external(role));
+        let refused = Err(NotExternal::DebuggedAndExternal { role: role.clone() });
+        checks.accept::<(), _>(&format!("launch.debug[{index}]"), refused);
     }
     let Some(roles) = roles else { return };
     check_processes(&raw.launch, &roles, checks);
@@ -369,6 +378,7 @@ fn check_external(raw: &Raw, roles: Option<Vec<&str>>, checks: &mut Checks<'_>) 
             let known = roles.join(", ");
             checks.refuse(
                 &format!("launch.{key}[{index}]"),
+                "unknown-role",
                 format!("there is no role `{role}`; this scenario has: {known}"),
             );
         }
@@ -380,18 +390,18 @@ fn check_processes(launch: &Launch, roles: &[&str], checks: &mut Checks<'_>) {
     let mut taken = Vec::new();
     for (process, names) in launch.processes.iter().enumerate() {
         let key = format!("launch.processes[{process}]");
-        checks.require(names.len() > 1, &key, || {
+        checks.require(names.len() > 1, &key, "role-alone", || {
             "a role alone has a process in any case; name two roles or more, or leave it out".to_owned()
         });
         for (index, name) in names.iter().enumerate() {
             let key = format!("{key}[{index}]");
             if !roles.contains(&name.as_str()) {
                 let known = roles.join(", ");
-                checks.refuse(&key, format!("there is no role `{name}`; this scenario has: {known}"));
+                checks.refuse(&key, "unknown-role", format!("there is no role `{name}`; this scenario has: {known}"));
             } else if taken.contains(&name) {
-                checks.refuse(&key, format!("the {name} cannot be in two places; name it once"));
+                checks.refuse(&key, "role-twice", format!("the {name} cannot be in two places; name it once"));
             } else if launch.external.contains(name) {
-                checks.refuse(&key, shared_with_external(name));
+                checks.accept::<(), _>(&key, Err(NotExternal::SharedAndExternal { role: name.clone() }));
             }
             taken.push(name);
         }
@@ -404,6 +414,7 @@ fn check_roles(policy: &Policy, known: &[&str], checks: &mut Checks<'_>) {
     for role in roles.keys().filter(|role| !known.contains(&role.as_str())) {
         checks.refuse(
             &format!("supervision.on_failure.{role}"),
+            "unknown-role",
             format!("there is no such role; {}", nearest(role, known)),
         );
     }
@@ -411,20 +422,26 @@ fn check_roles(policy: &Policy, known: &[&str], checks: &mut Checks<'_>) {
 
 fn check_realtime(realtime: &Realtime, checks: &mut Checks<'_>) {
     let priority = realtime.priority;
-    checks.require(priority == 0 || (1..=99).contains(&priority), "realtime.priority", || {
+    checks.require(priority == 0 || (1..=99).contains(&priority), "realtime.priority", "out-of-range", || {
         format!("{priority} is no SCHED_FIFO priority; give 1 to 99, or 0 not to ask for it")
     });
     for (key, value) in [("realtime.wake_lead_us", realtime.wake_lead_us), ("realtime.spin_us", realtime.spin_us)] {
-        checks.require((0.0..=100_000.0).contains(&value), key, || {
+        checks.require((0.0..=100_000.0).contains(&value), key, "out-of-range", || {
             format!("{value} us is no time to spin, which is for the last moments before a sample; give 0 to 100000")
         });
     }
-    checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", || {
+    checks.require(realtime.cutoff > 0.0 && realtime.cutoff <= 1.0, "realtime.cutoff", "out-of-range", || {
         format!("{} is no part of the period; give a number above 0, up to 1", realtime.cutoff)
     });
     if let Cores::List(cores) = &realtime.cores {
-        checks.require(!cores.is_empty() && cores.iter().all(|core| *core < 1024), "realtime.cores", || {
-            "the list is empty or names a core beyond 1023; name cores of this machine, \"auto\" or \"any\"".to_owned()
-        });
+        checks.require(
+            !cores.is_empty() && cores.iter().all(|core| *core < 1024),
+            "realtime.cores",
+            "bad-cores",
+            || {
+                "the list is empty or names a core beyond 1023; name cores of this machine, \"auto\" or \"any\""
+                    .to_owned()
+            },
+        );
     }
 }

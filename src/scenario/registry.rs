@@ -87,6 +87,6 @@ pub(crate) fn resolve(name: &str, sections: &Document, context: Context, checks:
         return (kind.resolve)(name, sections, context, checks);
     }
     let names: Vec<&str> = kinds().iter().flat_map(|kind| kind.names).copied().collect();
-    checks.refuse("rig", format!("there is no rig `{name}`; {}", nearest(name, &names)));
+    checks.refuse("rig", "unknown-rig", format!("there is no rig `{name}`; {}", nearest(name, &names)));
     Ok((None, toml::Table::new()))
 }

@@ -48,16 +48,20 @@ pub struct RoleSeat {
 }
 
 /// Why a role ended without a report.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum RoleError {
     /// The domain is none.
     #[error(transparent)]
+    #[strum(transparent)]
     Domain(#[from] DomainError),
     /// The scenario in the domain was refused.
     #[error(transparent)]
+    #[strum(serialize = "refused-scenario")]
     Config(#[from] ConfigError),
     /// Only a part of the run is here.
     #[error("the run in {} was launched on another host, and not all of its signals are here; look at it there", .0.display())]
+    #[strum(serialize = "partial-run")]
     Part(PathBuf),
     /// The scenario has no such role.
     #[error("there is no role `{role}` in this scenario; it has: {known}")]
@@ -71,6 +75,7 @@ pub enum RoleError {
     #[error(
         "in this run the {role} is in the process of the {host} (launch.processes); start that, or give each a process of its own"
     )]
+    #[strum(serialize = "hosted-role")]
     Hosted {
         /// As given.
         role: String,
@@ -90,6 +95,7 @@ pub enum RoleError {
         "a device can be one driven body (here: {driven}), the observer, the controller, or observer,controller, and none \
          that serves a fleet; `{roles}` is none of these"
     )]
+    #[strum(serialize = "no-device-role")]
     NoDevice {
         /// As given.
         roles: String,
@@ -98,15 +104,19 @@ pub enum RoleError {
     },
     /// There is no device for the seat.
     #[error(transparent)]
+    #[strum(transparent)]
     Device(#[from] DeviceError),
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// The role cannot go on.
     #[error(transparent)]
+    #[strum(transparent)]
     Node(#[from] NodeError),
     /// The counters could not be opened.
     #[error(transparent)]
+    #[strum(transparent)]
     Ledger(#[from] LedgerError),
     /// The launcher did not give the word in time.
     #[error("no word from the launcher for {waited_s} s; is `corotate run` alive in this domain?")]
@@ -116,18 +126,22 @@ pub enum RoleError {
     },
     /// It serves a fleet.
     #[error("{role} serves a fleet, which no function computes; give its bodies roles of their own")]
+    #[strum(serialize = "fleet-role")]
     Fleet {
         /// Its name.
         role: String,
     },
     /// The run is gone, and its launcher never told this role to stop.
     #[error("the run is gone: its launcher was killed; start it again")]
+    #[strum(serialize = "run-gone")]
     Gone,
     /// The launcher ended the run while this role was busy.
     #[error("the run ended without this role, which did not stop when told to; the run's incidents say why it ended")]
+    #[strum(serialize = "run-ended")]
     Late,
     /// The run was launched on another host, and its time is not to be had.
     #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "no-run-clock")]
     Clock {
         /// The file.
         path: PathBuf,
@@ -136,6 +150,7 @@ pub enum RoleError {
     },
     /// The report could not be written.
     #[error("cannot write the report {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-write")]
     Report {
         /// The file.
         path: PathBuf,

@@ -16,10 +16,12 @@ use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Why a ledger could not be opened.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum LedgerError {
     /// The memory could not be had.
     #[error("cannot keep the state in {}: {source}; {}", path.display(), remedy(source))]
+    #[strum(serialize = "cannot-keep-state")]
     Open {
         /// The file.
         path: PathBuf,
@@ -28,12 +30,14 @@ pub enum LedgerError {
     },
     /// Another process writes in it.
     #[error("{} is held by another process: that seat is taken; end it first", path.display())]
+    #[strum(serialize = "seat-taken")]
     Taken {
         /// The file.
         path: PathBuf,
     },
     /// The file is there and has another size.
     #[error("{} holds {found} bytes, not {expected}: it was written by another version of this program", path.display())]
+    #[strum(serialize = "state-size")]
     Size {
         /// The file.
         path: PathBuf,

@@ -41,6 +41,9 @@ pub struct Outage {
     pub back_at_tick: Option<u64>,
     /// The time without an answer, s.
     pub seconds: f64,
+    /// The stable name of the cause.
+    #[serde(default)]
+    pub code: String,
     /// The cause in words.
     pub cause: String,
 }

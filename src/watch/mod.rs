@@ -30,25 +30,31 @@ use crate::seat::RoleError;
 use std::io;
 
 /// Why there is nothing to watch.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum WatchError {
     /// The domain is none.
     #[error(transparent)]
+    #[strum(transparent)]
     Domain(#[from] DomainError),
     /// The run's scenario is missing or refused.
     #[error(transparent)]
+    #[strum(transparent)]
     Run(#[from] RoleError),
     /// The run did not open its signals, or its seats for readers are taken.
     #[error("{source}; does it still wait for a role? A run has room for few watchers, and of a fleet for one")]
+    #[strum(serialize = "cannot-join")]
     Join {
         /// The signal, and why.
         source: BusError,
     },
     /// A link failed.
     #[error(transparent)]
+    #[strum(transparent)]
     Bus(#[from] BusError),
     /// There is no terminal, or it failed.
     #[error("no terminal to draw on: {source}; `corotate watch --once` prints one screen as text")]
+    #[strum(serialize = "no-terminal")]
     Terminal {
         /// The system's reason.
         source: io::Error,

@@ -7,7 +7,7 @@ mod process;
 mod recording;
 
 pub use bench::Bench;
-pub use process::{Done, Running, WATCHDOG, await_some, catches, processes_marked, send_signal, status_of};
+pub use process::{Done, Running, WATCHDOG, await_some, catches, code_of, processes_marked, send_signal, status_of};
 pub use recording::{rewrite, rewrite_metadata};
 
 use proptest::test_runner::{Config, RngSeed};
@@ -48,6 +48,14 @@ pub fn python(directory: &str) -> PathBuf {
     let made = Command::new(root().join("tests").join(directory).join("venv")).output().unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     PathBuf::from(String::from_utf8(made.stdout).unwrap().trim())
+}
+
+/// The codes of errors that the manual lists.
+pub fn documented_codes() -> Vec<String> {
+    let page = std::fs::read_to_string(root().join("docs/commands.md")).unwrap();
+    let (_, list) = page.split_once("\nCodes of incidents:\n").unwrap();
+    let (list, _) = list.split_once("\n## ").unwrap();
+    list.split('`').skip(1).step_by(2).map(str::to_owned).collect()
 }
 
 /// The `summary.json` of a directory of results.

@@ -95,11 +95,33 @@ impl Done {
         self
     }
 
+    /// The codes of the errors that it printed, in their order. All of them are in the manual.
+    #[track_caller]
+    pub fn codes(&self) -> Vec<&str> {
+        let codes: Vec<&str> = self.stderr.lines().filter_map(code_of).collect();
+        let known = super::documented_codes();
+        assert!(codes.iter().all(|code| known.iter().any(|known| known == code)), "not in the manual: {codes:?}");
+        codes
+    }
+
+    /// Returns true if it printed an error of this code.
+    #[track_caller]
+    pub fn says(&self, code: &str) -> bool {
+        self.codes().contains(&code)
+    }
+
     /// What it printed, as JSON.
     #[track_caller]
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.stdout).unwrap_or_else(|error| panic!("{error}: {self:?}"))
     }
+}
+
+/// The code that ends an error's line, in brackets.
+pub fn code_of(line: &str) -> Option<&str> {
+    let (_, code) = line.strip_suffix(']')?.rsplit_once(" [")?;
+    let plain = code.bytes().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == b'-');
+    (plain && !code.is_empty()).then_some(code)
 }
 
 fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {

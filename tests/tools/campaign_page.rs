@@ -151,9 +151,9 @@ fn what_has_been_run_is_shown_and_what_a_campaign_has_not_is_refused() {
     for other in [&["--show", "leader/truth.omega_rad_s"][..], &["results"]] {
         let done = bench.run(&[&["report", "results"], other].concat());
         assert_eq!(done.code, Some(2), "{done:?}");
-        assert!(done.stderr.contains("holds a campaign, which is shown alone"), "{done:?}");
+        assert!(done.says("campaign-alone"), "{done:?}");
     }
     fs::write(&journal, "no journal").unwrap();
     let done = bench.run(&["report", "results"]);
-    assert!(done.code == Some(2) && done.stderr.contains("is no campaign's journal"), "{done:?}");
+    assert!(done.code == Some(2) && done.says("not-a-journal"), "{done:?}");
 }

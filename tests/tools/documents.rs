@@ -3,7 +3,7 @@
 //! What is not run here is listed with its reason; a command that is in neither place fails the test. The synopses of
 //! `docs/commands.md` are held against the program's own help.
 
-use crate::common::{Bench, Done, Running, root};
+use crate::common::{Bench, Done, Running, documented_codes, root};
 use corotate::record::{Recording, SignalInfo};
 use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -289,6 +289,37 @@ fn the_synopses_agree_with_the_help() {
         }
     }
     assert!(checked > 30, "{checked} options were found");
+}
+
+/// The manual lists each code that is written in the sources, and none that is in none of them.
+#[test]
+fn the_manual_lists_the_codes_of_all_errors() {
+    let (mut sources, mut directories) = (String::new(), vec![root().join("src")]);
+    while let Some(directory) = directories.pop() {
+        for path in fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path()) {
+            if path.is_dir() {
+                directories.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "rs") && !path.ends_with("tests.rs") {
+                let text = fs::read_to_string(path).unwrap();
+                sources += text.split("#[cfg(test)]\nmod tests").next().unwrap();
+            }
+        }
+    }
+    let listed = documented_codes();
+    let variant = |code: &str| -> String {
+        let capital = |word: &str| word[..1].to_uppercase() + &word[1..];
+        code.split('-').map(capital).collect()
+    };
+    for code in &listed {
+        let written = [format!("\"{code}\""), format!("[{code}]"), format!("    {}", variant(code))];
+        assert!(written.iter().any(|written| sources.contains(written)), "{code} is in no source");
+    }
+    for before in ["#[strum(serialize = \"", "Failure::new(\"", "Failure::new(\n            \"", "code: \""] {
+        for written in sources.split(before).skip(1) {
+            let code = written.split('"').next().unwrap();
+            assert!(listed.iter().any(|listed| listed == code), "{code} is not in the manual");
+        }
+    }
 }
 
 /// The layouts for Foxglove and PlotJuggler name fields that a recording of `rigid-pair` has.

@@ -355,7 +355,7 @@ fn files_of_two_runs_are_not_shown_as_one() {
     let scenario = Scenario::load(&a.join("scenario.toml"), &[]).unwrap();
     std::fs::write(a.join("scenario.toml"), scenario.to_toml()).unwrap();
     let done = report(&bench, &a, &[]);
-    assert!(done.code == Some(2) && done.stderr.contains("a run without an identifier"), "{done:?}");
+    assert!(done.code == Some(2) && done.says("two-runs"), "{done:?}");
 }
 
 /// A directory with somebody's own files of these names is refused before anything is removed or started.
@@ -438,7 +438,7 @@ fn bad_input_is_told_and_never_a_panic() {
     for part in [1, 10, 25, 50, 75, 99] {
         let cut = file("cut.mcap", &recording[..recording.len() * part / 100]);
         let done = report(&bench, &cut, &["--out", "cut.html"]);
-        let refused = done.code == Some(2) && done.stderr.contains("is no recording of corotate");
+        let refused = done.code == Some(2) && done.says("not-a-recording");
         assert!(refused || (done.code == Some(0) && done.stderr.contains("is not complete")), "{part} %: {done:?}");
         assert!(!done.stderr.contains("panicked"), "{done:?}");
     }

@@ -294,16 +294,16 @@ fn a_run_is_found_by_the_directory_of_its_results() {
         assert_eq!(run.wait().code, Some(128 + SIGTERM));
     }
     let over = bench.run(&["watch", "slow"]);
-    assert!(over.code == Some(2) && over.stderr.contains("corotate report slow"), "{over:?}");
+    assert!(over.code == Some(2) && over.says("run-over"), "{over:?}");
 }
 
 #[test]
 fn without_a_run_there_is_nothing_to_watch() {
     let bench = Bench::new();
     let none = bench.run(&["watch", "--once"]);
-    assert!(none.code == Some(2) && none.stderr.contains("no run of this user"), "{none:?}");
+    assert!(none.code == Some(2) && none.says("no-run"), "{none:?}");
     let other = bench.run(&["watch", "/tmp", "--once"]);
-    assert!(other.code == Some(2) && other.stderr.contains("not the domain of a run"), "{other:?}");
+    assert!(other.code == Some(2) && other.says("not-a-domain"), "{other:?}");
 }
 
 fn arguments(pid: u32) -> Vec<String> {

@@ -18,14 +18,16 @@ impl One<'_, '_, '_> {
         let mut given = answers.into_iter().filter(|(_, given)| *given);
         let (first, second) = (given.next(), given.next());
         if let (Some((first, _)), Some((second, _))) = (first, second) {
-            self.require(false, second, || format!("is a second answer to when it acts, beside `{first}`; give one"))?;
+            self.require(false, second, "conflicting-keys", || {
+                format!("is a second answer to when it acts, beside `{first}`; give one")
+            })?;
         }
-        self.require(probability > 0.0 && probability <= 1.0, "probability", || {
+        self.require(probability > 0.0 && probability <= 1.0, "probability", "out-of-range", || {
             format!("{probability} is none with which anything happens; give a number above 0, up to 1")
         })?;
         let draws = weakly_hard.is_none_or(|hard| hard.pattern == PatternName::Random);
         if let Some((first, _)) = first.filter(|(name, _)| *name != "weakly_hard" || !draws) {
-            self.require(probability >= 1.0, "probability", || {
+            self.require(probability >= 1.0, "probability", "conflicting-keys", || {
                 format!("is a second answer to when it acts, beside `{first}`; remove one")
             })?;
         }
@@ -39,13 +41,13 @@ impl One<'_, '_, '_> {
 
     /// Whether the fault lasts so long that the key has a meaning.
     fn long_enough(&mut self, name: &str, ticks: u64) -> Option<()> {
-        self.require(self.raw.ticks >= ticks, "ticks", || {
+        self.require(self.raw.ticks >= ticks, "ticks", "out-of-range", || {
             format!("{} are too few for `{name}`; give at least {ticks}", self.raw.ticks)
         })
     }
 
     fn every(&mut self, n: u64) -> Option<Occurrence> {
-        self.require(n >= 2, "every", || {
+        self.require(n >= 2, "every", "out-of-range", || {
             format!("every {n} is no interval; give 2 or more, or leave it out for every tick")
         })?;
         self.long_enough("every", n.saturating_add(1))?;
@@ -60,12 +62,12 @@ impl One<'_, '_, '_> {
             ("when_good", when_good, 0.0),
             ("when_bad", when_bad, 0.0),
         ] {
-            self.require((least..=1.0).contains(&value), &format!("gilbert_elliott.{name}"), || {
+            self.require((least..=1.0).contains(&value), &format!("gilbert_elliott.{name}"), "out-of-range", || {
                 let from = if least > 0.0 { "above 0" } else { "from 0" };
                 format!("{value} is no such probability; give a number {from}, up to 1")
             })?;
         }
-        self.require(when_good != when_bad, "gilbert_elliott.when_bad", || {
+        self.require(when_good != when_bad, "gilbert_elliott.when_bad", "no-effect", || {
             "is the same as when_good, and the state of the channel changes nothing; give `probability` instead"
                 .to_owned()
         })?;
@@ -76,13 +78,13 @@ impl One<'_, '_, '_> {
     fn weakly_hard(&mut self, raw: RawWeaklyHard) -> Option<Occurrence> {
         let RawWeaklyHard { misses, window, pattern } = raw;
         let (longest, probability) = (u64::from(WINDOW_MAX), self.raw.probability);
-        self.require((2..=longest).contains(&window), "weakly_hard.window", || {
+        self.require((2..=longest).contains(&window), "weakly_hard.window", "out-of-range", || {
             format!("{window} ticks are no window; give 2 to {longest}")
         })?;
-        self.require((1..window).contains(&misses), "weakly_hard.misses", || {
+        self.require((1..window).contains(&misses), "weakly_hard.misses", "out-of-range", || {
             format!("{misses} of {window} are no constraint; give 1 to {}", window - 1)
         })?;
-        self.require(pattern != PatternName::Random || probability < 1.0, "probability", || {
+        self.require(pattern != PatternName::Random || probability < 1.0, "probability", "missing-key", || {
             "is missing for pattern = \"random\", or is 1, which makes it \"burst\"; give a number below 1".to_owned()
         })?;
         self.long_enough("weakly_hard", window)?;
@@ -100,7 +102,7 @@ impl One<'_, '_, '_> {
         let commands = self.raw.role == "controller";
         let slack_ticks = if commands { self.setting.actuation_delay_ticks - 1 } else { 0 };
         let delay = Delay { slack_ticks, ..self.lateness()? };
-        self.require(delay.bound() > slack_ticks, "delay_ticks", || {
+        self.require(delay.bound() > slack_ticks, "delay_ticks", "no-effect", || {
             format!("no command would be late: with actuation_delay_ticks they have {slack_ticks} ticks; give more")
         })?;
         Some(delay)
@@ -110,35 +112,35 @@ impl One<'_, '_, '_> {
         let RawFault { jitter_ticks, distribution, spread_ticks, .. } = *self.raw;
         let ticks = self.raw.delay_ticks?;
         let least = u64::from(jitter_ticks.is_none());
-        self.require((least..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", || {
+        self.require((least..=MAX_DELAY_TICKS).contains(&ticks), "delay_ticks", "out-of-range", || {
             format!("{ticks} is no delay that is kept; give {least} to {MAX_DELAY_TICKS}, or drop the sample")
         })?;
         let Some(jitter_ticks) = jitter_ticks else {
-            self.require(distribution.is_none(), "distribution", || {
+            self.require(distribution.is_none(), "distribution", "unused-key", || {
                 "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
             })?;
-            self.require(spread_ticks.is_none(), "spread_ticks", || {
+            self.require(spread_ticks.is_none(), "spread_ticks", "unused-key", || {
                 "is that of the jitter, and there is none; give jitter_ticks, or remove it".to_owned()
             })?;
             return Some(Delay::constant(ticks));
         };
         let most = MAX_DELAY_TICKS - ticks;
-        self.require((1..=most).contains(&jitter_ticks), "jitter_ticks", || {
+        self.require((1..=most).contains(&jitter_ticks), "jitter_ticks", "out-of-range", || {
             format!("{jitter_ticks} is no jitter that is kept; give 1 to {most}: no sample is kept for more than {MAX_DELAY_TICKS}")
         })?;
         let distribution = distribution.unwrap_or(DistributionName::Uniform);
         if distribution == DistributionName::Uniform {
-            self.require(spread_ticks.is_none(), "spread_ticks", || {
+            self.require(spread_ticks.is_none(), "spread_ticks", "unused-key", || {
                 "has no meaning for a uniform distribution; remove it, or give another distribution".to_owned()
             })?;
             return Some(Delay { jitter_ticks, ..Delay::constant(ticks) });
         }
-        self.require(spread_ticks.is_some(), "spread_ticks", || {
+        self.require(spread_ticks.is_some(), "spread_ticks", "missing-key", || {
             "is missing for this distribution: the mean of a geometric one, the standard deviation of a normal one; add it"
                 .to_owned()
         })?;
         let spread = spread_ticks?;
-        self.require(spread > 0.0 && spread <= jitter_ticks as f64, "spread_ticks", || {
+        self.require(spread > 0.0 && spread <= jitter_ticks as f64, "spread_ticks", "out-of-range", || {
             format!(
                 "{spread} does not fit into {jitter_ticks} ticks of jitter; give a number above 0, up to {jitter_ticks}"
             )

@@ -69,7 +69,7 @@ impl Limits {
         let initial = states.iter().map(speed).fold(0.0, f64::max);
         if let Some(limit) = raw.speed_du_s {
             checks.positive("limits.speed_du_s", limit);
-            checks.require(limit > initial.max(circle), "limits.speed_du_s", || {
+            checks.require(limit > initial.max(circle), "limits.speed_du_s", "limit-too-low", || {
                 format!(
                     "{limit} is not above the {:.3} du/s that a body has or is to have; raise it",
                     initial.max(circle)

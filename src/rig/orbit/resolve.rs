@@ -311,13 +311,13 @@ struct Review<'a, 'd> {
 }
 
 impl Review<'_, '_> {
-    fn require(&mut self, holds: bool, key: &str, reason: impl FnOnce() -> String) {
+    fn require(&mut self, holds: bool, key: &str, code: &'static str, reason: impl FnOnce() -> String) {
         *self.sound &= holds;
-        self.checks.require(holds, key, reason);
+        self.checks.require(holds, key, code, reason);
     }
 
     fn positive(&mut self, key: &str, value: f64) {
-        self.require(value > 0.0, key, || format!("{value} is not above zero; give a positive number"));
+        self.require(value > 0.0, key, "not-positive", || format!("{value} is not above zero; give a positive number"));
     }
 
     fn field(&mut self, raw: &RawCentralBody) -> Option<CentralField> {
@@ -329,7 +329,7 @@ impl Review<'_, '_> {
                     CentralFieldError::EmptyRegion { inner, .. } if inner <= 0.0 => "central_body.radius_du",
                     CentralFieldError::EmptyRegion { .. } => "central_body.escape_radius_du",
                 };
-                self.require(false, key, || error.to_string());
+                self.require(false, key, (&error).into(), || error.to_string());
                 None
             }
         }
@@ -338,7 +338,7 @@ impl Review<'_, '_> {
     /// A radius at which a body is to be.
     fn place(&mut self, key: &str, r: f64, field: Option<&CentralField>) {
         match field {
-            Some(field) => self.require(field.holds(r), key, || {
+            Some(field) => self.require(field.holds(r), key, "out-of-range", || {
                 format!(
                     "{r} du is not between the central body's radius and the escape radius; move it, or change \
                      central_body.radius_du or central_body.escape_radius_du"
@@ -359,7 +359,7 @@ impl Review<'_, '_> {
 
     fn sensor(&mut self, body: &str, noise: &RawSensor) {
         let real = noise.components().iter().all(|deviation| *deviation >= 0.0);
-        self.require(real, &format!("{body}.noise"), || {
+        self.require(real, &format!("{body}.noise"), "negative", || {
             "a standard deviation is below zero; give 0 or more".to_owned()
         });
     }
@@ -375,11 +375,11 @@ impl Review<'_, '_> {
     fn controller(&mut self, controller: Option<(&RawGain, f64, bool)>, alone: bool) {
         match controller {
             Some((gain, thrust_max, _)) => self.loops(gain, thrust_max),
-            None => self.require(alone, "controller", || {
+            None => self.require(alone, "controller", "missing-key", || {
                 "is missing; followers need a [controller] with gain and thrust_max_du_s2".to_owned()
             }),
         }
-        self.require(controller.is_none() || !alone, "controller", || {
+        self.require(controller.is_none() || !alone, "controller", "unused-key", || {
             "has no follower to drive; add a [[follower]] or remove it".to_owned()
         });
     }
@@ -401,7 +401,7 @@ fn check_loop(rig: &OrbitRig, checks: &mut Checks<'_>) {
     };
     match sampled {
         Ok(None) => {}
-        Ok(Some(sampled)) => checks.require(sampled.holds(), "controller.gain", || {
+        Ok(Some(sampled)) => checks.require(sampled.holds(), "controller.gain", "unstable-loop", || {
             format!(
                 "the sampled loop is unstable: its slowest mode is multiplied by {:.4} from tick to tick; lower the gains \
                  or raise tick_hz",
@@ -409,7 +409,7 @@ fn check_loop(rig: &OrbitRig, checks: &mut Checks<'_>) {
             )
         }),
         Err(_) => checks.refuse(
-            "tick_hz",
+            "tick_hz", "tick-too-long",
             format!("in a tick of {} s a body moves further than can be resolved; raise tick_hz", rig.tick_s),
         ),
     }

@@ -186,13 +186,17 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     check_observer(&raw.observer, checks);
     check_fleets(raw, checks);
     match (&raw.controller, raw.follower.is_empty()) {
-        (None, false) => checks.refuse("controller", "is missing; followers need a [controller] with gain_per_s"),
-        (Some(_), true) => checks.refuse("controller", "has no follower to drive; add a [[follower]] or remove it"),
+        (None, false) => {
+            checks.refuse("controller", "missing-key", "is missing; followers need a [controller] with gain_per_s")
+        }
+        (Some(_), true) => {
+            checks.refuse("controller", "unused-key", "has no follower to drive; add a [[follower]] or remove it")
+        }
         (Some(controller), false) => {
             for (axis, gain) in controller.gain_per_s.into_iter().enumerate() {
                 checks.positive(&format!("controller.gain_per_s[{axis}]"), gain);
             }
-            checks.require(controller.adaptation_gain >= 0.0, "controller.adaptation_gain", || {
+            checks.require(controller.adaptation_gain >= 0.0, "controller.adaptation_gain", "negative", || {
                 format!("{} is below zero and would unlearn; give 0 or more", controller.adaptation_gain)
             });
         }
@@ -203,14 +207,17 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
 /// The leader moves by its own dynamics or by a log.
 fn check_motion(leader: &RawLeader, checks: &mut Checks<'_>) {
     match (leader.initial_rate_rad_s, &leader.data) {
-        (None, None) => checks.refuse("leader.initial_rate_rad_s", "is missing; add it, or leader.data with a log"),
+        (None, None) => {
+            checks.refuse("leader.initial_rate_rad_s", "missing-key", "is missing; add it, or leader.data with a log")
+        }
         (Some(_), Some(_)) => checks.refuse(
             "leader.initial_rate_rad_s",
+            "conflicting-keys",
             "has no meaning where leader.data tells the motion; remove one of them",
         ),
         _ => {}
     }
-    checks.require(leader.playback.is_none() || leader.data.is_some(), "leader.playback", || {
+    checks.require(leader.playback.is_none() || leader.data.is_some(), "leader.playback", "unused-key", || {
         "says how a log is read, and there is none; add leader.data".to_owned()
     });
 }
@@ -224,8 +231,8 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
         ("observer.symmetry_axis", observer.symmetry_axis.is_some(), symmetric),
     ] {
         match (given, needed) {
-            (false, true) => checks.refuse(key, "is missing for this observer.kind; add it"),
-            (true, false) => checks.refuse(key, "has no meaning for this observer.kind; remove it"),
+            (false, true) => checks.refuse(key, "missing-key", "is missing for this observer.kind; add it"),
+            (true, false) => checks.refuse(key, "unused-key", "has no meaning for this observer.kind; remove it"),
             _ => {}
         }
     }
@@ -234,21 +241,24 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     }
     if let Some(bandwidth) = &observer.identifier_bandwidth {
         bandwidth.iter().for_each(|value| checks.positive("observer.identifier_bandwidth", *value));
-        checks.require(observer.identifier_decay.is_none(), "observer.identifier_bandwidth", || {
-            "is of second order, and observer.identifier_decay of first; give one of them".to_owned()
-        });
+        checks.require(
+            observer.identifier_decay.is_none(),
+            "observer.identifier_bandwidth",
+            "conflicting-keys",
+            || "is of second order, and observer.identifier_decay of first; give one of them".to_owned(),
+        );
     }
 }
 
 fn check_noise(checks: &mut Checks<'_>, body: &str, deviation: &[f64; 3]) {
     let real = deviation.iter().all(|deviation| *deviation >= 0.0);
-    checks.require(real, &format!("{body}.noise_rad_s"), || {
+    checks.require(real, &format!("{body}.noise_rad_s"), "negative", || {
         format!("{deviation:?} has a standard deviation below zero; give 0 or more")
     });
 }
 
 fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
-    checks.require(followers.len() <= MAX_FOLLOWERS, "follower", || {
+    checks.require(followers.len() <= MAX_FOLLOWERS, "follower", "too-many", || {
         format!("{} are more than a run holds; give at most {MAX_FOLLOWERS}", followers.len())
     });
     for (index, follower) in followers.iter().enumerate() {
@@ -267,23 +277,26 @@ fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
         let key = |name: &str| format!("follower[{index}].{name}");
         let spread = follower.initial_rate_spread_rad_s;
         let Some(count) = follower.count else {
-            checks.require(spread.is_none(), &key("initial_rate_spread_rad_s"), || {
+            checks.require(spread.is_none(), &key("initial_rate_spread_rad_s"), "unused-key", || {
                 "is for many bodies, and this follower is one; give count, or remove it".to_owned()
             });
             continue;
         };
-        checks.require((1..=MAX_BODIES).contains(&count), &key("count"), || {
+        checks.require((1..=MAX_BODIES).contains(&count), &key("count"), "out-of-range", || {
             format!("{count} is no number of bodies that one process hosts; give 1 to {MAX_BODIES}")
         });
-        checks.require(spread.iter().flatten().all(|spread| *spread >= 0.0), &key("initial_rate_spread_rad_s"), || {
-            "is a distance to either side and below zero; give 0 or more".to_owned()
-        });
+        checks.require(
+            spread.iter().flatten().all(|spread| *spread >= 0.0),
+            &key("initial_rate_spread_rad_s"),
+            "negative",
+            || "is a distance to either side and below zero; give 0 or more".to_owned(),
+        );
         for (name, plain) in [
             ("inertia_factor", follower.inertia_factor == identical()),
             ("noise_rad_s", follower.noise_rad_s == [0.0; 3]),
             ("bias_rad_s", follower.bias_rad_s == [0.0; 3]),
         ] {
-            checks.require(plain, &key(name), || {
+            checks.require(plain, &key(name), "fleet-key", || {
                 "has no meaning for a fleet, whose bodies are like the leader and perfectly measured; remove it or count"
                     .to_owned()
             });
@@ -291,11 +304,11 @@ fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
     }
     if raw.follower.iter().any(|follower| follower.count.is_some()) {
         let adapts = raw.controller.as_ref().is_some_and(|controller| controller.adaptation_gain > 0.0);
-        checks.require(!adapts, "controller.adaptation_gain", || {
+        checks.require(!adapts, "controller.adaptation_gain", "fleet-key", || {
             "learns the inertia of single followers, and a fleet's is the leader's; give 0 or leave the fleet out"
                 .to_owned()
         });
-        checks.require(raw.limits.repeats.is_none(), "limits.repeats", || {
+        checks.require(raw.limits.repeats.is_none(), "limits.repeats", "fleet-key", || {
             "is not counted for the bodies of a fleet; remove it or the fleet".to_owned()
         });
     }
@@ -313,7 +326,7 @@ pub(super) fn hidden_axis(raw: &Raw, checks: &mut Checks<'_>) -> Option<usize> {
             2 => "does not leave exactly one axis hidden; name two different axes of 1, 2 and 3",
             _ => "is not all axes, which learning needs; give [1, 2, 3] and let one fail with [[leader.outage]]",
         };
-        checks.refuse("leader.measured_axes", format!("{measured:?} {remedy}"));
+        checks.refuse("leader.measured_axes", "bad-axes", format!("{measured:?} {remedy}"));
         return None;
     }
     let supplied = hidden.first().or(raw.leader.outage.first().map(|outage| &outage.axis));

@@ -76,7 +76,7 @@ impl Limits {
         }
         let fastest_rad_s = about.leader_rad_s.max(about.follower_rad_s);
         if let Some(rate_rad_s) = raw.rate_rad_s {
-            checks.require(rate_rad_s > fastest_rad_s, "limits.rate_rad_s", || {
+            checks.require(rate_rad_s > fastest_rad_s, "limits.rate_rad_s", "limit-too-low", || {
                 format!("{rate_rad_s} is not above the {fastest_rad_s:.3} rad/s that a body may turn at; raise it")
             });
         }

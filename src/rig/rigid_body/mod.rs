@@ -59,7 +59,7 @@ impl RigidBodyRig {
     fn check_tick(&self, checks: &mut Checks<'_>) {
         let (m, tick_s) = (self.rate_bound_rad_s(), self.tick_s);
         let limit_rad_s = MAX_TURN_RAD / tick_s;
-        checks.require(m < limit_rad_s, "tick_hz", || {
+        checks.require(m < limit_rad_s, "tick_hz", "ambiguous-phase", || {
             format!(
                 "the leader may turn at {m:.3} rad/s, so its phase is ambiguous from one tick of {tick_s} s to the next; \
                  raise tick_hz above {:.3}",
@@ -68,7 +68,7 @@ impl RigidBodyRig {
         });
         for (index, (rate, spread)) in self.initial_rates.iter().zip(&self.spreads).skip(1).enumerate() {
             let rate_rad_s = (rate.abs() + spread).norm();
-            checks.require(rate_rad_s < limit_rad_s, &format!("follower[{index}].initial_rate_rad_s"), || {
+            checks.require(rate_rad_s < limit_rad_s, &format!("follower[{index}].initial_rate_rad_s"), "turns-too-far", || {
                 format!(
                     "at {rate_rad_s:.3} rad/s it turns too far from one tick of {tick_s} s to the next to be driven; lower \
                      it or raise tick_hz above {:.3}",
@@ -77,12 +77,12 @@ impl RigidBodyRig {
             });
         }
         if let ObserverDesign::Hidden { relation, guess_rad_s, .. } = &self.observer {
-            checks.require(guess_rad_s.abs() < limit_rad_s, "observer.initial_guess_rad_s", || {
+            checks.require(guess_rad_s.abs() < limit_rad_s, "observer.initial_guess_rad_s", "ambiguous-phase", || {
                 format!("at {guess_rad_s} rad/s the phase would be ambiguous from tick to tick; guess nearer to 0")
             });
             // A leader at rest needs no observer and passes.
             let floor_rad_s = relation.floor_rad_s();
-            checks.require(m == 0.0 || floor_rad_s < m, "observer.observability_floor_rad_s", || {
+            checks.require(m == 0.0 || floor_rad_s < m, "observer.observability_floor_rad_s", "never-observed", || {
                 format!(
                     "{floor_rad_s} is not below the {m:.3} rad/s that the leader may turn at, so it is never observed; \
                      lower it"
@@ -91,7 +91,7 @@ impl RigidBodyRig {
         }
         if let Some(controller) = self.controller {
             let step = Certificate::gain_step(&controller.gain_per_s, tick_s, self.unpredicted_ticks(&controller));
-            checks.require(step.holds(), "controller.gain_per_s", || {
+            checks.require(step.holds(), "controller.gain_per_s", "unstable-loop", || {
                 format!(
                     "the largest gain times the tick is {:.3}, and the sampled loop is unstable from {} on; lower the gain \
                      or raise tick_hz",

@@ -55,26 +55,34 @@ pub(super) enum AtEnd {
 }
 
 /// Why there is no motion to play.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub(super) enum PlaybackError {
     #[error(transparent)]
+    #[strum(transparent)]
     Data(#[from] DataError),
     #[error("`{0}` is no unit {1}")]
+    #[strum(serialize = "unknown-unit")]
     Unit(String, &'static str),
     #[error("{path} has {segments} segments; name one with leader.playback.segment, one of: {names}")]
+    #[strum(serialize = "several-segments")]
     Several { path: String, segments: usize, names: String },
     #[error("{path} has no segment `{segment}`; it has: {names}")]
+    #[strum(serialize = "no-such-segment")]
     NoSegment { path: String, segment: String, names: String },
     #[error(
         "the motion in {path} has {samples} samples, and two are the least that can be joined; name a longer segment"
     )]
+    #[strum(serialize = "log-too-short")]
     Short { path: String, samples: usize },
     #[error(
         "{path} is not what it was when this scenario was resolved: its samples have the hash {found}; bring the old file \
          back, or remove leader.playback.hash"
     )]
+    #[strum(serialize = "log-changed")]
     Changed { path: String, found: String },
     #[error("the axes are no rotation: their columns must be of length 1, at right angles, and right-handed")]
+    #[strum(serialize = "no-rotation")]
     Axes,
 }
 

@@ -117,14 +117,16 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
     for (index, outage) in raw.leader.outage.iter().enumerate() {
         let key = |name: &str| format!("leader.outage[{index}].{name}");
         let known = raw.leader.measured_axes.contains(&outage.axis) && (1..=3).contains(&outage.axis);
-        checks.require(known, &key("axis"), || {
+        checks.require(known, &key("axis"), "no-such-axis", || {
             format!("axis {} has no gyro to fail; name one of leader.measured_axes", outage.axis)
         });
-        checks.require(outage.from_s >= 0.0, &key("from_s"), || {
+        checks.require(outage.from_s >= 0.0, &key("from_s"), "negative", || {
             format!("{} is before the start; give 0 or more", outage.from_s)
         });
         let until_s = outage.until_s.unwrap_or(f64::INFINITY);
-        checks.require(until_s > outage.from_s, &key("until_s"), || format!("{until_s} is not after from_s; raise it"));
+        checks.require(until_s > outage.from_s, &key("until_s"), "wrong-order", || {
+            format!("{until_s} is not after from_s; raise it")
+        });
         let tick = |time_s: f64| (time_s / tick_s).round() as u64;
         if known {
             outages.push(Outage {
@@ -154,7 +156,7 @@ fn load_playback(
     leader.data = Some(path.display().to_string());
     let playback = checks.accept("leader.data", raw.load(&path, context.duration_s))?;
     let (samples, longest_s) = playback.sampling();
-    checks.require(playback.repeats() || context.duration_s <= playback.length_s(), "duration_s", || {
+    checks.require(playback.repeats() || context.duration_s <= playback.length_s(), "duration_s", "log-too-short", || {
         format!(
             "{} s is longer than the motion of leader.data, {} s; lower it, or give leader.playback.at_end = \"repeat\"",
             context.duration_s,
@@ -221,10 +223,15 @@ fn design_observer(
     )?;
     if let FilterDesign::Kalman(_) = filter {
         let noisy = |axis: &usize| raw.leader.noise_rad_s.get(axis.wrapping_sub(1)).is_some_and(|noise| *noise > 0.0);
-        checks.require(raw.leader.measured_axes.iter().all(noisy), "observer.process_noise_rad2_s3", || {
-            "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
-                .to_owned()
-        });
+        checks.require(
+            raw.leader.measured_axes.iter().all(noisy),
+            "observer.process_noise_rad2_s3",
+            "no-noise",
+            || {
+                "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
+                    .to_owned()
+            },
+        );
     }
     match observer.kind {
         Kind::HiddenRate => Some(ObserverDesign::Hidden {
@@ -236,6 +243,7 @@ fn design_observer(
             let FilterDesign::First([decay_rate_per_s]) = filter else {
                 checks.refuse(
                     "observer.kind",
+                    "wrong-filter",
                     "learns with a filter of first order; give observer.decay_rate_per_s instead",
                 );
                 return None;
@@ -258,7 +266,7 @@ fn check_digits(
 ) {
     let part = relation.rounding_rad_s(rate_rad_s, tick_s) / inertia.rate_bound_rad_s(rate_rad_s);
     let (axis, lacking) = (relation.hidden() + 1, part / LARGEST_ROUNDING);
-    checks.require(!(lacking > 1.0 && lacking.is_finite()), "leader.inertia_kg_m2", || {
+    checks.require(!(lacking > 1.0 && lacking.is_finite()), "leader.inertia_kg_m2", "unobservable-axis", || {
         format!(
             "axis {axis} cannot be observed: the moments are so nearly equal that in a tick of {tick_s} s the hidden \
              component hardly changes the measured ones by more than their rounding, which may move the estimate by {part:.1e} \
@@ -287,7 +295,7 @@ fn design_identifier(
             (_, Some(bandwidth)) => FilterDesign::Second([bandwidth[0]]),
             _ => {
                 let key = "observer.identifier_decay";
-                checks.refuse(key, "is a matrix, but there is one unknown; give three equal rates");
+                checks.refuse(key, "not-a-matrix", "is a matrix, but there is one unknown; give three equal rates");
                 return None;
             }
         };
@@ -321,13 +329,13 @@ fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_
         return;
     }
     let (spin_rad_s, moments) = (leader.initial()[axis - 1], inertia.moments_kg_m2());
-    checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", || {
+    checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", "no-spin", || {
         format!(
             "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
              nothing of its inertia; give component {axis} a rate"
         )
     });
-    checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", || {
+    checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", "not-symmetric", || {
         format!("the moments about the axes other than {axis} differ; use observer.kind = \"inertia\" for this body")
     });
 }

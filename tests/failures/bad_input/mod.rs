@@ -8,7 +8,7 @@ mod random;
 mod text;
 mod values;
 
-use crate::common::{Bench, Done};
+use crate::common::{Bench, Done, code_of};
 use std::path::PathBuf;
 
 /// The text that is spoilt.
@@ -16,8 +16,8 @@ const PAIR: &str = include_str!("../../../config/rigid-pair.toml");
 /// The name that it is given, as messages must name it.
 const FILE: &str = "bad.toml";
 
-/// What one key is set to, and what must be said of it: a part of the reason, a part of the remedy.
-type Row = (&'static str, &'static str, &'static str, &'static str);
+/// A key, the value that it is set to, and the code of the mistake.
+type Row = (&'static str, &'static str, &'static str);
 
 /// The line numbers, from 1, and paths of all keys and tables of a text that is laid out as the shipped ones.
 fn paths(text: &str) -> Vec<(usize, String)> {
@@ -139,19 +139,27 @@ fn is_quote(line: &str) -> bool {
     number.is_some_and(|(number, _)| number.trim().parse::<usize>().is_ok())
 }
 
-/// Asserts that one of the lines says all of this.
-fn assert_says(lines: &[String], start: &str, parts: &[&str]) {
-    let says = |line: &String| line.starts_with(start) && parts.iter().all(|part| line.contains(part));
-    assert!(lines.iter().any(says), "expected {start:?} and {parts:?}, got {lines:#?}");
+/// Asserts that one of the lines is of a place and has a code.
+fn assert_says(lines: &[String], start: &str, code: &str) {
+    let says = |line: &String| line.starts_with(start) && code_of(line) == Some(code);
+    assert!(lines.iter().any(says), "expected {start:?} and {code}, got {lines:#?}");
+    assert!(lines.iter().all(|line| code_of(line).is_some()), "no code: {lines:#?}");
 }
 
 /// Asserts that a text is refused for one key, in the right place.
-fn assert_refused(text: &str, key: &str, parts: &[&str]) {
-    assert_says(&refused(text, &[]), &format!("corotate: {}: {key}", place(text, key)), parts);
+fn assert_refused(text: &str, key: &str, code: &str) {
+    assert_says(&refused(text, &[]), &format!("corotate: {}: {key}", place(text, key)), code);
+}
+
+/// Asserts the same of a word that is like one that is known.
+fn assert_suggests(text: &str, key: &str, code: &str, meant: &str) {
+    let lines = refused(text, &[]);
+    assert_says(&lines, &format!("corotate: {}: {key}", place(text, key)), code);
+    assert!(lines.iter().any(|line| line.contains(&format!("`{meant}`"))), "{meant}: {lines:#?}");
 }
 
 fn assert_all_refused(rows: &[Row]) {
-    for (key, value, reason, remedy) in rows {
-        assert_refused(&with(PAIR, key, value), key, &[reason, remedy]);
+    for (key, value, code) in rows {
+        assert_refused(&with(PAIR, key, value), key, code);
     }
 }
