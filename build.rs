@@ -1,19 +1,18 @@
-//! Notes what the program is made of, for its summaries and `--version`: the source revision, the transport's version, the
-//! target. Without git, and outside a package that says it, the revision is `unknown`.
+//! Notes what the program is made of, for its summaries and `--version`: the source revision and the target. Without git, and
+//! outside a package that says it, the revision is `unknown`.
 
 use std::path::Path;
 use std::process::Command;
 
 /// What the program is made of: a change elsewhere does not make it another one.
-const SOURCES: [&str; 6] = ["build.rs", "Cargo.toml", "Cargo.lock", "src", "bin", "config"];
+const SOURCES: [&str; 7] = ["build.rs", "Cargo.toml", "Cargo.lock", "bin", "config", "crates", "src"];
 
 fn main() {
     // A package may lie in somebody else's repository.
     let revision = packaged().or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12"]));
     let revision = revision.unwrap_or("unknown".to_owned());
     let target = std::env::var("TARGET").unwrap_or("unknown".to_owned());
-    let transport = exact_version("iceoryx2").unwrap_or("unknown".to_owned());
-    for (name, value) in [("REVISION", revision), ("TARGET", target), ("ICEORYX2", transport)] {
+    for (name, value) in [("REVISION", revision), ("TARGET", target)] {
         println!("cargo::rustc-env=COROTATE_{name}={value}");
     }
     SOURCES.iter().for_each(|path| println!("cargo::rerun-if-changed={path}"));
@@ -28,14 +27,6 @@ fn packaged() -> Option<String> {
     let noted = std::fs::read_to_string(".cargo_vcs_info.json").ok()?;
     let revision = noted.split_once("\"sha1\": \"")?.1.split_once('"')?.0;
     Some(revision.chars().take(12).collect())
-}
-
-/// The version of a dependency that the manifest pins, in either way that it may be written.
-fn exact_version(name: &str) -> Option<String> {
-    let manifest = std::fs::read_to_string("Cargo.toml").ok()?;
-    let marks = [format!("\n{name} = "), format!("[dependencies.{name}]")];
-    let entry = marks.iter().find_map(|mark| Some(manifest.split_once(mark)?.1))?;
-    Some(entry.split_once("\"=")?.1.split_once('"')?.0.to_owned())
 }
 
 fn git(arguments: &[&str]) -> Option<String> {

@@ -238,7 +238,7 @@ impl Program {
         let _ = CAMPAIGNS.set(self.campaigns);
         // A file that meets its size limit is an error like a full disk, told by whoever writes it; without this it is the end.
         let _ = signal_hook::flag::register(libc::SIGXFSZ, Arc::default());
-        panics::set_hook(remark);
+        panics::set_hook(crate::FILE, remark);
     }
 }
 

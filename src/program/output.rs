@@ -1,9 +1,8 @@
 //! What a command prints, and the exit code that it gives its parent.
 
-use crate::config::ConfigError;
+pub use crate::failure::Failure;
 use crate::launch::LaunchError;
 use crate::system::remedy;
-use std::fmt;
 use std::io::{self, Write};
 
 /// What the process says to its parent.
@@ -29,47 +28,6 @@ impl Exit {
             Self::PrivilegeMissing => 5,
             Self::Signal(number) => 128_u8.saturating_add(number.min(127) as u8),
         }
-    }
-}
-
-/// An error as it is printed: the text of each mistake, and its code (docs/errors.md).
-pub struct Failure(pub Vec<(String, &'static str)>);
-
-impl Failure {
-    pub fn new(code: &'static str, text: impl ToString) -> Self {
-        Self(vec![(text.to_string(), code)])
-    }
-
-    /// The same about something: an option, or a file.
-    pub fn of(what: impl fmt::Display, error: impl Into<Self>) -> Self {
-        let Self(mistakes) = error.into();
-        Self(mistakes.into_iter().map(|(text, code)| (format!("{what}: {text}"), code)).collect())
-    }
-}
-
-impl<E: fmt::Display> From<E> for Failure
-where
-    for<'e> &'e E: Into<&'static str>,
-{
-    fn from(error: E) -> Self {
-        Self::new((&error).into(), error)
-    }
-}
-
-impl From<ConfigError> for Failure {
-    fn from(error: ConfigError) -> Self {
-        Self(error.mistakes())
-    }
-}
-
-/// The code ends the first line of a mistake; the line of a file that it quotes comes after.
-impl fmt::Display for Failure {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, (text, code)) in self.0.iter().enumerate() {
-            let (first, others) = text.split_at(text.find('\n').unwrap_or(text.len()));
-            write!(f, "{}{first} [{code}]{others}", if index > 0 { "\n" } else { "" })?;
-        }
-        Ok(())
     }
 }
 

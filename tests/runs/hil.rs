@@ -501,7 +501,7 @@ fn a_partner_that_keeps_the_run_waiting_is_named_with_what_came_instead() {
         let cause = format!("it kept the run waiting for 6 s: {lack}");
         for line in [
             format!("waiting for follower (external) for 5 s: {lack}"),
-            format!("corotate: follower failed at tick {tick}: {cause}; the run ends"),
+            format!("corotate: follower failed at tick {tick}: {cause}; the run ends [waited-too-long]"),
         ] {
             assert_eq!(done.stderr.lines().filter(|told| *told == line).count(), 1, "{line}: {done:?}");
         }

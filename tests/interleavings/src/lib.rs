@@ -7,7 +7,7 @@
 mod atomic {
     pub use loom::sync::atomic::{AtomicU64, Ordering, fence};
 }
-#[path = "../../../src/telemetry/handover.rs"]
+#[path = "../../../crates/runtime/src/telemetry/handover.rs"]
 mod handover;
 
 use atomic::{AtomicU64, Ordering};

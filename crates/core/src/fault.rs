@@ -1,0 +1,281 @@
+//! Scripted faults: what goes wrong with a role or with what it sends, and when, as a function of seed and tick alone.
+//!
+//! Pure: the same fault gives the same bits under every clock and in every life of a role. Must not send, wait or count; the
+//! runtime does that with what is decided here.
+
+mod delay;
+mod occurrence;
+
+pub use delay::{Delay, Distribution};
+pub use occurrence::{Channel, Course, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
+
+use crate::model::Noise;
+use crate::sample::{Field, FieldKind, Message, Stamp};
+
+/// Bytes of one word: every element of a sample is one.
+const WORD: usize = 8;
+/// Words of the stamp, with which every sample begins.
+const STAMP: usize = size_of::<Stamp>() / WORD;
+
+/// One scripted fault.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fault {
+    /// The first tick at which it may act.
+    pub from_tick: u64,
+    /// For how many ticks it may.
+    pub ticks: u64,
+    /// On which of these it does; a [`Course`] tells.
+    pub occurrence: Occurrence,
+    /// What its draws follow from, beside the tick.
+    pub seed: u64,
+    /// What goes wrong.
+    pub action: Action,
+}
+
+/// What goes wrong.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Action {
+    /// The content of a sample, before it is handed to the link.
+    Content(Tamper),
+    /// The way of a sample.
+    Transport(Transport),
+    /// The role itself, before it executes the tick.
+    Role(Interruption),
+}
+
+/// What happens to a sample on its way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Transport {
+    /// It is never sent.
+    Drop,
+    /// It is sent twice.
+    Duplicate,
+    /// It is sent late.
+    Delay(Delay),
+}
+
+/// What has happened to one sample on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Way {
+    /// It is never sent.
+    Dropped,
+    /// It is sent twice.
+    Twice,
+    /// It is sent so many ticks late, at least 1.
+    Late(u64),
+}
+
+/// What happens to a role.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Interruption {
+    /// It does nothing for so long, ns.
+    Stall {
+        /// The time.
+        ns: u64,
+    },
+    /// Its process is killed, in its first life only.
+    Kill,
+    /// It does not execute the tick.
+    Miss,
+}
+
+/// What happens to the content of a sample, and to which words of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tamper {
+    /// What happens.
+    pub change: Change,
+    /// The words it happens to.
+    pub words: Words,
+}
+
+/// Consecutive words of 8 bytes of a sample, counted from its start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Words {
+    /// The first.
+    pub first: usize,
+    /// How many, at least 1.
+    pub count: usize,
+}
+
+impl Words {
+    /// Everything but the stamp of a sample of so many bytes.
+    pub fn content(size: usize) -> Self {
+        Self { first: STAMP, count: size / WORD - STAMP }
+    }
+}
+
+/// How words change.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Change {
+    /// They stay as they were in the last sample.
+    Freeze,
+    /// They become this number: one that is none, one that is infinite, or one that no body has.
+    Set(f64),
+    /// One bit of one of them is inverted: this one, or a drawn one. 0 is the least significant.
+    Flip(Option<u32>),
+    /// White noise of this standard deviation is added.
+    Noise(f64),
+    /// They become 0 and are marked as not valid in this word: bit i for the i-th word after the stamp.
+    Lose {
+        /// The word that holds the bits.
+        valid: usize,
+    },
+}
+
+impl Fault {
+    /// Whether it changes contents.
+    pub fn tampers(&self) -> bool {
+        matches!(self.action, Action::Content(_))
+    }
+
+    /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if it is
+    /// in time nevertheless.
+    pub fn way(&self, tick: u64) -> Option<Way> {
+        match self.action {
+            Action::Transport(Transport::Drop) => Some(Way::Dropped),
+            Action::Transport(Transport::Duplicate) => Some(Way::Twice),
+            Action::Transport(Transport::Delay(delay)) => {
+                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > delay.slack_ticks).map(Way::Late)
+            }
+            _ => None,
+        }
+    }
+
+    /// Changes the content of the sample of `tick`, where it is a fault of that kind. `last` is the sample sent before.
+    pub fn tamper<S: Message + ?Sized>(&self, tick: u64, sample: &mut S, last: &S) {
+        let Action::Content(Tamper { change, words }) = self.action else { return };
+        let (last, sample) = (last.words(), sample.words_mut());
+        let range = words.first..words.first + words.count;
+        match change {
+            Change::Freeze => sample[range.clone()].copy_from_slice(&last[range]),
+            Change::Set(value) => sample[range].fill(value.to_bits()),
+            Change::Flip(bit) => {
+                let word = words.first + (self.draw(tick, 1) % words.count as u64) as usize;
+                sample[word] ^= 1 << bit.map_or(self.draw(tick, 2) % 64, u64::from);
+            }
+            Change::Noise(deviation) => {
+                let mut noise = Noise::<1>::new(self.seed, tick, [deviation], [0.0]);
+                for word in &mut sample[range] {
+                    *word = (f64::from_bits(*word) + noise.sample().x).to_bits();
+                }
+            }
+            Change::Lose { valid } => {
+                for word in range {
+                    sample[word] = 0;
+                    sample[valid] &= !(1 << (word - STAMP));
+                }
+            }
+        }
+    }
+
+    /// A number for this fault, tick and purpose, and for nothing else.
+    fn draw(&self, tick: u64, purpose: u64) -> u64 {
+        mix(mix(self.seed ^ purpose.rotate_left(48)) ^ tick)
+    }
+}
+
+/// The word of a sample at which a field begins, its number of elements and their kind; of the stamp, `tick` and
+/// `generation` are fields too. `fields` are those after the stamp.
+pub fn field(fields: &[Field], name: &str) -> Option<(Words, FieldKind)> {
+    let stamp = [("tick", 0), ("generation", 1)].into_iter().find(|(known, _)| *known == name);
+    let of_stamp = stamp.map(|(_, first)| (Words { first, count: 1 }, FieldKind::U64));
+    let of_content = || {
+        let field = fields.iter().find(|field| field.name == name)?;
+        Some((Words { first: field.offset / WORD, count: field.count }, field.kind))
+    };
+    of_stamp.or_else(of_content)
+}
+
+/// A seed for the fault of this number in a scenario's list: adding one changes no other's draws.
+pub fn seed(scenario: u64, number: u64) -> u64 {
+    mix(mix(scenario) ^ number.rotate_left(32))
+}
+
+/// The finaliser of SplitMix64: every bit of the result depends on every bit of the argument.
+pub fn mix(value: u64) -> u64 {
+    let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    let value = (value ^ value >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let value = (value ^ value >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+    value ^ value >> 31
+}
+
+/// A draw as a number in \[0, 1).
+pub fn unit(draw: u64) -> f64 {
+    (draw >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample::{RateMeasurement, Sample};
+
+    fn fault(change: Change, words: Words) -> Fault {
+        let action = Action::Content(Tamper { change, words });
+        Fault { from_tick: 10, ticks: 3, occurrence: Occurrence::Independent(1.0), seed: seed(7, 0), action }
+    }
+
+    fn sample() -> RateMeasurement {
+        RateMeasurement {
+            stamp: Stamp { tick: 10, generation: 1, ..Stamp::default() },
+            omega_rad_s: [0.1, 0.2, 0.3],
+            applied_rad_s2: [1.0, 2.0, 3.0],
+            valid: 7,
+            status: 0,
+        }
+    }
+
+    fn tampered(fault: &Fault, tick: u64) -> RateMeasurement {
+        let mut tampered = sample();
+        fault.tamper(tick, &mut tampered, &RateMeasurement { omega_rad_s: [9.0; 3], ..sample() });
+        tampered
+    }
+
+    fn omega() -> Words {
+        field(RateMeasurement::FIELDS, "omega_rad_s").unwrap().0
+    }
+
+    #[test]
+    fn every_change_does_what_it_says_and_nothing_else() {
+        let second = Words { first: omega().first + 1, count: 1 };
+        assert_eq!(tampered(&fault(Change::Freeze, second), 10).omega_rad_s, [0.1, 9.0, 0.3]);
+        assert_eq!(tampered(&fault(Change::Set(5.0), second), 10).omega_rad_s, [0.1, 5.0, 0.3]);
+        assert!(tampered(&fault(Change::Set(f64::NAN), omega()), 10).omega_rad_s.iter().all(|value| value.is_nan()));
+        assert_eq!(tampered(&fault(Change::Flip(Some(63)), second), 10).omega_rad_s, [0.1, -0.2, 0.3]);
+        let valid = field(RateMeasurement::FIELDS, "valid").unwrap().0.first;
+        let lost = tampered(&fault(Change::Lose { valid }, second), 10);
+        assert_eq!(lost, RateMeasurement { omega_rad_s: [0.1, 0.0, 0.3], valid: 0b101, ..sample() });
+        let noisy = tampered(&fault(Change::Noise(1.0), omega()), 10);
+        assert!(noisy.omega_rad_s.iter().zip(sample().omega_rad_s).all(|(noisy, was)| *noisy != was));
+        assert_eq!((noisy.applied_rad_s2, noisy.stamp), (sample().applied_rad_s2, sample().stamp));
+    }
+
+    #[test]
+    fn draws_follow_from_seed_and_tick_alone() {
+        let flip = fault(Change::Flip(None), Words::content(size_of::<RateMeasurement>()));
+        assert_eq!(tampered(&flip, 10), tampered(&flip, 10));
+        let other = Fault { seed: seed(8, 0), ..flip.clone() };
+        let differ = |a: &Fault, b: &Fault| (0..64).filter(|tick| tampered(a, *tick) != tampered(b, *tick)).count();
+        assert!(differ(&flip, &other) > 50);
+        assert!(differ(&flip, &Fault { seed: seed(7, 1), ..flip.clone() }) > 50);
+        let changed = |tick| {
+            let (before, after) = (sample(), tampered(&flip, tick));
+            let bits = |a: &RateMeasurement, b: &RateMeasurement| -> u32 {
+                let pairs = bytemuck::bytes_of(a).iter().zip(bytemuck::bytes_of(b));
+                pairs.map(|(a, b)| (a ^ b).count_ones()).sum()
+            };
+            bits(&before, &after)
+        };
+        assert!((0..1000).all(|tick| changed(tick) == 1), "one bit, every time");
+    }
+
+    #[test]
+    fn fields_are_found_by_name_those_of_the_stamp_too() {
+        assert_eq!(field(RateMeasurement::FIELDS, "tick"), Some((Words { first: 0, count: 1 }, FieldKind::U64)));
+        assert_eq!(
+            field(RateMeasurement::FIELDS, "applied_rad_s2"),
+            Some((Words { first: 7, count: 3 }, FieldKind::F64))
+        );
+        assert_eq!(field(RateMeasurement::FIELDS, "sent_ns"), None);
+        assert_eq!(Words::content(size_of::<RateMeasurement>()), Words { first: 4, count: 8 });
+    }
+}

@@ -1,0 +1,372 @@
+//! What a log says of a body, as sums: all that the least squares need, whatever their model, and whatever the log's length.
+//!
+//! Integrated over time, Euler's equations need no derivative of a measured rate (the *weak form*): of every sample only the
+//! angular velocity ω, the integrals of its products ω_i ω_j, and its own integral enter. Within a *piece*, a stretch of one
+//! free motion, their covariance about the mean says everything, for the constants of integration are unknown. Must not keep a
+//! sample longer than its two neighbours, nor join what a gap parts.
+
+use nalgebra::{SMatrix, SVector, Vector3};
+
+/// ω, the integrals of ω_x², ω_y², ω_z², ω_y ω_z, ω_z ω_x, ω_x ω_y, and the integral of ω.
+pub(super) const FEATURES: usize = 12;
+/// Where the products and the turns begin among the features.
+pub(super) const PRODUCTS: usize = 3;
+pub(super) const TURNS: usize = 9;
+/// What is integrated.
+const INTEGRALS: usize = 9;
+
+/// Pieces are dealt out to so many groups, of which each is left out once to learn how sure the result is.
+pub(super) const GROUPS: usize = 20;
+
+/// A piece ends when the body has turned so far, rad: what no model knows of has then had time to add up.
+const PIECE_TURN_RAD: f64 = 8.0 * core::f64::consts::PI;
+/// Fewer samples say nothing of a motion whose constants of integration are unknown.
+const PIECE_SAMPLES: u64 = 4;
+
+/// A sample of a log.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sample {
+    /// When, s.
+    pub time_s: f64,
+    /// The angular velocity, rad/s; finite.
+    pub rate_rad_s: Vector3<f64>,
+}
+
+/// Sums over pieces.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sums {
+    /// Σ (z − z̄)(z − z̄)ᵀ of the features z, about the mean of each piece.
+    pub scatter: SMatrix<f64, FEATURES, FEATURES>,
+    pub samples: u64,
+    pub pieces: u64,
+}
+
+impl Default for Sums {
+    fn default() -> Self {
+        Self { scatter: SMatrix::zeros(), samples: 0, pieces: 0 }
+    }
+}
+
+/// The motion that a log shows, as sums that do not grow with it.
+///
+/// ```
+/// # extern crate corotate_core as corotate;
+/// use corotate::identify::{Motion, Sample};
+/// use corotate::model::{Inertia, RigidBody};
+/// use corotate::nalgebra::Vector3;
+///
+/// let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
+/// let (mut rate, mut motion) = (Vector3::new(3.0, 2.0, -2.5), Motion::default());
+/// for tick in 0..2000 {
+///     motion.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: rate });
+///     rate = body.flow(&rate, &Vector3::zeros(), 0.01);
+/// }
+/// motion.end_segment();
+/// let fit = motion.about_known_axes(false).unwrap();
+/// assert!((fit.coefficients - body.coefficients()).amax() < 1e-4);
+/// assert!(fit.closure().abs() < 1e-4);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Motion {
+    pub(super) groups: [Sums; GROUPS],
+    integral: Integral,
+    piece: Piece,
+    account: Account,
+}
+
+/// What a log amounts to.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Account {
+    /// The samples that were used.
+    pub samples: u64,
+    /// The pieces that they were cut into, for resampling.
+    pub pieces: u64,
+    /// The segments.
+    pub segments: u64,
+    /// How long all segments are together, s.
+    pub duration_s: f64,
+    /// By which angle the body turned in all of them, rad.
+    pub turn_rad: f64,
+    /// The fastest rate, rad/s.
+    pub fastest_rad_s: f64,
+}
+
+impl Default for Motion {
+    fn default() -> Self {
+        Self {
+            groups: [Sums::default(); GROUPS],
+            integral: Integral::default(),
+            piece: Piece::default(),
+            account: Account::default(),
+        }
+    }
+}
+
+impl Motion {
+    /// The motion of some segments, each of samples whose times increase.
+    pub fn of<'a>(segments: impl IntoIterator<Item = &'a [Sample]>) -> Self {
+        let mut motion = Self::default();
+        for segment in segments {
+            segment.iter().for_each(|sample| motion.push(sample));
+            motion.end_segment();
+        }
+        motion
+    }
+
+    /// Takes in the next sample of a segment; its time is after the last one's.
+    #[inline]
+    pub fn push(&mut self, sample: &Sample) {
+        if let Some(last) = self.integral.newest() {
+            let interval_s = sample.time_s - last.sample.time_s;
+            let turn = 0.5 * (last.sample.rate_rad_s.norm() + sample.rate_rad_s.norm()) * interval_s;
+            self.account.duration_s += interval_s;
+            self.account.turn_rad += turn;
+            self.piece.turn_rad += turn;
+        }
+        self.account.fastest_rad_s = self.account.fastest_rad_s.max(sample.rate_rad_s.norm());
+        self.account.samples += 1;
+        if let Some(features) = self.integral.push(sample) {
+            self.take(&features);
+        }
+    }
+
+    /// Ends a segment: the next sample begins another motion.
+    pub fn end_segment(&mut self) {
+        let ended = self.integral.end();
+        self.account.segments += u64::from(ended.is_some());
+        if let Some(features) = ended {
+            self.take(&features);
+        }
+        self.end_piece();
+    }
+
+    /// What it amounts to.
+    pub fn account(&self) -> &Account {
+        &self.account
+    }
+
+    /// All pieces together.
+    pub(super) fn total(&self) -> Sums {
+        let mut total = Sums::default();
+        for group in &self.groups {
+            total.scatter += group.scatter;
+            total.samples += group.samples;
+            total.pieces += group.pieces;
+        }
+        total
+    }
+
+    #[inline]
+    fn take(&mut self, features: &SVector<f64, FEATURES>) {
+        self.piece.take(features);
+        if self.piece.turn_rad > PIECE_TURN_RAD {
+            self.end_piece();
+            // What was the last sample of one piece is the first of the next.
+            self.piece.take(features);
+        }
+    }
+
+    fn end_piece(&mut self) {
+        let piece = core::mem::take(&mut self.piece);
+        if piece.samples >= PIECE_SAMPLES {
+            let group = &mut self.groups[(self.account.pieces % GROUPS as u64) as usize];
+            group.scatter += piece.scatter;
+            group.samples += piece.samples;
+            group.pieces += 1;
+            self.account.pieces += 1;
+        }
+    }
+}
+
+/// A stretch of one motion, by Welford's sums: no digits are lost to a mean that is large.
+#[derive(Debug, Clone)]
+struct Piece {
+    samples: u64,
+    turn_rad: f64,
+    mean: SVector<f64, FEATURES>,
+    scatter: SMatrix<f64, FEATURES, FEATURES>,
+}
+
+impl Default for Piece {
+    fn default() -> Self {
+        Self { samples: 0, turn_rad: 0.0, mean: SVector::zeros(), scatter: SMatrix::zeros() }
+    }
+}
+
+impl Piece {
+    #[inline]
+    fn take(&mut self, features: &SVector<f64, FEATURES>) {
+        self.samples += 1;
+        let share = 1.0 / self.samples as f64;
+        let apart = features - self.mean;
+        self.mean += apart * share;
+        let weighted = apart * (1.0 - share);
+        for column in 0..FEATURES {
+            // The upper triangle; the other is its mirror.
+            for row in 0..=column {
+                self.scatter[(row, column)] += weighted[row] * apart[column];
+            }
+        }
+    }
+}
+
+/// An integrand at one sample.
+#[derive(Debug, Clone, Copy)]
+struct Point {
+    sample: Sample,
+    value: SVector<f64, INTEGRALS>,
+}
+
+impl Point {
+    #[inline]
+    fn new(sample: &Sample) -> Self {
+        let [x, y, z] = sample.rate_rad_s.into();
+        Self { sample: *sample, value: SVector::from([x * x, y * y, z * z, y * z, z * x, x * y, x, y, z]) }
+    }
+
+    /// The features of the sample, its integrals being `integral`.
+    #[inline]
+    fn features(&self, integral: &SVector<f64, INTEGRALS>) -> SVector<f64, FEATURES> {
+        let mut features = SVector::<f64, FEATURES>::zeros();
+        features.fixed_rows_mut::<3>(0).copy_from(&self.sample.rate_rad_s);
+        features.fixed_rows_mut::<INTEGRALS>(PRODUCTS).copy_from(integral);
+        features
+    }
+}
+
+/// Integrals over a segment by Hermite's rule, the slopes those of parabolas through three samples: of fourth order in the
+/// interval, and for intervals of any length. A sample comes out when the next one is known.
+#[derive(Debug, Clone, Copy, Default)]
+struct Integral {
+    /// The last two samples.
+    last: Option<Point>,
+    next: Option<Step>,
+    value: SVector<f64, INTEGRALS>,
+}
+
+/// The newest sample, and the way to it.
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    point: Point,
+    interval_s: f64,
+    /// The mean slope from the sample before, and the slope there if it is known.
+    mean: SVector<f64, INTEGRALS>,
+    start: Option<SVector<f64, INTEGRALS>>,
+}
+
+impl Integral {
+    /// The sample that came last.
+    #[inline]
+    fn newest(&self) -> Option<&Point> {
+        self.next.as_ref().map(|step| &step.point).or(self.last.as_ref())
+    }
+
+    /// Takes in a sample; gives the features of the one before, or those of the segment's first.
+    #[inline]
+    fn push(&mut self, sample: &Sample) -> Option<SVector<f64, FEATURES>> {
+        let point = Point::new(sample);
+        let Some(last) = self.last else {
+            *self = Self { last: Some(point), next: None, value: SVector::zeros() };
+            return Some(point.features(&self.value));
+        };
+        let from = self.next.as_ref().map_or(&last, |step| &step.point);
+        let interval_s = sample.time_s - from.sample.time_s;
+        let mean = (point.value - from.value) / interval_s;
+        let Some(step) = self.next else {
+            self.next = Some(Step { point, interval_s, mean, start: None });
+            return None;
+        };
+        let (h, k) = (step.interval_s, interval_s);
+        let slope = (step.mean * k + mean * h) / (h + k);
+        let features = self.move_to(&step, &last, slope);
+        self.last = Some(step.point);
+        self.next = Some(Step { point, interval_s, mean, start: Some(slope) });
+        Some(features)
+    }
+
+    /// Gives the features of the segment's last sample, if it has more than one, and forgets it.
+    fn end(&mut self) -> Option<SVector<f64, FEATURES>> {
+        let (last, step) = (self.last.take()?, self.next.take()?);
+        // A parabola, or of two samples a line.
+        let slope = step.start.map_or(step.mean, |start| step.mean * 2.0 - start);
+        Some(self.move_to(&step, &last, slope))
+    }
+
+    /// Integrates over a step that ends with the given slope.
+    #[inline]
+    fn move_to(&mut self, step: &Step, last: &Point, slope: SVector<f64, INTEGRALS>) -> SVector<f64, FEATURES> {
+        let h = step.interval_s;
+        let start = step.start.unwrap_or(step.mean * 2.0 - slope);
+        self.value += (last.value + step.point.value) * (0.5 * h) + (start - slope) * (h * h / 12.0);
+        step.point.features(&self.value)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn samples(
+        count: u32,
+        interval_s: impl Fn(u32) -> f64,
+        rate: impl Fn(f64) -> [f64; 3],
+    ) -> impl Iterator<Item = Sample> {
+        let mut time_s = 0.0;
+        (0..count).map(move |tick| {
+            time_s += interval_s(tick);
+            Sample { time_s, rate_rad_s: rate(time_s).into() }
+        })
+    }
+
+    /// The last integrals of a segment.
+    fn integrals(samples: impl Iterator<Item = Sample>) -> SVector<f64, FEATURES> {
+        let mut integral = Integral::default();
+        samples.for_each(|sample| _ = integral.push(&sample));
+        integral.end().unwrap()
+    }
+
+    #[test]
+    fn integrals_are_of_fourth_order_at_intervals_of_any_length() {
+        let error = |scale: f64| {
+            let jitter = move |tick: u32| scale * (1.0 + 0.3 * f64::from(tick % 3));
+            let count = (2.0 / (1.3 * scale)) as u32;
+            let rates = |t: f64| [libm::sin(3.0 * t), libm::cos(2.0 * t), 1.0];
+            let path: Vec<Sample> = samples(count, jitter, rates).collect();
+            let (from, to) = (path[0].time_s, path[path.len() - 1].time_s);
+            let exact = (libm::sin(2.0 * to) - libm::sin(2.0 * from)) / 2.0;
+            (integrals(path.into_iter())[PRODUCTS + 3] - exact).abs()
+        };
+        let (coarse, fine) = (error(0.04), error(0.02));
+        assert!(coarse < 1e-4 && fine < coarse / 7.0, "{coarse:e} {fine:e}");
+    }
+
+    #[test]
+    fn two_samples_are_joined_by_a_line_and_one_is_nothing() {
+        let path = samples(2, |_| 0.5, |t| [t, 0.0, 1.0]);
+        let features = integrals(path);
+        assert!((features[TURNS] - 0.375).abs() < 1e-15 && (features[TURNS + 2] - 0.5).abs() < 1e-15, "{features}");
+        let mut motion = Motion::default();
+        motion.push(&Sample { time_s: 0.0, rate_rad_s: Vector3::x() });
+        motion.end_segment();
+        assert_eq!((motion.account().samples, motion.account().segments, motion.total().samples), (1, 0, 0));
+    }
+
+    #[test]
+    fn sums_are_those_about_the_mean_of_each_piece() {
+        let path: Vec<Sample> = samples(400, |_| 0.01, |t| [6.0 + libm::sin(t), 1e-3 * t, 5.0]).collect();
+        let motion = Motion::of([&path[..], &path[..]]);
+        let account = motion.account();
+        assert_eq!((account.samples, account.segments, account.pieces), (800, 2, 4));
+        assert!((account.duration_s - 2.0 * 3.99).abs() < 1e-12);
+        let total = motion.total();
+        // The samples at which a piece ends are in the next one too.
+        assert_eq!(total.samples, 802);
+        let (first, second) = (motion.groups[0].scatter, motion.groups[2].scatter);
+        assert!((first - second).amax() < 1e-9 * first.amax(), "the same motion twice");
+        let cut = motion.groups[0].samples as usize;
+        let mean = path[..cut].iter().map(|sample| sample.rate_rad_s.x).sum::<f64>() / cut as f64;
+        let direct: f64 =
+            path[..cut].iter().map(|sample| (sample.rate_rad_s.x - mean) * (sample.rate_rad_s.x - mean)).sum();
+        assert!((first[(0, 0)] - direct).abs() < 1e-12 * direct.max(1.0), "{} {direct}", first[(0, 0)]);
+    }
+}

@@ -1,0 +1,79 @@
+//! Findings about a scenario, collected so that all of them are reported at once.
+
+use super::{ConfigError, Document, Problem};
+use std::cell::RefCell;
+use std::path::PathBuf;
+
+/// A collector of findings, so that all of them are reported at once.
+pub struct Checks<'a> {
+    document: &'a Document,
+    problems: Vec<Problem>,
+    warnings: Vec<String>,
+    files: RefCell<Vec<(String, PathBuf)>>,
+}
+
+impl<'a> Checks<'a> {
+    /// Checks of a document in which nothing is wrong yet.
+    pub fn new(document: &'a Document) -> Self {
+        Self { document, problems: Vec::new(), warnings: Vec::new(), files: RefCell::default() }
+    }
+
+    /// Notes that the value at `key` makes no sense. The code names the kind of mistake, in lower case with hyphens.
+    pub fn refuse(&mut self, key: &str, code: &'static str, reason: impl Into<String>) {
+        self.problems.push(Problem::new(self.document.place(key), key, code, reason));
+    }
+
+    /// Notes that the value at `key` has no effect: the scenario is valid all the same.
+    pub fn warn(&mut self, key: &str, reason: impl std::fmt::Display) {
+        self.warnings.push(format!("{key}: {reason}"));
+    }
+
+    /// The file that the value at `key` names: beside the scenario, or where the program was started if it was named there.
+    pub fn file(&self, key: &str, name: &str) -> PathBuf {
+        let here = self.document.place(key).line.is_none();
+        let path = if here { name.into() } else { self.document.directory().join(name) };
+        self.files.borrow_mut().push((key.to_owned(), path.clone()));
+        path
+    }
+
+    /// Notes it unless `holds`.
+    pub fn require(&mut self, holds: bool, key: &str, code: &'static str, reason: impl FnOnce() -> String) {
+        if !holds {
+            self.refuse(key, code, reason());
+        }
+    }
+
+    /// Notes a number that is not positive. Non-finite numbers never get so far.
+    pub fn positive(&mut self, key: &str, value: f64) {
+        self.require(value > 0.0, key, "not-positive", || format!("{value} is not above zero; give a positive number"));
+    }
+
+    /// Takes the value, or notes why there is none, with the error's code.
+    pub fn accept<T, E: std::fmt::Display>(&mut self, key: &str, value: Result<T, E>) -> Option<T>
+    where
+        for<'e> &'e E: Into<&'static str>,
+    {
+        value.map_err(|error| self.refuse(key, (&error).into(), error.to_string())).ok()
+    }
+
+    /// Takes the files that values name, and the warnings.
+    pub(crate) fn take_remarks(&mut self) -> (Vec<(String, PathBuf)>, Vec<String>) {
+        (self.files.take(), std::mem::take(&mut self.warnings))
+    }
+
+    /// Keeps the problems with these keys alone.
+    pub(crate) fn retain(&mut self, keep: impl Fn(&str) -> bool) {
+        self.problems.retain(|problem| keep(&problem.key));
+    }
+
+    /// Returns the value that the checks allowed.
+    ///
+    /// # Errors
+    /// With every problem that was noted.
+    pub fn finish<T>(self, value: Option<T>) -> Result<T, ConfigError> {
+        match value {
+            Some(value) if self.problems.is_empty() => Ok(value),
+            _ => Err(ConfigError::Invalid { problems: self.problems }),
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! Scenario files: text as typed, with its checks, and the [`Settings`] that it resolves to. Nothing is started on a scenario that
+//! is not valid.
+//!
+//! Every error says where (file, line, key), why, and what to do. Must not touch the machine beyond reading the file.
+
+pub(crate) mod accept;
+mod body;
+mod checks;
+mod document;
+mod edit;
+mod error;
+pub(crate) mod fault;
+pub(crate) mod hosts;
+pub(crate) mod raw;
+mod reader;
+mod run_id;
+mod settings;
+mod shape;
+pub(crate) mod watchdog;
+
+pub use accept::{Accept, TickAmount, TickLimit};
+pub use body::{BodyInfo, role_names};
+pub use checks::Checks;
+pub use document::{Document, read_text};
+pub use error::{ConfigError, PathError, Place, Problem};
+pub use fault::ScriptedFault;
+pub use hosts::{ClockSource, Host, Hosts, LinkBudget, Network};
+pub use raw::{ClockKind, Cores, NamedCores, OnFailure, Policy, Realtime, Supervision, Wake};
+pub(crate) use reader::keys_of;
+pub use run_id::{NoRunId, RunId};
+pub use settings::{NotExternal, Settings};
+pub(crate) use shape::{Key, Shape};
+
+pub use error::nearest;
+
+/// Whether a text names what ships with the program; otherwise it is a file's path.
+pub fn is_name(text: &str) -> bool {
+    !text.contains('/') && !text.ends_with(".toml")
+}
+
+/// The scenarios that ship with the program: name and text.
+pub const SHIPPED: [(&str, &str); 13] = [
+    ("rigid-pair", include_str!("../../config/rigid-pair.toml")),
+    ("rigid-pair-hyperbolic", include_str!("../../config/rigid-pair-hyperbolic.toml")),
+    ("rigid-trio", include_str!("../../config/rigid-trio.toml")),
+    ("rigid-fleet", include_str!("../../config/rigid-fleet.toml")),
+    ("noisy-pair", include_str!("../../config/noisy-pair.toml")),
+    ("mismatched-follower", include_str!("../../config/mismatched-follower.toml")),
+    ("inertia", include_str!("../../config/inertia.toml")),
+    ("inertia-axisymmetric", include_str!("../../config/inertia-axisymmetric.toml")),
+    ("gyro-loss", include_str!("../../config/gyro-loss.toml")),
+    ("recorded-leader", include_str!("../../config/recorded-leader.toml")),
+    ("faults", include_str!("../../config/faults.toml")),
+    ("orbit-hold", include_str!("../../config/orbit-hold.toml")),
+    ("orbit-rendezvous", include_str!("../../config/orbit-rendezvous.toml")),
+];

@@ -1,0 +1,393 @@
+//! Decides when a node runs: by the time grid, or by its inputs. One driver per clock.
+//!
+//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a notifier; what is
+//! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
+
+use super::error::NodeError;
+use super::hooks::{self, Failpoint};
+use super::node::{Node, Poll, ReadyNode, RunCondition};
+use super::role_id::RoleId;
+use crate::bus::{Bus, BusError, Read, Write};
+use crate::clock::{Grid, monotonic_ns, sleep_until, wait_until};
+use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
+use std::cell::Cell;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// How often a role looks at the schedule and says how it is, ns.
+const TURN_NS: u64 = 20_000_000;
+/// Between two looks whether the run is still there, ns.
+const GONE_NS: u64 = 1_000_000_000;
+/// How long a role naps between two looks where there is no input that it could sleep on, ns.
+const NAP_NS: u64 = 50_000;
+/// How long a role sleeps on the notifier of the input that it lacks before it looks around, ns.
+const SLEEP_NS: u64 = 20_000_000;
+/// How long after its last tick a role still waits for inputs, ns and periods.
+const GRACE_NS: u64 = 1_000_000_000;
+const GRACE_PERIODS: u64 = 5;
+/// Lockstep ticks between two looks at the schedule and the time.
+const TURN_TICKS: u64 = 256;
+
+/// How a drive ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// The last tick is done.
+    Finished,
+    /// The launcher or a signal said stop.
+    Stopped,
+}
+
+/// What one role says of itself.
+pub struct Heartbeat<B: Bus> {
+    /// Whose it is.
+    pub role: RoleId,
+    /// Where it is said.
+    pub health: B::Writer<Health>,
+    /// Which of the role's lives this is, from 1.
+    pub generation: u64,
+}
+
+/// A process's line to the launcher, with the heartbeat of each of its roles.
+pub struct Control<'a, B: Bus> {
+    bus: &'a B,
+    schedule: B::Reader<Schedule>,
+    heartbeats: Vec<Heartbeat<B>>,
+    denied: u64,
+    terminated: &'a AtomicBool,
+    /// Whether the run was gone when that was looked at last, and when it will be again, ns.
+    gone: bool,
+    next_look_ns: u64,
+}
+
+impl<'a, B: Bus> Control<'a, B> {
+    /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
+    /// that asks the process to end.
+    pub fn new(
+        bus: &'a B,
+        schedule: B::Reader<Schedule>,
+        heartbeats: Vec<Heartbeat<B>>,
+        denied: u64,
+        terminated: &'a AtomicBool,
+    ) -> Self {
+        Self { bus, schedule, heartbeats, denied, terminated, gone: false, next_look_ns: 0 }
+    }
+
+    /// Whether nobody has had these seats before.
+    pub fn first(&self) -> bool {
+        self.heartbeats.iter().all(|heartbeat| heartbeat.generation == 1)
+    }
+
+    /// Tells the launcher how the roles are.
+    ///
+    /// # Errors
+    /// [`BusError::Send`].
+    pub fn announce(&mut self, state: RoleState, node: &dyn Node) -> Result<(), BusError> {
+        let denied = self.denied;
+        for Heartbeat { role, health, generation } in &mut self.heartbeats {
+            let ticks = node.of(*role).unwrap_or(node).ticks();
+            health.send(|health| {
+                let sent_ns = monotonic_ns();
+                health.stamp = Stamp { tick: ticks.elapsed, generation: *generation, origin_ns: sent_ns, sent_ns };
+                health.state = state as u64;
+                health.executed = ticks.executed;
+                health.missed = ticks.missed;
+                health.denied = denied;
+            })?;
+            health.prepare()?;
+        }
+        Ok(())
+    }
+
+    /// The launcher's last word.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn schedule(&mut self) -> Result<Schedule, BusError> {
+        while self.schedule.advance()? {}
+        Ok(self.schedule.current().copied().unwrap_or_default())
+    }
+
+    /// Whether the run is over for this role.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    pub fn stopped(&mut self) -> Result<bool, BusError> {
+        let told = self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop;
+        Ok(told || self.gone())
+    }
+
+    /// Whether nobody is left who could give a word: a launcher that was killed gives none.
+    fn gone(&mut self) -> bool {
+        let now_ns = monotonic_ns();
+        if now_ns >= self.next_look_ns {
+            self.next_look_ns = now_ns + GONE_NS;
+            self.gone = self.bus.is_gone();
+        }
+        self.gone
+    }
+}
+
+/// How a role waits in real time.
+#[derive(Debug, Clone, Copy)]
+pub struct Waiting<'a> {
+    /// It wakes so long before the tick and spins the rest, ns.
+    pub lead_ns: u64,
+    /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
+    pub spin_ns: u64,
+    /// For samples of these roles it does not spin but gives way: they need its core.
+    pub yields_to: &'a [RoleId],
+    /// The part of the period after which it goes on without what is missing.
+    pub cutoff: f64,
+}
+
+/// What a driver needs besides its node.
+pub struct Drive<'a, 'b, B: Bus> {
+    control: &'a mut Control<'b, B>,
+    last_tick: u64,
+    window_ticks: u64,
+    next_turn_ns: u64,
+}
+
+impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
+    /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
+    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
+        Self { control, last_tick, window_ticks, next_turn_ns: 0 }
+    }
+
+    /// Drives a node on the time grid.
+    ///
+    /// # Errors
+    /// [`NodeError`] if a link failed.
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, NodeError> {
+        while node.next_tick() <= self.last_tick {
+            let due_ns = grid.due_ns(node.next_tick());
+            let timed = node.time_triggered() || waiting.spin_ns > 0;
+            if timed && self.idle_until(due_ns.saturating_sub(waiting.lead_ns), node)? {
+                return Ok(Ended::Stopped);
+            }
+            node.before_tick();
+            let begun = if node.time_triggered() { self.on_time(node, grid, waiting.lead_ns)? } else { Poll::Waiting };
+            let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
+            let executed = if waits { self.on_arrival(node, grid, waiting)? } else { Some(begun) };
+            match executed {
+                Some(Poll::Executed) => {
+                    if begun == Poll::Executed && !waiting.yields_to.is_empty() {
+                        // What it sent is what the others wait for, and they wait for its core too.
+                        std::thread::yield_now();
+                    }
+                    node.finish_tick()?;
+                }
+                Some(Poll::Waiting | Poll::Missed) => {}
+                None => return Ok(Ended::Stopped),
+            }
+            if self.turn(node)? {
+                return Ok(Ended::Stopped);
+            }
+        }
+        Ok(Ended::Finished)
+    }
+
+    /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
+    fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, NodeError> {
+        let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
+        node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
+    }
+
+    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the notifier of
+    /// the input that it lacks.
+    fn on_arrival(
+        &mut self,
+        node: &mut dyn Node,
+        grid: Grid,
+        waiting: &Waiting<'_>,
+    ) -> Result<Option<Poll>, NodeError> {
+        let tick = node.next_tick();
+        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;
+        let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
+        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + waiting.spin_ns;
+        loop {
+            let now_ns = monotonic_ns();
+            let condition = if now_ns >= overdue_ns { RunCondition::Overdue } else { RunCondition::Arrived };
+            match node.poll(condition)? {
+                Poll::Waiting => {}
+                done => return Ok(Some(done)),
+            }
+            hooks::at(Failpoint::Waiting);
+            if waiting.spin_ns > 0 && now_ns < spin_end_ns {
+                spin(node, waiting.yields_to);
+            } else if now_ns > end_ns {
+                node.skip_to(self.last_tick + 1);
+                return Ok(Some(Poll::Waiting));
+            } else {
+                if !node.sleep(overdue_ns.min(now_ns + SLEEP_NS).max(now_ns + NAP_NS))? {
+                    sleep_until(now_ns + NAP_NS);
+                }
+                if self.turn(node)? {
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
+    fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, NodeError> {
+        while monotonic_ns() < until_ns {
+            hooks::at(Failpoint::Waiting);
+            sleep_until(until_ns.min(monotonic_ns() + TURN_NS));
+            if until_ns > monotonic_ns() && self.turn(node)? {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Now and then: how this role is, and whether the run is over.
+    fn turn(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
+        if !self.turn_is_due() {
+            return Ok(false);
+        }
+        self.control.announce(RoleState::Running, node)?;
+        node.refresh()?;
+        Ok(self.control.stopped()?)
+    }
+
+    fn turn_is_due(&mut self) -> bool {
+        let now_ns = monotonic_ns();
+        let due = now_ns >= self.next_turn_ns;
+        if due {
+            self.next_turn_ns = now_ns + TURN_NS;
+        }
+        due
+    }
+
+    /// Waits for the input that a node lacks, or for credit.
+    fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), NodeError> {
+        // Nobody waits for who is so far ahead, and somebody may need its core.
+        let ahead = node.next_tick() > up_to;
+        if !ahead && backoff.brief() {
+            return Ok(());
+        }
+        let until_ns = monotonic_ns() + SLEEP_NS;
+        if ahead || !node.sleep(until_ns)? {
+            self.control.schedule.sleep(until_ns)?;
+        }
+        Ok(())
+    }
+
+    /// Drives a node by its inputs alone, at most its window ahead of the slowest consumer.
+    ///
+    /// # Errors
+    /// [`NodeError`] if a link failed.
+    pub fn lockstep(&mut self, node: &mut dyn Node) -> Result<Ended, NodeError> {
+        let mut up_to = self.window_ticks.min(self.last_tick);
+        let mut backoff = Backoff::default();
+        while node.next_tick() <= self.last_tick {
+            node.before_tick();
+            let polled = node.poll(RunCondition::Inputs { up_to })?;
+            if polled == Poll::Executed {
+                node.finish_tick()?;
+            }
+            if polled != Poll::Waiting {
+                backoff = Backoff::default();
+                if !node.next_tick().is_multiple_of(TURN_TICKS) {
+                    continue;
+                }
+            } else {
+                hooks::at(Failpoint::Waiting);
+                self.rest(node, up_to, &mut backoff)?;
+            }
+            if self.turn_is_due() {
+                self.control.announce(RoleState::Running, node)?;
+                node.refresh()?;
+            }
+            if self.control.stopped()? {
+                return Ok(Ended::Stopped);
+            }
+            up_to = (self.control.schedule()?.credit_tick + self.window_ticks).min(self.last_tick);
+        }
+        Ok(Ended::Finished)
+    }
+}
+
+/// One round of waiting for a sample that is due: whoever is to send it may need this core.
+fn spin(node: &dyn Node, yields_to: &[RoleId]) {
+    if node.awaits().is_some_and(|role| yields_to.contains(&role)) {
+        std::thread::yield_now();
+    } else {
+        std::hint::spin_loop();
+    }
+}
+
+/// Looks that are worth a spin.
+const SPIN_ROUNDS: u32 = 50;
+
+/// Waits longer the longer there is nothing to do: spins, then sleeps.
+///
+/// It does not yield: Linux takes a whole time slice off who does (6.18), and thousands of yields per second drive the queue's
+/// clock so far ahead that whoever wakes up beside other busy processes waits for seconds, the kernel's own threads too.
+#[derive(Default)]
+pub struct Backoff {
+    rounds: u32,
+}
+
+impl Backoff {
+    /// One round of waiting that is no sleep; false if it is time for one.
+    pub fn brief(&mut self) -> bool {
+        let brief = self.rounds < SPIN_ROUNDS;
+        if brief {
+            self.rounds += 1;
+            std::hint::spin_loop();
+        }
+        brief
+    }
+}
+
+/// Drives all nodes in one thread, each tick through all of them in the order given. `revive` gives a role whose life is over
+/// (its index) its successor, or ends the run.
+///
+/// # Errors
+/// [`NodeError`] if a link failed, or if the roles wait for one another in a circle.
+pub fn in_turn(
+    nodes: &mut Vec<ReadyNode>,
+    last_tick: u64,
+    revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
+    after_tick: impl FnMut(u64) -> bool,
+) -> Result<Ended, NodeError> {
+    in_noted_turn(nodes, last_tick, &Cell::new(None), revive, after_tick)
+}
+
+/// Runs the nodes in turn; `turn` is the index of the node whose turn it is, none between ticks.
+pub fn in_noted_turn(
+    nodes: &mut Vec<ReadyNode>,
+    last_tick: u64,
+    turn: &Cell<Option<usize>>,
+    mut revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
+    mut after_tick: impl FnMut(u64) -> bool,
+) -> Result<Ended, NodeError> {
+    for tick in 0..=last_tick {
+        for index in 0..nodes.len() {
+            turn.set(Some(index));
+            if nodes[index].before_tick() {
+                // The seat is left before it is taken again, as between processes.
+                let mut left = nodes.remove(index);
+                left.finish()?;
+                drop(left);
+                let Some(successor) = revive(index)? else { return leave(nodes, Ended::Stopped) };
+                nodes.insert(index, successor);
+            }
+            let node = &mut nodes[index];
+            if node.poll(RunCondition::Inputs { up_to: tick })? == Poll::Executed {
+                node.finish_tick()?;
+            }
+        }
+        turn.set(None);
+        if !after_tick(tick) {
+            return leave(nodes, Ended::Stopped);
+        }
+    }
+    leave(nodes, Ended::Finished)
+}
+
+fn leave(nodes: &mut [ReadyNode], ended: Ended) -> Result<Ended, NodeError> {
+    nodes.iter_mut().try_for_each(|node| node.finish())?;
+    Ok(ended)
+}

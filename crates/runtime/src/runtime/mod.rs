@@ -1,0 +1,93 @@
+//! Drives roles: a node is one role on a bus with its counters; a driver decides when it runs.
+//!
+//! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
+//! arrive from outside. Must not decide what a run is for, nor start processes.
+
+mod absence;
+mod budget;
+mod compute;
+mod device;
+mod disturb;
+pub(crate) mod drive;
+mod error;
+pub(crate) mod hooks;
+mod line;
+mod link;
+mod node;
+mod occupant;
+mod privileges;
+mod role_id;
+mod share;
+
+pub use budget::{empty_budgets, grant_budgets};
+pub use compute::{Compute, ComputedTick};
+pub use device::{DeviceLink, DeviceSeat};
+pub use disturb::{Disturbance, Interruptions, LateSamples};
+pub use drive::in_noted_turn;
+pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use error::{DeviceError, NodeError};
+pub use line::{Line, LineError};
+#[cfg(feature = "hosts")]
+pub use link::Kept;
+pub use link::{AcceptedTicks, Input, Output, Seek};
+#[cfg(feature = "hosts")]
+pub use node::kept;
+pub use node::{
+    Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
+};
+pub use node::{accepted_ticks, ledger_file, ledger_words, next_tick, shared_memory_bytes};
+pub use occupant::RoleImpl;
+#[cfg(feature = "hosts")]
+pub use privileges::go_before_roles;
+pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
+pub use privileges::{
+    go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
+    with_realtime_priority,
+};
+pub use role_id::RoleId;
+
+use crate::bus::Depths;
+use crate::config::{ClockKind, Settings};
+use crate::sample::FleetTruth;
+
+/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks: at most, and with large samples.
+const WINDOW_TICKS: std::ops::RangeInclusive<u64> = 2..=64;
+/// Samples of a fleet that may wait for one reader come to so many bytes at the most, where that is enough to go on.
+const WAITING_BYTES: usize = 1 << 20;
+/// The same for the scorer of a run in real time, which looks seldom.
+const SCORED_BYTES: usize = 1 << 22;
+
+/// How long the longest sample of a fleet is, bytes; none without a fleet.
+fn longest_sample(scenario: &Settings) -> Option<usize> {
+    let fleets = scenario.bodies.iter().filter_map(|body| body.fleet);
+    fleets.max().map(|bodies| FleetTruth::length(bodies) * size_of::<u64>())
+}
+
+/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks.
+pub fn window_ticks(scenario: &Settings) -> u64 {
+    let fits = longest_sample(scenario).map_or(u64::MAX, |bytes| (WAITING_BYTES / 2 / bytes) as u64);
+    fits.clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
+}
+
+/// How deep the links of a scenario are.
+pub fn depths(scenario: &Settings) -> Depths {
+    // The scorer looks about every 20 ms, the recorder every 5. Neither has priority: beside 18 ready tasks on two cores the
+    // recorder was not run for 0.4 s.
+    let second = (1_000_000_000 / scenario.period_ns).next_power_of_two() as usize;
+    match scenario.clock {
+        ClockKind::Realtime => {
+            let fits = longest_sample(scenario).map_or(usize::MAX, |bytes| (SCORED_BYTES / bytes).max(8));
+            let late = disturb::late_samples(scenario);
+            // Of commands on their way all are to be had.
+            let fits = fits.max(scenario.actuation_delay_ticks as usize);
+            Depths { role: 1, scorer: second.clamp(64, 8192).min(fits) + late, history: 0 }
+        }
+        // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever
+        // scripted faults add.
+        ClockKind::Lockstep | ClockKind::InProcess => {
+            let extra = disturb::extra_samples(scenario);
+            let deep = (2 + extra) * window_ticks(scenario) as usize + disturb::late_samples(scenario);
+            Depths { role: deep, scorer: deep, history: deep }
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! What every node of a run shares: its bus, its settings, and the links and the ledger that follow from them.
+
+use super::ports::{ports, topic};
+use crate::bus::{Bus, BusError, Carried, Port, Reader, Signal, Topic};
+use crate::clock::{Clock, Grid};
+use crate::config::{BodyInfo, ClockKind, Settings};
+use crate::role::Guard;
+use crate::runtime::disturb::{Disturbance, Interruptions, LateSamples, extra_samples, late_samples};
+use crate::runtime::link::{AcceptedTicks, Extent, Input, Kept, Output};
+use crate::runtime::role_id::RoleId;
+use crate::runtime::window_ticks;
+use crate::state::{Persist, Restore};
+use crate::telemetry::{Ledger, TickCounters};
+
+/// Between two looks at a device's line, ns.
+pub(super) const LOOK_NS: u64 = 50_000;
+
+/// What every node of a run shares.
+pub struct Seat<'a, B> {
+    pub(super) bus: &'a B,
+    pub(super) scenario: &'a Settings,
+    pub(super) role: RoleId,
+    pub(super) generation: u64,
+    pub(super) ledger: Ledger,
+    pub(super) clock: Clock,
+}
+
+impl<B: Bus> Seat<'_, B> {
+    pub(super) fn input<S, G: Guard<S>>(
+        &self,
+        body: &BodyInfo,
+        signal: Signal,
+        guard: G,
+    ) -> Result<Input<B, S, G>, BusError>
+    where
+        S: Carried + ?Sized,
+    {
+        // Where inputs of one tick may come ticks apart, the newest of each is not enough.
+        let lags = self.scenario.lag_ticks(self.role.name(self.scenario)) > 1;
+        self.input_of(body, signal, guard, if lags { Reader::Scorer } else { Reader::Role })
+    }
+
+    pub(super) fn input_of<S, G: Guard<S>>(
+        &self,
+        body: &BodyInfo,
+        signal: Signal,
+        guard: G,
+        reader: Reader,
+    ) -> Result<Input<B, S, G>, BusError>
+    where
+        S: Carried + ?Sized,
+    {
+        let topic = topic(self.scenario, &body.name, signal);
+        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), reader)?
+            .recovering(self.kept(&topic), body.bodies(), self.generation > 1)
+            .with_late(LateSamples::of(self.scenario, signal, &body.name))
+            .guarded(guard);
+        input.expect(accepted_ticks(self.scenario, None));
+        Ok(input)
+    }
+
+    /// What the writer of a signal keeps.
+    fn kept(&self, topic: &Topic) -> Option<Kept> {
+        kept(self.scenario, topic, |writer| {
+            let path = self.ledger.path()?.with_file_name(ledger_file(self.scenario, writer));
+            Ledger::shared(&path, ledger_words(self.scenario, writer)).ok()
+        })
+    }
+
+    pub(super) fn output<S: Carried + ?Sized>(
+        &self,
+        body: &BodyInfo,
+        signal: Signal,
+    ) -> Result<Output<B, S>, BusError> {
+        let topic = topic(self.scenario, &body.name, signal);
+        let (bodies, extent) = (body.bodies(), extent(self.scenario));
+        let output = Output::open(self.bus, &topic, bodies, self.generation, &self.ledger, extent)?;
+        // Nobody in the loop reads the truth, and the score is to tell what really happened.
+        let disturbance = match signal {
+            Signal::Truth => None,
+            _ => {
+                let role = self.role.name(self.scenario);
+                Disturbance::of(self.scenario, role, &body.name, bodies, next_tick(&self.ledger))
+            }
+        };
+        // In a process with others whoever has a short way is served at once, and all others when the tick is done.
+        let alone = self.role.host(self.scenario).hosted(self.scenario).len() == 1;
+        let output = if alone { output } else { output.shown_first() };
+        Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+    }
+
+    pub(super) fn interruptions(&self) -> Interruptions {
+        let role = self.role.name(self.scenario);
+        Interruptions::of(self.scenario, role, self.generation, next_tick(&self.ledger))
+    }
+}
+
+/// Where the samples of a signal are kept for the successors of its readers: in its writer's ledger, which `open` opens.
+pub fn kept(scenario: &Settings, topic: &Topic, open: impl Fn(RoleId) -> Option<Ledger>) -> Option<Kept> {
+    let extent = extent(scenario);
+    let writers = if extent.kept_samples == 0 { Vec::new() } else { RoleId::all(scenario) };
+    writers.into_iter().find_map(|writer| {
+        let written = ports(scenario, writer).writes;
+        let index = written.iter().position(|port| port.topic == *topic)?;
+        let (ledger, length) = (open(writer)?, words(&written[index]));
+        ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_samples, length));
+        Kept::open(&ledger, extent.kept_samples, length)
+    })
+}
+
+/// Which ticks samples can have; in real time only once the grid is known.
+pub fn accepted_ticks(scenario: &Settings, grid: Option<Grid>) -> AcceptedTicks {
+    match (scenario.clock, grid) {
+        (ClockKind::Realtime, None) => AcceptedTicks::Unknown,
+        (ClockKind::Realtime, Some(grid)) => AcceptedTicks::Due(grid),
+        (ClockKind::Lockstep | ClockKind::InProcess, _) => AcceptedTicks::Next,
+    }
+}
+
+/// How many words of a role's ledger lie beside its record.
+pub fn ledger_words(scenario: &Settings, role: RoleId) -> usize {
+    words_of(&ports(scenario, role).writes, extent(scenario))
+}
+
+pub(super) fn words_of(written: &[Port], extent: Extent) -> usize {
+    written.iter().map(|port| extent.words(words(port))).sum()
+}
+
+/// The length of a sample, words.
+pub(super) fn words(port: &Port) -> usize {
+    port.size / size_of::<u64>()
+}
+
+/// The name of the file that has a role's ledger.
+pub fn ledger_file(scenario: &Settings, role: RoleId) -> String {
+    format!("{}.books", role.name(scenario))
+}
+
+/// What the writing ends of a scenario keep. Where every sample is waited for, one may be under way for as long as the fastest
+/// role may be ahead of what is scored, and a little longer: a tick is scored before its command is used. As links, twice that.
+pub(super) fn extent(scenario: &Settings) -> Extent {
+    let lockstep = scenario.clock == ClockKind::Lockstep;
+    let kept_samples = if lockstep {
+        2 * window_ticks(scenario) * (1 + extra_samples(scenario) as u64) + late_samples(scenario) as u64
+    } else {
+        0
+    };
+    Extent { last_tick: scenario.last_tick, kept_samples }
+}
+
+/// The tick that a role has not executed, by its ledger.
+pub fn next_tick(ledger: &Ledger) -> u64 {
+    let mut ticks = TickCounters::default();
+    ticks.persist(&mut Restore(&ledger.record().unwrap_or_default()));
+    ticks.next()
+}

@@ -1,0 +1,529 @@
+//! Scores a run from the truth and the estimates, which nobody in the loop ever sees together.
+//!
+//! Must not hold the loop up, except by the credit it gives in lockstep.
+
+use crate::bus::{Bus, BusError, Carried, Reader, Signal, Topic};
+use crate::clock::Grid;
+use crate::config::{Accept, Settings};
+use crate::rig::{BodyInfo, Estimate, FleetTruth, Rig, Truth, field_named};
+use crate::role::Guard;
+use crate::runtime::{AcceptedTicks, Input, LateSamples, Seek, topic};
+use crate::sample::{Message, Sample, Stamp, status};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// The score of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Score {
+    /// Ticks at which every sample was there.
+    pub scored_ticks: u64,
+    /// Ticks at which some sample was missing.
+    pub unscored_ticks: u64,
+    /// Ticks at which some body was lost. The metrics are infinite then, which JSON writes as null.
+    pub faulted_ticks: u64,
+    /// One entry per metric of the rig.
+    pub metrics: Vec<MetricScore>,
+    /// How the live certificate fared, if the rig has one.
+    pub certificate: Option<CertificateScore>,
+    /// Samples received per signal that is scored, by service.
+    #[serde(skip)]
+    pub received: Vec<(String, u64)>,
+    /// Per signal, at how many ticks its status said what; only what was said.
+    pub statuses: BTreeMap<String, BTreeMap<String, u64>>,
+    /// Per incident that the loop recovered from, by its number: the time from its tick until every metric with a limit was within
+    /// it for good, or until the next incident, s.
+    #[serde(skip)]
+    pub recoveries_s: BTreeMap<u64, f64>,
+}
+
+/// For how many steps of all driven bodies the bound on V̇ held, of the true errors: V(k+1) ≤ V(k) + h·bound(k). Together
+/// these are all steps: a tick of a body is one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct CertificateScore {
+    /// It held, or V was at the floor of rounding.
+    pub held: u64,
+    /// It did not.
+    pub broken: u64,
+    /// Nothing can be said: before the first command acts, around missed ticks, and where nothing was observable.
+    pub unjudged: u64,
+}
+
+/// Status bits of an estimate that saw nothing of what it tells.
+const BLIND: u64 = status::UNOBSERVABLE | status::UNUSABLE | status::INITIAL;
+
+/// V from which on its change over one tick is more than rounding, for rates of the order of 1 rad/s.
+///
+/// The reconstruction of ε divides the rounding of a measured increment by h, and the change of V over a tick is a part h
+/// of V: errors count from rounding/h² on.
+pub fn lyapunov_floor(tick_s: f64) -> f64 {
+    let error = 64.0 * f64::EPSILON / (tick_s * tick_s);
+    error * error
+}
+
+/// The score by one metric.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MetricScore {
+    /// Its name; the unit is the last part.
+    pub name: String,
+    /// At the last tick that could be scored; NaN where none could.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
+    pub last: f64,
+    /// The largest value from `accept.settled_by_s` on; none if nothing was scored by then.
+    pub settled_max: Option<f64>,
+    /// The largest value from `accept.peak_from_s` on, settled or not; none if nothing was scored by then.
+    pub peak: Option<f64>,
+    /// The tick of that.
+    pub peak_tick: Option<u64>,
+    /// From this time on it stayed within the accepted limit, s; none without a limit or if it did not.
+    pub settled_at_s: Option<f64>,
+    /// The integral of its square over the run: (its unit)² s; a tick at which it could not be scored adds nothing.
+    #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
+    pub ise: f64,
+    /// Ticks from `accept.settled_by_s` on that were passed over without a value.
+    #[serde(skip)]
+    pub settled_blank: u64,
+    /// Ticks from `accept.peak_from_s` on that were passed over without a value.
+    #[serde(skip)]
+    pub peak_blank: u64,
+    /// What is accepted; infinite without a limit.
+    #[serde(skip)]
+    limit: f64,
+    #[serde(skip)]
+    last_above: Option<u64>,
+}
+
+/// Follows a run.
+pub trait Scorer {
+    /// Scores up to `budget` ticks that have arrived; returns how many.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn poll(&mut self, budget: u64) -> Result<u64, BusError>;
+    /// The next tick to score: every tick before it has been consumed.
+    fn next_tick(&self) -> u64;
+    /// The latest value of the first metric.
+    fn latest(&self) -> f64;
+    /// Hands over the time grid, once the epoch is known: no sample is of a tick that is not due.
+    fn start(&mut self, grid: Grid);
+    /// Notes that a role failed at a tick; the recovery is told by the number of the incident.
+    fn incident(&mut self, id: u64, tick: u64);
+    /// Scores what is there, complete or not, and closes the account.
+    ///
+    /// # Errors
+    /// [`BusError::Receive`].
+    fn finish(&mut self) -> Result<Score, BusError>;
+}
+
+/// The same for a rig whose type is known.
+pub(crate) fn score_rig<R: Rig, B: Bus + 'static>(
+    rig: &R,
+    scenario: &Settings,
+    bus: &B,
+) -> Result<Box<dyn Scorer>, BusError> {
+    Ok(Box::new(RigScorer::open(rig, scenario, bus)?))
+}
+
+/// A driven body, for the live certificate.
+struct DrivenBody {
+    body: usize,
+    /// Tick, V, and the bound on V̇, of the tick before.
+    before: Option<(u64, f64, f64)>,
+}
+
+/// The status bits of a sample; none where its type has no field `status`.
+#[inline]
+fn status_of<S: Sample>(sample: &S) -> u64 {
+    match const { field_named(S::FIELDS, "status") } {
+        Some(index) => sample.words()[S::FIELDS[index].offset / size_of::<u64>()],
+        None => 0,
+    }
+}
+
+/// How often the status of a signal's samples said what.
+struct Statuses {
+    signal: String,
+    counts: [u64; status::NAMES.len()],
+}
+
+impl Statuses {
+    fn new(body: &str, signal: Signal) -> Self {
+        Self { signal: format!("{body}/{}", signal.name()), counts: [0; status::NAMES.len()] }
+    }
+
+    /// Counts what a sample says. Most say nothing.
+    #[inline]
+    fn take<S: Sample>(&mut self, sample: &S) {
+        let told = status_of(sample);
+        if told != 0 {
+            let counts = self.counts.iter_mut().zip(status::NAMES);
+            counts.for_each(|(count, (_, bit))| *count += u64::from(told & bit != 0));
+        }
+    }
+
+    /// What was said, by name; that an estimate begins with its guess is nothing to tell.
+    fn told(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        let counts = status::NAMES.into_iter().zip(self.counts);
+        let told = counts.filter(|((_, bit), count)| *count > 0 && *bit != status::INITIAL);
+        told.map(|((name, _), count)| (name, count))
+    }
+}
+
+/// The truth of a body, or of a fleet.
+enum TruthInput<R: Rig, B: Bus> {
+    One(Input<B, Truth<R>>),
+    Fleet(Input<B, FleetTruth<R>>),
+}
+
+impl<R: Rig, B: Bus> TruthInput<R, B> {
+    fn open(bus: &B, topic: &Topic, fleet: Option<usize>) -> Result<Self, BusError> {
+        Ok(match fleet {
+            None => Self::One(Input::watch(bus, topic, Reader::Scorer)?),
+            Some(bodies) => Self::Fleet(Input::watch_many(bus, topic, bodies, Reader::Scorer)?),
+        })
+    }
+
+    fn expect(&mut self, accepted_ticks: AcceptedTicks) {
+        match self {
+            Self::One(input) => input.expect(accepted_ticks),
+            Self::Fleet(input) => input.expect(accepted_ticks),
+        }
+    }
+
+    fn seek(&mut self, tick: u64) -> Result<Seek, BusError> {
+        match self {
+            Self::One(input) => input.seek(tick),
+            Self::Fleet(input) => input.seek(tick),
+        }
+    }
+
+    fn last_tick(&self) -> Option<u64> {
+        match self {
+            Self::One(input) => input.last_tick(),
+            Self::Fleet(input) => input.last_tick(),
+        }
+    }
+
+    /// Returns the number of samples received.
+    fn samples(&mut self) -> u64 {
+        match self {
+            Self::One(input) => input.counters().samples(),
+            Self::Fleet(input) => input.counters().samples(),
+        }
+    }
+
+    /// That of the sample at hand.
+    fn stamp(&self) -> Option<&Stamp> {
+        match self {
+            Self::One(input) => input.sample().map(Message::stamp),
+            Self::Fleet(input) => input.sample().map(Message::stamp),
+        }
+    }
+
+    /// The sample at hand if it is that tick's and a single body's.
+    fn one(&self, tick: u64) -> Option<&Truth<R>> {
+        if let Self::One(input) = self { at(input, tick) } else { None }
+    }
+
+    /// The sample at hand if it is that tick's and a fleet's.
+    fn fleet(&self, tick: u64) -> Option<&FleetTruth<R>> {
+        if let Self::Fleet(input) = self { at(input, tick) } else { None }
+    }
+}
+
+struct RigScorer<R: Rig, B: Bus> {
+    truths: Vec<TruthInput<R, B>>,
+    estimate: Input<B, Estimate<R>, R::EstimateGuard>,
+    last_tick: u64,
+    scoring: Scoring<R>,
+}
+
+/// The score in the making, whoever has the samples.
+pub(crate) struct Scoring<R: Rig> {
+    rig: R,
+    accept: Accept,
+    tick_s: f64,
+    delay_ticks: u64,
+    driven: Vec<DrivenBody>,
+    /// Of the estimate, and of every body's truth.
+    statuses: Vec<Statuses>,
+    services: Vec<String>,
+    next_tick: u64,
+    /// Per incident: its number, its tick, and the last tick from there on at which some metric was not known to be within its limit.
+    incidents: Vec<(u64, u64, u64)>,
+    values: Vec<f64>,
+    score: Score,
+}
+
+impl<R: Rig> Scoring<R> {
+    pub fn new(rig: &R, scenario: &Settings) -> Self {
+        let bodies = rig.bodies().iter();
+        // The certificate is about single bodies.
+        let driven = bodies.clone().enumerate().filter(|(_, body)| body.driven && body.fleet.is_none());
+        let estimates = Statuses::new(&rig.bodies()[0].name, Signal::Estimate);
+        let truths = bodies.clone().map(|body| Statuses::new(&body.name, Signal::Truth));
+        let names = bodies.clone().map(|body| (&body.name, Signal::Truth));
+        let signals = core::iter::once((&rig.bodies()[0].name, Signal::Estimate)).chain(names);
+        let metric = |name: &&str| MetricScore {
+            name: (*name).to_owned(),
+            last: f64::NAN,
+            settled_max: None,
+            peak: None,
+            peak_tick: None,
+            settled_at_s: None,
+            ise: 0.0,
+            settled_blank: 0,
+            peak_blank: 0,
+            limit: scenario.accept.metric_max.get(*name).copied().unwrap_or(f64::INFINITY),
+            last_above: None,
+        };
+        Self {
+            rig: rig.clone(),
+            accept: scenario.accept.clone(),
+            tick_s: scenario.tick_s(),
+            delay_ticks: scenario.actuation_delay_ticks,
+            driven: driven.map(|(body, _)| DrivenBody { body, before: None }).collect(),
+            statuses: core::iter::once(estimates).chain(truths).collect(),
+            services: signals.map(|(body, signal)| topic(scenario, body, signal).to_string()).collect(),
+            next_tick: 0,
+            incidents: Vec::new(),
+            values: vec![f64::NAN; rig.metrics().len()],
+            score: Score {
+                scored_ticks: 0,
+                unscored_ticks: 0,
+                faulted_ticks: 0,
+                metrics: rig.metrics().iter().map(metric).collect(),
+                certificate: None,
+                received: Vec::new(),
+                statuses: BTreeMap::new(),
+                recoveries_s: BTreeMap::new(),
+            },
+        }
+    }
+
+    /// The latest value of the first metric.
+    pub fn latest(&self) -> f64 {
+        self.score.metrics.first().map_or(f64::NAN, |metric| metric.last)
+    }
+
+    /// Scores the next tick by the samples of it that there are; `complete` tells whether these are all.
+    #[inline]
+    pub fn take<'a>(
+        &mut self,
+        truth: impl Fn(usize) -> Option<&'a Truth<R>> + Copy,
+        fleet: impl Fn(usize) -> Option<&'a FleetTruth<R>>,
+        estimate: Option<&Estimate<R>>,
+        complete: bool,
+    ) {
+        let tick = self.next_tick;
+        *(if complete { &mut self.score.scored_ticks } else { &mut self.score.unscored_ticks }) += 1;
+        self.rig.score(truth, fleet, estimate, &mut self.values);
+        self.score.faulted_ticks += u64::from(self.values.contains(&f64::INFINITY));
+        let time_s = tick as f64 * self.tick_s;
+        for (index, metric) in self.score.metrics.iter_mut().enumerate() {
+            let value = self.values[index];
+            metric.take(tick, value, &self.accept, time_s);
+            metric.ise += if value.is_nan() { 0.0 } else { value * value * self.tick_s };
+        }
+        if !self.incidents.is_empty()
+            && !self.within()
+            && let Some((_, _, last)) = self.incidents.iter_mut().rfind(|(_, from, _)| *from <= tick)
+        {
+            *last = tick;
+        }
+        let (estimates, truths) = self.statuses.split_at_mut(1);
+        estimate.iter().for_each(|estimate| estimates[0].take(*estimate));
+        let told = truths.iter_mut().enumerate();
+        told.for_each(|(body, statuses)| truth(body).iter().for_each(|truth| statuses.take(*truth)));
+        // What the observer was not told of cannot be judged.
+        let seen = estimate.filter(|estimate| status_of(*estimate) & BLIND == 0);
+        for driven in &mut self.driven {
+            let (observed, own) = (truth(0), truth(driven.body));
+            let now = match (observed, own, seen) {
+                (Some(observed), Some(own), Some(estimate)) => self.rig.true_lyapunov(observed, own, estimate),
+                _ => None,
+            };
+            // A follower that held or was safe did not apply what the certificate is about.
+            let undisturbed = own.is_some_and(|truth| R::undisturbed(truth));
+            driven.judge(tick, (self.tick_s, self.delay_ticks), now, undisturbed, &mut self.score.certificate);
+        }
+        self.next_tick += 1;
+    }
+
+    /// Whether every metric that has a limit is known and within it.
+    fn within(&self) -> bool {
+        self.score.metrics.iter().zip(&self.values).all(|(metric, value)| *value <= metric.limit)
+    }
+
+    /// The recoveries, as far as there are limits to recover to.
+    fn recoveries_s(&self) -> BTreeMap<u64, f64> {
+        let recovery = |&(id, from, last_outside): &(u64, u64, u64)| {
+            let back = last_outside + 1;
+            let judged = !self.accept.metric_max.is_empty() && back < self.next_tick;
+            judged.then(|| (id, back.saturating_sub(from) as f64 * self.tick_s))
+        };
+        self.incidents.iter().filter_map(recovery).collect()
+    }
+
+    /// Closes the account. `received` holds how many samples came, of the estimate and of every body's truth.
+    pub fn finish(&mut self, received: impl Iterator<Item = u64>) -> Score {
+        let services = self.services.iter().cloned();
+        self.score.received = services.zip(received).collect();
+        self.score.recoveries_s = self.recoveries_s();
+        if let Some(certificate) = &mut self.score.certificate {
+            let steps = self.next_tick * self.driven.len() as u64;
+            certificate.unjudged = steps - certificate.held - certificate.broken;
+        }
+        let told = |statuses: &Statuses| {
+            (
+                statuses.signal.clone(),
+                statuses.told().map(|(name, ticks)| (name.to_owned(), ticks)).collect::<BTreeMap<_, _>>(),
+            )
+        };
+        self.score.statuses = self.statuses.iter().map(told).filter(|(_, told)| !told.is_empty()).collect();
+        let (tick_s, ticks) = (self.tick_s, self.next_tick);
+        for metric in &mut self.score.metrics {
+            let first_within = metric.last_above.map_or(0, |tick| tick + 1);
+            let limited = self.accept.metric_max.contains_key(&metric.name);
+            metric.settled_at_s = (limited && first_within < ticks).then_some(first_within as f64 * tick_s);
+        }
+        self.score.clone()
+    }
+}
+
+impl<R: Rig, B: Bus> RigScorer<R, B> {
+    fn open(rig: &R, scenario: &Settings, bus: &B) -> Result<Self, BusError> {
+        // What no role uses is not scored either.
+        let mut estimate =
+            Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
+                .with_late(LateSamples::of(scenario, Signal::Estimate, &rig.bodies()[0].name))
+                .guarded(rig.estimate_guard());
+        estimate.expect(crate::runtime::accepted_ticks(scenario, None));
+        let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);
+        Ok(Self {
+            truths: rig.bodies().iter().map(truth).collect::<Result<_, _>>()?,
+            estimate,
+            last_tick: scenario.last_tick,
+            scoring: Scoring::new(rig, scenario),
+        })
+    }
+
+    /// Whether no sample of the next tick can still come.
+    fn settled(&mut self) -> Result<bool, BusError> {
+        let next = self.scoring.next_tick;
+        let mut settled = self.estimate.seek(next)? != Seek::NotYet;
+        for truth in &mut self.truths {
+            settled &= truth.seek(next)? != Seek::NotYet;
+        }
+        Ok(settled)
+    }
+
+    fn score_tick(&mut self) {
+        let tick = self.scoring.next_tick;
+        let estimate = at(&self.estimate, tick);
+        let complete =
+            estimate.is_some() && self.truths.iter().all(|truth| truth.stamp().is_some_and(|stamp| stamp.tick == tick));
+        let truths = &self.truths;
+        self.scoring.take(|body| truths[body].one(tick), |body| truths[body].fleet(tick), estimate, complete);
+    }
+}
+
+impl DrivenBody {
+    /// Judges one step by what is known of V now.
+    #[inline]
+    fn judge(
+        &mut self,
+        tick: u64,
+        (tick_s, delay_ticks): (f64, u64),
+        now: Option<(f64, f64)>,
+        undisturbed: bool,
+        score: &mut Option<CertificateScore>,
+    ) {
+        let now = now.filter(|(v, bound)| v.is_finite() && bound.is_finite());
+        if let Some((v, _)) = now {
+            let score = score.get_or_insert_default();
+            // V is under control from where the first command acts.
+            if let Some((before, v_before, bound)) = self.before
+                && before + 1 == tick
+                && before >= delay_ticks
+                && undisturbed
+            {
+                let holds = v <= v_before + tick_s * bound || v <= lyapunov_floor(tick_s);
+                *(if holds { &mut score.held } else { &mut score.broken }) += 1;
+            }
+        }
+        self.before = now.filter(|_| undisturbed).map(|(v, bound)| (tick, v, bound));
+    }
+}
+
+/// The sample at hand if it is that tick's.
+fn at<B: Bus, S: Carried + ?Sized, G: Guard<S>>(input: &Input<B, S, G>, tick: u64) -> Option<&S> {
+    input.sample().filter(|sample| sample.stamp().tick == tick)
+}
+
+impl MetricScore {
+    #[inline]
+    fn take(&mut self, tick: u64, value: f64, accept: &Accept, time_s: f64) {
+        if value.is_nan() {
+            self.settled_blank += u64::from(time_s >= accept.settled_by_s);
+            self.peak_blank += u64::from(time_s >= accept.peak_from_s);
+            return;
+        }
+        self.last = value;
+        if time_s >= accept.settled_by_s {
+            self.settled_max = Some(self.settled_max.map_or(value, |worst| worst.max(value)));
+        }
+        if time_s >= accept.peak_from_s && self.peak.is_none_or(|peak| value > peak) {
+            (self.peak, self.peak_tick) = (Some(value), Some(tick));
+        }
+        if value > self.limit {
+            self.last_above = Some(tick);
+        }
+    }
+}
+
+impl<R: Rig, B: Bus> Scorer for RigScorer<R, B> {
+    fn poll(&mut self, budget: u64) -> Result<u64, BusError> {
+        let before = self.next_tick();
+        while self.next_tick() <= self.last_tick
+            && self.next_tick() < before.saturating_add(budget)
+            && self.settled()?
+        {
+            self.score_tick();
+        }
+        Ok(self.next_tick() - before)
+    }
+
+    fn next_tick(&self) -> u64 {
+        self.scoring.next_tick
+    }
+
+    fn latest(&self) -> f64 {
+        self.scoring.latest()
+    }
+
+    fn start(&mut self, grid: Grid) {
+        let accepted_ticks = AcceptedTicks::Due(grid);
+        self.truths.iter_mut().for_each(|truth| truth.expect(accepted_ticks));
+        self.estimate.expect(accepted_ticks);
+    }
+
+    fn incident(&mut self, id: u64, tick: u64) {
+        self.scoring.incidents.push((id, tick, tick));
+    }
+
+    fn finish(&mut self) -> Result<Score, BusError> {
+        // What has not come by now never will: go on as long as anything newer waits anywhere.
+        loop {
+            self.poll(u64::MAX)?;
+            let newest = |tick: Option<u64>| tick.is_some_and(|tick| tick >= self.scoring.next_tick);
+            let more = newest(self.estimate.last_tick()) || self.truths.iter().any(|truth| newest(truth.last_tick()));
+            if !more || self.next_tick() > self.last_tick {
+                break;
+            }
+            self.score_tick();
+        }
+        let estimates = self.estimate.counters().samples();
+        let truths = self.truths.iter_mut().map(TruthInput::samples);
+        Ok(self.scoring.finish(core::iter::once(estimates).chain(truths)))
+    }
+}

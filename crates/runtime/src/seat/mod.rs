@@ -1,0 +1,22 @@
+//! A role's seat in a run: who takes it, in a process of its own, and what it must know.
+//!
+//! | file | duty |
+//! |---|---|
+//! | `process` | a role of this program, or of a function, from its start to its report; the files of a domain |
+//! | `bridge` | a device in the place of a role |
+//! | `description` | what a program of somebody else's needs, as data |
+
+mod bridge;
+mod description;
+mod process;
+
+pub use bridge::{Served, run_bridge};
+pub use description::{SeatDescription, describe_seat, join_run, seat_path};
+pub use process::SUMMARY;
+pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
+#[cfg(feature = "hosts")]
+pub use process::{clock_path, join};
+pub use process::{
+    device_words_path, join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path,
+    write_whole,
+};

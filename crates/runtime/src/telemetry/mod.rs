@@ -1,0 +1,28 @@
+//! What a role remembers of its run: latency histograms, counters, and the hash of what it published.
+//!
+//! Everything is allocated before the loop and only counted in it; export and arithmetic come after. Must not log.
+
+mod books;
+mod export;
+mod handover;
+mod hash;
+mod host;
+mod latency;
+mod ledger;
+mod report;
+
+/// What [`handover`] is made of.
+mod atomic {
+    pub use std::sync::atomic::{AtomicU64, Ordering, fence};
+}
+
+pub use books::{ReadCounters, TickCounters, WriteCounters};
+pub use export::{write_hgrm, write_hlog};
+pub(crate) use handover::{find, keep};
+pub use hash::{Checkpoints, StateHash, combine};
+pub use host::Host;
+pub use latency::number_or_nan;
+pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
+pub use latency::{quantile, sorted};
+pub use ledger::{Ledger, LedgerError, Slots, Store};
+pub use report::{Grant, LinkRead, LinkWritten, Outage, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};
