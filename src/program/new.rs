@@ -86,7 +86,8 @@ fn write_all(directory: &Path, name: &str) -> io::Result<()> {
 fn manifest(name: &str) -> String {
     let (version, sources) = (env!("CARGO_PKG_VERSION"), Path::new(env!("CARGO_MANIFEST_DIR")));
     let own = std::fs::read_to_string(sources.join("Cargo.toml"));
-    let here = own.is_ok_and(|own| own.contains(&format!("name = \"corotate\"\nversion = \"{version}\"")));
+    let lines = ["name = \"corotate\"", &format!("version = \"{version}\"")];
+    let here = own.is_ok_and(|own| lines.iter().all(|wanted| own.lines().any(|line| line == *wanted)));
     let from =
         if here { format!("path = {:?}", sources.display().to_string()) } else { format!("version = \"{version}\"") };
     format!(
