@@ -7,7 +7,8 @@ use std::process::Command;
 fn hashes(clock: &str) -> Vec<String> {
     let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join(clock);
     let program = env!("CARGO_BIN_EXE_motor-pair");
-    let ended = Command::new(program).args(["run", "--clock", clock, "--out"]).arg(&out).output().unwrap();
+    let options = ["run", "--clock", clock, "--overwrite", "--out"];
+    let ended = Command::new(program).args(options).arg(&out).output().unwrap();
     assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
     let hashes = std::fs::read_to_string(out.join("hashes.txt")).unwrap();
     hashes.lines().filter(|line| !line.starts_with('#')).map(str::to_owned).collect()
