@@ -2,7 +2,7 @@
 
 use crate::run::{failed, refused, shipped};
 use corotate::campaign::{Campaign, Collection, SHIPPED, Sweep, Swept};
-use corotate::config::ClockKind;
+use corotate::config::{ClockKind, ConfigError};
 use corotate::launch::make_directory;
 use pyo3::prelude::*;
 use std::borrow::Cow;
@@ -17,7 +17,10 @@ const SIGINT: usize = 2;
 fn load(given: &str, kind: &str, overrides: &[String]) -> PyResult<Campaign> {
     let base = |name: &str| {
         let found = shipped().into_iter().find(|(known, _)| *known == name);
-        found.map(|(_, text)| Cow::Borrowed(text)).ok_or_else(|| format!("there is no scenario `{name}`"))
+        found.map(|(_, text)| Cow::Borrowed(text)).ok_or_else(|| ConfigError::Unknown {
+            code: "unknown-scenario",
+            text: format!("there is no scenario `{name}`"),
+        })
     };
     match kind {
         "tables" => {
