@@ -1,6 +1,6 @@
-//! A device behind a serial line: the follower of `config/rigid-pair.toml`, as firmware would be it.
+//! A device behind a serial line: the follower of `config/rigid-pair.toml`, as firmware would implement it.
 //!
-//! To be read by whoever writes firmware. What a device needs is here and in the crate `corotate-core`, which builds
+//! An example for authors of firmware. A device needs this file and the crate `corotate-core`, which builds
 //! `no_std`: a [`Body`] in its [`BodySeat`], the [`Device`] that speaks the protocol for it, a byte stream and a clock. This one simulates its
 //! body; a real one reads its gyros in `measure`, sets its torquers in `apply` and `apply_safe`, and leaves `flow` empty.
 //! Must not use anything of the library that needs more than `core`, the opening of the line apart.

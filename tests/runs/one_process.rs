@@ -218,11 +218,11 @@ fn what_cannot_share_a_process_is_refused_with_its_reason() {
     let path = |name: &str| shipped(name).to_str().unwrap().to_owned();
     let (pair, alone) = (path("rigid-pair"), path("inertia"));
     for role in ["observer", "controller"] {
-        let why = format!("the {role} in a process of ours, so nobody else can be it; take it out there");
-        refused(&["run", &pair, BOTH[0], BOTH[1], "--external", role], &["--external", role, &why]);
+        let why = "[shared-and-external]";
+        refused(&["run", &pair, BOTH[0], BOTH[1], "--external", role], &["--external", role, why]);
         let list = format!("--set=launch.external=[\"{role}\"]");
-        refused(&["run", &pair, BOTH[0], BOTH[1], &list], &["launch.processes[0]", &why]);
-        refused(&["seat", &pair, role, BOTH[0], BOTH[1]], &[&why]);
+        refused(&["run", &pair, BOTH[0], BOTH[1], &list], &["launch.processes[0]", role, why]);
+        refused(&["seat", &pair, role, BOTH[0], BOTH[1]], &[role, why]);
     }
     refused(
         &["run", &alone, BOTH[0], BOTH[1]],

@@ -12,7 +12,7 @@ impl Failure {
         Self(vec![(text.to_string(), code)])
     }
 
-    /// The same about something: an option, or a file.
+    /// Puts the name of an option or a file before the text of each mistake.
     pub fn of(what: impl fmt::Display, error: impl Into<Self>) -> Self {
         let Self(mistakes) = error.into();
         Self(mistakes.into_iter().map(|(text, code)| (format!("{what}: {text}"), code)).collect())

@@ -160,7 +160,7 @@ fn a_command_line_that_makes_no_sense_is_refused() {
     let bench = Bench::new();
     let path = bench.path("");
     let pair = shipped("rigid-pair").display().to_string();
-    // What clap refuses names the word, and where there is help.
+    // An error of clap names the word and points to the help.
     let words: [(&[&str], &str); 16] = [
         (&["nosuch"], "'nosuch'"),
         (&["--nosuch"], "'--nosuch'"),

@@ -48,7 +48,7 @@ impl<'a> Checks<'a> {
         self.require(value > 0.0, key, "not-positive", || format!("{value} is not above zero; give a positive number"));
     }
 
-    /// Takes the value, or notes why there is none, with the error's code.
+    /// Returns the value, or notes the error with its code.
     pub fn accept<T, E: std::fmt::Display>(&mut self, key: &str, value: Result<T, E>) -> Option<T>
     where
         for<'e> &'e E: Into<&'static str>,

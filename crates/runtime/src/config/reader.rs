@@ -110,7 +110,7 @@ impl Error for Refusal {
     }
 }
 
-/// What a type expects, in words for an author of scenarios. Types name it in serde's words, and in no other way.
+/// Returns the expected kind of value in words for the author of a scenario, from the words of serde.
 fn plain(wanted: String) -> String {
     let words = match wanted.as_str() {
         "f64" => "a number",

@@ -140,8 +140,10 @@ pub enum NotExternal {
         /// The role.
         role: String,
     },
-    /// The role shares a process of ours.
-    #[error("launch.processes has the {role} in a process of ours, so nobody else can be it; take it out there")]
+    /// The role is external and in `launch.processes`.
+    #[error(
+        "launch.processes places the {role} in a process of the launcher, so it cannot be external; remove it there"
+    )]
     SharedAndExternal {
         /// The role.
         role: String,
