@@ -39,6 +39,20 @@ pub struct Criterion {
     pub default: bool,
 }
 
+/// Returns a count as a whole number, and any other value in scientific notation with all its digits.
+pub fn exact(value: f64) -> String {
+    if is_count(value) { format!("{value}") } else { format!("{value:e}") }
+}
+
+/// Returns a count as a whole number, and any other value in scientific notation with three digits.
+pub fn short(value: f64) -> String {
+    if is_count(value) { format!("{value}") } else { format!("{value:.2e}") }
+}
+
+fn is_count(value: f64) -> bool {
+    value.fract() == 0.0 && value.abs() < 1e9
+}
+
 /// Why a criterion is not judged.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Unjudged {
@@ -404,6 +418,16 @@ mod tests {
     use crate::launch::summary::Judged;
     use crate::launch::{Launch, run};
     use std::sync::atomic::AtomicUsize;
+
+    #[test]
+    fn counts_are_whole_and_other_values_scientific() {
+        let cases =
+            [(40.0, "40", "40"), (0.0, "0", "0"), (1.2345e-6, "1.2345e-6", "1.23e-6"), (1e300, "1e300", "1.00e300")];
+        for (value, all, three) in cases {
+            assert_eq!((exact(value), short(value)), (all.to_owned(), three.to_owned()));
+        }
+        assert_eq!(exact(f64::INFINITY), "inf");
+    }
 
     /// A run that is well, of a scenario with these changes, and what is judged of it once it has been changed.
     fn judged(overrides: &[&str], change: impl FnOnce(&mut Outcome)) -> (Option<bool>, String, Vec<Criterion>) {

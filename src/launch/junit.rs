@@ -2,7 +2,7 @@
 //!
 //! Must not be more lenient than the exit code, nor ever be without a case: what did not run is an error.
 
-use super::{Action, Criterion, Summary};
+use super::{Action, Criterion, Summary, exact};
 use crate::config::RunId;
 use quick_xml::Writer;
 use std::io;
@@ -108,12 +108,12 @@ fn cases(summary: &Summary) -> Vec<Case> {
 }
 
 fn judge(criterion: &Criterion) -> Verdict {
-    let limit = criterion.limit;
+    let limit = exact(criterion.limit);
     let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
     match (criterion.holds, criterion.value) {
         (Some(true), _) => Verdict::Passed,
-        (Some(false), Some(value)) => Verdict::Failed(format!("{role}{value:e} is above the limit {limit:e}")),
-        (Some(false), None) => Verdict::Failed(format!("nothing was measured; the limit is {limit:e}")),
+        (Some(false), Some(value)) => Verdict::Failed(format!("{role}{} is above the limit {limit}", exact(value))),
+        (Some(false), None) => Verdict::Failed(format!("nothing was measured; the limit is {limit}")),
         (None, _) => {
             let reason = criterion.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
             Verdict::Skipped(format!("not judged{reason}"))

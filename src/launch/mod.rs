@@ -31,6 +31,7 @@ mod trace;
 
 pub use crate::score::{CertificateScore, MetricScore, Score, Scorer};
 pub use criteria::{Criterion, Unjudged, tick_words};
+pub(crate) use criteria::{exact, short};
 pub use error::LaunchError;
 pub use incident::{Action, Incident};
 pub use janitor::janitor;

@@ -1,7 +1,7 @@
 //! The end of a run on the screen.
 
 use super::outcome::{LinkCounters, State};
-use super::{Incident, Summary};
+use super::{Incident, Summary, exact, short};
 use crate::analysis::digits;
 use crate::hosts::{HostsSummary, Silence};
 use crate::serial::LineCounters;
@@ -89,16 +89,15 @@ fn results(summary: &Summary, text: &mut String) {
             metric.name.clone(),
             if metric.last.is_nan() { "-".to_owned() } else { format!("{:.2e}", metric.last) },
             metric.settled_max.map_or("-".to_owned(), |value| format!("{value:.2e}")),
-            criterion.map_or("-".to_owned(), |criterion| format!("{:e}", criterion.limit)),
+            criterion.map_or("-".to_owned(), |criterion| exact(criterion.limit)),
             metric.settled_at_s.map_or("-".to_owned(), |time| format!("{} s", digits(time))),
             verdict(criterion.and_then(|criterion| criterion.holds)),
         ]);
     }
     let of_metric = |name: &str| summary.score.metrics.iter().any(|metric| name == format!("{}_max", metric.name));
     for criterion in summary.criteria.iter().filter(|criterion| !of_metric(&criterion.name)) {
-        let number = |value: f64| if value.fract() == 0.0 { format!("{value}") } else { format!("{value:.2e}") };
-        let value = criterion.value.map_or("not measured".to_owned(), number);
-        let limit = number(criterion.limit);
+        let value = criterion.value.map_or("not measured".to_owned(), short);
+        let limit = exact(criterion.limit);
         let dash = || "-".to_owned();
         rows.add_row([criterion.label(), value, dash(), limit, dash(), verdict(criterion.holds)]);
     }

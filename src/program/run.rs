@@ -13,8 +13,8 @@ use crate::doctor::Machine;
 use crate::files;
 use crate::hosts::{Address, HostSeat};
 use crate::launch::{
-    Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, junit, make_directory, make_latest,
-    new_run, table, tick_words, write_run,
+    Action, Launch, Outcome, Progress, ResultsError, Summary, check_cores, claim, exact, junit, make_directory,
+    make_latest, new_run, table, tick_words, write_run,
 };
 use crate::runtime::{priority_remedy, refused_priority};
 use crate::scenario::Scenario;
@@ -401,9 +401,9 @@ impl Verdict {
         }
         let broken: Vec<_> = summary.criteria.iter().filter(|criterion| criterion.holds == Some(false)).collect();
         for criterion in &broken {
-            let value = criterion.value.map_or("nothing was measured".to_owned(), |value| format!("{value:e}"));
+            let value = criterion.value.map_or("nothing was measured".to_owned(), exact);
             let role = criterion.role.as_ref().map_or(String::new(), |role| format!("{role}: "));
-            let text = format!("accept.{}: {role}{value}, limit {:e}", criterion.name, criterion.limit);
+            let text = format!("accept.{}: {role}{value}, limit {}", criterion.name, exact(criterion.limit));
             remark(&Failure::new("not-met", text));
         }
         let ended = (summary.signal != 0).then(|| format!("ended in order by signal {}", summary.signal));

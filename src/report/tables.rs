@@ -5,7 +5,7 @@ use super::source::Source;
 use super::traces::Traces;
 use crate::analysis::{Claim, Reach, apart, digits};
 use crate::hosts::{HostReport, LinkEnd, Silence};
-use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, reasons};
+use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, exact, reasons, short};
 use crate::rig::{ConditionReport, Figure};
 use crate::telemetry::{Host, Percentiles, Ticks};
 
@@ -65,8 +65,7 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     if let Some(summary) = &source.summary {
         let row = |criterion: &Criterion| {
-            let value =
-                criterion.value.map_or("not finite, or not measured".to_owned(), |value| format!("{value:.2e}"));
+            let value = criterion.value.map_or("not finite, or not measured".to_owned(), short);
             let default = criterion.default.then(|| "default".to_owned());
             let about: Vec<String> =
                 [default, criterion.role.clone(), criterion.reason.as_ref().map(ToString::to_string)]
@@ -75,7 +74,7 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
                     .collect();
             let about = if about.is_empty() { String::new() } else { format!(" ({})", about.join(", ")) };
             let verdict = format!("{}{about}", held(criterion.holds));
-            vec![criterion.name.clone(), value, format!("{:e}", criterion.limit), verdict]
+            vec![criterion.name.clone(), value, exact(criterion.limit), verdict]
         };
         let rows: Vec<_> = summary.criteria.iter().map(row).collect();
         if rows.is_empty() {
