@@ -1,7 +1,7 @@
 //! A device behind a serial line: the follower of `config/rigid-pair.toml`, as firmware would implement it.
 //!
 //! An example for authors of firmware. A device needs this file and the crate `corotate-core`, which builds
-//! `no_std`: a [`Body`] in its [`BodySeat`], the [`Device`] that speaks the protocol for it, a byte stream and a clock. This one simulates its
+//! `no_std`: a [`Body`] in its [`DevicePlant`], the [`Device`] that speaks the protocol for it, a byte stream and a clock. This one simulates its
 //! body; a real one reads its gyros in `measure`, sets its torquers in `apply` and `apply_safe`, and leaves `flow` empty.
 //! Must not use anything of the library that needs more than `core`, the opening of the line apart.
 //!
@@ -15,7 +15,7 @@ use corotate::model::{Inertia, RigidBody};
 use corotate::role::Body;
 use corotate::runtime::Line;
 use corotate::sample::{RateCommand, RateMeasurement, RateTruth};
-use corotate::serial::{BodySeat, Device, Hello, Seat};
+use corotate::serial::{Device, DevicePlant, DeviceRole, Hello};
 use nalgebra::Vector3;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -39,10 +39,10 @@ pub struct Follower {
 
 impl Follower {
     /// The follower at its initial state, if that is what the host asks for.
-    pub fn asked_for(hello: &Hello<'_>) -> Option<BodySeat<Self>> {
+    pub fn asked_for(hello: &Hello<'_>) -> Option<DevicePlant<Self>> {
         let body = RigidBody::new(&Inertia::new(INERTIA_KG_M2).ok()?);
         let follower = Self { body, rate: INITIAL_RATE_RAD_S.into(), torque: Vector3::zeros() };
-        (hello.role == "follower").then(|| BodySeat::new(follower, hello))
+        (hello.role == "follower").then(|| DevicePlant::new(follower, hello))
     }
 }
 
@@ -72,7 +72,7 @@ impl Body for Follower {
         (out.valid, out.status) = (ALL_VALID, status);
     }
 
-    /// Only a simulation knows more than it measures. A real device says [`BodySeat::without_truth`].
+    /// Only a simulation knows more than it measures. A real device says [`DevicePlant::without_truth`].
     fn truth(&self, status: u64, out: &mut RateTruth) {
         out.omega_rad_s = self.rate.into();
         out.applied_rad_s2 = self.torque.into();
@@ -86,7 +86,7 @@ impl Body for Follower {
 }
 
 /// The device's main loop, until it is switched off or unplugged: bytes in, frames out, and a look at the clock.
-pub fn serve<S: Seat, M>(line: &mut Line, device: &mut Device<S, M>, on: &AtomicBool)
+pub fn serve<S: DeviceRole, M>(line: &mut Line, device: &mut Device<S, M>, on: &AtomicBool)
 where
     M: FnMut(&Hello<'_>) -> Option<S>,
 {

@@ -4,7 +4,7 @@ use crate::pair;
 use corotate::model::RigidBody;
 use corotate::role::Body;
 use corotate::sample::{RateCommand, RateMeasurement, RateTruth};
-use corotate::serial::{BodySeat, Hello};
+use corotate::serial::{DevicePlant, Hello};
 use nalgebra::Vector3;
 
 /// What the device is called: kind and version.
@@ -20,10 +20,10 @@ pub struct Follower {
 }
 
 /// The follower at its initial state, if that is what the host asks for.
-pub fn seat(hello: &Hello<'_>) -> Option<BodySeat<Follower>> {
+pub fn seat(hello: &Hello<'_>) -> Option<DevicePlant<Follower>> {
     let body = RigidBody::new(&pair::inertia()?);
     let follower = Follower { body, rate: pair::FOLLOWER_RATE_RAD_S.into(), torque: Vector3::zeros() };
-    (hello.role == "follower").then(|| BodySeat::new(follower, hello))
+    (hello.role == "follower").then(|| DevicePlant::new(follower, hello))
 }
 
 impl Body for Follower {

@@ -4,7 +4,7 @@
 use corotate::config::SHIPPED;
 use corotate::rig::{Rig, RigidBodyRig};
 use corotate::scenario::Scenario;
-use corotate::serial::{Device, FlightSeat, Hello, Host, MAX_FRAME, Samples, Terms, decode, encode};
+use corotate::serial::{Device, DeviceFlightComputer, Hello, HostSession, MAX_FRAME, Samples, Terms, decode, encode};
 use libfuzzer_sys::fuzz_target;
 use std::cell::OnceCell;
 
@@ -14,11 +14,11 @@ thread_local! {
 
 fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>().expect("the first shipped scenario is of rigid bodies");
-    let seat = |hello: &Hello<'_>| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello));
+    let seat = |hello: &Hello<'_>| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello));
     let mut device = Device::new("fuzz", seat);
     let mut outputs = [0; 32];
     (outputs[0], outputs[1]) = (64, 56);
-    let mut host = Host::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1 });
+    let mut host = HostSession::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1 });
     let mut frame = [0; MAX_FRAME];
     for (index, piece) in pieces.iter().enumerate() {
         let now_ns = index as u64 * 1_000_000;

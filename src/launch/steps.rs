@@ -173,7 +173,7 @@ impl Steps {
             while let Some(words) = reader.next()? {
                 // A sample of this tick; no other tick's, and no marker that there is none.
                 let stamp: &crate::sample::Stamp = bytemuck::from_bytes(bytemuck::cast_slice(&words[..STAMP]));
-                if stamp.tick == self.tick && stamp.generation & crate::sample::VOID == 0 && stamp.generation > 0 {
+                if stamp.tick == self.tick && stamp.generation & crate::sample::NO_SAMPLE == 0 && stamp.generation > 0 {
                     let mut kept = room.clone().unwrap_or_default();
                     kept.clear();
                     kept.extend_from_slice(words);

@@ -7,7 +7,7 @@
 use crate::bus::iox::IoxBus;
 use crate::bus::{BusError, Reader, Signal, Topic, WordReader, WriterProcess};
 use crate::runtime::{RoleId, ports};
-use crate::sample::{Health, RoleState, Stamp, VOID};
+use crate::sample::{Health, NO_SAMPLE, RoleState, Stamp};
 use crate::scenario::Scenario;
 use std::fmt;
 
@@ -177,7 +177,7 @@ struct Seen {
 
 impl Seen {
     fn take(&mut self, stamp: Stamp) {
-        self.came = Some(Stamp { generation: stamp.generation & !VOID, ..stamp });
+        self.came = Some(Stamp { generation: stamp.generation & !NO_SAMPLE, ..stamp });
         // Readers take generation 0 for a warm-up before the first sample only, and for a fall of the generation after it.
         if stamp.generation == 0 && self.run.is_none() {
             return;
@@ -229,7 +229,7 @@ mod tests {
         let mut seen = Seen::default();
         seen.take(Stamp::default());
         assert!(!seen.has(0) && seen.next_tick == 0);
-        seen.take(Stamp { generation: 1 | VOID, ..Stamp::default() });
+        seen.take(Stamp { generation: 1 | NO_SAMPLE, ..Stamp::default() });
         seen.take(Stamp { tick: 1, ..Stamp::default() });
         assert!(seen.has(0) && seen.has(1) && seen.came.is_some_and(|came| came.generation == 0));
     }

@@ -10,7 +10,7 @@ use super::recorder::{END, RUN, SCHEMA, SignalReport, layouts};
 use super::writer::{CHECKSUM, checksum};
 use crate::config::{RunId, ScriptedFault};
 use crate::files;
-use crate::sample::{CDR_HEADER, FieldKind, Layout, Stamp, VOID};
+use crate::sample::{CDR_HEADER, FieldKind, Layout, NO_SAMPLE, Stamp};
 use crate::scenario::Scenario;
 use crate::telemetry::{Grant, Ticks};
 use mcap::records::{Record, op};
@@ -383,7 +383,7 @@ impl Track {
         let mut next = 0;
         (0..self.len()).filter(move |index| {
             let stamp = self.stamp(*index);
-            let first = stamp.tick >= next && stamp.generation & VOID == 0;
+            let first = stamp.tick >= next && stamp.generation & NO_SAMPLE == 0;
             if first {
                 next = stamp.tick.saturating_add(1);
             }

@@ -273,5 +273,5 @@ fn about(scenario: &Scenario) -> BTreeMap<String, String> {
 pub(super) fn layouts(scenario: &Scenario) -> Vec<(String, Layout)> {
     let of = |role| ports(scenario, role).writes;
     let written = RoleId::all(scenario).into_iter().flat_map(of);
-    written.map(|port| (port.topic.to_string(), Layout::of(port.type_name, &port.fields))).collect()
+    written.map(|port| (port.topic.to_string(), Layout::from_fields(port.type_name, &port.fields))).collect()
 }

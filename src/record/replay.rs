@@ -9,7 +9,7 @@ use super::script::{Limit, Script, Step};
 use crate::bus::memory::MemoryBus;
 use crate::bus::{AnyBus, BusError, Reader, WordReader, WordWriter};
 use crate::runtime::{NodeError, Poll, ReadyNode, RoleId, RunCondition, depths, ports, private_ledger};
-use crate::sample::{FieldKind, Stamp, VOID};
+use crate::sample::{FieldKind, NO_SAMPLE, Stamp};
 use crate::scenario::Scenario;
 use crate::scenario::build;
 use crate::telemetry::Ledger;
@@ -139,7 +139,7 @@ impl<'a> Comparer<'a> {
 
     /// Real time has no voids: in its replay they stand for what was not published.
     fn counts(&self, stamp: &Stamp) -> bool {
-        stamp.generation != 0 && !(self.realtime && stamp.generation & VOID != 0)
+        stamp.generation != 0 && !(self.realtime && stamp.generation & NO_SAMPLE != 0)
     }
 
     fn beyond(&self, tick: u64) -> bool {

@@ -12,9 +12,9 @@ use super::reader::{Recording, SignalInfo, Track};
 use crate::bus::Port;
 use crate::clock::Grid;
 use crate::config::{ClockKind, ScriptedFault};
-use crate::fault::{Action, Change, Course, Interruption, Tamper, Transport};
+use crate::fault::{Action, Change, ContentFault, FaultSequence, Interruption, Transport};
 use crate::runtime::{RoleId, ports};
-use crate::sample::{Stamp, VOID, status};
+use crate::sample::{NO_SAMPLE, Stamp, status};
 use crate::scenario::Scenario;
 use crate::telemetry::Ticks;
 use std::collections::{BTreeMap, BTreeSet};
@@ -62,7 +62,7 @@ impl InputScript {
         match self.items[item] {
             Item::Recorded(index) => bytes.extend_from_slice(self.track.sample(index)),
             Item::Void(tick, generation) => {
-                let stamp = Stamp { tick, generation: generation | VOID, ..Stamp::default() };
+                let stamp = Stamp { tick, generation: generation | NO_SAMPLE, ..Stamp::default() };
                 bytes.extend_from_slice(bytemuck::bytes_of(&stamp));
                 bytes.resize(self.track.info.layout.size(), 0);
             }
@@ -215,7 +215,7 @@ struct Acting<'a> {
 impl<'a> Acting<'a> {
     fn of(scenario: &'a Scenario, role: &str) -> Vec<Self> {
         let acting = |scripted: &'a ScriptedFault| {
-            let (mut course, from) = (Course::new(scripted.fault.clone()), scripted.fault.from_tick);
+            let (mut course, from) = (FaultSequence::new(scripted.fault.clone()), scripted.fault.from_tick);
             let ticks = scripted.fault.ticks.min((scenario.last_tick + 1).saturating_sub(from));
             let mut bits = vec![0; ticks.div_ceil(64) as usize];
             (0..ticks).filter(|at| course.acts(from + at)).for_each(|at| bits[(at / 64) as usize] |= 1 << (at % 64));
@@ -245,7 +245,8 @@ impl Reading<'_> {
 
     /// Whether one may have changed the stamp.
     fn forged(&self, output: &Track, tick: u64) -> bool {
-        let flips = |tamper: &Tamper| matches!(tamper.change, Change::Flip(_)) && tamper.words.first < STAMP_WORDS;
+        let flips =
+            |tamper: &ContentFault| matches!(tamper.change, Change::Flip(_)) && tamper.words.first < STAMP_WORDS;
         self.touched(output, tick, |action| matches!(action, Action::Content(tamper) if flips(tamper)))
     }
 
@@ -271,7 +272,7 @@ impl Reading<'_> {
         if let Some(output) = self.outputs.first() {
             for index in 0..output.len() {
                 let stamp = output.stamp(index);
-                let generation = stamp.generation & !VOID;
+                let generation = stamp.generation & !NO_SAMPLE;
                 let disturbed = self.disturbed(output, next) || self.disturbed(output, stamp.tick);
                 if !disturbed && stamp.tick <= next && (life + 1..life + LIVES_MAX).contains(&generation) {
                     // The successor does again what was not finished.

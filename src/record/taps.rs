@@ -9,7 +9,7 @@ use crate::bus::{AnyBus, BusError, Reader, WordReader};
 use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
 use crate::runtime::{RoleId, ports};
-use crate::sample::{Layout, Stamp, VOID};
+use crate::sample::{Layout, NO_SAMPLE, Stamp};
 use crate::scenario::Scenario;
 use std::collections::BTreeMap;
 
@@ -72,7 +72,7 @@ impl SignalCounters {
             return;
         }
         self.gap_to(stamp.tick);
-        *(if stamp.generation & VOID == 0 { &mut self.recorded } else { &mut self.void }) += 1;
+        *(if stamp.generation & NO_SAMPLE == 0 { &mut self.recorded } else { &mut self.void }) += 1;
         (self.next, self.begun) = (stamp.tick + 1, true);
     }
 
@@ -142,7 +142,7 @@ impl Tap {
             ("signal", topic.signal.name().to_owned()),
         ];
         let about = about.map(|(key, value)| (key.to_owned(), value)).into();
-        self.channel = sink.channel(&topic.to_string(), &Layout::of(type_name, fields), about)?;
+        self.channel = sink.channel(&topic.to_string(), &Layout::from_fields(type_name, fields), about)?;
         Ok(())
     }
 }

@@ -7,7 +7,7 @@ use super::columns::{Columns, Corners, Count, Extremes};
 use crate::bus::Signal;
 use crate::record::{RecordError, Recording, SignalInfo};
 use crate::rig::{Picture, Plane, WordGuard};
-use crate::sample::{Column, FieldKind, Stamp, VOID, status};
+use crate::sample::{Column, FieldKind, NO_SAMPLE, Stamp, status};
 use crate::scenario::AnyRig;
 use crate::scenario::Scenario;
 use crate::score::lyapunov_floor;
@@ -183,7 +183,7 @@ impl Tracer {
         signal.last = Some(tick);
         let (first, last) = self.traces.ticks.unwrap_or((tick, tick));
         self.traces.ticks = Some((first.min(tick), last.max(tick)));
-        if stamp.generation & VOID != 0 {
+        if stamp.generation & NO_SAMPLE != 0 {
             return;
         }
         if let Some(role) = signal.role {

@@ -11,7 +11,7 @@ use crate::clock::{Grid, monotonic_ns};
 use crate::config::ClockKind;
 use crate::fault::{Action, Fault, Interruption, Transport};
 use crate::runtime::{RoleId, ports, topic, window_ticks};
-use crate::sample::{Field, FieldKind, Health, RoleState, Stamp, VOID, status};
+use crate::sample::{Field, FieldKind, Health, NO_SAMPLE, RoleState, Stamp, status};
 use crate::scenario::AnyRig;
 use crate::scenario::Scenario;
 use std::collections::VecDeque;
@@ -76,7 +76,7 @@ impl Tap {
         {
             let stamp: Stamp = bytemuck::pod_read_unaligned(bytemuck::cast_slice(&words[..STAMP]));
             // Warm-up, and voids.
-            if stamp.generation == 0 || stamp.generation & VOID != 0 {
+            if stamp.generation == 0 || stamp.generation & NO_SAMPLE != 0 {
                 continue;
             }
             news.push(stamp);

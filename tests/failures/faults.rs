@@ -3,7 +3,7 @@
 
 use crate::common::{Bench, shipped};
 use corotate::launch::{Launch, Summary, run};
-use corotate::role::DOUBTS;
+use corotate::role::SUSPECT_SAMPLES;
 use corotate::scenario::Scenario;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -553,6 +553,6 @@ fn a_guard_is_no_trap() {
         let run = Disturbed::run(&Scenario::parse(&text, "trap", &overrides).unwrap());
         assert!(run.last < SETTLED_RAD_S, "{overrides:?}: {}", run.last);
         // The guards of the controller and of nobody else doubt; the follower leaves its range once, and comes back.
-        assert_eq!(run.count("rejected_samples"), if doubts { DOUBTS } else { 0 }, "{overrides:?}");
+        assert_eq!(run.count("rejected_samples"), if doubts { SUSPECT_SAMPLES } else { 0 }, "{overrides:?}");
     }
 }

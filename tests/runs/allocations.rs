@@ -11,7 +11,7 @@ use corotate::runtime::{
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::scenario::Scenario;
 use corotate::seat::{Service, serve};
-use corotate::serial::{BodySeat, Device, FlightSeat, Hello, Seat};
+use corotate::serial::{Device, DeviceFlightComputer, DevicePlant, DeviceRole, Hello};
 use corotate::telemetry::RoleReport;
 use corotate::with_shipped_rig;
 use rustix::fd::OwnedFd;
@@ -203,12 +203,12 @@ fn line() -> (OwnedFd, PathBuf) {
 /// A device with these roles of the scenario, until the other end hangs up.
 fn device(scenario: &Scenario, roles: &[RoleId], far: &OwnedFd) {
     with_shipped_rig!(scenario.rig, rig => match roles {
-        [RoleId::Plant(index)] => live(|hello| Some(BodySeat::new(rig.body(*index), hello)), far),
-        _ => live(|hello| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello)), far),
+        [RoleId::Plant(index)] => live(|hello| Some(DevicePlant::new(rig.body(*index), hello)), far),
+        _ => live(|hello| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello)), far),
     })
 }
 
-fn live<S: Seat>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
+fn live<S: DeviceRole>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd) {
     let (mut device, mut bytes) = (Device::new("test", seat), [0; 512]);
     while let Ok(count @ 1..) = rustix::io::read(far, &mut bytes) {
         device.receive(&bytes[..count], 0, |frame| assert_eq!(rustix::io::write(far, frame), Ok(frame.len())));

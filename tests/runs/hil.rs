@@ -10,7 +10,7 @@ use corotate::clock::monotonic_ns;
 use corotate::config::ClockKind;
 use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, in_turn, private_ledger, topic};
 use corotate::sample::{
-    FieldKind, Health, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, VOID, status,
+    FieldKind, Health, NO_SAMPLE, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
 };
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -210,7 +210,7 @@ fn conducted(rearm: &str) -> Scenario {
 fn command(tick: u64) -> RateCommand {
     let mut command = RateCommand::default();
     let missing = matches!(tick, 10 | 20..24 | 40..50);
-    (command.stamp.tick, command.stamp.generation) = (tick, if missing { 1 | VOID } else { 1 });
+    (command.stamp.tick, command.stamp.generation) = (tick, if missing { 1 | NO_SAMPLE } else { 1 });
     if !missing {
         let third = if tick == 60 { f64::NAN } else { 0.25 };
         command.acceleration_rad_s2 = [0.1 + 0.01 * tick as f64, -0.005 * tick as f64, third];

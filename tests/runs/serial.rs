@@ -10,8 +10,8 @@ use corotate::runtime::Line;
 use corotate::sample::{RateCommand, Sample};
 use corotate::scenario::Scenario;
 use corotate::serial::{
-    BodySeat, ControllerSeat, Decoder, Device, FlightSeat, Hello, MAX_FRAME, MAX_PAYLOAD, Message, ObserverSeat,
-    Reason, Refuse, Seat, Welcome, encode, parse, write,
+    Decoder, Device, DeviceController, DeviceFlightComputer, DeviceObserver, DevicePlant, DeviceRole, Hello, MAX_FRAME,
+    MAX_PAYLOAD, Message, Reason, Refuse, Welcome, encode, parse, write,
 };
 use corotate::with_shipped_rig;
 use libc::{SIGINT, SIGKILL};
@@ -190,7 +190,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
             path,
             &mut Device::new("any", |hello| {
                 asked(hello);
-                Some(ObserverSeat::new(rig.estimator(), hello))
+                Some(DeviceObserver::new(rig.estimator(), hello))
             }),
             on,
         ),
@@ -198,7 +198,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
             path,
             &mut Device::new("any", |hello| {
                 asked(hello);
-                Some(ControllerSeat::new([rig.law(1)]))
+                Some(DeviceController::new([rig.law(1)]))
             }),
             on,
         ),
@@ -206,7 +206,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
             path,
             &mut Device::new("any", |hello| {
                 asked(hello);
-                Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello))
+                Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello))
             }),
             on,
         ),
@@ -214,7 +214,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
             path,
             &mut Device::new("any", |hello| {
                 asked(hello);
-                Some(BodySeat::new(rig.body(1), hello))
+                Some(DevicePlant::new(rig.body(1), hello))
             }),
             on,
         ),
@@ -222,7 +222,7 @@ fn any_role<R: Rig>(rig: &R, role: &str, path: &Path, on: &AtomicBool) {
 }
 
 /// A device keeps its state while its line is cut and joined again.
-fn live<S: Seat, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &mut Device<S, M>, on: &AtomicBool) {
+fn live<S: DeviceRole, M: FnMut(&Hello<'_>) -> Option<S>>(path: &Path, device: &mut Device<S, M>, on: &AtomicBool) {
     while on.load(Ordering::Relaxed) {
         match Line::open(path, None) {
             Ok(mut line) => serve(&mut line, device, on),
@@ -435,7 +435,7 @@ fn a_flight_computer_that_pauses_misses_what_it_slept_through_and_no_more() {
         (cable.device.path.clone(), short("rigid-pair", &["duration_s=30", "tick_hz=100", "accept={}"]));
     let _device = Powered::new(move |on| {
         with_shipped_rig!(scenario.rig, rig => {
-            let seat = |hello: &Hello<'_>| Some(FlightSeat::new(rig.estimator(), [rig.law(1)], hello));
+            let seat = |hello: &Hello<'_>| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello));
             let (mut line, mut device) = (Line::open(&path, None).unwrap(), Device::new("sleepy", seat));
             let (mut bytes, mut answers) = ([0; 512], 0);
             while on.load(Ordering::Relaxed) {

@@ -7,7 +7,7 @@ mod delay;
 mod occurrence;
 
 pub use delay::{Delay, Distribution};
-pub use occurrence::{Channel, Course, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
+pub use occurrence::{Channel, FaultSequence, Occurrence, Pattern, WINDOW_MAX, WeaklyHard};
 
 use crate::model::Noise;
 use crate::sample::{Field, FieldKind, Message, Stamp};
@@ -24,7 +24,7 @@ pub struct Fault {
     pub from_tick: u64,
     /// For how many ticks it may.
     pub ticks: u64,
-    /// On which of these it does; a [`Course`] tells.
+    /// On which of these it does; a [`FaultSequence`] tells.
     pub occurrence: Occurrence,
     /// What its draws follow from, beside the tick.
     pub seed: u64,
@@ -36,7 +36,7 @@ pub struct Fault {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Action {
     /// The content of a sample, before it is handed to the link.
-    Content(Tamper),
+    Content(ContentFault),
     /// The way of a sample.
     Transport(Transport),
     /// The role itself, before it executes the tick.
@@ -56,7 +56,7 @@ pub enum Transport {
 
 /// What has happened to one sample on its way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Way {
+pub enum Delivery {
     /// It is never sent.
     Dropped,
     /// It is sent twice.
@@ -81,7 +81,7 @@ pub enum Interruption {
 
 /// What happens to the content of a sample, and to which words of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tamper {
+pub struct ContentFault {
     /// What happens.
     pub change: Change,
     /// The words it happens to.
@@ -130,12 +130,12 @@ impl Fault {
 
     /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if it is
     /// in time nevertheless.
-    pub fn way(&self, tick: u64) -> Option<Way> {
+    pub fn delivery(&self, tick: u64) -> Option<Delivery> {
         match self.action {
-            Action::Transport(Transport::Drop) => Some(Way::Dropped),
-            Action::Transport(Transport::Duplicate) => Some(Way::Twice),
+            Action::Transport(Transport::Drop) => Some(Delivery::Dropped),
+            Action::Transport(Transport::Duplicate) => Some(Delivery::Twice),
             Action::Transport(Transport::Delay(delay)) => {
-                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > delay.slack_ticks).map(Way::Late)
+                Some(delay.draw(self.draw(tick, 4))).filter(|ticks| *ticks > delay.slack_ticks).map(Delivery::Late)
             }
             _ => None,
         }
@@ -143,7 +143,7 @@ impl Fault {
 
     /// Changes the content of the sample of `tick`, where it is a fault of that kind. `last` is the sample sent before.
     pub fn tamper<S: Message + ?Sized>(&self, tick: u64, sample: &mut S, last: &S) {
-        let Action::Content(Tamper { change, words }) = self.action else { return };
+        let Action::Content(ContentFault { change, words }) = self.action else { return };
         let (last, sample) = (last.words(), sample.words_mut());
         let range = words.first..words.first + words.count;
         match change {
@@ -210,7 +210,7 @@ mod tests {
     use crate::sample::{RateMeasurement, Sample};
 
     fn fault(change: Change, words: Words) -> Fault {
-        let action = Action::Content(Tamper { change, words });
+        let action = Action::Content(ContentFault { change, words });
         Fault { from_tick: 10, ticks: 3, occurrence: Occurrence::Independent(1.0), seed: seed(7, 0), action }
     }
 

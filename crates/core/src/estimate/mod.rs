@@ -13,7 +13,7 @@ mod reconstruction;
 #[cfg(feature = "std")]
 mod score;
 
-pub use rate::{RateChoice, Survey};
+pub use rate::{RateChoice, RateSurvey};
 pub use reconstruction::{FilterKind, Reconstructed, Reconstruction, ReconstructionError, Setup};
 #[cfg(feature = "std")]
 pub use score::{Score, SegmentScore};

@@ -18,7 +18,7 @@ const ORDER_POWER: f64 = 924.0;
 
 /// What there is to be known of a log before a rate is chosen: takes in samples, keeps sums.
 #[derive(Debug, Clone)]
-pub struct Survey {
+pub struct RateSurvey {
     /// i, j and k.
     axes: [usize; 3],
     coefficients: Vector3<f64>,
@@ -68,7 +68,7 @@ impl RateChoice {
     }
 }
 
-impl Survey {
+impl RateSurvey {
     /// A survey for hidden axis `axis`, 1 to 3, of a body with the coefficients a of \[D\](2).
     pub fn new(coefficients: &Vector3<f64>, axis: usize) -> Self {
         Self {
@@ -175,7 +175,7 @@ mod tests {
     fn choice(noise_rad_s: f64, samples: u32) -> RateChoice {
         let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
         let mut noise = Noise::new(9, 0, [noise_rad_s; 3], [0.0; 3]);
-        let mut survey = Survey::new(body.coefficients(), 3);
+        let mut survey = RateSurvey::new(body.coefficients(), 3);
         for _ in 0..4000 / samples {
             let mut rate = Vector3::new(2.0, -3.0, 2.5);
             for tick in 0..samples {
@@ -210,8 +210,8 @@ mod tests {
     #[test]
     fn a_log_without_motion_or_time_has_no_rate() {
         let coefficients = Vector3::new(-0.5, 0.75, -0.4);
-        assert!(Survey::new(&coefficients, 3).choose().is_none());
-        let mut survey = Survey::new(&coefficients, 1);
+        assert!(RateSurvey::new(&coefficients, 3).choose().is_none());
+        let mut survey = RateSurvey::new(&coefficients, 1);
         survey.push(&Sample { time_s: 0.0, rate_rad_s: Vector3::zeros() });
         assert!(survey.choose().is_none());
     }

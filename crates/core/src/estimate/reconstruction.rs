@@ -204,7 +204,7 @@ impl Reconstruction {
             self.last = Some((sample.time_s, to));
         } else {
             self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
-            self.filter = self.filter.begun_at(self.filter.estimate() / self.growth);
+            self.filter = self.filter.with_guess(self.filter.estimate() / self.growth);
         }
         self.told(observed)
     }
@@ -221,7 +221,7 @@ impl Reconstruction {
     fn take(&mut self, increment: &Increment<1>) {
         // The Kalman filter weighs its guess itself.
         if !self.begun && !matches!(self.filter, Filter::Kalman(_)) {
-            self.filter = self.filter.begun_at(increment.reconstruction() - increment.drift);
+            self.filter = self.filter.with_guess(increment.reconstruction() - increment.drift);
         }
         self.begun = true;
         self.filter.step(increment);

@@ -72,7 +72,7 @@ impl Pattern {
 
 /// A fault that is asked tick by tick. What is remembered of the past is computed anew where it is asked for an earlier tick.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Course {
+pub struct FaultSequence {
     fault: Fault,
     /// The first tick that is not decided.
     next: u64,
@@ -82,7 +82,7 @@ pub struct Course {
     acts: bool,
 }
 
-impl Course {
+impl FaultSequence {
     /// A fault of which nothing is decided.
     pub fn new(fault: Fault) -> Self {
         let next = fault.from_tick;
@@ -158,12 +158,12 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn course(from_tick: u64, ticks: u64, number: u64, occurrence: Occurrence) -> Course {
+    fn course(from_tick: u64, ticks: u64, number: u64, occurrence: Occurrence) -> FaultSequence {
         let action = Action::Role(Interruption::Miss);
-        Course::new(Fault { from_tick, ticks, occurrence, seed: seed(number, 0), action })
+        FaultSequence::new(Fault { from_tick, ticks, occurrence, seed: seed(number, 0), action })
     }
 
-    fn acted(course: &mut Course, ticks: core::ops::Range<u64>) -> Vec<bool> {
+    fn acted(course: &mut FaultSequence, ticks: core::ops::Range<u64>) -> Vec<bool> {
         ticks.map(|tick| course.acts(tick)).collect()
     }
 

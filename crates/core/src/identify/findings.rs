@@ -174,7 +174,7 @@ impl Finding {
 
 /// What is to be known of these fits, the most serious first; scale is always among them.
 pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorFit>) -> Vec<Finding> {
-    let account = motion.account();
+    let account = motion.summary();
     let mut found = Vec::new();
     if account.samples < FEW_SAMPLES {
         found.push(Finding::Short { samples: account.samples });

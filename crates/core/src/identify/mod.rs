@@ -23,7 +23,7 @@ mod tensor;
 pub use axes::AxesFit;
 #[cfg(feature = "std")]
 pub use findings::{Finding, findings};
-pub use motion::{Account, Motion, Sample};
+pub use motion::{Motion, MotionSummary, Sample};
 pub(crate) use recursive::freed;
 pub use recursive::{Recursive, RecursiveAxisymmetric, RecursiveFit};
 pub use tensor::TensorFit;

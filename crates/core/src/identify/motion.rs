@@ -71,12 +71,12 @@ pub struct Motion {
     pub(super) groups: [Sums; GROUPS],
     integral: Integral,
     piece: Piece,
-    account: Account,
+    account: MotionSummary,
 }
 
 /// What a log amounts to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Account {
+pub struct MotionSummary {
     /// The samples that were used.
     pub samples: u64,
     /// The pieces that they were cut into, for resampling.
@@ -97,14 +97,14 @@ impl Default for Motion {
             groups: [Sums::default(); GROUPS],
             integral: Integral::default(),
             piece: Piece::default(),
-            account: Account::default(),
+            account: MotionSummary::default(),
         }
     }
 }
 
 impl Motion {
     /// The motion of some segments, each of samples whose times increase.
-    pub fn of<'a>(segments: impl IntoIterator<Item = &'a [Sample]>) -> Self {
+    pub fn from_segments<'a>(segments: impl IntoIterator<Item = &'a [Sample]>) -> Self {
         let mut motion = Self::default();
         for segment in segments {
             segment.iter().for_each(|sample| motion.push(sample));
@@ -141,7 +141,7 @@ impl Motion {
     }
 
     /// What it amounts to.
-    pub fn account(&self) -> &Account {
+    pub fn summary(&self) -> &MotionSummary {
         &self.account
     }
 
@@ -348,14 +348,14 @@ mod tests {
         let mut motion = Motion::default();
         motion.push(&Sample { time_s: 0.0, rate_rad_s: Vector3::x() });
         motion.end_segment();
-        assert_eq!((motion.account().samples, motion.account().segments, motion.total().samples), (1, 0, 0));
+        assert_eq!((motion.summary().samples, motion.summary().segments, motion.total().samples), (1, 0, 0));
     }
 
     #[test]
     fn sums_are_those_about_the_mean_of_each_piece() {
         let path: Vec<Sample> = samples(400, |_| 0.01, |t| [6.0 + libm::sin(t), 1e-3 * t, 5.0]).collect();
-        let motion = Motion::of([&path[..], &path[..]]);
-        let account = motion.account();
+        let motion = Motion::from_segments([&path[..], &path[..]]);
+        let account = motion.summary();
         assert_eq!((account.samples, account.segments, account.pieces), (800, 2, 4));
         assert!((account.duration_s - 2.0 * 3.99).abs() < 1e-12);
         let total = motion.total();

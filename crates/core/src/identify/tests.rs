@@ -161,7 +161,7 @@ fn nothing_gives_nothing() {
     assert!(empty.about_known_axes(true).is_none() && empty.about_unknown_axes(true).is_none());
     let rest =
         [Sample { time_s: 0.0, rate_rad_s: Vector3::zeros() }, Sample { time_s: 1.0, rate_rad_s: Vector3::zeros() }];
-    let motion = Motion::of([&rest[..]; 8]);
+    let motion = Motion::from_segments([&rest[..]; 8]);
     assert!(motion.about_known_axes(true).is_none() && motion.about_unknown_axes(true).is_none());
 }
 

@@ -150,7 +150,7 @@ impl<const N: usize> InvariantFilter<N> {
     }
 
     /// The same filter, begun at another guess.
-    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+    pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 

@@ -39,11 +39,11 @@ impl<const N: usize> Filter<N> {
     }
 
     /// The same filter, begun at another guess.
-    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+    pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         match self {
-            Self::First(filter) => Self::First(filter.begun_at(guess)),
-            Self::Second(filter) => Self::Second(filter.begun_at(guess)),
-            Self::Kalman(filter) => Self::Kalman(filter.begun_at(guess)),
+            Self::First(filter) => Self::First(filter.with_guess(guess)),
+            Self::Second(filter) => Self::Second(filter.with_guess(guess)),
+            Self::Kalman(filter) => Self::Kalman(filter.with_guess(guess)),
         }
     }
 

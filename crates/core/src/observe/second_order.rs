@@ -39,7 +39,7 @@ impl<const N: usize> SecondOrderFilter<N> {
     }
 
     /// The same filter, begun at another guess.
-    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+    pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 
@@ -149,7 +149,7 @@ impl<const N: usize> KalmanFilter<N> {
     }
 
     /// The same filter, begun at another guess.
-    pub fn begun_at(self, guess: SVector<f64, N>) -> Self {
+    pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 

@@ -29,7 +29,7 @@ pub(crate) fn seen(measurement: &RateMeasurement) -> RateSample {
 #[derive(Debug, Clone)]
 pub struct HiddenObserver {
     relation: HiddenRate,
-    body: Knowledge,
+    body: KnownBody,
     guess: Filter<1>,
     filter: Filter<1>,
     /// The valid bits that it cannot do without.
@@ -50,7 +50,7 @@ impl HiddenObserver {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
             relation,
-            body: Knowledge::new(coefficients),
+            body: KnownBody::new(coefficients),
             guess,
             filter: guess,
             needed: ALL & !(1 << relation.hidden()),
@@ -171,13 +171,13 @@ impl Persist for HiddenObserver {
 
 /// A body known by its coefficients. Where they are known, its relation is computed once.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Knowledge {
+pub(crate) struct KnownBody {
     pub(super) coefficients: Vector3<f64>,
     closure: f64,
     inertia_ratios: [f64; 2],
 }
 
-impl Knowledge {
+impl KnownBody {
     /// Returns the knowledge of a body with these coefficients.
     pub fn new(coefficients: Vector3<f64>) -> Self {
         let closure = closure(&coefficients);

@@ -34,11 +34,11 @@ impl Identifier {
     }
 
     /// The same identifier, begun at other coefficients.
-    pub fn begun_at(self, a: &Vector3<f64>) -> Self {
+    pub fn with_guess(self, a: &Vector3<f64>) -> Self {
         let kind = match self.kind {
-            Kind::Asymmetric { relation, filter } => Kind::Asymmetric { relation, filter: filter.begun_at(*a) },
+            Kind::Asymmetric { relation, filter } => Kind::Asymmetric { relation, filter: filter.with_guess(*a) },
             Kind::Axisymmetric { relation, filter, axis } => {
-                Kind::Axisymmetric { relation, filter: filter.begun_at(Vector1::new(a[axis % 3])), axis }
+                Kind::Axisymmetric { relation, filter: filter.with_guess(Vector1::new(a[axis % 3])), axis }
             }
         };
         Self { kind, ..self }

@@ -4,7 +4,7 @@
 //! Its modes are explicit and told in the status word. Must not jump when an axis goes or comes back, and must stay bounded
 //! when it goes too early.
 
-use super::hidden::{ALL, HiddenObserver, Knowledge, filter, seen};
+use super::hidden::{ALL, HiddenObserver, KnownBody, filter, seen};
 use super::identifier::Identifier;
 use crate::model::closure;
 use crate::observe::{HiddenRate, RateSample};
@@ -26,7 +26,7 @@ const SUPPLIER_WORDS: usize = 11;
 
 /// What a [`Learner`] is made of.
 #[derive(Debug, Clone)]
-pub struct Parts {
+pub struct LearnerDesign {
     /// The identifier at its initial guess.
     pub identifier: Identifier,
     /// Decay rate of a supplied component, 1/s.
@@ -38,7 +38,7 @@ pub struct Parts {
 /// Learns the inertia, and supplies a component that is lost.
 #[derive(Debug)]
 pub struct Learner {
-    parts: Parts,
+    parts: LearnerDesign,
     identifier: Identifier,
     last: RateSample,
     fastest_rad_s: f64,
@@ -59,7 +59,7 @@ struct Supplier {
 
 impl Learner {
     /// One that has learned nothing yet.
-    pub fn new(parts: Parts) -> Self {
+    pub fn new(parts: LearnerDesign) -> Self {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
             identifier: parts.identifier.clone(),
@@ -150,7 +150,7 @@ impl Learner {
     pub(crate) fn write(&self, status: u64, out: &mut RateEstimate) {
         let a = self.identifier.coefficients();
         let supplier = self.supplier.as_ref();
-        Knowledge::new(a).write(&self.rate(), out);
+        KnownBody::new(a).write(&self.rate(), out);
         out.innovation_rad_s = supplier.and_then(|s| s.observer.as_ref()).map_or(0.0, HiddenObserver::innovation);
         out.excitation = self.identifier.excitation();
         out.status = self.status | status;

@@ -14,5 +14,5 @@ pub use hidden::ALL;
 pub use hidden::HiddenObserver;
 pub use identifier::Identifier;
 pub use law::{RateLaw, RateLawDesign};
-pub use learner::{Learner, Parts};
+pub use learner::{Learner, LearnerDesign};
 pub use observer::{KalmanObserver, RateObserver};

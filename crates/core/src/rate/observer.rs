@@ -1,6 +1,6 @@
 //! The observers of a rig of angular velocities: which components are measured, which one is supplied, and from what.
 
-use super::hidden::{ALL, HiddenObserver, Knowledge, finite, seen};
+use super::hidden::{ALL, HiddenObserver, KnownBody, finite, seen};
 use super::learner::Learner;
 use crate::observe::{GuardedKalman, RateNoise, RateSample};
 use crate::role::Estimator;
@@ -90,7 +90,7 @@ impl Persist for RateObserver {
 /// Supplies one component from the other two, all of them filtered: the noise of the sensors is known.
 #[derive(Debug)]
 pub struct KalmanObserver {
-    body: Knowledge,
+    body: KnownBody,
     noise: RateNoise,
     hidden: usize,
     floor_rad_s: f64,
@@ -113,7 +113,7 @@ impl KalmanObserver {
         guess_rad_s: f64,
     ) -> Self {
         let last = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
-        let body = Knowledge::new(coefficients);
+        let body = KnownBody::new(coefficients);
         let (filter, coasted) = (None, None);
         Self { body, noise, hidden, floor_rad_s, guess_rad_s, filter, last, coasted, status: status::INITIAL }
     }

@@ -2,7 +2,7 @@
 //!
 //! Must not repair anything: a sample is believed whole or not at all. Must not refuse for ever what was right: the change
 //! that is allowed grows with the time since the last sample that was believed, and a body that moves beyond its range as its
-//! equations of motion say is believed after [`DOUBTS`] samples.
+//! equations of motion say is believed after [`SUSPECT_SAMPLES`] samples.
 
 use crate::sample::Stamp;
 use crate::state::{Persist, Words, persist_fields};
@@ -63,11 +63,11 @@ impl Refusal {
 
 /// Believes everything: for those who watch and do not act.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Unguarded;
+pub struct AcceptAll;
 
-persist_fields!(Unguarded,);
+persist_fields!(AcceptAll,);
 
-impl<S: ?Sized> Guard<S> for Unguarded {
+impl<S: ?Sized> Guard<S> for AcceptAll {
     #[inline]
     fn accepts(&mut self, _sample: &S) -> bool {
         true
@@ -92,7 +92,7 @@ const SHORT_GAP_TICKS: u64 = 2;
 
 /// Components that are checked against their bounds and against the last ones believed.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Plausible<const N: usize> {
+pub struct PlausibilityCheck<const N: usize> {
     bounds: Bounds<N>,
     /// Per component, the last value that was believed, and its tick.
     believed: [f64; N],
@@ -110,7 +110,7 @@ pub struct Plausible<const N: usize> {
     refusal: Refusal,
 }
 
-impl<const N: usize> Plausible<N> {
+impl<const N: usize> PlausibilityCheck<N> {
     /// The bits of all components.
     const ALL: u64 = (1 << N) - 1;
 
@@ -200,7 +200,7 @@ impl<const N: usize> Plausible<N> {
         let believed = refusal.is_none();
         self.refusal = refusal.unwrap_or(self.refusal);
         if believed {
-            self.believe(stamp, values, valid);
+            self.record_accepted(stamp, values, valid);
         }
         (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
         self.set_current();
@@ -209,7 +209,7 @@ impl<const N: usize> Plausible<N> {
 
     /// Remembers a sample that was found to be right in another way.
     #[inline]
-    pub fn believe(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) {
+    pub fn record_accepted(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) {
         self.spell_out();
         for i in (0..N).filter(|i| valid >> i & 1 == 1) {
             (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
@@ -273,7 +273,7 @@ impl<const N: usize> Plausible<N> {
     }
 }
 
-impl<const N: usize> Persist for Plausible<N> {
+impl<const N: usize> Persist for PlausibilityCheck<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.spell_out();
         self.believed.persist(words);
@@ -287,17 +287,17 @@ impl<const N: usize> Persist for Plausible<N> {
 }
 
 /// So many samples in a row of a body beyond its range are not believed, however right they are.
-pub const DOUBTS: u64 = 8;
+pub const SUSPECT_SAMPLES: u64 = 8;
 /// Of the way that a body moves, so much may be other than its equations say: its inertia is not known exactly.
 const MISMATCH: f64 = 0.25;
 
 /// Tells a body that moves beyond its range from a sensor that lies: the body moves as its equations and what is applied to
 /// it say.
 ///
-/// It is followed from a sample on, for [`DOUBTS`] samples, and then from the last of them: small differences do not add up,
+/// It is followed from a sample on, for [`SUSPECT_SAMPLES`] samples, and then from the last of them: small differences do not add up,
 /// and a lie that hides in noise at first does not stay hidden. What stops following is doubted anew.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pursuit<const N: usize> {
+pub struct MotionCheck<const N: usize> {
     /// Where the body is at `next_tick` if it follows.
     next: [f64; N],
     next_tick: u64,
@@ -307,13 +307,13 @@ pub struct Pursuit<const N: usize> {
     samples: u64,
 }
 
-impl<const N: usize> Default for Pursuit<N> {
+impl<const N: usize> Default for MotionCheck<N> {
     fn default() -> Self {
         Self { next: [0.0; N], next_tick: 0, path: 0.0, samples: 0 }
     }
 }
 
-impl<const N: usize> Pursuit<N> {
+impl<const N: usize> MotionCheck<N> {
     /// Whether a body is being followed.
     #[inline]
     pub fn active(&self) -> bool {
@@ -328,7 +328,7 @@ impl<const N: usize> Pursuit<N> {
 
     /// Whether a body that was sampled at this tick has been found to move as it must. `allowance` is the noise of two
     /// samples; `flow` tells where it is one tick later. Call it with every sample as long as it is [active](Self::active).
-    pub fn follows(
+    pub fn is_consistent(
         &mut self,
         tick: u64,
         values: &[f64; N],
@@ -338,17 +338,17 @@ impl<const N: usize> Pursuit<N> {
         let near = |i: usize| (values[i] - self.next[i]).abs() <= allowance[i] + MISMATCH * self.path;
         let follows = self.active() && tick == self.next_tick && (0..N).all(near);
         self.samples = if follows { self.samples + 1 } else { 1 };
-        let anew = self.samples % DOUBTS == 1;
+        let anew = self.samples % SUSPECT_SAMPLES == 1;
         let from = if anew { *values } else { self.next };
         self.next = flow(&from);
         self.next_tick = tick + 1;
         let moved = from.iter().zip(&self.next).map(|(from, next)| (next - from) * (next - from)).sum::<f64>();
         self.path = if anew { 0.0 } else { self.path } + libm::sqrt(moved);
-        self.samples > DOUBTS
+        self.samples > SUSPECT_SAMPLES
     }
 }
 
-impl<const N: usize> Persist for Pursuit<N> {
+impl<const N: usize> Persist for MotionCheck<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.next.persist(words);
         self.next_tick.persist(words);
@@ -361,12 +361,12 @@ impl<const N: usize> Persist for Pursuit<N> {
 mod tests {
     use super::*;
 
-    fn guard() -> Plausible<3> {
+    fn guard() -> PlausibilityCheck<3> {
         let slew_per_tick = [0.01, 0.01, f64::INFINITY];
-        Plausible::new(Bounds { magnitude: [2.0; 3], slew_per_tick, allowance: [0.001; 3], repeats: u64::MAX })
+        PlausibilityCheck::new(Bounds { magnitude: [2.0; 3], slew_per_tick, allowance: [0.001; 3], repeats: u64::MAX })
     }
 
-    fn accepts(guard: &mut Plausible<3>, tick: u64, values: [f64; 3], valid: u64) -> bool {
+    fn accepts(guard: &mut PlausibilityCheck<3>, tick: u64, values: [f64; 3], valid: u64) -> bool {
         guard.accepts(&Stamp { tick, generation: 1, ..Stamp::default() }, &values, valid)
     }
 
@@ -379,7 +379,7 @@ mod tests {
             random.next_u64() % below
         };
         let guard = |repeats| {
-            Plausible::new(Bounds {
+            PlausibilityCheck::new(Bounds {
                 magnitude: [2.0; 3],
                 slew_per_tick: [0.01, 0.02, f64::INFINITY],
                 allowance: [1e-3; 3],
@@ -407,7 +407,7 @@ mod tests {
             long.repeated = [0; 3];
             short.spell_out();
             // As text: what is not a number is unequal to itself.
-            assert_eq!(format!("{:?}", Plausible { bounds: long.bounds, ..short }), format!("{long:?}"));
+            assert_eq!(format!("{:?}", PlausibilityCheck { bounds: long.bounds, ..short }), format!("{long:?}"));
         }
         assert!((10_000..95_000).contains(&believed), "{believed}");
     }
@@ -503,7 +503,7 @@ mod tests {
 
     #[test]
     fn what_is_stuck_is_believed_for_a_while_only() {
-        let mut guard = Plausible::new(Bounds { repeats: 3, ..guard().bounds });
+        let mut guard = PlausibilityCheck::new(Bounds { repeats: 3, ..guard().bounds });
         let believed = (0..10).filter(|tick| accepts(&mut guard, *tick, [0.5; 3], 7)).count();
         assert_eq!(believed, 4, "the first, and three repetitions");
         assert!(!accepts(&mut guard, 10, [0.501, 0.501, 0.5], 7), "one component is stuck still");
@@ -512,7 +512,7 @@ mod tests {
 
     #[test]
     fn what_is_refused_has_its_reason() {
-        let mut guard = Plausible::new(Bounds { repeats: 2, ..guard().bounds });
+        let mut guard = PlausibilityCheck::new(Bounds { repeats: 2, ..guard().bounds });
         assert!(accepts(&mut guard, 0, [0.5; 3], 7));
         for (tick, value, reason) in [
             (1, f64::NAN, Refusal::NotFinite),

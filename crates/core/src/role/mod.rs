@@ -10,7 +10,7 @@ mod plant;
 mod relation;
 
 pub use controller::{Controller, Law};
-pub use guard::{Bounds, DOUBTS, Guard, Plausible, Pursuit, Refusal, Unguarded};
+pub use guard::{AcceptAll, Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal, SUSPECT_SAMPLES};
 pub use observer::{Estimator, Observer};
 pub use plant::{Actuation, Body, CommandEvent, Plant, Rearm, SingleBody};
 pub use relation::{InvariantRelation, RelationObserver};

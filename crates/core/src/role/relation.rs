@@ -46,7 +46,7 @@ impl<R: InvariantRelation<N>, const N: usize> Estimator for RelationObserver<R, 
     type Estimate = R::Estimate;
 
     fn start(&mut self, measurement: &R::Measurement) {
-        self.filter = self.filter.begun_at(self.guess);
+        self.filter = self.filter.with_guess(self.guess);
         (self.last, self.status) = (*measurement, status::INITIAL);
     }
 

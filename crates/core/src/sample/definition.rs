@@ -52,7 +52,7 @@ pub struct Layout {
 
 impl Layout {
     /// The layout of a sample of ours.
-    pub fn of(type_name: &str, fields: &[Field]) -> Self {
+    pub fn from_fields(type_name: &str, fields: &[Field]) -> Self {
         let column = |field: &Field| Column {
             name: field.name.to_owned(),
             kind: field.kind,
@@ -139,12 +139,12 @@ mod tests {
     #[test]
     fn a_definition_reads_back_as_the_layout_that_it_was_made_of() {
         for layout in [
-            Layout::of(RateEstimate::TYPE_NAME, RateEstimate::FIELDS),
-            Layout::of(OrbitMeasurement::TYPE_NAME, OrbitMeasurement::FIELDS),
+            Layout::from_fields(RateEstimate::TYPE_NAME, RateEstimate::FIELDS),
+            Layout::from_fields(OrbitMeasurement::TYPE_NAME, OrbitMeasurement::FIELDS),
         ] {
             assert_eq!(Layout::parse(&layout.definition()).unwrap(), layout);
         }
-        let layout = Layout::of(RateEstimate::TYPE_NAME, RateEstimate::FIELDS);
+        let layout = Layout::from_fields(RateEstimate::TYPE_NAME, RateEstimate::FIELDS);
         assert_eq!(layout.size(), size_of::<RateEstimate>());
         assert_eq!(layout.message_name(), "corotate/msg/RigidBodyEstimateV2");
         assert!(layout.definition().contains("\nfloat64[3] omega_rad_s\n"));

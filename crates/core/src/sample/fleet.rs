@@ -24,7 +24,7 @@ pub trait FleetLayout: fmt::Debug + Send + Sync + 'static {
     /// The names of its vectors, in order; the unit is the last part of each.
     const VECTORS: &'static [&'static str];
     /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
-    const LAYOUT_NAME: LayoutName = LayoutName::of_fleet(Self::TYPE_NAME, Self::VECTORS);
+    const LAYOUT_NAME: LayoutName = LayoutName::for_fleet(Self::TYPE_NAME, Self::VECTORS);
     /// The type name with a hash of the vectors.
     const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 }
@@ -121,7 +121,7 @@ impl<L: FleetLayout> FleetSample<L> {
 
     /// For how many bodies its sender says that it is.
     #[inline]
-    pub fn told_bodies(&self) -> u64 {
+    pub fn declared_bodies(&self) -> u64 {
         self.words[BODIES]
     }
 
@@ -222,7 +222,7 @@ mod tests {
                 values.iter_mut().enumerate().for_each(|(body, slot)| *slot = value(body));
             }
         }
-        assert_eq!((sample.stamp().tick, sample.status(), sample.told_bodies()), (7, 9, 5));
+        assert_eq!((sample.stamp().tick, sample.status(), sample.declared_bodies()), (7, 9, 5));
         let second = FleetTruth::fields(5).find(|field| field.name == "applied_rad_s2").unwrap();
         assert_eq!(f64::from_bits(words[second.offset / 8 + 5 + 2]), 112.0, "vector 1, axis 1, body 2");
         let sample = FleetTruth::over(&words);

@@ -22,15 +22,15 @@ impl LayoutName {
     ///
     /// # Panics
     /// If the type name is longer than 200 bytes.
-    pub const fn of(type_name: &str, fields: &[Field]) -> Self {
+    pub const fn from_fields(type_name: &str, fields: &[Field]) -> Self {
         Self::new(type_name, Hash::new().text(type_name).fields(&Stamp::FIELDS).fields(fields))
     }
 
     /// The name of a fleet's layout, which has these vectors.
     ///
     /// # Panics
-    /// As [`of`](Self::of).
-    pub const fn of_fleet(type_name: &str, vectors: &[&str]) -> Self {
+    /// As [`from_fields`](Self::from_fields).
+    pub const fn for_fleet(type_name: &str, vectors: &[&str]) -> Self {
         let mut hash = Hash::new().text(type_name).fields(&Stamp::FIELDS);
         let mut index = 0;
         while index < vectors.len() {
@@ -130,15 +130,15 @@ mod tests {
     fn whatever_differs_in_a_layout_differs_in_its_name() {
         use FieldKind::{F64, U64};
         let layouts = [
-            LayoutName::of("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, F64, 1)]),
-            LayoutName::of("x/y/v1", &[field("b", 32, F64, 1), field("a", 40, F64, 1)]),
-            LayoutName::of("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, U64, 1)]),
-            LayoutName::of("x/y/v1", &[field("a", 32, F64, 1), field("b", 48, F64, 1)]),
-            LayoutName::of("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, F64, 2)]),
-            LayoutName::of("x/y/v1", &[field("ab", 32, F64, 1), field("", 40, F64, 1)]),
-            LayoutName::of("x/y/v2", &[field("a", 32, F64, 1), field("b", 40, F64, 1)]),
-            LayoutName::of_fleet("x/y/v1", &["a", "b"]),
-            LayoutName::of_fleet("x/y/v1", &["b", "a"]),
+            LayoutName::from_fields("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, F64, 1)]),
+            LayoutName::from_fields("x/y/v1", &[field("b", 32, F64, 1), field("a", 40, F64, 1)]),
+            LayoutName::from_fields("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, U64, 1)]),
+            LayoutName::from_fields("x/y/v1", &[field("a", 32, F64, 1), field("b", 48, F64, 1)]),
+            LayoutName::from_fields("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, F64, 2)]),
+            LayoutName::from_fields("x/y/v1", &[field("ab", 32, F64, 1), field("", 40, F64, 1)]),
+            LayoutName::from_fields("x/y/v2", &[field("a", 32, F64, 1), field("b", 40, F64, 1)]),
+            LayoutName::for_fleet("x/y/v1", &["a", "b"]),
+            LayoutName::for_fleet("x/y/v1", &["b", "a"]),
         ];
         let names: std::collections::BTreeSet<&str> = layouts.iter().map(LayoutName::as_str).collect();
         assert_eq!(names.len(), layouts.len(), "{names:?}");

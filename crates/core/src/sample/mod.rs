@@ -60,7 +60,7 @@ impl Stamp {
 ///
 /// Where everybody waits for inputs (lockstep, one thread), a sample that is missing would stop the loop; a void stands in
 /// its place. Readers count it and treat the tick as they treat a sample that was lost. Real time needs none.
-pub const VOID: u64 = 1 << 63;
+pub const NO_SAMPLE: u64 = 1 << 63;
 
 /// The type of one field's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -132,7 +132,7 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     /// The fields after the stamp, in order.
     const FIELDS: &'static [Field];
     /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
-    const LAYOUT_NAME: LayoutName = LayoutName::of(Self::TYPE_NAME, Self::FIELDS);
+    const LAYOUT_NAME: LayoutName = LayoutName::from_fields(Self::TYPE_NAME, Self::FIELDS);
     /// The type name with a hash of the fields: by it the ends of links, seats and devices know that they mean the same.
     const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 

@@ -1,11 +1,11 @@
-//! The device's end: bytes in, frames out, and a [`Seat`] that they drive tick by tick.
+//! The device's end: bytes in, frames out, and a [`DeviceRole`] that they drive tick by tick.
 //!
 //! What firmware has to add is what the seat needs (a [`Body`](crate::role::Body), an observer, a law), a byte stream and a
 //! clock. Must not do I/O, nor look at a clock: both are handed in. Must not panic on anything that comes over the line.
 
-use super::frame::{Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, encode};
+use super::frame::{Decoder, FrameCounters, MAX_FRAME, MAX_PAYLOAD, encode};
 use super::message::{Answer, Hello, Message, ParseError, Reason, Refuse, Tick, Welcome, parse, shorten, write};
-use super::seat::{Inputs, Layout, Outputs, Seat, length};
+use super::role::{DeviceRole, Inputs, Layout, Outputs, length};
 use super::{MAX_CONTENT, MAX_SAMPLES};
 use crate::role::CommandEvent;
 
@@ -13,7 +13,7 @@ use crate::role::CommandEvent;
 ///
 /// `make` is asked once per run and gives the seat's occupant at its initial state, or nothing if this device has not that
 /// role.
-pub struct Device<S: Seat, M> {
+pub struct Device<S: DeviceRole, M> {
     name: &'static str,
     make: M,
     decoder: Decoder,
@@ -43,7 +43,7 @@ struct Session<S> {
     heard_ns: u64,
 }
 
-impl<S: Seat, M: FnMut(&Hello<'_>) -> Option<S>> Device<S, M> {
+impl<S: DeviceRole, M: FnMut(&Hello<'_>) -> Option<S>> Device<S, M> {
     /// A device that calls itself `name` (kind and version, for people; cut to 64 bytes).
     ///
     /// # Panics
@@ -107,7 +107,7 @@ impl<S: Seat, M: FnMut(&Hello<'_>) -> Option<S>> Device<S, M> {
     }
 
     /// What has been met on the line.
-    pub fn counters(&self) -> FrameBook {
+    pub fn counters(&self) -> FrameCounters {
         self.decoder.counters()
     }
 }
@@ -140,7 +140,7 @@ fn unlike(asked: &str, own: impl Iterator<Item = Layout>) -> Option<&'static str
 }
 
 /// Begins a run, or goes on with one. Returns the next tick.
-fn greet<S: Seat>(
+fn greet<S: DeviceRole>(
     session: &mut Option<Session<S>>,
     make: &mut impl FnMut(&Hello<'_>) -> Option<S>,
     hello: &Hello<'_>,
@@ -163,7 +163,7 @@ fn greet<S: Seat>(
     Ok(session.insert(begun).next.unwrap_or(0))
 }
 
-impl<S: Seat> Session<S> {
+impl<S: DeviceRole> Session<S> {
     fn new(seat: S, hello: &Hello<'_>, now_ns: u64) -> Self {
         Self {
             run: hello.run,

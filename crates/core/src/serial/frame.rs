@@ -47,7 +47,7 @@ pub fn encode<'a>(payload: &[u8], frame: &'a mut [u8; MAX_FRAME]) -> Result<&'a 
 
 /// What a decoder has met.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct FrameBook {
+pub struct FrameCounters {
     /// Bytes taken in.
     pub bytes: u64,
     /// Frames found.
@@ -71,7 +71,7 @@ pub struct Decoder {
     excess: u64,
     /// Whether a block was dropped since the last good frame.
     lost: bool,
-    counters: FrameBook,
+    counters: FrameCounters,
 }
 
 enum Fault {
@@ -81,7 +81,7 @@ enum Fault {
 
 impl Default for Decoder {
     fn default() -> Self {
-        Self { block: [0; MAX_BLOCK], length: 0, excess: 0, lost: false, counters: FrameBook::default() }
+        Self { block: [0; MAX_BLOCK], length: 0, excess: 0, lost: false, counters: FrameCounters::default() }
     }
 }
 
@@ -132,7 +132,7 @@ impl Decoder {
     }
 
     /// What has been met so far.
-    pub fn counters(&self) -> FrameBook {
+    pub fn counters(&self) -> FrameCounters {
         self.counters
     }
 
@@ -163,7 +163,7 @@ mod tests {
         encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec()
     }
 
-    fn decode(bytes: &[u8]) -> (Vec<Vec<u8>>, FrameBook) {
+    fn decode(bytes: &[u8]) -> (Vec<Vec<u8>>, FrameCounters) {
         let (mut decoder, mut found) = (Decoder::default(), Vec::new());
         decoder.feed(bytes, |payload| found.push(payload.to_vec()));
         (found, decoder.counters())

@@ -65,7 +65,7 @@ pub struct LineCounters {
 
 /// What the device said that its host must know.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Heard<'a> {
+pub enum DeviceEvent<'a> {
     /// It takes part.
     Welcome(Welcome<'a>),
     /// It does not.
@@ -111,7 +111,7 @@ struct Request {
 }
 
 /// The host of one device in one run.
-pub struct Host {
+pub struct HostSession {
     terms: Terms,
     decoder: Decoder,
     frame: [u8; MAX_FRAME],
@@ -133,7 +133,7 @@ pub struct Host {
     counters: LineCounters,
 }
 
-impl Host {
+impl HostSession {
     /// A host that has not greeted its device yet.
     pub fn new(terms: Terms) -> Self {
         Self {
@@ -175,7 +175,7 @@ impl Host {
     /// The frame to be sent now, if there is one. To be asked again until there is none.
     pub fn due(&mut self, now_ns: u64, hello: &Hello<'_>) -> Option<&[u8]> {
         if self.silent >= SILENT_REQUESTS {
-            self.greet_anew(now_ns);
+            self.greet_again(now_ns);
         }
         if !self.greeted {
             if now_ns < self.greet_due_ns {
@@ -205,12 +205,12 @@ impl Host {
     }
 
     /// Takes a byte that has arrived, and tells what it completes.
-    pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<Heard<'_>> {
+    pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<DeviceEvent<'_>> {
         let Self { terms, decoder, heard, counters, .. } = self;
         let payload = decoder.push(byte)?;
         let (sequence, message) = match parse(payload) {
             Ok(said) => said,
-            Err(ParseError::Version(theirs)) => return Some(Heard::OtherVersion(theirs)),
+            Err(ParseError::Version(theirs)) => return Some(DeviceEvent::OtherVersion(theirs)),
             Err(ParseError::Malformed) => {
                 counters.malformed += 1;
                 return None;
@@ -236,7 +236,7 @@ impl Host {
                     if let Some(request) = &mut self.request {
                         (request.due_ns, request.sent) = (now_ns, 0);
                     }
-                    return Some(Heard::Welcome(welcome));
+                    return Some(DeviceEvent::Welcome(welcome));
                 }
             }
             // Of another run: it was on its way for long.
@@ -245,7 +245,7 @@ impl Host {
                 note(heard, counters, sequence);
                 self.greeted = false;
             }
-            Message::Refuse(refusal) => return Some(Heard::Refused(refusal)),
+            Message::Refuse(refusal) => return Some(DeviceEvent::Refused(refusal)),
             Message::Answer(answer) => {
                 note(heard, counters, sequence);
                 if !terms.hold(&answer.outputs) {
@@ -262,7 +262,7 @@ impl Host {
                 match self.request.take_if(|request| request.tick == answer.tick) {
                     Some(_) => {
                         self.answered = Some(answer.tick);
-                        return Some(Heard::Answer(answer));
+                        return Some(DeviceEvent::Answer(answer));
                     }
                     None if self.answered.is_some_and(|tick| answer.tick == tick) => counters.duplicates += 1,
                     None => counters.late += 1,
@@ -275,7 +275,7 @@ impl Host {
     /// The line was cut: what was on its way is lost, and nobody knows who is there when it is whole again.
     pub fn cut(&mut self, now_ns: u64) {
         self.decoder.cut();
-        self.greet_anew(now_ns);
+        self.greet_again(now_ns);
     }
 
     /// The line was opened again.
@@ -299,7 +299,7 @@ impl Host {
     }
 
     /// Begins to wait anew.
-    pub fn wait_anew(&mut self) {
+    pub fn restart_wait(&mut self) {
         self.silent_since_ns = None;
     }
 
@@ -322,7 +322,7 @@ impl Host {
         }
     }
 
-    fn greet_anew(&mut self, now_ns: u64) {
+    fn greet_again(&mut self, now_ns: u64) {
         self.greeted = false;
         self.silent = 0;
         self.greet_due_ns = now_ns;

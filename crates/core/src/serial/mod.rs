@@ -13,22 +13,24 @@ mod documented;
 mod frame;
 mod host;
 mod message;
-mod seat;
+mod role;
 #[cfg(test)]
 mod tests;
 
 pub use device::Device;
-pub use frame::{CRC, Decoder, FrameBook, MAX_FRAME, MAX_PAYLOAD, TooLong, encode};
-pub use host::{Heard, Host, LineCounters, Terms};
+pub use frame::{CRC, Decoder, FrameCounters, MAX_FRAME, MAX_PAYLOAD, TooLong, encode};
+pub use host::{DeviceEvent, HostSession, LineCounters, Terms};
 pub use message::{
     Answer, Hello, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, MAX_TEXT, Message, ParseError, Reason, Refuse, Samples, Tick,
     VERSION, Welcome, parse, write,
 };
-pub use seat::{BodySeat, ControllerSeat, FlightSeat, Inputs, Layout, ObserverSeat, Outputs, Seat};
+pub use role::{
+    DeviceController, DeviceFlightComputer, DeviceObserver, DevicePlant, DeviceRole, Inputs, Layout, Outputs,
+};
 
 /// Takes any bytes as if they had come over a line, and hands on what is found in them: the whole way from bytes to
 /// messages, for a fuzzer or a recorder.
-pub fn decode(bytes: &[u8], mut each: impl FnMut(Result<(u32, Message<'_>), ParseError>)) -> FrameBook {
+pub fn decode(bytes: &[u8], mut each: impl FnMut(Result<(u32, Message<'_>), ParseError>)) -> FrameCounters {
     let mut decoder = Decoder::default();
     decoder.feed(bytes, |payload| each(parse(payload)));
     decoder.counters()

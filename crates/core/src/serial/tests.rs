@@ -67,11 +67,11 @@ fn command(value: f64) -> RateCommand {
     RateCommand { acceleration_rad_s2: [value, 0.0, 0.0], ..RateCommand::default() }
 }
 
-type Make = fn(&Hello<'_>) -> Option<BodySeat<Spinner>>;
-type Spinning = Device<BodySeat<Spinner>, Make>;
+type Make = fn(&Hello<'_>) -> Option<DevicePlant<Spinner>>;
+type Spinning = Device<DevicePlant<Spinner>, Make>;
 
 fn device() -> Spinning {
-    Device::new("spinner 1", |hello| Some(BodySeat::new(spinner(), hello)))
+    Device::new("spinner 1", |hello| Some(DevicePlant::new(spinner(), hello)))
 }
 
 /// What befalls the bytes of a line, per byte.
@@ -86,7 +86,7 @@ const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0 };
 
 /// Both ends, the line between them, and a clock that somebody else moves.
 struct Rig {
-    host: Host,
+    host: HostSession,
     device: Spinning,
     hello: Hello<'static>,
     faults: Faults,
@@ -113,7 +113,7 @@ impl Rig {
             required: 1,
         };
         let random = Pcg64::seed_from_u64(seed);
-        Self { host: Host::new(terms), device: device(), hello, faults, random, now_ns: 1, cut: false }
+        Self { host: HostSession::new(terms), device: device(), hello, faults, random, now_ns: 1, cut: false }
     }
 
     fn damage(&mut self, bytes: &[u8]) -> Vec<u8> {
@@ -153,10 +153,10 @@ impl Rig {
         for &byte in bytes {
             let Some(heard) = self.host.push(byte, self.now_ns) else { continue };
             events.push(match heard {
-                Heard::Welcome(welcome) => Event::Welcome(welcome.next_tick),
-                Heard::Refused(refuse) => Event::Refused(refuse.reason, refuse.detail.to_owned()),
-                Heard::OtherVersion(version) => Event::OtherVersion(version),
-                Heard::Answer(answer) => {
+                DeviceEvent::Welcome(welcome) => Event::Welcome(welcome.next_tick),
+                DeviceEvent::Refused(refuse) => Event::Refused(refuse.reason, refuse.detail.to_owned()),
+                DeviceEvent::OtherVersion(version) => Event::OtherVersion(version),
+                DeviceEvent::Answer(answer) => {
                     let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
                     let (measured, true_one) = answer.outputs.bytes.split_at(MEASUREMENT);
                     assert!(measurement.set_content(measured) && truth.set_content(true_one));
@@ -603,7 +603,7 @@ fn an_answer_of_another_length_is_none() {
 
 #[test]
 fn a_real_device_tells_no_truth() {
-    let seat = |hello: &Hello<'_>| Some(BodySeat::new(spinner(), hello).without_truth());
+    let seat = |hello: &Hello<'_>| Some(DevicePlant::new(spinner(), hello).without_truth());
     let mut device = Device::new("real", seat);
     let mut payload = [0; MAX_PAYLOAD];
     let mut lengths = Vec::new();

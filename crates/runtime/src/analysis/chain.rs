@@ -3,7 +3,7 @@
 //! It gives the bits of an undisturbed run. Must not compute anything that a role computes.
 
 use crate::rig::{Command, Estimate, Measurement, Rig, Truth};
-use crate::role::{Actuation, Controller, DOUBTS, Guard, Observer, Plant, Rearm};
+use crate::role::{Actuation, Controller, Guard, Observer, Plant, Rearm, SUSPECT_SAMPLES};
 use crate::sample::{Field, FieldKind, Message, Sample, Stamp};
 use crate::state::{Persist, Words};
 
@@ -199,7 +199,7 @@ impl<R: Rig> Guards<R> {
         let mut counted = self.refused.iter_mut().zip(accepted);
         counted.find_map(|(refused, (name, accepted))| {
             *refused = if accepted { 0 } else { *refused + 1 };
-            (*refused > DOUBTS).then_some(name)
+            (*refused > SUSPECT_SAMPLES).then_some(name)
         })
     }
 }

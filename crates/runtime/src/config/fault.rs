@@ -11,7 +11,7 @@ use super::body::{BodyInfo, role_names};
 use super::checks::Checks;
 use super::nearest;
 use crate::bus::{Port, Signal};
-use crate::fault::{self, Action, Change, Fault, Interruption, Tamper, Transport, Words};
+use crate::fault::{self, Action, Change, ContentFault, Fault, Interruption, Transport, Words};
 use crate::sample::FieldKind;
 use raw::Kind;
 
@@ -200,13 +200,13 @@ impl One<'_, '_, '_> {
         Some(Fields::of(port, if has_axes { self.setting.axes } else { 0 }))
     }
 
-    fn tamper(&mut self, fields: &Fields) -> Option<Tamper> {
+    fn tamper(&mut self, fields: &Fields) -> Option<ContentFault> {
         let raw = self.raw;
         if raw.kind == Kind::LostAxis {
             return self.lost_axis(fields);
         }
         if raw.kind == Kind::Freeze && raw.field.is_none() && raw.component.is_none() {
-            return Some(Tamper { change: Change::Freeze, words: fields.content });
+            return Some(ContentFault { change: Change::Freeze, words: fields.content });
         }
         let (words, kind) = self.words(fields)?;
         let number = !matches!(raw.kind, Kind::Freeze | Kind::BitFlip);
@@ -235,7 +235,7 @@ impl One<'_, '_, '_> {
                 Change::Flip(raw.bit.map(|bit| bit as u32))
             }
         };
-        Some(Tamper { change, words })
+        Some(ContentFault { change, words })
     }
 
     /// The words of the field and component that are named; by default the first field, and all of its components.
@@ -256,7 +256,7 @@ impl One<'_, '_, '_> {
         Some((Words { first: words.first + component - 1, count: 1 }, kind))
     }
 
-    fn lost_axis(&mut self, fields: &Fields) -> Option<Tamper> {
+    fn lost_axis(&mut self, fields: &Fields) -> Option<ContentFault> {
         let component = self.raw.component?;
         let valid = fields.all.iter().find(|(name, ..)| *name == VALID);
         self.require(valid.is_some(), "kind", "wrong-signal", || {
@@ -268,7 +268,7 @@ impl One<'_, '_, '_> {
             format!("there is no axis {component} to lose; give 1 to {}", fields.axes)
         })?;
         let words = Words { first: fields.content.first + component - 1, count: 1 };
-        Some(Tamper { change: Change::Lose { valid: valid.first }, words })
+        Some(ContentFault { change: Change::Lose { valid: valid.first }, words })
     }
 }
 

@@ -6,7 +6,7 @@ use super::form::{DataError, Options};
 use super::identification::{LogAccount, sample};
 use super::log::{Entry, Log};
 use crate::estimate::{
-    FilterKind, RateChoice, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup, Survey,
+    FilterKind, RateChoice, RateSurvey, Reconstructed, Reconstruction, ReconstructionError, Score, SegmentScore, Setup,
 };
 use crate::identify::Sample;
 use nalgebra::{Matrix3, Vector3};
@@ -211,8 +211,8 @@ fn survey(
     log: &mut Log,
     request: &Request,
     principal: impl Fn(&Entry) -> Vector3<f64>,
-) -> Result<(Vec<(Entry, Option<String>)>, Survey), EstimateError> {
-    let (mut head, mut survey) = (Vec::new(), Survey::new(&request.coefficients, request.axis));
+) -> Result<(Vec<(Entry, Option<String>)>, RateSurvey), EstimateError> {
+    let (mut head, mut survey) = (Vec::new(), RateSurvey::new(&request.coefficients, request.axis));
     while head.len() < SURVEY_SAMPLES {
         let Some(entry) = log.next().transpose()? else { break };
         if entry.begins {

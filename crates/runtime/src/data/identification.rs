@@ -3,7 +3,8 @@
 use super::form::{DataError, Meaning, Options};
 use super::log::{Counts, Entry, Log};
 use crate::identify::{
-    Account, AxesFit, Finding, Motion, Recursive, RecursiveAxisymmetric, RecursiveFit, Sample, TensorFit, findings,
+    AxesFit, Finding, Motion, MotionSummary, Recursive, RecursiveAxisymmetric, RecursiveFit, Sample, TensorFit,
+    findings,
 };
 use std::path::{Path, PathBuf};
 
@@ -35,7 +36,7 @@ pub struct Identified {
     /// The logs.
     pub logs: Vec<LogAccount>,
     /// What they amount to.
-    pub account: Account,
+    pub account: MotionSummary,
     /// Least squares about the sensor's axes, each axis by itself.
     pub axes: Option<AxesFit>,
     /// Least squares about the sensor's axes, of one body.
@@ -92,7 +93,7 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
     let tensor = motion.about_unknown_axes(ways.damping);
     Ok(Identified {
         logs,
-        account: *motion.account(),
+        account: *motion.summary(),
         findings: findings(&motion, axes.as_ref(), tensor.as_ref()),
         axes,
         body,

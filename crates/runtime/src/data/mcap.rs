@@ -6,7 +6,7 @@ use super::form::{DataError, Meaning, Options, Row, Rows};
 use super::stamp::Stamp;
 use super::unit::{RateUnit, TimeUnit};
 use crate::sample::Layout;
-use crate::sample::{FieldKind, VOID};
+use crate::sample::{FieldKind, NO_SAMPLE};
 use mcap::McapError;
 use mcap::records::Record;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -249,7 +249,7 @@ fn own(
     let body = message.get(CDR_HEADER..)?;
     let word = |at: usize| Some(u64::from_le_bytes(body.get(at..at.checked_add(8)?)?.try_into().ok()?));
     let valid = valid.map_or(Some(u64::MAX), word)?;
-    let void = generation.map_or(Some(0), word)? & VOID != 0;
+    let void = generation.map_or(Some(0), word)? & NO_SAMPLE != 0;
     let mut rates = [f64::NAN; 3];
     for (axis, rate) in rates.iter_mut().enumerate() {
         let value = f64::from_bits(word(omega.checked_add(8 * axis)?)?);

@@ -14,8 +14,8 @@ use crate::config::{ClockKind, Settings};
 use crate::role::Rearm;
 use crate::sample::{Stamp, type_name_of};
 use crate::serial::{
-    Answer, Heard, Hello, Host, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse, Samples, Terms,
-    Welcome,
+    Answer, DeviceEvent, Hello, HostSession, LineCounters, MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, Reason, Refuse,
+    Samples, Terms, Welcome,
 };
 use crate::telemetry::Outage;
 use std::path::PathBuf;
@@ -141,7 +141,7 @@ impl Layouts {
 /// A device on its line, with the host's end of the protocol.
 pub struct DeviceLink {
     line: Line,
-    host: Host,
+    host: HostSession,
     greeting: Greeting,
     /// Bytes of each sample that the device reads, in order.
     inputs: Vec<usize>,
@@ -194,7 +194,7 @@ impl DeviceLink {
         let line = Line::open(&seat.path, seat.baud)?;
         Ok(Self {
             line,
-            host: Host::new(terms),
+            host: HostSession::new(terms),
             greeting,
             inputs,
             patience_ns,
@@ -238,7 +238,7 @@ impl DeviceLink {
         while !terminated.load(Ordering::Relaxed) {
             self.exchange(monotonic_ns(), |_| {})?;
             if self.host.greeted() {
-                self.host.wait_anew();
+                self.host.restart_wait();
                 return Ok(self.device.clone());
             }
             sleep_until(monotonic_ns() + LOOK_NS);
@@ -298,16 +298,16 @@ impl DeviceLink {
             for &byte in &bytes[..count] {
                 match host.push(byte, now_ns) {
                     None => {}
-                    Some(Heard::Refused(refuse)) if greeting.drop_hashes(&refuse, now_ns) => {}
-                    Some(Heard::Refused(refuse)) => return Err(refused(line, greeting, &refuse)),
-                    Some(Heard::OtherVersion(theirs)) => {
+                    Some(DeviceEvent::Refused(refuse)) if greeting.drop_hashes(&refuse, now_ns) => {}
+                    Some(DeviceEvent::Refused(refuse)) => return Err(refused(line, greeting, &refuse)),
+                    Some(DeviceEvent::OtherVersion(theirs)) => {
                         return Err(DeviceError::Version { path: line.path().to_owned(), theirs });
                     }
-                    Some(Heard::Answer(heard)) => {
+                    Some(DeviceEvent::Answer(heard)) => {
                         absences.answered(heard.tick);
                         answer(&heard);
                     }
-                    Some(Heard::Welcome(welcome)) => {
+                    Some(DeviceEvent::Welcome(welcome)) => {
                         let renamed = welcomed(line, &welcome, device, *other_device)?;
                         absences.greeted(welcome.next_tick, renamed.then_some(device.as_deref()).flatten());
                     }

@@ -5,7 +5,7 @@
 use crate::bus::{Carried, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ScriptedFault, Settings};
-use crate::fault::{Action, Change, Course, Fault, Interruption, Transport, Way};
+use crate::fault::{Action, Change, Delivery, Fault, FaultSequence, Interruption, Transport};
 use crate::state::{Persist, Words};
 use crate::telemetry::TickCounters;
 use std::borrow::{Borrow, BorrowMut};
@@ -13,7 +13,7 @@ use std::borrow::{Borrow, BorrowMut};
 /// What happens to the samples of one signal.
 #[derive(Debug)]
 pub struct Disturbance<S: Carried + ?Sized> {
-    faults: Vec<Course>,
+    faults: Vec<FaultSequence>,
     /// Samples that are held back, each with the tick at which it is sent, in the order in which they are sent. As much room
     /// as can ever be needed is taken at the start.
     late: Vec<(u64, S::Owned)>,
@@ -29,8 +29,8 @@ impl<S: Carried + ?Sized> Disturbance<S> {
         Self::new(courses(scenario, role, Some(body), next_tick), bodies)
     }
 
-    fn new(faults: Vec<Course>, bodies: usize) -> Option<Box<Self>> {
-        let kept = |course: &Course| delay_bound(course.fault()).min(course.fault().ticks) as usize;
+    fn new(faults: Vec<FaultSequence>, bodies: usize) -> Option<Box<Self>> {
+        let kept = |course: &FaultSequence| delay_bound(course.fault()).min(course.fault().ticks) as usize;
         // One is added before those that are due are let go.
         let room = faults.iter().map(kept).sum::<usize>() + 1;
         (!faults.is_empty()).then(|| Box::new(Self { faults, late: Vec::with_capacity(room), room, bodies }))
@@ -43,8 +43,8 @@ impl<S: Carried + ?Sized> Disturbance<S> {
     }
 
     /// What happens to the sample of `tick` on its way: of several faults, what the first says.
-    pub fn way(&mut self, tick: u64) -> Option<Way> {
-        way(&mut self.faults, tick)
+    pub fn delivery(&mut self, tick: u64) -> Option<Delivery> {
+        delivery(&mut self.faults, tick)
     }
 
     /// A sample to be disturbed.
@@ -91,10 +91,10 @@ impl<S: Carried + ?Sized> Persist for Disturbance<S> {
 
 /// What a scenario does to a role (`body` none) or to its signal about a body. What a predecessor has passed is decided here,
 /// and not at its successor's first tick.
-fn courses(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) -> Vec<Course> {
+fn courses(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) -> Vec<FaultSequence> {
     let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == body;
     let course = |scripted: &ScriptedFault| {
-        let mut course = Course::new(scripted.fault.clone());
+        let mut course = FaultSequence::new(scripted.fault.clone());
         if let Some(last) = next_tick.checked_sub(1) {
             course.acts(last);
         }
@@ -103,14 +103,14 @@ fn courses(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) 
     scenario.faults.iter().filter(here).map(course).collect()
 }
 
-fn way(faults: &mut [Course], tick: u64) -> Option<Way> {
-    faults.iter_mut().find_map(|course| course.fault().way(tick).filter(|_| course.acts(tick)))
+fn delivery(faults: &mut [FaultSequence], tick: u64) -> Option<Delivery> {
+    faults.iter_mut().find_map(|course| course.fault().delivery(tick).filter(|_| course.acts(tick)))
 }
 
 /// Which samples of a signal are late because a scripted fault says so. Where there are no voids, a reader knows by it that
 /// they are, however soon after their tick it looks: what is late is so by the script, not by who was faster.
 #[derive(Debug)]
-pub struct LateSamples(Vec<Course>);
+pub struct LateSamples(Vec<FaultSequence>);
 
 impl LateSamples {
     /// Those of a signal about a body; nothing if there are none that a reader could take for samples in time.
@@ -128,7 +128,7 @@ impl LateSamples {
 
     /// Whether that of a tick is.
     pub fn contains(&mut self, tick: u64) -> bool {
-        matches!(way(&mut self.0, tick), Some(Way::Late(_)))
+        matches!(delivery(&mut self.0, tick), Some(Delivery::Late(_)))
     }
 }
 
@@ -165,7 +165,7 @@ struct InjectedFaults {
 /// What happens to a role before its ticks.
 #[derive(Debug)]
 pub struct Interruptions {
-    faults: Vec<Course>,
+    faults: Vec<FaultSequence>,
     first_life: bool,
     /// Whether the role is a process, which can be killed.
     process: bool,
@@ -251,8 +251,8 @@ mod tests {
     use crate::fault::{Delay, Occurrence};
     use crate::sample::RateCommand;
 
-    fn fault(from_tick: u64, ticks: u64, action: Action) -> Course {
-        Course::new(Fault { from_tick, ticks, occurrence: Occurrence::Independent(1.0), seed: 1, action })
+    fn fault(from_tick: u64, ticks: u64, action: Action) -> FaultSequence {
+        FaultSequence::new(Fault { from_tick, ticks, occurrence: Occurrence::Independent(1.0), seed: 1, action })
     }
 
     #[test]
@@ -266,12 +266,12 @@ mod tests {
             let sent = (0..due).map(|index| disturbance.late(index).unwrap().stamp.tick).collect::<Vec<_>>();
             disturbance.forget(due);
             assert_eq!(sent, if tick < 8 { vec![] } else { vec![tick - 3] });
-            assert_eq!(disturbance.way(tick), Some(Way::Late(3)));
+            assert_eq!(disturbance.delivery(tick), Some(Delivery::Late(3)));
             let mut sample = RateCommand::default();
             sample.stamp.tick = tick;
             disturbance.keep(tick + 3, &sample);
         }
-        assert_eq!((disturbance.way(105), disturbance.late.capacity()), (None, room));
+        assert_eq!((disturbance.delivery(105), disturbance.late.capacity()), (None, room));
     }
 
     /// Whatever is drawn, what is late finds room, and comes when it is due.
@@ -290,8 +290,8 @@ mod tests {
                 come.push(sent);
             }
             disturbance.forget(due);
-            match disturbance.way(tick) {
-                Some(Way::Late(ticks)) => {
+            match disturbance.delivery(tick) {
+                Some(Delivery::Late(ticks)) => {
                     let mut sample = RateCommand::default();
                     sample.stamp.tick = tick;
                     disturbance.keep(tick + ticks, &sample);
@@ -312,8 +312,8 @@ mod tests {
     fn of_several_faults_the_first_decides_the_way() {
         let [drop, twice] = [Transport::Drop, Transport::Duplicate].map(Action::Transport);
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)], 1).unwrap();
-        let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.way(tick));
-        let (drop, twice) = (Some(Way::Dropped), Some(Way::Twice));
+        let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.delivery(tick));
+        let (drop, twice) = (Some(Delivery::Dropped), Some(Delivery::Twice));
         assert_eq!(ways, [None, twice, twice, drop, None]);
         assert!(Disturbance::<RateCommand>::new(Vec::new(), 1).is_none());
     }

@@ -8,7 +8,7 @@ use crate::bus::iox::{self, Qos};
 use crate::bus::{Depths, Port, Reader, Signal};
 use crate::role::Rearm;
 use crate::runtime::{RoleId, depths, ports, window_ticks};
-use crate::sample::{Field, FieldKind, Phase, RoleState, Stamp, VOID, status};
+use crate::sample::{Field, FieldKind, NO_SAMPLE, Phase, RoleState, Stamp, status};
 use crate::scenario::Scenario;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -144,7 +144,7 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
         phases: Phase::NAMES.into_iter().map(|(name, phase)| (name, phase as u64)).collect(),
         states: RoleState::NAMES.into_iter().map(|(name, state)| (name, state as u64)).collect(),
         status: status::NAMES.into_iter().collect(),
-        void_bit: VOID.trailing_zeros(),
+        void_bit: NO_SAMPLE.trailing_zeros(),
         warm_up: WarmUp { samples: WARM_UP_SAMPLES, pause_ns: WARM_UP_PAUSE_NS },
         report: domain.map(|domain| report_path(domain.root(), name)),
         scenario: scenario.resolved.clone(),
@@ -265,7 +265,7 @@ mod tests {
         assert_eq!(seat["phases"]["warm_up"], 1);
         assert_eq!(seat["states"]["done"], 4);
         assert_eq!(seat["status"]["fault"], 512);
-        assert_eq!(1 << seat["void_bit"].as_u64().unwrap(), VOID);
+        assert_eq!(1 << seat["void_bit"].as_u64().unwrap(), NO_SAMPLE);
         assert_eq!(seat["scenario"]["leader"]["inertia_kg_m2"][2], 2.5);
         assert_eq!(seat["scenario"]["follower"][0]["inertia_factor"][0], 1.0);
     }

@@ -5,7 +5,7 @@ use super::latest::{LatestReader, LatestWriter};
 use super::service::{Ipc, Wire, is_written, writer};
 use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Topic, Write, WriterProcess};
-use crate::sample::{Sample, VOID};
+use crate::sample::{NO_SAMPLE, Sample};
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -139,7 +139,7 @@ pub(super) enum Lane<S: Sample> {
 #[inline]
 fn key(sample: &impl Sample) -> (u64, u64) {
     let stamp = sample.stamp();
-    (stamp.generation & !VOID, stamp.tick)
+    (stamp.generation & !NO_SAMPLE, stamp.tick)
 }
 
 /// No sample has this key.

@@ -7,7 +7,7 @@ use crate::config::Checks;
 use crate::model::{CentralField, OrbitState};
 use crate::rig::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
-use crate::role::{Bounds, Guard, Plausible, Refusal};
+use crate::role::{Bounds, Guard, PlausibilityCheck, Refusal};
 use crate::sample::{OrbitCommand, OrbitEstimate, OrbitMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector4;
@@ -105,7 +105,7 @@ impl Limits {
             allowance: (spread * 2.0 + Vector4::repeat(ROUNDING)).into(),
             repeats: self.repeats,
         };
-        MeasurementGuard { limits: *self, radius_offset: offset[0], state: Plausible::new(bounds), needed }
+        MeasurementGuard { limits: *self, radius_offset: offset[0], state: PlausibilityCheck::new(bounds), needed }
     }
 
     /// A guard for estimates, whose radius is as measured with this standard deviation and bias.
@@ -129,7 +129,7 @@ impl Limits {
 pub struct MeasurementGuard {
     limits: Limits,
     radius_offset: f64,
-    state: Plausible<4>,
+    state: PlausibilityCheck<4>,
     needed: u64,
 }
 

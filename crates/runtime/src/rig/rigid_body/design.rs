@@ -7,7 +7,7 @@ use crate::config::BodyInfo;
 use crate::control::Certificate;
 use crate::model::{Inertia, Noise};
 use crate::observe::HiddenRate;
-use crate::rate::Parts;
+use crate::rate::LearnerDesign;
 use crate::rig::filter::FilterDesign;
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -48,7 +48,7 @@ pub struct RigidBodyRig {
 #[derive(Debug, Clone)]
 pub(super) enum ObserverDesign {
     Hidden { relation: HiddenRate, filter: FilterDesign<1>, guess_rad_s: f64 },
-    Learner(Parts),
+    Learner(LearnerDesign),
 }
 
 /// The controller's parameters.

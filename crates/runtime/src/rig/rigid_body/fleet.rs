@@ -8,7 +8,7 @@ use super::limits::Motion;
 use crate::control::{FleetLaw, InFlight};
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rig::Fleet;
-use crate::role::{Body, Bounds, Guard, Law, Pursuit, Refusal};
+use crate::role::{Body, Bounds, Guard, Law, MotionCheck, Refusal};
 use crate::sample::{
     CommandLayout, FleetCommand, FleetMeasurement, FleetTruth, MeasurementLayout, Message, RateEstimate, TruthLayout,
 };
@@ -118,7 +118,7 @@ impl Fleet<RateEstimate> for RateFleet {
         FleetMeasurementGuard {
             bounds: self.bounds,
             motion: self.motion,
-            pursuits: vec![Pursuit::default(); self.count()],
+            pursuits: vec![MotionCheck::default(); self.count()],
             pursuing: false,
             acceleration_max_rad_s2: self.acceleration_max_rad_s2,
             believed: zeros(self.count()),
@@ -243,7 +243,7 @@ pub struct FleetMeasurementGuard {
     bounds: Bounds<3>,
     motion: Option<Motion>,
     /// One per body; all of them are active if `pursuing`, else none.
-    pursuits: Vec<Pursuit<3>>,
+    pursuits: Vec<MotionCheck<3>>,
     pursuing: bool,
     acceleration_max_rad_s2: f64,
     /// The last rates that were believed, and their tick.
@@ -289,7 +289,7 @@ impl FleetMeasurementGuard {
     }
 
     fn stop(&mut self) {
-        self.pursuits.iter_mut().for_each(Pursuit::stop);
+        self.pursuits.iter_mut().for_each(MotionCheck::stop);
         self.pursuing = false;
     }
 
@@ -320,7 +320,7 @@ impl Persist for FleetMeasurementGuard {
 impl Guard<FleetMeasurement> for FleetMeasurementGuard {
     fn accepts(&mut self, sample: &FleetMeasurement) -> bool {
         let limit = self.acceleration_max_rad_s2;
-        let whole = sample.told_bodies() == self.believed[0].len() as u64;
+        let whole = sample.declared_bodies() == self.believed[0].len() as u64;
         if !(whole && sample.vector(APPLIED).into_iter().all(|applied| within(applied, limit))) {
             return false;
         }
@@ -343,7 +343,7 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
 
     fn refusal(&self, sample: &FleetMeasurement) -> Refusal {
         let (rates, applied) = (sample.vector(OMEGA), sample.vector(APPLIED));
-        if sample.told_bodies() != self.believed[0].len() as u64 {
+        if sample.declared_bodies() != self.believed[0].len() as u64 {
             Refusal::Incomplete
         } else if !applied.into_iter().all(|applied| within(applied, self.acceleration_max_rad_s2)) {
             of_vectors(applied)
@@ -367,11 +367,16 @@ persist_fields!(FleetCommandGuard,);
 impl Guard<FleetCommand> for FleetCommandGuard {
     fn accepts(&mut self, sample: &FleetCommand) -> bool {
         let asked = sample.vector(ACCELERATION);
-        sample.told_bodies() == self.count && asked.into_iter().all(|asked| within(asked, self.acceleration_max_rad_s2))
+        sample.declared_bodies() == self.count
+            && asked.into_iter().all(|asked| within(asked, self.acceleration_max_rad_s2))
     }
 
     fn refusal(&self, sample: &FleetCommand) -> Refusal {
-        if sample.told_bodies() == self.count { of_vectors(sample.vector(ACCELERATION)) } else { Refusal::Incomplete }
+        if sample.declared_bodies() == self.count {
+            of_vectors(sample.vector(ACCELERATION))
+        } else {
+            Refusal::Incomplete
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use crate::model::RigidBody;
 use crate::rate::ALL;
 use crate::rig::Figure;
 use crate::rig::filter::SURE_DEVIATIONS;
-use crate::role::{Bounds, Guard, Plausible, Pursuit, Refusal};
+use crate::role::{Bounds, Guard, MotionCheck, PlausibilityCheck, Refusal};
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement, status};
 use crate::state::persist_fields;
 use nalgebra::Vector3;
@@ -108,8 +108,8 @@ impl Limits {
     /// A guard for a body's measurements; without the components in `needed` a measurement is of no use to the reader.
     pub fn measurement(&self, body: &Sensed, tick_s: f64, needed: u64) -> MeasurementGuard {
         MeasurementGuard {
-            rate: Plausible::new(self.bounds(body, tick_s)),
-            pursuit: Pursuit::default(),
+            rate: PlausibilityCheck::new(self.bounds(body, tick_s)),
+            pursuit: MotionCheck::default(),
             motion: body.motion(tick_s),
             acceleration_rad_s2: self.acceleration_rad_s2,
             needed,
@@ -144,7 +144,7 @@ impl Limits {
             allowance: [0.0; 3],
             repeats: self.repeats,
         };
-        EstimateGuard { rate: Plausible::new(bounds) }
+        EstimateGuard { rate: PlausibilityCheck::new(bounds) }
     }
 
     /// A guard for commands.
@@ -189,7 +189,7 @@ impl Motion {
     /// image.
     pub fn follows(
         &self,
-        pursuit: &mut Pursuit<3>,
+        pursuit: &mut MotionCheck<3>,
         tick: u64,
         rate: &[f64; 3],
         applied: &[f64; 3],
@@ -200,7 +200,7 @@ impl Motion {
             return false;
         }
         let applied = Vector3::from(*applied).component_div(&self.factor);
-        pursuit.follows(tick, rate, &bounds.allowance, |from| {
+        pursuit.is_consistent(tick, rate, &bounds.allowance, |from| {
             self.body.flow(&Vector3::from(*from), &applied, self.tick_s).into()
         })
     }
@@ -210,8 +210,8 @@ impl Motion {
 /// its range is believed once it was seen to move as it must.
 #[derive(Debug)]
 pub struct MeasurementGuard {
-    rate: Plausible<3>,
-    pursuit: Pursuit<3>,
+    rate: PlausibilityCheck<3>,
+    pursuit: MotionCheck<3>,
     motion: Option<Motion>,
     acceleration_rad_s2: f64,
     needed: u64,
@@ -227,7 +227,7 @@ impl MeasurementGuard {
         let (rate, tick) = (&sample.omega_rad_s, sample.stamp.tick);
         let follows = motion.follows(&mut self.pursuit, tick, rate, &sample.applied_rad_s2, self.rate.bounds());
         if follows {
-            self.rate.believe(&sample.stamp, rate, ALL);
+            self.rate.record_accepted(&sample.stamp, rate, ALL);
         }
         follows
     }
@@ -261,7 +261,7 @@ impl Guard<RateMeasurement> for MeasurementGuard {
 /// which is not valid is said to be a guess. Without a filter of first order on quiet sensors their slew is not bounded.
 #[derive(Debug)]
 pub struct EstimateGuard {
-    rate: Plausible<3>,
+    rate: PlausibilityCheck<3>,
 }
 
 persist_fields!(EstimateGuard, rate);
@@ -314,7 +314,7 @@ fn within(values: &[f64; 3], limit: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::role::DOUBTS;
+    use crate::role::SUSPECT_SAMPLES;
     use crate::sample::Stamp;
 
     const LIMITS: Limits = Limits {
@@ -370,7 +370,7 @@ mod tests {
 
     #[test]
     fn a_body_beyond_its_range_that_moves_as_it_must_is_believed_after_a_few_doubts() {
-        assert_eq!(believed(|_, rate| rate), (1 + DOUBTS..100).collect::<Vec<_>>());
+        assert_eq!(believed(|_, rate| rate), (1 + SUSPECT_SAMPLES..100).collect::<Vec<_>>());
     }
 
     #[test]
@@ -383,7 +383,7 @@ mod tests {
         assert_eq!(believed(|tick, rate| if tick % 5 == 0 { 3.0 * rate } else { rate }), NEVER);
         assert_eq!(believed(|_, _| Vector3::repeat(f64::MAX)), NEVER);
         let then_stuck = believed(|tick, rate| if tick < 30 { rate } else { stuck });
-        assert_eq!(then_stuck, (1 + DOUBTS..30).collect::<Vec<_>>());
+        assert_eq!(then_stuck, (1 + SUSPECT_SAMPLES..30).collect::<Vec<_>>());
     }
 
     #[test]

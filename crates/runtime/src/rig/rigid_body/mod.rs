@@ -391,7 +391,7 @@ impl Rig for RigidBodyRig {
                     // Coefficients are at most 1 where rates are of the leader's size.
                     let off = off / leader.norm().max(f64::MIN_POSITIVE);
                     let begun = self.inertia.coefficients() + Vector3::new(1.0, -0.6, 0.8) * off;
-                    parts.identifier = parts.identifier.clone().begun_at(&begun);
+                    parts.identifier = parts.identifier.clone().with_guess(&begun);
                 }
             }
         }

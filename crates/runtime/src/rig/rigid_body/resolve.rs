@@ -10,7 +10,7 @@ use super::playback::{self, Playback};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
 use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
-use crate::rate::{Identifier, Parts};
+use crate::rate::{Identifier, LearnerDesign};
 use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use crate::rig::{BodyInfo, Context};
 use nalgebra::{Matrix3, Vector1, Vector3};
@@ -249,7 +249,7 @@ fn design_observer(
                 return None;
             };
             let identifier = design_identifier(&raw.leader, observer, inertia, notes, checks)?;
-            Some(ObserverDesign::Learner(Parts { identifier, decay_rate_per_s, floor_rad_s }))
+            Some(ObserverDesign::Learner(LearnerDesign { identifier, decay_rate_per_s, floor_rad_s }))
         }
     }
 }

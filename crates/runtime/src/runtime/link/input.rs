@@ -6,9 +6,9 @@
 use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
-use crate::role::{Guard, Refusal, Unguarded};
+use crate::role::{AcceptAll, Guard, Refusal};
 use crate::runtime::disturb::LateSamples;
-use crate::sample::{Stamp, VOID};
+use crate::sample::{NO_SAMPLE, Stamp};
 use crate::state::{Persist, Words};
 use crate::telemetry::ReadCounters;
 use std::borrow::{Borrow, BorrowMut};
@@ -49,7 +49,7 @@ enum Newest {
 }
 
 /// The reading end of a signal.
-pub struct Input<B: Bus, S: Carried + ?Sized, G = Unguarded> {
+pub struct Input<B: Bus, S: Carried + ?Sized, G = AcceptAll> {
     port: S::Reader<B>,
     guard: G,
     accepted_ticks: AcceptedTicks,
@@ -125,7 +125,7 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
     pub fn watch_many(bus: &B, topic: &Topic, bodies: usize, reader: Reader) -> Result<Self, BusError> {
         Ok(Self {
             port: S::reader(bus, topic, reader, bodies)?,
-            guard: Unguarded,
+            guard: AcceptAll,
             accepted_ticks: AcceptedTicks::Unknown,
             last: None,
             newest: Newest::None,
@@ -212,7 +212,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         }
         let Some(stamp) = self.port.current().map(|sample| *sample.stamp()) else { return Ok(false) };
         if let Some(recovery) = &mut self.recovery
-            && self.last.is_some_and(|(_, known)| stamp.generation & !VOID != known)
+            && self.last.is_some_and(|(_, known)| stamp.generation & !NO_SAMPLE != known)
             && !stamp.is_warm_up()
         {
             self.newest = Newest::None;
@@ -266,7 +266,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         if !stamp.is_warm_up() {
             self.counters.take();
         }
-        let generation = stamp.generation & !VOID;
+        let generation = stamp.generation & !NO_SAMPLE;
         let (newest_tick, known) = match self.last {
             Some((tick, known)) => (Some(tick), known),
             // Warm-up.
@@ -301,7 +301,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         }
         self.doubted = None;
         self.last = Some((stamp.tick, generation));
-        if stamp.generation & VOID != 0 {
+        if stamp.generation & NO_SAMPLE != 0 {
             self.counters.void(stamp.tick);
             return Newest::None;
         }

@@ -6,10 +6,10 @@
 
 use super::kept::Kept;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
-use crate::fault::Way;
+use crate::fault::Delivery;
 use crate::runtime::disturb::Disturbance;
 use crate::runtime::hooks::{self, Failpoint};
-use crate::sample::{Stamp, VOID};
+use crate::sample::{NO_SAMPLE, Stamp};
 use crate::state::{Persist, Words, persist_fields};
 use crate::telemetry::{Ledger, LinkWritten, Slots, WriteCounters};
 use std::borrow::{Borrow, BorrowMut};
@@ -187,21 +187,21 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         sample.stamp_mut().generation = self.generation;
         let stamp = *sample.stamp();
         let tampered = disturbance.tamper(stamp.tick, sample, self.sample.borrow());
-        let way = disturbance.way(stamp.tick);
+        let way = disturbance.delivery(stamp.tick);
         if tampered || way.is_some() {
             self.counters.injected();
         }
         let late = disturbance.due(stamp.tick);
         // A sample with a broken stamp goes out as it is, but not as the one of its tick.
         let sound = (sample.stamp().tick, sample.stamp().generation) == (stamp.tick, stamp.generation);
-        let delivered = sound && !matches!(way, Some(Way::Dropped | Way::Late(_)));
+        let delivered = sound && !matches!(way, Some(Delivery::Dropped | Delivery::Late(_)));
         let copies = match way {
-            Some(Way::Dropped) => 0,
-            Some(Way::Late(ticks)) => {
+            Some(Delivery::Dropped) => 0,
+            Some(Delivery::Late(ticks)) => {
                 disturbance.keep(stamp.tick + ticks, sample);
                 0
             }
-            Some(Way::Twice) => 2,
+            Some(Delivery::Twice) => 2,
             None => 1,
         };
         self.counters.extra(late + copies - u64::from(delivered));
@@ -271,9 +271,9 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let lives = if kind == Staged::ABSENT { 0 } else { made.generation ^ self.generation };
         let own: Stamp = bytemuck::cast(self.staged.stamp);
         let void = if kind == Staged::ABSENT {
-            Stamp { tick, generation: self.generation | VOID, ..Stamp::default() }
+            Stamp { tick, generation: self.generation | NO_SAMPLE, ..Stamp::default() }
         } else {
-            Stamp { generation: made.generation | VOID, ..made }
+            Stamp { generation: made.generation | NO_SAMPLE, ..made }
         };
         for index in self.already_sent()..self.staged.samples(self.voids) {
             self.port.prepare()?;
@@ -304,7 +304,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                     stamp.generation ^= lives;
                 }
                 if first && (kept.is_some() || late.is_some()) {
-                    stamp.generation = generation | stamp.generation & VOID;
+                    stamp.generation = generation | stamp.generation & NO_SAMPLE;
                 }
             })?;
             self.port.deliver()?;

@@ -20,13 +20,13 @@ pub struct Layout {
 
 impl Layout {
     /// That of a sample.
-    pub const fn of<S: Sample>() -> Self {
+    pub const fn for_sample<S: Sample>() -> Self {
         Self { name: S::LAYOUT, length: content_length::<S>() }
     }
 }
 
 /// What a device is in one run: a state machine, tick by tick.
-pub trait Seat {
+pub trait DeviceRole {
     /// The samples that it reads, in order.
     fn reads() -> impl Iterator<Item = Layout>;
     /// The samples that it writes, in order.
@@ -119,12 +119,12 @@ pub(super) fn length(layouts: impl Iterator<Item = Layout>, present: u32) -> Opt
 }
 
 /// A body with its sensors and actuators, which protect themselves: a [`Plant`].
-pub struct BodySeat<B: SingleBody> {
+pub struct DevicePlant<B: SingleBody> {
     plant: Plant<B>,
     tells_truth: bool,
 }
 
-impl<B: SingleBody> BodySeat<B> {
+impl<B: SingleBody> DevicePlant<B> {
     /// A body at its initial state, in the run of this greeting.
     pub fn new(body: B, hello: &Hello<'_>) -> Self {
         let rearm = if hello.manual_rearm { Rearm::Manual } else { Rearm::Auto };
@@ -140,13 +140,13 @@ impl<B: SingleBody> BodySeat<B> {
     }
 }
 
-impl<B: SingleBody> Seat for BodySeat<B> {
+impl<B: SingleBody> DeviceRole for DevicePlant<B> {
     fn reads() -> impl Iterator<Item = Layout> {
-        [Layout::of::<B::Command>()].into_iter()
+        [Layout::for_sample::<B::Command>()].into_iter()
     }
 
     fn writes() -> impl Iterator<Item = Layout> {
-        [Layout::of::<B::Measurement>(), Layout::of::<B::Truth>()].into_iter()
+        [Layout::for_sample::<B::Measurement>(), Layout::for_sample::<B::Truth>()].into_iter()
     }
 
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent {
@@ -185,11 +185,11 @@ impl<B: SingleBody> Seat for BodySeat<B> {
 }
 
 /// An observer of the first body.
-pub struct ObserverSeat<E: Estimator> {
+pub struct DeviceObserver<E: Estimator> {
     observer: Observer<E>,
 }
 
-impl<E: Estimator> ObserverSeat<E> {
+impl<E: Estimator> DeviceObserver<E> {
     /// An observer at its initial guess, in the run of this greeting.
     pub fn new(estimator: E, hello: &Hello<'_>) -> Self {
         Self { observer: Observer::new(estimator, hello.period_ns as f64 / 1e9) }
@@ -206,13 +206,13 @@ impl<E: Estimator> ObserverSeat<E> {
     }
 }
 
-impl<E: Estimator> Seat for ObserverSeat<E> {
+impl<E: Estimator> DeviceRole for DeviceObserver<E> {
     fn reads() -> impl Iterator<Item = Layout> {
-        [Layout::of::<E::Measurement>()].into_iter()
+        [Layout::for_sample::<E::Measurement>()].into_iter()
     }
 
     fn writes() -> impl Iterator<Item = Layout> {
-        [Layout::of::<E::Estimate>()].into_iter()
+        [Layout::for_sample::<E::Estimate>()].into_iter()
     }
 
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent {
@@ -222,11 +222,11 @@ impl<E: Estimator> Seat for ObserverSeat<E> {
 }
 
 /// A controller of N driven bodies.
-pub struct ControllerSeat<L: Law, const N: usize> {
+pub struct DeviceController<L: Law, const N: usize> {
     controllers: [Controller<L>; N],
 }
 
-impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> ControllerSeat<L, N> {
+impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceController<L, N> {
     /// A controller with the law of each body.
     pub fn new(laws: [L; N]) -> Self {
         Self { controllers: laws.map(Controller::new) }
@@ -246,13 +246,13 @@ impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> ControllerSea
     }
 }
 
-impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> Seat for ControllerSeat<L, N> {
+impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceRole for DeviceController<L, N> {
     fn reads() -> impl Iterator<Item = Layout> {
-        [Layout::of::<L::Estimate>()].into_iter().chain([Layout::of::<L::Measurement>(); N])
+        [Layout::for_sample::<L::Estimate>()].into_iter().chain([Layout::for_sample::<L::Measurement>(); N])
     }
 
     fn writes() -> impl Iterator<Item = Layout> {
-        [Layout::of::<L::Command>(); N].into_iter()
+        [Layout::for_sample::<L::Command>(); N].into_iter()
     }
 
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent {
@@ -263,33 +263,33 @@ impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> Seat for Cont
 }
 
 /// Observer and controller in one device, a flight computer: measurements in, the estimate and the commands out.
-pub struct FlightSeat<E: Estimator, L: Law, const N: usize> {
-    observer: ObserverSeat<E>,
-    controller: ControllerSeat<L, N>,
+pub struct DeviceFlightComputer<E: Estimator, L: Law, const N: usize> {
+    observer: DeviceObserver<E>,
+    controller: DeviceController<L, N>,
 }
 
-impl<E, L, const N: usize> FlightSeat<E, L, N>
+impl<E, L, const N: usize> DeviceFlightComputer<E, L, N>
 where
     E: Estimator,
     L: Law<Estimate = E::Estimate, Measurement: Sample, Command: Sample>,
 {
     /// Both at their beginnings, in the run of this greeting.
     pub fn new(estimator: E, laws: [L; N], hello: &Hello<'_>) -> Self {
-        Self { observer: ObserverSeat::new(estimator, hello), controller: ControllerSeat::new(laws) }
+        Self { observer: DeviceObserver::new(estimator, hello), controller: DeviceController::new(laws) }
     }
 }
 
-impl<E, L, const N: usize> Seat for FlightSeat<E, L, N>
+impl<E, L, const N: usize> DeviceRole for DeviceFlightComputer<E, L, N>
 where
     E: Estimator,
     L: Law<Estimate = E::Estimate, Measurement: Sample, Command: Sample>,
 {
     fn reads() -> impl Iterator<Item = Layout> {
-        ObserverSeat::<E>::reads().chain(ControllerSeat::<L, N>::reads().skip(1))
+        DeviceObserver::<E>::reads().chain(DeviceController::<L, N>::reads().skip(1))
     }
 
     fn writes() -> impl Iterator<Item = Layout> {
-        ObserverSeat::<E>::writes().chain(ControllerSeat::<L, N>::writes())
+        DeviceObserver::<E>::writes().chain(DeviceController::<L, N>::writes())
     }
 
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent {
