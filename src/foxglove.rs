@@ -13,7 +13,7 @@ use crate::record::{Channel, MessageSink, RecordError, Taps};
 use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Layout, MESSAGE_ENCODING, Phase, SCHEMA_ENCODING, Schedule, frame, topic_of};
 use crate::scenario::Scenario;
-use crate::seat::{RoleError, join_whole, run_under_way, write_whole};
+use crate::seat::{RoleError, find_run, join_complete, write_whole};
 use foxglove::{ChannelBuilder, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle};
 use std::collections::BTreeMap;
 use std::io;
@@ -91,8 +91,8 @@ pub enum FoxgloveError {
 /// # Errors
 /// [`FoxgloveError`].
 pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), FoxgloveError> {
-    let root = run_under_way(seat.domain.as_deref()).map_err(RoleError::from)?;
-    let (domain, scenario) = join_whole(&root)?;
+    let root = find_run(seat.domain.as_deref()).map_err(RoleError::from)?;
+    let (domain, scenario) = join_complete(&root)?;
     let mut links = join_at_low_priority(&scenario, NICENESS, || Links::open(&domain, &scenario))
         .map_err(|source| FoxgloveError::Join { source })?;
     let ended = show(seat, &scenario, &domain, &mut links, terminated);

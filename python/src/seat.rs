@@ -2,10 +2,10 @@
 
 use crate::run::{failed, scenario};
 use corotate::bus::Port;
-use corotate::runtime::{Compute, ComputedTick, RoleId, ports};
+use corotate::runtime::{RoleFunction, TickSamples, RoleId, ports};
 use corotate::sample::{FieldKind, Stamp};
 use corotate::scenario::Scenario;
-use corotate::seat::{RoleSeat, run_computed};
+use corotate::seat::{RoleAddress, run_function};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 use std::path::PathBuf;
@@ -62,7 +62,7 @@ pub fn describe(given: &str, kind: &str, role: &str) -> PyResult<(Vec<LayoutOf>,
 #[pyfunction]
 pub fn domain_of(given: PathBuf) -> PyResult<Option<PathBuf>> {
     use corotate::bus::domain::DomainError;
-    match corotate::seat::run_under_way(Some(&given)) {
+    match corotate::seat::find_run(Some(&given)) {
         Ok(domain) => Ok(Some(domain).filter(|domain| domain.join("scenario.toml").exists())),
         Err(DomainError::NoRun | DomainError::Over { .. } | DomainError::NotADomain { .. }) => Ok(None),
         Err(error) => Err(failed(error)),
@@ -70,7 +70,7 @@ pub fn domain_of(given: PathBuf) -> PyResult<Option<PathBuf>> {
 }
 
 /// The samples of a tick as bytes without their stamps.
-fn inputs(tick: &ComputedTick<'_>) -> Vec<Option<Vec<u8>>> {
+fn inputs(tick: &TickSamples<'_>) -> Vec<Option<Vec<u8>>> {
     let words = size_of::<Stamp>() / size_of::<u64>();
     let content = |words_of: &&[u64]| words_of[words..].iter().flat_map(|word| word.to_ne_bytes()).collect();
     tick.inputs.iter().map(|input| input.as_ref().map(content)).collect()
@@ -95,7 +95,7 @@ fn blank(outputs: &[Vec<u64>]) -> Vec<Vec<u8>> {
 pub fn serve(py: Python<'_>, domain: PathBuf, role: String, function: Py<PyAny>) -> PyResult<()> {
     let raised = Arc::new(Mutex::new(None));
     let function = Function { function, raised: Arc::clone(&raised) };
-    let served = py.detach(|| run_computed(&RoleSeat { domain, role }, Box::new(function), &AtomicBool::new(false)));
+    let served = py.detach(|| run_function(&RoleAddress { domain, role }, Box::new(function), &AtomicBool::new(false)));
     let raised: Option<PyErr> = raised.lock().map_err(failed)?.take();
     served.map_err(|error| raised.unwrap_or_else(|| failed(error)))
 }
@@ -105,8 +105,8 @@ struct Function {
     raised: Arc<Mutex<Option<PyErr>>>,
 }
 
-impl Compute for Function {
-    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+impl RoleFunction for Function {
+    fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
         let computed = Python::attach(|py| {
             let bytes = |bytes: Vec<u8>| PyBytes::new(py, &bytes).unbind();
             let given: Vec<Option<Py<PyBytes>>> = inputs(&tick).into_iter().map(|input| input.map(bytes)).collect();
@@ -145,8 +145,8 @@ struct Handed {
     answers: Receiver<Vec<Vec<u8>>>,
 }
 
-impl Compute for Handed {
-    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+impl RoleFunction for Handed {
+    fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
         let asked = (tick.tick, inputs(&tick), blank(tick.outputs));
         self.asked.send(asked).map_err(|_| LEFT.to_owned())?;
         fill(tick.outputs, &self.answers.recv().map_err(|_| LEFT.to_owned())?);
@@ -175,7 +175,7 @@ impl Ticks {
         let terminated = Arc::clone(&leaves);
         let served = std::thread::spawn(move || {
             let handed = Box::new(Handed { asked, answers });
-            run_computed(&RoleSeat { domain, role }, handed, &terminated).map_err(|error| error.to_string())
+            run_function(&RoleAddress { domain, role }, handed, &terminated).map_err(|error| error.to_string())
         });
         Self { line: Mutex::new(Some((ticks, give))), served: Some(served), leaves }
     }

@@ -19,7 +19,7 @@ use crate::bus::iox::IoxBus;
 use crate::bus::{Bus, BusError, Read, Reader, Signal, WordReader, WordWriter, Write};
 use crate::clock::{Grid, RunClock, monotonic_ns, raw_ns};
 use crate::config::ClockKind;
-use crate::runtime::{Kept, depths, go_before_roles, kept, topic};
+use crate::runtime::{RetainedSamples, depths, retained_samples, take_priority_above_roles, topic};
 use crate::sample::{Health, Phase, Schedule, Stamp};
 use crate::scenario::Scenario;
 use crate::seat::{RoleError, clock_path, join, open_ledger, report_path, scenario_path, write_whole};
@@ -139,7 +139,7 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
     let plan = Plan::new(&scenario, own, hub).ok_or_else(|| RelayError::NoHost(own.clone(), hub.clone()))?;
     if scenario.clock == ClockKind::Realtime {
         // Before the engine's threads are started, which inherit it.
-        go_before_roles(&scenario);
+        take_priority_above_roles(&scenario);
     }
     let run = scenario.run.map_or_else(|| scenario.name.clone(), |run| run.to_string());
     let shared = Arc::new(Shared {
@@ -275,9 +275,9 @@ impl Ear {
 struct Incoming {
     writer: Option<WordWriter>,
     /// In lockstep, what stands in for the writer's own: a reader that dies takes what it had not used with it.
-    kept: Option<Kept>,
+    kept: Option<RetainedSamples>,
     /// How many were kept.
-    kept_samples: u64,
+    retained_samples: u64,
     /// The stamp of the last sample of the loop, where nothing is lost.
     last: Option<Stamp>,
     lossless: bool,
@@ -351,9 +351,10 @@ impl<'a> Relay<'a> {
             let here = link.to.iter().find(|way| way.host == plan.own);
             incoming.push(Incoming {
                 writer: here.map(|_| link.port.writer(bus)).transpose()?,
-                kept: here
-                    .and_then(|_| kept(scenario, &link.port.topic, |role| open_ledger(domain, scenario, role).ok())),
-                kept_samples: 0,
+                kept: here.and_then(|_| {
+                    retained_samples(scenario, &link.port.topic, |role| open_ledger(domain, scenario, role).ok())
+                }),
+                retained_samples: 0,
                 last: None,
                 lossless: here.is_some_and(|way| way.lossless),
                 next: 0,
@@ -530,8 +531,8 @@ impl<'a> Relay<'a> {
             }
             if let Some(kept) = &incoming.kept {
                 let words = sample.chunks_exact(size_of::<u64>()).map(bytemuck::pod_read_unaligned);
-                kept.keep(incoming.kept_samples, words);
-                incoming.kept_samples += 1;
+                kept.keep(incoming.retained_samples, words);
+                incoming.retained_samples += 1;
             }
         }
         writer.send(sample)?;

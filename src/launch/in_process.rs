@@ -9,7 +9,7 @@ use crate::config::OnFailure;
 use crate::direct::TURN_TICKS;
 use crate::panics;
 use crate::record::Recorder;
-use crate::runtime::{Ended, RoleId, depths, in_noted_turn, private_ledger, report};
+use crate::runtime::{Ended, RoleId, depths, drive_in_turn_tracked, private_ledger, report};
 use crate::scenario::Scenario;
 use crate::scenario::build;
 use crate::scenario::scorer as open_scorer;
@@ -97,7 +97,8 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
             }
         }
     };
-    let ended = match panics::catch(|| in_noted_turn(&mut nodes, scenario.last_tick, &turn, revive, after_tick)) {
+    let ended = match panics::catch(|| drive_in_turn_tracked(&mut nodes, scenario.last_tick, &turn, revive, after_tick))
+    {
         Ok(ended) => ended?,
         Err(panic) => {
             let Some(index) = turn.get() else { return Err(LaunchError::Panicked { panic }) };

@@ -14,7 +14,7 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal};
 use crate::clock::{self, RunClock, monotonic_ns, raw_ns};
 use crate::config::ClockKind;
 use crate::hosts::{HostSeat, RELAY, far_end_path};
-use crate::runtime::{depths, hold_low_latency_idle, take_short_turns, topic};
+use crate::runtime::{depths, hold_low_latency_idle, request_short_slices, topic};
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::Scenario;
 use crate::seat::{clock_path, report_path, write_whole};
@@ -52,7 +52,7 @@ pub fn join(
     hub: &str,
     launch: &mut Launch<'_>,
 ) -> Result<FarOutcome, LaunchError> {
-    take_short_turns();
+    request_short_slices();
     let domain = owned.domain();
     prepare(scenario, launch, domain)?;
     let path = clock_path(domain);

@@ -25,7 +25,8 @@ use crate::config::ClockKind;
 use crate::hosts::{HostsSummary, RELAY};
 use crate::record::RECORDER;
 use crate::runtime::{
-    Backoff, RoleId, depths, hold_low_latency_idle, report, shared_memory_bytes, take_short_turns, topic, window_ticks,
+    Backoff, RoleId, depths, hold_low_latency_idle, report, request_short_slices, shared_memory_bytes, topic,
+    window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule, Stamp};
 use crate::scenario::Scenario;
@@ -69,7 +70,7 @@ const HUNG_PERIODS: u64 = 10;
 /// Runs all roles of a scenario as processes.
 pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, LaunchError> {
     // What it starts has them too.
-    take_short_turns();
+    request_short_slices();
     let owned = new_domain(scenario)?;
     let domain = owned.domain();
     prepare(scenario, launch, domain)?;
@@ -234,7 +235,7 @@ impl<'a> Supervisor<'a> {
                 false => RoleProcess::start(scenario, role, domain).map(|process| (role, Some(process))),
             }
         };
-        let hosts = RoleId::all(scenario).into_iter().filter(|role| role.host(scenario) == *role);
+        let hosts = RoleId::all(scenario).into_iter().filter(|role| role.process_role(scenario) == *role);
         let mut started = hosts.map(start).collect::<Result<Vec<_>, _>>()?;
         let open = |(role, process): &(RoleId, Option<RoleProcess>)| {
             let elsewhere = elsewhere(scenario, launch, role.name(scenario));

@@ -65,7 +65,7 @@ pub fn replay_as_process(
 fn cut(script: &mut Script, scenario: &Scenario) {
     let plant = matches!(script.role, RoleId::Plant(_));
     // What a scripted fault took from it, that takes from it again.
-    let (mut next, mut interruptions) = (0, Interruptions::of(scenario, &script.name, 1, 0));
+    let (mut next, mut interruptions) = (0, Interruptions::for_role(scenario, &script.name, 1, 0));
     let broken = script.steps.iter().find_map(|step| {
         let missed = plant && (next..step.tick).any(|tick| !interruptions.misses(tick));
         next = step.tick + 1;

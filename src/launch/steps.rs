@@ -9,7 +9,7 @@ use crate::bus::memory::MemoryBus;
 use crate::bus::{BusError, Reader, Signal, WordReader};
 use crate::config::ClockKind;
 use crate::runtime::{
-    Compute, ComputedTick, Poll, ReadyNode, RoleId, RoleImpl, RunCondition, depths, ports, private_ledger, report,
+    Poll, ReadyNode, RoleFunction, RoleId, RoleImpl, RunCondition, TickSamples, depths, ports, private_ledger, report,
 };
 use crate::sample::Field;
 use crate::scenario::Scenario;
@@ -108,8 +108,8 @@ impl TruthReader {
 /// Hands the caller's commands on.
 struct Given(Rc<RefCell<Vec<Vec<u64>>>>);
 
-impl Compute for Given {
-    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+impl RoleFunction for Given {
+    fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
         for (output, given) in tick.outputs.iter_mut().zip(self.0.borrow().iter()) {
             output.copy_from_slice(given);
         }
@@ -142,11 +142,11 @@ impl Steps {
         let content = |port: &Port| vec![0; port.size / size_of::<u64>() - STAMP];
         let commands = Rc::new(RefCell::new(of_controller.writes.iter().map(content).collect()));
         let node = |(role, ledger): &(RoleId, Ledger)| {
-            let occupant = match role {
-                RoleId::Controller => RoleImpl::Computed(*role, Box::new(Given(Rc::clone(&commands)))),
+            let role_impl = match role {
+                RoleId::Controller => RoleImpl::Function(*role, Box::new(Given(Rc::clone(&commands)))),
                 role => RoleImpl::from(*role),
             };
-            build(&scenario, occupant, &bus, ledger)
+            build(&scenario, role_impl, &bus, ledger)
         };
         let nodes = seats.iter().map(node).collect::<Result<Vec<_>, _>>()?;
         let (inputs, outputs) = (vec![None; readers.len()], of_controller.writes);

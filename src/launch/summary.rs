@@ -199,7 +199,7 @@ impl Summary {
 }
 
 fn hosted(scenario: &Scenario) -> BTreeMap<String, String> {
-    let roles = RoleId::all(scenario).into_iter().map(|role| (role, role.host(scenario)));
+    let roles = RoleId::all(scenario).into_iter().map(|role| (role, role.process_role(scenario)));
     let hosted = roles.filter(|(role, host)| role != host);
     hosted.map(|(role, host)| (role.name(scenario).to_owned(), host.name(scenario).to_owned())).collect()
 }
@@ -223,7 +223,7 @@ fn privileges_unknown(scenario: &Scenario, outcome: &Outcome) -> Vec<String> {
     }
     let tells = |name: &str| outcome.reports.iter().any(|report| report.role == name && !report.grants.is_empty());
     let asked = outcome.reports.iter().any(|report| !report.grants.is_empty());
-    let hosts = RoleId::all(scenario).into_iter().filter(|role| *role == role.host(scenario));
+    let hosts = RoleId::all(scenario).into_iter().filter(|role| *role == role.process_role(scenario));
     let names = hosts.map(|role| role.name(scenario).to_owned());
     names.filter(|name| outcome.unbooked.contains(name) || asked && !tells(name)).collect()
 }

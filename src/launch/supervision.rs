@@ -17,7 +17,7 @@ use crate::panics::Panic;
 use crate::runtime::{RoleId, topic};
 use crate::sample::{Health, RoleState};
 use crate::scenario::Scenario;
-use crate::seat::{device_words_path, open_ledger, panic_path, report_path, words_path};
+use crate::seat::{device_failure_path, failure_path, open_ledger, panic_path, report_path};
 use crate::system::tell;
 use crate::telemetry::Ledger;
 
@@ -138,7 +138,7 @@ impl Member {
     ) -> Result<Self, LaunchError> {
         let now_ns = monotonic_ns();
         let name = role.name(scenario).to_owned();
-        let hosted = role.hosted(scenario).into_iter().filter(|other| *other != role);
+        let hosted = role.process_members(scenario).into_iter().filter(|other| *other != role);
         let hosted = hosted.map(|other| Ok((other, open_ledger(domain, scenario, other)?)));
         Ok(Self {
             hosted: hosted.collect::<Result<_, LaunchError>>()?,
@@ -396,11 +396,11 @@ impl Member {
             Some(Panic::take(&panic).map_or_else(|| Failure::new(code, cause, last_words), Failure::of))
         };
         if state != RoleState::Done
-            && let Ok(last_words) = std::fs::read_to_string(words_path(janitor.root(), &self.name))
+            && let Ok(last_words) = std::fs::read_to_string(failure_path(janitor.root(), &self.name))
         {
             return fail(left(), last_words);
         }
-        let words = device_words_path(janitor.root(), &self.name);
+        let words = device_failure_path(janitor.root(), &self.name);
         let fail = |cause: (&str, String)| fail(cause, std::fs::read_to_string(&words).unwrap_or_default());
         let timeout_s = match &self.host {
             Some(_) => scenario.host_silence_s(state >= RoleState::Running),

@@ -3,8 +3,8 @@
 use super::output::{Ended, Exit, Failure, fail, say};
 use super::runs::join;
 use crate::launch::line_words;
-use crate::runtime::{DeviceError, DeviceSeat, NodeError};
-use crate::seat::{RoleError, Served, run_bridge};
+use crate::runtime::{DeviceConfig, DeviceError, NodeError};
+use crate::seat::{BridgeResult, RoleError, run_bridge};
 use crate::system::tell;
 use std::path::PathBuf;
 
@@ -55,7 +55,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Serves the seat to the end of the run.
 pub fn bridge(arguments: &Arguments) -> Ended {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
-    let seat = DeviceSeat {
+    let seat = DeviceConfig {
         domain,
         roles: arguments.role.clone(),
         path: arguments.serial.clone(),
@@ -66,7 +66,7 @@ pub fn bridge(arguments: &Arguments) -> Ended {
     let role = seat.roles.join(",");
     let welcomed = |device: &str| tell(format_args!("{role} on {}: {device}", seat.path.display()));
     let served = run_bridge(&seat, &terminated, welcomed).map_err(|error| fail(exit_of(&error), error))?;
-    let Some(Served { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
+    let Some(BridgeResult { counters, outages, lost }) = served else { return Ok(Exit::Ok) };
     if arguments.json {
         let object = serde_json::json!({ "schema": SCHEMA, "role": role, "line": counters, "outages": outages });
         say(&format!("{object}\n"))?;

@@ -2,7 +2,7 @@
 
 use super::output::{Ended, Exit, fail};
 use super::runs::join;
-use crate::seat::{RoleError, RoleSeat, run_role};
+use crate::seat::{RoleAddress, RoleError, run_role};
 use std::path::PathBuf;
 
 /// Options of every role.
@@ -36,7 +36,7 @@ pub struct PlantArguments {
 /// Serves a role to the end of the run.
 pub fn role(name: &str, arguments: &Arguments) -> Ended {
     let (domain, terminated) = join(arguments.parent, arguments.domain.as_deref())?;
-    let seat = RoleSeat { domain, role: name.to_owned() };
+    let seat = RoleAddress { domain, role: name.to_owned() };
     run_role(&seat, &terminated).map(|()| Exit::Ok).map_err(|error| match error {
         RoleError::Domain(_) | RoleError::Config(_) | RoleError::NoSuchRole { .. } | RoleError::Hosted { .. } => {
             fail(Exit::Usage, error)

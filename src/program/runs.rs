@@ -8,7 +8,7 @@ use super::signals::{die_with, terminated_by_signals};
 use crate::bus::domain::Domain;
 use crate::files::{self, Directory};
 use crate::launch::{LATEST, RECORDING, RUNS};
-use crate::seat::{results_path, run_under_way};
+use crate::seat::{find_run, results_path};
 use std::ffi::OsString;
 use std::fs;
 use std::io::ErrorKind;
@@ -89,7 +89,7 @@ pub fn newest_recording(than: &Path) -> Option<PathBuf> {
 /// The exit code, once the reason is told.
 pub fn domain(given: Option<&Path>) -> Result<PathBuf, Exit> {
     let given = given.filter(|given| *given != Path::new(LATEST));
-    run_under_way(given).map_err(|error| fail(Exit::Usage, error))
+    find_run(given).map_err(|error| fail(Exit::Usage, error))
 }
 
 /// Prepares a process to join a run: it dies with its parent, if one is given, and signals set a flag. Returns the run's domain and

@@ -12,12 +12,12 @@ use crate::bus::{Bus, BusError, Read, Reader, Signal, Write};
 use crate::clock::{monotonic_ns, sleep_until};
 use crate::config::ClockKind;
 use crate::runtime::{
-    Backoff, RoleId, depths, go_before_ordinary, join_at_low_priority, report, topic, window_ticks,
+    Backoff, RoleId, depths, join_at_low_priority, report, take_lowest_realtime_priority, topic, window_ticks,
     with_realtime_priority,
 };
 use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use crate::scenario::Scenario;
-use crate::seat::{RoleError, join_whole, open_ledger, report_path, write_whole};
+use crate::seat::{RoleError, join_complete, open_ledger, report_path, write_whole};
 use crate::telemetry::RoleReport;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -48,12 +48,12 @@ pub struct RecorderSeat {
 /// # Errors
 /// [`RecordError`] if nothing could be recorded. What ended a recording before its time is in the report.
 pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<RecordingReport, RecordError> {
-    let (domain, scenario) = join_whole(&seat.domain)?;
+    let (domain, scenario) = join_complete(&seat.domain)?;
     let (bus, mut line, mut recorder) = join_at_low_priority(&scenario, 0, || open(seat, &domain, &scenario))?;
     let lockstep = scenario.clock != ClockKind::Realtime;
     // It must not lose samples because something is being compiled, and must stay behind the roles.
     if !lockstep && scenario.realtime.priority > 1 {
-        go_before_ordinary();
+        take_lowest_realtime_priority();
     }
     let credit_ticks = lockstep.then(|| CREDIT_TICKS.min(window_ticks(&scenario) / 4).max(1));
     let ended =

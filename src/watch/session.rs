@@ -12,7 +12,7 @@ use crate::clock::{Grid, monotonic_ns, sleep_until};
 use crate::runtime::{depths, join_at_low_priority, topic, with_realtime_priority};
 use crate::sample::{Phase, Schedule};
 use crate::scenario::Scenario;
-use crate::seat::{RoleError, join_whole, run_under_way};
+use crate::seat::{RoleError, find_run, join_complete};
 use std::path::Path;
 
 /// How much a watcher gives way to everybody.
@@ -57,10 +57,10 @@ impl Session {
     /// # Errors
     /// [`WatchError`].
     pub fn open(directory: Option<&Path>, stop: impl Fn() -> bool) -> Result<Self, WatchError> {
-        let root = run_under_way(directory)?;
+        let root = find_run(directory)?;
         let end_ns = monotonic_ns() + JOIN_NS;
         let patient = || monotonic_ns() < end_ns && !stop();
-        let (domain, scenario) = insist(patient, || join_whole(&root))?;
+        let (domain, scenario) = insist(patient, || join_complete(&root))?;
         let mut model = Model {
             scenario: scenario.name.clone(),
             clock: scenario.clock.name(),

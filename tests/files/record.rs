@@ -6,7 +6,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::clock::{Grid, monotonic_ns};
 use corotate::record::{Recorder, Recording, RoleReplay, replay_in_process};
 use corotate::runtime::{
-    Poll, ReadyNode, RoleId, RunCondition, depths, in_turn, ports, private_ledger, report, shared_ledger,
+    Poll, ReadyNode, RoleId, RunCondition, depths, drive_in_turn, ports, private_ledger, report, shared_ledger,
 };
 use corotate::sample::topic_of;
 use corotate::scenario::Scenario;
@@ -44,7 +44,7 @@ fn published(scenario: &Scenario) -> BTreeMap<String, Vec<u8>> {
     let none = |_| panic!("no role dies here");
     let grid = Grid { epoch_ns: 0, period_ns: scenario.period_ns };
     nodes.iter_mut().for_each(|node| node.start(grid, 0).unwrap());
-    in_turn(&mut nodes, scenario.last_tick, none, |_| {
+    drive_in_turn(&mut nodes, scenario.last_tick, none, |_| {
         for (service, reader) in &mut taps {
             while let Some(words) = reader.next().unwrap() {
                 all.entry(service.clone()).or_default().extend_from_slice(bytemuck::cast_slice(words));

@@ -7,7 +7,7 @@ use corotate::bus::{Reader, Signal};
 use corotate::control::{OrbitGains, OrbitHold};
 use corotate::model::{CentralField, OrbitState};
 use corotate::observe::{InvariantFilter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
-use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{OrbitEstimate, OrbitTruth};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -149,12 +149,12 @@ fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> 
     let bodies = scenario.rig.bodies();
     let mut truths: Vec<Input<MemoryBus, OrbitTruth>> = bodies
         .iter()
-        .map(|body| Input::watch(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
+        .map(|body| Input::open(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
         .collect();
     let mut estimate: Input<MemoryBus, OrbitEstimate> =
-        Input::watch(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+        Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
-    in_turn(
+    drive_in_turn(
         &mut nodes,
         scenario.last_tick,
         |_| Ok(None),

@@ -3,7 +3,7 @@
 use crate::common::{Bench, reference, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{RateEstimate, RateTruth};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -36,13 +36,13 @@ fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
         .map(|role| build(scenario, role, &bus, &private_ledger(scenario, role)).unwrap())
         .collect();
     let truth = |body: &str| -> Input<MemoryBus, RateTruth> {
-        Input::watch(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()
+        Input::open(&bus, &topic(scenario, body, Signal::Truth), Reader::Scorer).unwrap()
     };
     let (mut leader, mut follower) = (truth("leader"), truth("follower"));
     let mut estimate: Input<MemoryBus, RateEstimate> =
-        Input::watch(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
+        Input::open(&bus, &topic(scenario, "leader", Signal::Estimate), Reader::Scorer).unwrap();
     let mut rows = Vec::new();
-    in_turn(
+    drive_in_turn(
         &mut nodes,
         scenario.last_tick,
         |_| Ok(None),

@@ -6,11 +6,11 @@ use corotate::bus::iox::IoxBus;
 use corotate::bus::{Bus, BusError, Carried, Read, Reader, Signal, Topic, Write};
 use corotate::rig::Rig;
 use corotate::runtime::{
-    DeviceLink, DeviceSeat, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
+    DeviceConfig, DeviceLink, Privileges, RoleId, RoleImpl, build_rig, depths, private_ledger, topic,
 };
 use corotate::sample::{FleetLayout, Health, Phase, RoleState, Sample, Schedule};
 use corotate::scenario::Scenario;
-use corotate::seat::{Service, serve};
+use corotate::seat::{RoleEnvironment, serve};
 use corotate::serial::{Device, DeviceFlightComputer, DevicePlant, DeviceRole, Hello};
 use corotate::telemetry::RoleReport;
 use corotate::with_shipped_rig;
@@ -144,17 +144,17 @@ impl<S: Carried + ?Sized, W: Write<S>> Write<S> for CountedWriter<W> {
 }
 
 /// Serves one role in this thread and gives its report and what it allocated.
-fn count_role(scenario: &Scenario, occupant: impl Into<RoleImpl>, domain: &OwnedDomain) -> (RoleReport, Count) {
-    let occupant = occupant.into();
-    let role = occupant.role();
+fn count_role(scenario: &Scenario, role_impl: impl Into<RoleImpl>, domain: &OwnedDomain) -> (RoleReport, Count) {
+    let role_impl = role_impl.into();
+    let role = role_impl.role();
     let bus = CountedBus(IoxBus::enter(domain.domain(), role.name(scenario), depths(scenario)).unwrap());
     let terminated = AtomicBool::new(false);
     let mut result = None;
     let ledger = private_ledger(scenario, role);
-    let build = |occupant| with_shipped_rig!(scenario.rig, rig => build_rig(rig, scenario, occupant, &bus, &ledger));
+    let build = |role_impl| with_shipped_rig!(scenario.rig, rig => build_rig(rig, scenario, role_impl, &bus, &ledger));
     let privileges = Privileges::default();
-    let service = Service { scenario, bus: &bus, ledger: &ledger, terminated: &terminated, privileges };
-    serve(service, occupant, build, |report| {
+    let service = RoleEnvironment { scenario, bus: &bus, ledger: &ledger, terminated: &terminated, privileges };
+    serve(service, role_impl, build, |report| {
         result = Some((report.clone(), COUNT.get()));
         Ok(())
     })
@@ -218,7 +218,7 @@ fn live<S: DeviceRole>(seat: impl FnMut(&Hello<'_>) -> Option<S>, far: &OwnedFd)
 /// The link to that device, greeted.
 fn linked(scenario: &Scenario, roles: &[RoleId], path: &Path) -> RoleImpl {
     let names = roles.iter().map(|role| role.name(scenario).to_owned()).collect();
-    let seat = DeviceSeat {
+    let seat = DeviceConfig {
         domain: PathBuf::new(),
         roles: names,
         path: path.to_owned(),
@@ -246,7 +246,7 @@ fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport,
     // All roles of a device are in the process of the last.
     let elsewhere = &in_device[..in_device.len().saturating_sub(1)];
     let hosts = RoleId::all(&scenario).into_iter();
-    let hosts = hosts.filter(|role| role.host(&scenario) == *role && !elsewhere.contains(role));
+    let hosts = hosts.filter(|role| role.process_role(&scenario) == *role && !elsewhere.contains(role));
     let (roles, (far, path)) = (hosts.collect::<Vec<_>>(), line());
     std::thread::scope(|scope| {
         let (scenario, domain, path) = (&scenario, &domain, &path);
@@ -259,7 +259,7 @@ fn counts(text: &str, in_device: &[RoleId], processes: &str) -> Vec<(RoleReport,
                     scope.spawn(move || count_role(scenario, linked(scenario, in_device, path), domain))
                 }
                 role => scope.spawn(move || {
-                    let others = role.hosted(scenario).into_iter().filter(|other| other != role);
+                    let others = role.process_members(scenario).into_iter().filter(|other| other != role);
                     let others = others.map(|other| (other, private_ledger(scenario, other))).collect();
                     count_role(scenario, RoleImpl::Role(*role, others), domain)
                 }),

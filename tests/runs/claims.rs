@@ -11,7 +11,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Reader, Signal};
 use corotate::config::SHIPPED;
 use corotate::rig::{Estimate, Rig, Truth};
-use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, report, topic};
+use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, report, topic};
 use corotate::sample::{FieldKind, Sample};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -231,10 +231,10 @@ fn run(scenario: &Scenario) -> Trace {
             seats.iter().map(|(role, ledger)| build(scenario, *role, &bus, ledger).unwrap()).collect();
         let bodies = rig.bodies();
         let mut truths: Vec<Input<MemoryBus, Truth<R>>> = (bodies.iter())
-            .map(|body| Input::watch(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
+            .map(|body| Input::open(&bus, &topic(scenario, &body.name, Signal::Truth), Reader::Scorer).unwrap())
             .collect();
         let mut estimate: Input<MemoryBus, Estimate<R>> =
-            Input::watch(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
+            Input::open(&bus, &topic(scenario, &bodies[0].name, Signal::Estimate), Reader::Scorer).unwrap();
         let numbers: Vec<_> = Truth::<R>::FIELDS
             .iter()
             .filter(|field| field.kind == FieldKind::F64 && R::CONTROLLED.contains(&field.name))
@@ -251,7 +251,7 @@ fn run(scenario: &Scenario) -> Trace {
             motion.push(numbers.iter().flat_map(of).map(f64::from_bits).collect());
             true
         };
-        in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
+        drive_in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
         let read = seats.iter().flat_map(|(role, ledger)| report(scenario, *role, ledger, Vec::new(), Vec::new()).read);
         let rejected = read.map(|link| link.rejected).sum();
         Trace { tick_s: scenario.tick_s(), errors, motion, rejected }

@@ -7,10 +7,10 @@ use corotate::config::SHIPPED;
 use corotate::launch::{Launch, Outcome, Steps, Summary, run};
 use corotate::rig::{Command, Estimate, Measurement, Rig, RigidBodyRig};
 use corotate::role::Law;
-use corotate::runtime::{Compute, ComputedTick};
+use corotate::runtime::{RoleFunction, TickSamples};
 use corotate::sample::Message;
 use corotate::scenario::Scenario;
-use corotate::seat::{RoleError, RoleSeat, run_computed};
+use corotate::seat::{RoleAddress, RoleError, run_function};
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::time::SystemTime;
 
@@ -52,8 +52,8 @@ impl Laws {
     }
 }
 
-impl Compute for Laws {
-    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+impl RoleFunction for Laws {
+    fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
         for (output, command) in tick.outputs.iter_mut().zip(self.commands(tick.inputs)) {
             output.copy_from_slice(&command);
         }
@@ -113,10 +113,10 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
         let domain = await_some(|| bench.domains().pop());
         let seat = await_some(|| {
             let seat = domain.join("controller.seat.json");
-            seat.exists().then(|| RoleSeat { domain: domain.clone(), role: "controller".to_owned() })
+            seat.exists().then(|| RoleAddress { domain: domain.clone(), role: "controller".to_owned() })
         });
         let laws = Laws::of(&scenario("rigid-pair", &[]));
-        run_computed(&seat, Box::new(laws), &AtomicBool::new(false)).unwrap();
+        run_function(&seat, Box::new(laws), &AtomicBool::new(false)).unwrap();
         let done = running.wait().succeeded();
         let (own, built_in) = (told(&done.stdout), told(&alone.stdout));
         if own["state"]["first_disturbed_tick"].is_null() {
@@ -131,11 +131,11 @@ fn a_controller_of_ones_own_has_the_bits_of_the_built_in_one() {
 }
 
 /// A run that waits for a controller of this process.
-fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleSeat) {
+fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleAddress) {
     let waits = ["run", "rigid-pair", "--external", "controller", "--set", "accept={}", "--json"];
     let running = bench.start(&[&waits[..], options].concat());
     let domain = bench.await_seat("controller").parent().unwrap().to_owned();
-    (running, RoleSeat { domain, role: "controller".to_owned() })
+    (running, RoleAddress { domain, role: "controller".to_owned() })
 }
 
 /// A function that fails ends its role with what it says, and the run in order, whatever the tick and the clock: by what it
@@ -143,8 +143,8 @@ fn start_waiting(bench: &Bench, options: &[&str]) -> (Running, RoleSeat) {
 #[test]
 fn a_function_that_fails_ends_the_run_in_order() {
     struct Fails(u64);
-    impl Compute for Fails {
-        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+    impl RoleFunction for Fails {
+        fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
             if tick.tick < self.0 { Ok(()) } else { Err("it cannot divide by zero".to_owned()) }
         }
     }
@@ -152,7 +152,7 @@ fn a_function_that_fails_ends_the_run_in_order() {
         let bench = Bench::new();
         let patient = ["--clock", clock, "--duration", "1000", "--set", "supervision.heartbeat_timeout_s=3600"];
         let (running, seat) = start_waiting(&bench, &patient);
-        let error = run_computed(&seat, Box::new(Fails(tick)), &AtomicBool::new(false)).unwrap_err();
+        let error = run_function(&seat, Box::new(Fails(tick)), &AtomicBool::new(false)).unwrap_err();
         assert_eq!(error.to_string(), "it cannot divide by zero");
         let done = running.wait();
         assert_eq!(done.code, Some(4), "{done:?}");
@@ -171,8 +171,8 @@ fn a_function_that_fails_ends_the_run_in_order() {
 #[test]
 fn a_function_that_is_slow_is_waited_for_in_lockstep() {
     struct Slow;
-    impl Compute for Slow {
-        fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String> {
+    impl RoleFunction for Slow {
+        fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String> {
             if tick.tick == 50 {
                 std::thread::sleep(std::time::Duration::from_secs(3));
             }
@@ -184,7 +184,7 @@ fn a_function_that_is_slow_is_waited_for_in_lockstep() {
         let bench = Bench::new();
         let limit = format!("launch.external_timeout_s={limit}");
         let (running, seat) = start_waiting(&bench, &[&brief[..], &["--set", &limit]].concat());
-        let served = run_computed(&seat, Box::new(Slow), &AtomicBool::new(false));
+        let served = run_function(&seat, Box::new(Slow), &AtomicBool::new(false));
         let done = running.wait();
         assert_eq!(done.code, Some(exit), "{done:?}");
         let summary = done.json();

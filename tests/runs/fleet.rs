@@ -4,7 +4,7 @@
 use crate::common::{ANY_TICKS, Bench, await_some, send_signal, shipped};
 use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Carried, Reader, Signal};
-use corotate::runtime::{Input, RoleId, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, RoleId, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{FleetTruth, RateTruth};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
@@ -28,13 +28,13 @@ fn watch<S: Carried + ?Sized>(name: &str, overrides: &[String], bodies: usize, m
     let mut nodes: Vec<_> = RoleId::all(&scenario).into_iter().map(node).collect();
     let body = &scenario.rig.bodies()[1].name;
     let mut truth: Input<MemoryBus, S> =
-        Input::watch_many(&bus, &topic(&scenario, body, Signal::Truth), bodies, Reader::Scorer).unwrap();
+        Input::open_many(&bus, &topic(&scenario, body, Signal::Truth), bodies, Reader::Scorer).unwrap();
     let each = |_| {
         assert!(truth.advance().unwrap());
         look(truth.sample().unwrap());
         true
     };
-    in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
+    drive_in_turn(&mut nodes, scenario.last_tick, |_| Ok(None), each).unwrap();
 }
 
 fn alone(rate: [f64; 3], overrides: &[String]) -> Motion {

@@ -8,7 +8,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Read, Reader, Signal, Write};
 use corotate::clock::monotonic_ns;
 use corotate::config::ClockKind;
-use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, in_turn, private_ledger, topic};
+use corotate::runtime::{Input, Poll, RoleId, RunCondition, Seek, depths, drive_in_turn, private_ledger, topic};
 use corotate::sample::{
     FieldKind, Health, NO_SAMPLE, Phase, RateCommand, RateMeasurement, RateTruth, RoleState, Sample, Schedule, status,
 };
@@ -141,7 +141,7 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
     let mut truth = reader(&bus, &scenario, Signal::Truth);
     let mut command = reader(&bus, &scenario, Signal::Command);
     let mut seen = (Vec::new(), Vec::new(), Vec::new());
-    in_turn(
+    drive_in_turn(
         &mut nodes,
         scenario.last_tick,
         |_| Ok(None),
@@ -157,7 +157,7 @@ fn built_in() -> (Vec<RateMeasurement>, Vec<RateTruth>, Vec<RateCommand>) {
 }
 
 fn reader<S: Sample>(bus: &MemoryBus, scenario: &Scenario, signal: Signal) -> Input<MemoryBus, S> {
-    Input::watch(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
+    Input::open(bus, &topic(scenario, "follower", signal), Reader::Scorer).unwrap()
 }
 
 fn next<S: Sample>(input: &mut Input<MemoryBus, S>) -> S {
@@ -242,7 +242,7 @@ fn conduct(scenario: &Scenario, domain: &OwnedDomain) {
     let mut schedule = bus.writer::<Schedule>(&topic(scenario, "run", Signal::Schedule), 1).unwrap();
     let mut health = bus.reader::<Health>(&topic(scenario, "follower", Signal::Health), Reader::Role).unwrap();
     let measurement = topic(scenario, "follower", Signal::Measurement);
-    let mut measurement = Input::<IoxBus, RateMeasurement>::watch(&bus, &measurement, Reader::Role).unwrap();
+    let mut measurement = Input::<IoxBus, RateMeasurement>::open(&bus, &measurement, Reader::Role).unwrap();
     let mut writer = bus.writer::<RateCommand>(&topic(scenario, "follower", Signal::Command), 1).unwrap();
     let mut asked = 0;
     let mut lead = |phase: Phase, until: RoleState| {
@@ -420,7 +420,7 @@ impl Partner {
         let scenario = Scenario::load(&domain.join("scenario.toml"), &[]).unwrap();
         let bus = IoxBus::enter(&Domain::join(domain).unwrap(), "partner", depths(&scenario)).unwrap();
         let signal = |signal| topic(&scenario, "follower", signal);
-        let mut command = Input::<IoxBus, RateCommand>::watch(&bus, &signal(Signal::Command), Reader::Role).unwrap();
+        let mut command = Input::<IoxBus, RateCommand>::open(&bus, &signal(Signal::Command), Reader::Role).unwrap();
         let mut schedule = bus.reader::<Schedule>(&topic(&scenario, "run", Signal::Schedule), Reader::Role).unwrap();
         let mut measurement = bus.writer::<RateMeasurement>(&signal(Signal::Measurement), 1).unwrap();
         let mut truth = bus.writer::<RateTruth>(&signal(Signal::Truth), 1).unwrap();

@@ -177,8 +177,8 @@ enum TruthInput<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> TruthInput<R, B> {
     fn open(bus: &B, topic: &Topic, fleet: Option<usize>) -> Result<Self, BusError> {
         Ok(match fleet {
-            None => Self::One(Input::watch(bus, topic, Reader::Scorer)?),
-            Some(bodies) => Self::Fleet(Input::watch_many(bus, topic, bodies, Reader::Scorer)?),
+            None => Self::One(Input::open(bus, topic, Reader::Scorer)?),
+            Some(bodies) => Self::Fleet(Input::open_many(bus, topic, bodies, Reader::Scorer)?),
         })
     }
 
@@ -393,10 +393,9 @@ impl<R: Rig> Scoring<R> {
 impl<R: Rig, B: Bus> RigScorer<R, B> {
     fn open(rig: &R, scenario: &Settings, bus: &B) -> Result<Self, BusError> {
         // What no role uses is not scored either.
-        let mut estimate =
-            Input::watch(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
-                .with_late(LateSamples::of(scenario, Signal::Estimate, &rig.bodies()[0].name))
-                .guarded(rig.estimate_guard());
+        let mut estimate = Input::open(bus, &topic(scenario, &rig.bodies()[0].name, Signal::Estimate), Reader::Scorer)?
+            .with_late(LateSamples::for_signal(scenario, Signal::Estimate, &rig.bodies()[0].name))
+            .with_guard(rig.estimate_guard());
         estimate.expect(crate::runtime::accepted_ticks(scenario, None));
         let truth = |body: &BodyInfo| TruthInput::open(bus, &topic(scenario, &body.name, Signal::Truth), body.fleet);
         Ok(Self {

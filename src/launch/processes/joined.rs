@@ -16,7 +16,9 @@ impl<'a> Supervisor<'a> {
         let schedule = bus.writer(&topic(scenario, "run", Signal::Schedule), 1)?;
         let recorder = RecorderWatch::start(None, scenario, domain, bus)?;
         let foxglove = foxglove::start(None, domain)?;
-        let own = |role: &RoleId| role.host(scenario) == *role && scenario.hosts.of(role.name(scenario)) == Some(host);
+        let own = |role: &RoleId| {
+            role.process_role(scenario) == *role && scenario.hosts.of(role.name(scenario)) == Some(host)
+        };
         let roles = RoleId::all(scenario).into_iter().filter(own);
         let started = roles.map(|role| Ok((role, RoleProcess::start(scenario, role, domain)?)));
         let open = |(role, process)| {

@@ -37,7 +37,7 @@ const FRAME_OVERHEAD: u64 = 14;
 
 /// Which seat a device takes, and where it is.
 #[derive(Debug, Clone)]
-pub struct DeviceSeat {
+pub struct DeviceConfig {
     /// The domain's directory.
     pub domain: PathBuf,
     /// The role's name: a driven body's, `observer` or `controller`; or both of these.
@@ -106,7 +106,7 @@ struct Layouts {
 
 impl Layouts {
     /// Those of a role, or of observer and controller together, which keep the estimate to themselves.
-    fn of(scenario: &Settings, roles: &[RoleId]) -> Self {
+    fn for_roles(scenario: &Settings, roles: &[RoleId]) -> Self {
         let mut layouts = Self { reads: Vec::new(), writes: Vec::new() };
         for role in roles {
             let ports = ports(scenario, *role);
@@ -118,17 +118,18 @@ impl Layouts {
         layouts
     }
 
-    fn lengths(of: &[(&'static str, usize)]) -> Vec<usize> {
-        of.iter().map(|(_, length)| *length).collect()
+    fn lengths(layouts: &[(&'static str, usize)]) -> Vec<usize> {
+        layouts.iter().map(|(_, length)| *length).collect()
     }
 
-    fn names(of: &[(&'static str, usize)]) -> String {
-        of.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(" ")
+    fn names(layouts: &[(&'static str, usize)]) -> String {
+        layouts.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(" ")
     }
 
     /// Refuses what no message could hold.
     fn check(&self, role: &str) -> Result<(), DeviceError> {
-        let [read, written]: [usize; 2] = [&self.reads, &self.writes].map(|of| Self::lengths(of).iter().sum());
+        let [read, written]: [usize; 2] =
+            [&self.reads, &self.writes].map(|layouts| Self::lengths(layouts).iter().sum());
         let samples = self.reads.len().max(self.writes.len());
         let names = Self::names(&self.reads).len().max(Self::names(&self.writes).len());
         if read.max(written) > MAX_CONTENT || samples > MAX_SAMPLES || names > MAX_NAMES {
@@ -158,12 +159,12 @@ impl DeviceLink {
     ///
     /// # Errors
     /// [`DeviceError::Line`], [`DeviceError::Delayed`], [`DeviceError::TooLong`] and [`DeviceError::TooSlow`].
-    pub fn open(seat: &DeviceSeat, scenario: &Settings, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
+    pub fn open(seat: &DeviceConfig, scenario: &Settings, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
         let body = matches!(roles, [RoleId::Plant(_)]);
         if body && scenario.actuation_delay_ticks > 1 {
             return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
         }
-        let layouts = Layouts::of(scenario, roles);
+        let layouts = Layouts::for_roles(scenario, roles);
         let role = roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(" ");
         layouts.check(&role)?;
         let (inputs, written) = (Layouts::lengths(&layouts.reads), Layouts::lengths(&layouts.writes));

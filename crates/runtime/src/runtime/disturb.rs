@@ -25,7 +25,7 @@ pub struct Disturbance<S: Carried + ?Sized> {
 impl<S: Carried + ?Sized> Disturbance<S> {
     /// What a scenario does to a role's signal about a body, or a fleet of so many, from a tick on; nothing if there is
     /// nothing.
-    pub fn of(scenario: &Settings, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
+    pub fn for_signal(scenario: &Settings, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
         Self::new(courses(scenario, role, Some(body), next_tick), bodies)
     }
 
@@ -114,7 +114,7 @@ pub struct LateSamples(Vec<FaultSequence>);
 
 impl LateSamples {
     /// Those of a signal about a body; nothing if there are none that a reader could take for samples in time.
-    pub fn of(scenario: &Settings, signal: Signal, body: &str) -> Option<Box<Self>> {
+    pub fn for_signal(scenario: &Settings, signal: Signal, body: &str) -> Option<Box<Self>> {
         let role = match signal {
             Signal::Measurement => body,
             Signal::Estimate => "observer",
@@ -175,7 +175,7 @@ pub struct Interruptions {
 
 impl Interruptions {
     /// What a scenario does to a role in this generation of it, from a tick on.
-    pub fn of(scenario: &Settings, role: &str, generation: u64, next_tick: u64) -> Self {
+    pub fn for_role(scenario: &Settings, role: &str, generation: u64, next_tick: u64) -> Self {
         let process = scenario.clock != ClockKind::InProcess;
         let faults = courses(scenario, role, None, next_tick);
         Self { faults, first_life: generation == 1, process, next: 0 }

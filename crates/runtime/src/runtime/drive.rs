@@ -47,7 +47,7 @@ pub struct Heartbeat<B: Bus> {
 }
 
 /// A process's line to the launcher, with the heartbeat of each of its roles.
-pub struct Control<'a, B: Bus> {
+pub struct LauncherLink<'a, B: Bus> {
     bus: &'a B,
     schedule: B::Reader<Schedule>,
     heartbeats: Vec<Heartbeat<B>>,
@@ -58,7 +58,7 @@ pub struct Control<'a, B: Bus> {
     next_look_ns: u64,
 }
 
-impl<'a, B: Bus> Control<'a, B> {
+impl<'a, B: Bus> LauncherLink<'a, B> {
     /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
     /// that asks the process to end.
     pub fn new(
@@ -83,7 +83,7 @@ impl<'a, B: Bus> Control<'a, B> {
     pub fn announce(&mut self, state: RoleState, node: &dyn Node) -> Result<(), BusError> {
         let denied = self.denied;
         for Heartbeat { role, health, generation } in &mut self.heartbeats {
-            let ticks = node.of(*role).unwrap_or(node).ticks();
+            let ticks = node.member(*role).unwrap_or(node).ticks();
             health.send(|health| {
                 let sent_ns = monotonic_ns();
                 health.stamp = Stamp { tick: ticks.elapsed, generation: *generation, origin_ns: sent_ns, sent_ns };
@@ -128,7 +128,7 @@ impl<'a, B: Bus> Control<'a, B> {
 
 /// How a role waits in real time.
 #[derive(Debug, Clone, Copy)]
-pub struct Waiting<'a> {
+pub struct WaitPolicy<'a> {
     /// It wakes so long before the tick and spins the rest, ns.
     pub lead_ns: u64,
     /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
@@ -140,37 +140,37 @@ pub struct Waiting<'a> {
 }
 
 /// What a driver needs besides its node.
-pub struct Drive<'a, 'b, B: Bus> {
-    control: &'a mut Control<'b, B>,
+pub struct Driver<'a, 'b, B: Bus> {
+    launcher: &'a mut LauncherLink<'b, B>,
     last_tick: u64,
     window_ticks: u64,
     next_turn_ns: u64,
 }
 
-impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
+impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
-    pub fn new(control: &'a mut Control<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
-        Self { control, last_tick, window_ticks, next_turn_ns: 0 }
+    pub fn new(launcher: &'a mut LauncherLink<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
+        Self { launcher, last_tick, window_ticks, next_turn_ns: 0 }
     }
 
     /// Drives a node on the time grid.
     ///
     /// # Errors
     /// [`NodeError`] if a link failed.
-    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, waiting: &Waiting<'_>) -> Result<Ended, NodeError> {
+    pub fn realtime(&mut self, node: &mut dyn Node, grid: Grid, policy: &WaitPolicy<'_>) -> Result<Ended, NodeError> {
         while node.next_tick() <= self.last_tick {
             let due_ns = grid.due_ns(node.next_tick());
-            let timed = node.time_triggered() || waiting.spin_ns > 0;
-            if timed && self.idle_until(due_ns.saturating_sub(waiting.lead_ns), node)? {
+            let timed = node.time_triggered() || policy.spin_ns > 0;
+            if timed && self.idle_until(due_ns.saturating_sub(policy.lead_ns), node)? {
                 return Ok(Ended::Stopped);
             }
             node.before_tick();
-            let begun = if node.time_triggered() { self.on_time(node, grid, waiting.lead_ns)? } else { Poll::Waiting };
+            let begun = if node.time_triggered() { self.on_time(node, grid, policy.lead_ns)? } else { Poll::Waiting };
             let waits = begun == Poll::Waiting && node.next_tick() <= self.last_tick;
-            let executed = if waits { self.on_arrival(node, grid, waiting)? } else { Some(begun) };
+            let executed = if waits { self.on_arrival(node, grid, policy)? } else { Some(begun) };
             match executed {
                 Some(Poll::Executed) => {
-                    if begun == Poll::Executed && !waiting.yields_to.is_empty() {
+                    if begun == Poll::Executed && !policy.yields_to.is_empty() {
                         // What it sent is what the others wait for, and they wait for its core too.
                         std::thread::yield_now();
                     }
@@ -198,12 +198,12 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         &mut self,
         node: &mut dyn Node,
         grid: Grid,
-        waiting: &Waiting<'_>,
+        policy: &WaitPolicy<'_>,
     ) -> Result<Option<Poll>, NodeError> {
         let tick = node.next_tick();
-        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * waiting.cutoff) as u64;
+        let overdue_ns = grid.due_ns(tick) + (grid.period_ns as f64 * policy.cutoff) as u64;
         let end_ns = grid.due_ns(self.last_tick) + GRACE_NS + GRACE_PERIODS * grid.period_ns;
-        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + waiting.spin_ns;
+        let spin_end_ns = monotonic_ns().max(grid.due_ns(tick)) + policy.spin_ns;
         loop {
             let now_ns = monotonic_ns();
             let condition = if now_ns >= overdue_ns { RunCondition::Overdue } else { RunCondition::Arrived };
@@ -212,8 +212,8 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 done => return Ok(Some(done)),
             }
             hooks::at(Failpoint::Waiting);
-            if waiting.spin_ns > 0 && now_ns < spin_end_ns {
-                spin(node, waiting.yields_to);
+            if policy.spin_ns > 0 && now_ns < spin_end_ns {
+                spin(node, policy.yields_to);
             } else if now_ns > end_ns {
                 node.skip_to(self.last_tick + 1);
                 return Ok(Some(Poll::Waiting));
@@ -245,9 +245,9 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         if !self.turn_is_due() {
             return Ok(false);
         }
-        self.control.announce(RoleState::Running, node)?;
+        self.launcher.announce(RoleState::Running, node)?;
         node.refresh()?;
-        Ok(self.control.stopped()?)
+        Ok(self.launcher.stopped()?)
     }
 
     fn turn_is_due(&mut self) -> bool {
@@ -268,7 +268,7 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
         }
         let until_ns = monotonic_ns() + SLEEP_NS;
         if ahead || !node.sleep(until_ns)? {
-            self.control.schedule.sleep(until_ns)?;
+            self.launcher.schedule.sleep(until_ns)?;
         }
         Ok(())
     }
@@ -296,13 +296,13 @@ impl<'a, 'b, B: Bus> Drive<'a, 'b, B> {
                 self.rest(node, up_to, &mut backoff)?;
             }
             if self.turn_is_due() {
-                self.control.announce(RoleState::Running, node)?;
+                self.launcher.announce(RoleState::Running, node)?;
                 node.refresh()?;
             }
-            if self.control.stopped()? {
+            if self.launcher.stopped()? {
                 return Ok(Ended::Stopped);
             }
-            up_to = (self.control.schedule()?.credit_tick + self.window_ticks).min(self.last_tick);
+            up_to = (self.launcher.schedule()?.credit_tick + self.window_ticks).min(self.last_tick);
         }
         Ok(Ended::Finished)
     }
@@ -346,17 +346,17 @@ impl Backoff {
 ///
 /// # Errors
 /// [`NodeError`] if a link failed, or if the roles wait for one another in a circle.
-pub fn in_turn(
+pub fn drive_in_turn(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
     revive: impl FnMut(usize) -> Result<Option<ReadyNode>, NodeError>,
     after_tick: impl FnMut(u64) -> bool,
 ) -> Result<Ended, NodeError> {
-    in_noted_turn(nodes, last_tick, &Cell::new(None), revive, after_tick)
+    drive_in_turn_tracked(nodes, last_tick, &Cell::new(None), revive, after_tick)
 }
 
 /// Runs the nodes in turn; `turn` is the index of the node whose turn it is, none between ticks.
-pub fn in_noted_turn(
+pub fn drive_in_turn_tracked(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
     turn: &Cell<Option<usize>>,

@@ -3,13 +3,13 @@
 #[cfg(test)]
 mod balance;
 mod input;
-mod kept;
 mod output;
+mod retained;
 
 pub use input::{AcceptedTicks, Input, Seek};
-pub use kept::Kept;
 pub(super) use output::written;
 pub use output::{Extent, Output};
+pub use retained::RetainedSamples;
 
 #[cfg(test)]
 mod tests {
@@ -40,7 +40,7 @@ mod tests {
         }
     }
 
-    const EXTENT: Extent = Extent { last_tick: 100, kept_samples: 24 };
+    const EXTENT: Extent = Extent { last_tick: 100, retained_samples: 24 };
     pub(super) const WORDS: usize = size_of::<RateCommand>() / size_of::<u64>();
 
     fn topic() -> Topic {
@@ -54,7 +54,7 @@ mod tests {
     fn ends_with(ledger: Ledger, depth: usize) -> Ends {
         let bus = MemoryBus::new(Depths { role: depth, scorer: 1, history: 0 });
         let output = output(&bus, &ledger, 1);
-        let input = Input::watch(&bus, &topic(), Reader::Role).unwrap();
+        let input = Input::open(&bus, &topic(), Reader::Role).unwrap();
         Ends { bus, ledger, output, input }
     }
 
@@ -170,7 +170,7 @@ mod tests {
         ends.input.counters().persist(&mut counters);
         ends.input.persist(&mut state);
         let Ends { bus, mut output, .. } = ends;
-        let mut input = Input::<_, RateCommand>::watch(&bus, &topic(), Reader::Role).unwrap();
+        let mut input = Input::<_, RateCommand>::open(&bus, &topic(), Reader::Role).unwrap();
         input.counters().persist(&mut Restore(&counters.0));
         input.persist(&mut Restore(&state.0));
         input.repeated = true;
@@ -223,15 +223,15 @@ mod tests {
                 samples.iter().for_each(|sample| writer.send(|slot| *slot = *sample).unwrap());
             };
             let writer = |generation, next_tick| {
-                let faults = Disturbance::of(&scenario, "controller", "follower", 1, next_tick);
-                output(&sends, &ledger, generation).with_voids(true).disturbed(faults)
+                let faults = Disturbance::for_signal(&scenario, "controller", "follower", 1, next_tick);
+                output(&sends, &ledger, generation).with_markers(true).disturbed(faults)
             };
             let reader = |bus: &MemoryBus, generation| {
                 let shared = ledger.reopened();
-                shared.take(EXTENT.words(WORDS) - Kept::words(EXTENT.kept_samples, WORDS));
-                let kept = Kept::open(&shared, EXTENT.kept_samples, WORDS);
-                let input = Input::<_, RateCommand>::watch(bus, &topic(), Reader::Role).unwrap();
-                let mut input = input.recovering(kept, 1, generation > 1);
+                shared.take(EXTENT.words(WORDS) - RetainedSamples::words(EXTENT.retained_samples, WORDS));
+                let kept = RetainedSamples::open(&shared, EXTENT.retained_samples, WORDS);
+                let input = Input::<_, RateCommand>::open(bus, &topic(), Reader::Role).unwrap();
+                let mut input = input.with_recovery(kept, 1, generation > 1);
                 input.expect(AcceptedTicks::Next);
                 input
             };

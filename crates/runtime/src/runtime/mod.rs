@@ -5,7 +5,6 @@
 
 mod absence;
 mod budget;
-mod compute;
 mod device;
 mod disturb;
 pub(crate) mod drive;
@@ -14,37 +13,38 @@ pub(crate) mod hooks;
 mod line;
 mod link;
 mod node;
-mod occupant;
 mod privileges;
+mod role_function;
 mod role_id;
-mod share;
+mod role_impl;
+mod sample_source;
 
 pub use budget::{empty_budgets, grant_budgets};
-pub use compute::{Compute, ComputedTick};
-pub use device::{DeviceLink, DeviceSeat};
+pub use device::{DeviceConfig, DeviceLink};
 pub use disturb::{Disturbance, Interruptions, LateSamples};
-pub use drive::in_noted_turn;
-pub use drive::{Backoff, Control, Drive, Ended, in_turn};
+pub use drive::drive_in_turn_tracked;
+pub use drive::{Backoff, Driver, Ended, LauncherLink, drive_in_turn};
 pub use error::{DeviceError, NodeError};
 pub use line::{Line, LineError};
 #[cfg(feature = "hosts")]
-pub use link::Kept;
+pub use link::RetainedSamples;
 pub use link::{AcceptedTicks, Input, Output, Seek};
 #[cfg(feature = "hosts")]
-pub use node::kept;
+pub use node::retained_samples;
 pub use node::{
     Node, Poll, Ports, ReadyNode, RunCondition, build_rig, ports, private_ledger, report, shared_ledger, topic,
 };
 pub use node::{accepted_ticks, ledger_file, ledger_words, next_tick, shared_memory_bytes};
-pub use occupant::RoleImpl;
 #[cfg(feature = "hosts")]
-pub use privileges::go_before_roles;
+pub use privileges::take_priority_above_roles;
 pub use privileges::{Privileges, hold_low_latency_idle, priority_remedy, refused_priority, unavailable_cores};
 pub use privileges::{
-    go_before_ordinary, join_at_low_priority, release as release_priority, take as take_privileges, take_short_turns,
+    join_at_low_priority, release_priority, request_short_slices, take_lowest_realtime_priority, take_privileges,
     with_realtime_priority,
 };
+pub use role_function::{RoleFunction, TickSamples};
 pub use role_id::RoleId;
+pub use role_impl::RoleImpl;
 
 use crate::bus::Depths;
 use crate::config::{ClockKind, Settings};

@@ -3,6 +3,7 @@
 //! Must not wait, and must not decide when it runs; a driver does.
 
 mod bridge;
+mod context;
 mod contract;
 mod controller;
 mod group;
@@ -11,20 +12,19 @@ mod observer;
 mod persistent;
 mod plant;
 pub(super) mod ports;
-mod seat;
 
+pub use context::NodeContext;
+#[cfg(feature = "hosts")]
+pub use context::retained_samples;
+pub use context::{accepted_ticks, ledger_file, ledger_words, next_tick};
 pub use contract::{Node, Poll, ReadyNode, RunCondition};
 pub use ports::{Ports, ports, topic};
-pub use seat::Seat;
-#[cfg(feature = "hosts")]
-pub use seat::kept;
-pub use seat::{accepted_ticks, ledger_file, ledger_words, next_tick};
 
-use super::compute::Computing;
 use super::link;
-use super::occupant::RoleImpl;
+use super::role_function::FunctionRole;
 use super::role_id::RoleId;
-use super::share::{Computer, Share};
+use super::role_impl::RoleImpl;
+use super::sample_source::{DeviceHandle, SampleSource};
 use crate::bus::iox::{COMMON_BYTES, footprint};
 use crate::bus::{Bus, BusError, Port, Signal};
 use crate::clock::Clock;
@@ -33,8 +33,8 @@ use crate::control::Watchdog;
 use crate::rig::{Fleet, Rig};
 use crate::state::{Persist, Restore};
 use crate::telemetry::{Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, WatchReport};
+use context::{extent, words};
 use plant::PlantNode;
-use seat::{extent, words};
 use std::path::Path;
 
 /// An upper bound on the state of a role, bytes, but for samples and what is remembered of them.
@@ -133,41 +133,41 @@ pub fn report(
 pub fn build_rig<R: Rig, B: Bus + 'static>(
     rig: &R,
     scenario: &Settings,
-    occupant: impl Into<RoleImpl>,
+    role_impl: impl Into<RoleImpl>,
     bus: &B,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
-    let occupant = occupant.into();
+    let role_impl = role_impl.into();
     let clock = if scenario.clock == ClockKind::Realtime { Clock::Monotonic } else { Clock::None };
-    let mut roles = occupant.books(ledger);
-    let seat = |(role, ledger): &(RoleId, Ledger)| {
+    let mut roles = role_impl.ledgers(ledger);
+    let context = |(role, ledger): &(RoleId, Ledger)| {
         let generation = ledger.enter();
-        Seat { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
+        NodeContext { bus, scenario, role: *role, generation, ledger: ledger.reopened(), clock }
     };
-    match occupant {
+    match role_impl {
         RoleImpl::Device(RoleId::Plant(index), _, link) => {
-            let seat = seat(&(RoleId::Plant(index), ledger.reopened()));
-            return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &seat)?));
+            let context = context(&(RoleId::Plant(index), ledger.reopened()));
+            return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &context)?));
         }
         RoleImpl::Device(role, others, link) if others.is_empty() => {
-            let computer = Computer::Device(Share::all(link));
-            return role_node(rig, &seat(&(role, ledger.reopened())), Some(computer));
+            let computer = SampleSource::Device(DeviceHandle::all(link));
+            return role_node(rig, &context(&(role, ledger.reopened())), Some(computer));
         }
         RoleImpl::Device(_, _, link) => {
-            let shares = roles.iter().zip(Share::both(link));
+            let shares = roles.iter().zip(DeviceHandle::both(link));
             let open = |(of, share): (&(RoleId, Ledger), _)| {
-                Ok((of.0, role_node(rig, &seat(of), Some(Computer::Device(share)))?))
+                Ok((of.0, role_node(rig, &context(of), Some(SampleSource::Device(share)))?))
             };
             let nodes = shares.map(open).collect::<Result<_, BusError>>()?;
             return Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)));
         }
-        RoleImpl::Computed(role, compute) => {
-            let computing = Computing::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
-            return role_node(rig, &seat(&(role, ledger.reopened())), Some(Computer::Function(computing)));
+        RoleImpl::Function(role, compute) => {
+            let computing = FunctionRole::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
+            return role_node(rig, &context(&(role, ledger.reopened())), Some(SampleSource::Function(computing)));
         }
         RoleImpl::Role(..) => {}
     }
-    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &seat(of), None)?));
+    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &context(of), None)?));
     if let [only] = &mut roles[..] {
         return open(only).map(|(_, node)| node);
     }
@@ -178,26 +178,26 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
 /// The node of one role of this program, whose samples somebody else may compute.
 fn role_node<R: Rig, B: Bus + 'static>(
     rig: &R,
-    seat: &Seat<'_, B>,
-    computer: Option<Computer>,
+    context: &NodeContext<'_, B>,
+    computer: Option<SampleSource>,
 ) -> Result<ReadyNode, BusError> {
-    Ok(match seat.role {
+    Ok(match context.role {
         RoleId::Plant(index) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {
                 None => {
                     // A device in its place has a node of its own.
                     let function = match computer {
-                        Some(Computer::Function(function)) => Some(function),
-                        Some(Computer::Device(_)) | None => None,
+                        Some(SampleSource::Function(function)) => Some(function),
+                        Some(SampleSource::Device(_)) | None => None,
                     };
-                    Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, seat, function)?)
+                    Box::new(PlantNode::open(rig.body(index), rig.command_guard(index), info, context, function)?)
                 }
-                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, seat, None)?),
+                Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, context, None)?),
             }
         }
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, seat, computer)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, seat, computer)?),
+        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, context, computer)?),
+        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, context, computer)?),
     })
 }
 

@@ -49,7 +49,7 @@ pub struct Privileges {
 }
 
 /// Takes what a role of a scenario asks for, for the calling thread.
-pub fn take(scenario: &Settings, role: RoleId) -> Privileges {
+pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
     let settings = &scenario.realtime;
     // No privilege: without SCHED_FIFO the kernel would let timers run late by 50 us to save power.
     let _ = set_current_timer_slack(NonZero::new(1));
@@ -72,7 +72,9 @@ pub fn take(scenario: &Settings, role: RoleId) -> Privileges {
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
         if pinned.is_ok() && has_realtime {
             co_located = RoleId::all(scenario);
-            co_located.retain(|other| other.host(scenario) != role && core_of(&cores, *other, scenario) == Some(core));
+            co_located.retain(|other| {
+                other.process_role(scenario) != role && core_of(&cores, *other, scenario) == Some(core)
+            });
         }
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
@@ -150,7 +152,7 @@ fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
 fn core_of(cores: &[usize], role: RoleId, scenario: &Settings) -> Option<usize> {
     let bodies = scenario.bodies.len();
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
-    let place = match role.host(scenario).hosted(scenario).first()? {
+    let place = match role.process_role(scenario).process_members(scenario).first()? {
         RoleId::Plant(index) => *index,
         RoleId::Observer => own_or(bodies, 0),
         RoleId::Controller => own_or(bodies + 1, 1),
@@ -175,21 +177,21 @@ pub fn join_at_low_priority<T>(scenario: &Settings, niceness: i32, open: impl Fn
 /// A role that finds a link half made waits until it is whole, and must not wait for a process that others keep from going
 /// on.
 pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
-    go_before_ordinary();
+    take_lowest_realtime_priority();
     let done = act();
-    release();
+    release_priority();
     done
 }
 
 /// Goes before all ordinary processes from now on, behind roles of a higher priority. Not granted, it takes its chance.
-pub fn go_before_ordinary() {
+pub fn take_lowest_realtime_priority() {
     let _ = set_fifo(1);
 }
 
 /// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
 /// does little, and whoever spins for a sample that it has would hold it up. What is not granted is done without.
 #[cfg(feature = "hosts")]
-pub fn go_before_roles(scenario: &Settings) {
+pub fn take_priority_above_roles(scenario: &Settings) {
     let _ = set_current_timer_slack(NonZero::new(1));
     if (1..99).contains(&scenario.realtime.priority) {
         let _ = set_fifo(scenario.realtime.priority + 1);
@@ -208,7 +210,7 @@ fn yield_cores(scenario: &Settings, niceness: i32) {
 }
 
 /// Gives the real-time priority of the calling thread back: what follows the last tick must not delay another role's.
-pub fn release() {
+pub fn release_priority() {
     // Failing to give up what one has harms nobody but the last tick.
     let _ = set_scheduler(libc::SCHED_OTHER, 0);
 }
@@ -219,7 +221,7 @@ const TURN_NS: u64 = 100_000;
 /// Asks for short turns, for the calling thread and what it starts from now on. Whoever sleeps until a sample comes is then woken at
 /// once, and not when the turns of busy processes are over; its share of the processor stays the same. It needs no privilege. Linux
 /// heeds it from 6.12 on; on others nothing changes.
-pub fn take_short_turns() {
+pub fn request_short_slices() {
     let mut attributes = libc::sched_attr {
         size: size_of::<libc::sched_attr>() as u32,
         sched_policy: 0,
@@ -306,7 +308,7 @@ mod tests {
     fn what_is_not_granted_is_reported_with_a_remedy() {
         let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
         let scenario = shipped("rigid-pair", &overrides);
-        let Privileges { grants, has_realtime, co_located } = take(&scenario, RoleId::Observer);
+        let Privileges { grants, has_realtime, co_located } = take_privileges(&scenario, RoleId::Observer);
         assert_eq!((grants.len(), has_realtime, co_located), (1, false, Vec::new()));
         assert!(!grants[0].granted && grants[0].reason.contains("realtime.cores"), "{grants:?}");
     }

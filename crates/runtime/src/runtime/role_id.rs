@@ -37,7 +37,7 @@ impl RoleId {
 
     /// The role in whose process it runs: its own, unless the scenario gives it one together with others. Then it is the last of
     /// them in the order of a tick.
-    pub fn host(self, scenario: &Settings) -> Self {
+    pub fn process_role(self, scenario: &Settings) -> Self {
         let name = self.name(scenario);
         let process = scenario.processes.iter().find(|roles| roles.iter().any(|role| role == name));
         let Some(process) = process.filter(|_| scenario.clock != ClockKind::InProcess) else { return self };
@@ -47,9 +47,9 @@ impl RoleId {
     }
 
     /// The roles that run in its process, in the order of a tick; none if it is in another's.
-    pub fn hosted(self, scenario: &Settings) -> Vec<Self> {
+    pub fn process_members(self, scenario: &Settings) -> Vec<Self> {
         let mut hosted = Self::all(scenario);
-        hosted.retain(|role| role.host(scenario) == self);
+        hosted.retain(|role| role.process_role(scenario) == self);
         hosted
     }
 

@@ -40,7 +40,7 @@ pub trait AnyRig: WordView + Any + Send + Sync {
     fn node(
         &self,
         settings: &Settings,
-        occupant: RoleImpl,
+        role_impl: RoleImpl,
         bus: AnyBus<'_>,
         ledger: &Ledger,
     ) -> Result<ReadyNode, BusError>;
@@ -100,13 +100,13 @@ impl<R: Rig> AnyRig for R {
     fn node(
         &self,
         settings: &Settings,
-        occupant: RoleImpl,
+        role_impl: RoleImpl,
         bus: AnyBus<'_>,
         ledger: &Ledger,
     ) -> Result<ReadyNode, BusError> {
         match bus {
-            AnyBus::Memory(bus) => build_rig(self, settings, occupant, bus, ledger),
-            AnyBus::Shared(bus) => build_rig(self, settings, occupant, bus, ledger),
+            AnyBus::Memory(bus) => build_rig(self, settings, role_impl, bus, ledger),
+            AnyBus::Shared(bus) => build_rig(self, settings, role_impl, bus, ledger),
         }
     }
 

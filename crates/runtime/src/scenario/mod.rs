@@ -239,11 +239,11 @@ pub fn claims(scenario: &Scenario) -> Vec<Claim> {
 /// [`BusError::Open`].
 pub fn build<'a>(
     scenario: &Scenario,
-    occupant: impl Into<RoleImpl>,
+    role_impl: impl Into<RoleImpl>,
     bus: impl Into<AnyBus<'a>>,
     ledger: &Ledger,
 ) -> Result<ReadyNode, BusError> {
-    scenario.rig.node(scenario, occupant.into(), bus.into(), ledger)
+    scenario.rig.node(scenario, role_impl.into(), bus.into(), ledger)
 }
 
 /// Opens a scorer on the run's bus.

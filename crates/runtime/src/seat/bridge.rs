@@ -1,10 +1,10 @@
 //! A device in a role's seat: the process that serves it to the end of the run.
 
 use super::process::{
-    RoleError, device_words_path, find_role, in_domain, join, require_process, take_ledger, words_path, write_whole,
+    RoleError, device_failure_path, failure_path, find_role, in_domain, join, require_process, take_ledger, write_whole,
 };
 use crate::config::{ClockKind, Settings};
-use crate::runtime::{DeviceLink, DeviceSeat, NodeError, RoleId, RoleImpl};
+use crate::runtime::{DeviceConfig, DeviceLink, NodeError, RoleId, RoleImpl};
 use crate::serial::LineCounters;
 use crate::telemetry::Outage;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use std::sync::atomic::AtomicBool;
 
 /// The result of a device's run.
 #[derive(Debug, Clone)]
-pub struct Served {
+pub struct BridgeResult {
     /// The line's counters.
     pub counters: LineCounters,
     /// When the device was absent.
@@ -53,10 +53,10 @@ fn device_path(root: &Path, roles: &str) -> PathBuf {
 /// # Errors
 /// [`RoleError`].
 pub fn run_bridge(
-    seat: &DeviceSeat,
+    seat: &DeviceConfig,
     terminated: &AtomicBool,
     welcomed: impl FnOnce(&str),
-) -> Result<Option<Served>, RoleError> {
+) -> Result<Option<BridgeResult>, RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let roles = roles(&scenario, &seat.roles)?;
     roles.iter().try_for_each(|role| require_process(&scenario, *role))?;
@@ -71,17 +71,17 @@ pub fn run_bridge(
     let (last, others) = roles.split_last().expect("a seat has a role");
     let others = others.iter().map(|other| Ok((*other, take_ledger(&domain, &scenario, *other)?)));
     let others = others.collect::<Result<_, RoleError>>()?;
-    let (mut served, occupant) = (None, RoleImpl::Device(*last, others, Box::new(link)));
-    let done = in_domain(&domain, &scenario, occupant, terminated, |report| {
+    let (mut served, role_impl) = (None, RoleImpl::Device(*last, others, Box::new(link)));
+    let done = in_domain(&domain, &scenario, role_impl, terminated, |report| {
         if let Some(counters) = report.line {
             let lost = report.outages.iter().rev().find_map(|outage| lost(outage, &scenario));
-            served = Some(Served { counters, outages: report.outages.clone(), lost });
+            served = Some(BridgeResult { counters, outages: report.outages.clone(), lost });
         }
     });
     if let Err(RoleError::Node(NodeError::Device(error))) = &done {
         // For the launcher, which has no line to it. If the run is gone, the caller is told all the same.
         for role in &roles {
-            let path = if scenario.clock == ClockKind::Realtime { device_words_path } else { words_path };
+            let path = if scenario.clock == ClockKind::Realtime { device_failure_path } else { failure_path };
             let _ = write_whole(&path(domain.root(), role.name(&scenario)), error.to_string().as_bytes());
         }
     }

@@ -10,13 +10,13 @@ mod bridge;
 mod description;
 mod process;
 
-pub use bridge::{Served, run_bridge};
+pub use bridge::{BridgeResult, run_bridge};
 pub use description::{SeatDescription, describe_seat, join_run, seat_path};
 pub use process::SUMMARY;
-pub use process::{RoleError, RoleSeat, Service, run_computed, run_role, run_under_way, serve};
+pub use process::{RoleAddress, RoleEnvironment, RoleError, find_run, run_function, run_role, serve};
 #[cfg(feature = "hosts")]
 pub use process::{clock_path, join};
 pub use process::{
-    device_words_path, join_whole, open_ledger, panic_path, report_path, results_path, scenario_path, words_path,
-    write_whole,
+    device_failure_path, failure_path, join_complete, open_ledger, panic_path, report_path, results_path,
+    scenario_path, write_whole,
 };

@@ -9,11 +9,11 @@ use crate::clock::{self, Grid, monotonic_ns, sleep_until};
 use crate::config::{ClockKind, ConfigError, Realtime, Settings, Wake};
 use crate::files;
 use crate::panics;
-use crate::runtime::drive::{Control, Drive, Ended, Heartbeat, Waiting};
+use crate::runtime::drive::{Driver, Ended, Heartbeat, LauncherLink, WaitPolicy};
 use crate::runtime::hooks::{self, Failpoint};
 use crate::runtime::{
-    Compute, DeviceError, NodeError, Privileges, ReadyNode, RoleId, RoleImpl, depths, ledger_file, ledger_words, ports,
-    release_priority, report, take_privileges, take_short_turns, topic, window_ticks,
+    DeviceError, NodeError, Privileges, ReadyNode, RoleFunction, RoleId, RoleImpl, depths, ledger_file, ledger_words,
+    ports, release_priority, report, request_short_slices, take_privileges, topic, window_ticks,
 };
 use crate::sample::{Phase, RoleState, Schedule};
 use crate::scenario::{self, Scenario};
@@ -40,7 +40,7 @@ const LEAVE_NS: u64 = 120_000_000_000;
 
 /// Which role to take, where.
 #[derive(Debug, Clone)]
-pub struct RoleSeat {
+pub struct RoleAddress {
     /// The domain's directory.
     pub domain: PathBuf,
     /// The role's name.
@@ -170,13 +170,13 @@ pub fn report_path(root: &Path, role: &str) -> PathBuf {
 }
 
 /// The file in a domain's directory that an external role leaves its last words in, if it has any.
-pub fn words_path(root: &Path, role: &str) -> PathBuf {
+pub fn failure_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.words"))
 }
 
 /// The file in a domain's directory that a bridge in real time leaves its last words in: another one may take its seat, so they end
 /// nothing by themselves.
-pub fn device_words_path(root: &Path, role: &str) -> PathBuf {
+pub fn device_failure_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.device.words"))
 }
 
@@ -198,7 +198,7 @@ pub const SUMMARY: &str = "summary.json";
 ///
 /// # Errors
 /// [`DomainError::NoRun`], [`DomainError::Over`], [`DomainError::NotADomain`], [`DomainError::Privacy`].
-pub fn run_under_way(given: Option<&Path>) -> Result<PathBuf, DomainError> {
+pub fn find_run(given: Option<&Path>) -> Result<PathBuf, DomainError> {
     // A domain that cannot be joined is told by the process that joins it.
     if let Some(given) = given.filter(|given| !matches!(Domain::join(given), Err(DomainError::NotADomain { .. }))) {
         return Ok(given.to_owned());
@@ -221,22 +221,26 @@ pub fn run_under_way(given: Option<&Path>) -> Result<PathBuf, DomainError> {
 ///
 /// # Errors
 /// [`RoleError`].
-pub fn run_role(seat: &RoleSeat, terminated: &AtomicBool) -> Result<(), RoleError> {
+pub fn run_role(seat: &RoleAddress, terminated: &AtomicBool) -> Result<(), RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
     require_process(&scenario, role)?;
     panics::keep_in(panic_path(domain.root(), &seat.role));
-    let others = role.hosted(&scenario).into_iter().filter(|other| *other != role);
+    let others = role.process_members(&scenario).into_iter().filter(|other| *other != role);
     let others = others.map(|other| Ok((other, take_ledger(&domain, &scenario, other)?)));
-    let occupant = RoleImpl::Role(role, others.collect::<Result<_, LedgerError>>()?);
-    in_domain(&domain, &scenario, occupant, terminated, |_| {})
+    let role_impl = RoleImpl::Role(role, others.collect::<Result<_, LedgerError>>()?);
+    in_domain(&domain, &scenario, role_impl, terminated, |_| {})
 }
 
 /// The same with a function that computes the role's samples. The process takes no privileges for it.
 ///
 /// # Errors
 /// [`RoleError`]; [`RoleError::Fleet`] for a role that serves a fleet.
-pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &AtomicBool) -> Result<(), RoleError> {
+pub fn run_function(
+    seat: &RoleAddress,
+    compute: Box<dyn RoleFunction>,
+    terminated: &AtomicBool,
+) -> Result<(), RoleError> {
     let (domain, scenario) = join(&seat.domain)?;
     let role = find_role(&scenario, &seat.role)?;
     require_process(&scenario, role)?;
@@ -244,17 +248,17 @@ pub fn run_computed(seat: &RoleSeat, compute: Box<dyn Compute>, terminated: &Ato
     if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
         return Err(RoleError::Fleet { role: seat.role.clone() });
     }
-    let served = in_domain(&domain, &scenario, RoleImpl::Computed(role, compute), terminated, |_| {});
+    let served = in_domain(&domain, &scenario, RoleImpl::Function(role, compute), terminated, |_| {});
     if let Err(RoleError::Node(NodeError::Computed { reason })) = &served {
         // For the launcher, which has no line to it. If the run is gone, whoever called it is told all the same.
-        let _ = write_whole(&words_path(domain.root(), &seat.role), reason.as_bytes());
+        let _ = write_whole(&failure_path(domain.root(), &seat.role), reason.as_bytes());
     }
     served
 }
 
 /// Refuses a role that has no process of its own.
 pub(super) fn require_process(scenario: &Settings, role: RoleId) -> Result<(), RoleError> {
-    let host = role.host(scenario);
+    let host = role.process_role(scenario);
     let name = |role: RoleId| role.name(scenario).to_owned();
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
 }
@@ -274,7 +278,7 @@ pub fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
 }
 
 /// The same for whoever wants to see the whole run.
-pub fn join_whole(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
+pub fn join_complete(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let (domain, scenario) = join(directory)?;
     // Only hosts that joined a run have a clock to be corrected.
     if clock_path(&domain).exists() {
@@ -294,19 +298,19 @@ pub(super) fn find_role(scenario: &Settings, name: &str) -> Result<RoleId, RoleE
 pub(super) fn in_domain(
     domain: &Domain,
     scenario: &Scenario,
-    occupant: RoleImpl,
+    role_impl: RoleImpl,
     terminated: &AtomicBool,
     mut reported: impl FnMut(&RoleReport),
 ) -> Result<(), RoleError> {
-    let role = occupant.role();
+    let role = role_impl.role();
     // Before any link is opened, so that the links' memory is locked as it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
-    take_short_turns();
+    request_short_slices();
     // What computes in an interpreter has threads and memory of its own.
-    let takes = realtime && !matches!(occupant, RoleImpl::Computed(..));
+    let takes = realtime && !matches!(role_impl, RoleImpl::Function(..));
     let privileges = if takes { take_privileges(scenario, role) } else { Privileges::default() };
     let ledger = take_ledger(domain, scenario, role)?;
-    let roles: Vec<&str> = occupant.books(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
+    let roles: Vec<&str> = role_impl.ledgers(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
     if roles.iter().any(|role| scenario.debug.iter().any(|name| name == role)) {
         // Yama restricts debuggers to a process's parent; without it there is nothing to allow.
         let _ = rustix::process::set_ptracer(rustix::process::PTracer::Any);
@@ -314,9 +318,9 @@ pub(super) fn in_domain(
     hooks::enter(&roles, ledger.generation() + 1);
     hooks::at(Failpoint::Opening);
     let bus = IoxBus::enter(domain, role.name(scenario), depths(scenario))?;
-    let build = |occupant| scenario::build(scenario, occupant, &bus, &ledger);
-    let service = Service { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
-    let served = serve(service, occupant, build, |report| {
+    let build = |role_impl| scenario::build(scenario, role_impl, &bus, &ledger);
+    let service = RoleEnvironment { scenario, bus: &bus, ledger: &ledger, terminated, privileges };
+    let served = serve(service, role_impl, build, |report| {
         reported(report);
         write_report(domain, report)
     });
@@ -354,7 +358,7 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 }
 
 /// What a seat is served with.
-pub struct Service<'a, B> {
+pub struct RoleEnvironment<'a, B> {
     /// The scenario.
     pub scenario: &'a Settings,
     /// The bus.
@@ -373,14 +377,14 @@ pub struct Service<'a, B> {
 /// # Errors
 /// [`RoleError`].
 pub fn serve<B: Bus + 'static>(
-    service: Service<'_, B>,
-    occupant: impl Into<RoleImpl>,
+    service: RoleEnvironment<'_, B>,
+    role_impl: impl Into<RoleImpl>,
     build: impl FnOnce(RoleImpl) -> Result<ReadyNode, BusError>,
     mut deliver: impl FnMut(&RoleReport) -> Result<(), RoleError>,
 ) -> Result<(), RoleError> {
-    let Service { scenario, bus, ledger, terminated, privileges } = service;
-    let occupant = occupant.into();
-    let (role, books) = (occupant.role(), occupant.books(ledger));
+    let RoleEnvironment { scenario, bus, ledger, terminated, privileges } = service;
+    let role_impl = role_impl.into();
+    let (role, books) = (role_impl.role(), role_impl.ledgers(ledger));
     let heartbeat = |(role, ledger): &(RoleId, Ledger)| {
         let (role, generation) = (*role, ledger.generation() + 1);
         let health = bus.writer(&topic(scenario, role.name(scenario), Signal::Health), generation)?;
@@ -388,9 +392,9 @@ pub fn serve<B: Bus + 'static>(
     };
     // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
     let heartbeats = books.iter().map(heartbeat).collect::<Result<_, BusError>>()?;
-    let mut node = build(occupant)?;
+    let mut node = build(role_impl)?;
     node.restore()?;
-    let mut control = Control::<B>::new(
+    let mut launcher = LauncherLink::<B>::new(
         bus,
         bus.reader(&topic(scenario, "run", Signal::Schedule), Reader::Role)?,
         heartbeats,
@@ -399,8 +403,8 @@ pub fn serve<B: Bus + 'static>(
     );
     let mut stages = Vec::new();
     let leads = books.iter().any(|(role, _)| *role == RoleId::Plant(0));
-    let ended = match begin(scenario, leads, &mut node, &mut control, &mut stages)? {
-        Some(schedule) => drive(scenario, role, &mut node, &mut control, &schedule, &privileges)?,
+    let ended = match begin(scenario, leads, &mut node, &mut launcher, &mut stages)? {
+        Some(schedule) => drive(scenario, role, &mut node, &mut launcher, &schedule, &privileges)?,
         None => Ended::Stopped,
     };
     node.finish()?;
@@ -408,23 +412,23 @@ pub fn serve<B: Bus + 'static>(
         release_priority();
     }
     if bus.is_gone() {
-        let told = control.schedule().is_ok_and(|word| Phase::from_number(word.phase) == Phase::Stop);
+        let told = launcher.schedule().is_ok_and(|word| Phase::from_number(word.phase) == Phase::Stop);
         return Err(if told { RoleError::Late } else { RoleError::Gone });
     }
     for (of, ledger) in &books {
         // What was asked of the machine is the seat's own, and what was measured before the ticks the leader's.
         let mut stages = if *of == RoleId::Plant(0) { std::mem::take(&mut stages) } else { Vec::new() };
         let grants = if *of == role { privileges.grants.clone() } else { Vec::new() };
-        let node = node.of(*of).unwrap_or(&*node);
+        let node = node.member(*of).unwrap_or(&*node);
         stages.extend(node.stages());
         let (line, outages) = (node.line(), node.outages());
         deliver(&RoleReport { line, outages, ..report(scenario, *of, ledger, stages, grants) })?;
     }
     // Samples may still wait to be read: the links stay open until everybody is done.
     if ended == Ended::Finished {
-        let mut patience = Patience::new(LEAVE_NS);
-        while patience.lasts(control.schedule()?.stamp.tick) && !control.stopped()? {
-            control.announce(RoleState::Done, &*node)?;
+        let mut patience = LauncherTimeout::new(LEAVE_NS);
+        while patience.lasts(launcher.schedule()?.stamp.tick) && !launcher.stopped()? {
+            launcher.announce(RoleState::Done, &*node)?;
             node.refresh()?;
             sleep_until(monotonic_ns() + LOOK_NS);
         }
@@ -434,14 +438,14 @@ pub fn serve<B: Bus + 'static>(
 
 /// How long a role waits for its launcher, which announces again and again while it lives. Time in which this process is
 /// stopped does not count.
-struct Patience {
+struct LauncherTimeout {
     limit_ns: u64,
     silent_ns: u64,
     looked_ns: u64,
     heard: Option<u64>,
 }
 
-impl Patience {
+impl LauncherTimeout {
     fn new(limit_ns: u64) -> Self {
         Self { limit_ns, silent_ns: 0, looked_ns: monotonic_ns(), heard: None }
     }
@@ -462,23 +466,23 @@ fn begin<B: Bus>(
     scenario: &Settings,
     leads: bool,
     node: &mut ReadyNode,
-    control: &mut Control<'_, B>,
+    launcher: &mut LauncherLink<'_, B>,
     stages: &mut Vec<StageReport>,
 ) -> Result<Option<Schedule>, RoleError> {
-    if await_phase(scenario, node, control, RoleState::Open, Phase::WarmUp)?.is_none() {
+    if await_phase(scenario, node, launcher, RoleState::Open, Phase::WarmUp)?.is_none() {
         return Ok(None);
     }
-    if control.first() {
+    if launcher.first() {
         for _ in 0..WARM_UP_SAMPLES {
             node.warm_up()?;
             sleep_until(monotonic_ns() + WARM_UP_PAUSE_NS);
         }
     }
-    if scenario.clock == ClockKind::Realtime && leads && control.first() {
+    if scenario.clock == ClockKind::Realtime && leads && launcher.first() {
         stages.extend(StageReport::all(&[("baseline", &baseline())]));
     }
     hooks::at(Failpoint::Ready);
-    await_phase(scenario, node, control, RoleState::Ready, Phase::Run)
+    await_phase(scenario, node, launcher, RoleState::Ready, Phase::Run)
 }
 
 /// The machine's own lateness on this core at this priority: bare absolute sleeps, nothing else.
@@ -496,19 +500,19 @@ fn baseline() -> Latency {
 fn await_phase<B: Bus>(
     scenario: &Settings,
     node: &mut ReadyNode,
-    control: &mut Control<'_, B>,
+    launcher: &mut LauncherLink<'_, B>,
     state: RoleState,
     phase: Phase,
 ) -> Result<Option<Schedule>, RoleError> {
     let waited_s = 2.0 * scenario.startup_timeout_s;
-    let mut patience = Patience::new((waited_s * 1e9) as u64);
-    let mut schedule = control.schedule()?;
+    let mut patience = LauncherTimeout::new((waited_s * 1e9) as u64);
+    let mut schedule = launcher.schedule()?;
     while patience.lasts(schedule.stamp.tick) {
-        control.announce(state, &**node)?;
-        if control.stopped()? {
+        launcher.announce(state, &**node)?;
+        if launcher.stopped()? {
             return Ok(None);
         }
-        schedule = control.schedule()?;
+        schedule = launcher.schedule()?;
         if Phase::from_number(schedule.phase) >= phase {
             return Ok(Some(schedule));
         }
@@ -518,7 +522,7 @@ fn await_phase<B: Bus>(
 }
 
 /// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
-fn waiting<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges) -> Waiting<'a> {
+fn wait_policy<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges) -> WaitPolicy<'a> {
     // A way between hosts may take its budget: one tick, less what comes after the cutoff, is there in any case.
     let lag_ticks = scenario.lag_ticks(role.name(scenario)).saturating_sub(1);
     let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
@@ -528,26 +532,26 @@ fn waiting<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges) ->
         Wake::Spin => (spin_ns, &[][..]),
         Wake::Auto | Wake::Event => (0, &[][..]),
     };
-    Waiting { lead_ns, spin_ns, yields_to, cutoff: cutoff + lag_ticks as f64 }
+    WaitPolicy { lead_ns, spin_ns, yields_to, cutoff: cutoff + lag_ticks as f64 }
 }
 
 fn drive<B: Bus>(
     scenario: &Settings,
     role: RoleId,
     node: &mut ReadyNode,
-    control: &mut Control<'_, B>,
+    launcher: &mut LauncherLink<'_, B>,
     schedule: &Schedule,
     privileges: &Privileges,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
     // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
-    let late = scenario.clock == ClockKind::Realtime && !control.first();
+    let late = scenario.clock == ClockKind::Realtime && !launcher.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1))?;
-    let mut drive = Drive::new(control, scenario.last_tick, window_ticks(scenario));
+    let mut driver = Driver::new(launcher, scenario.last_tick, window_ticks(scenario));
     let ended = match scenario.clock {
-        ClockKind::Realtime => drive.realtime(&mut **node, grid, &waiting(scenario, role, privileges)),
-        ClockKind::Lockstep | ClockKind::InProcess => drive.lockstep(&mut **node),
+        ClockKind::Realtime => driver.realtime(&mut **node, grid, &wait_policy(scenario, role, privileges)),
+        ClockKind::Lockstep | ClockKind::InProcess => driver.lockstep(&mut **node),
     };
     Ok(ended?)
 }

@@ -182,7 +182,7 @@ fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader:
     let overrides = [format!("clock='{clock}'"), format!("fault=[{}]", schedule.faults.join(", "))];
     let scenario = Rc::new(Scenario::parse(SHIPPED[0].1, "pair", &overrides).unwrap());
     let topic = Topic { scenario: "s".to_owned(), body: service.to_string(), signal: Signal::Command };
-    let extent = Extent { last_tick: 100, kept_samples: 0 };
+    let extent = Extent { last_tick: 100, retained_samples: 0 };
     let directory = tempfile::tempdir().unwrap();
     let ledger = Ledger::shared(&directory.path().join("x.books"), extent.words(WORDS)).unwrap();
     let grid = Rc::new(Cell::new(None));
@@ -191,17 +191,16 @@ fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader:
         None => AcceptedTicks::Unknown,
         Some(grid) => AcceptedTicks::Due(grid),
     };
-    let open =
-        {
-            let (bus, topic, scenario, grid) = (bus.clone(), topic.clone(), scenario.clone(), grid.clone());
-            Rc::new(move || {
-                let mut input = Input::<B, RateCommand>::watch(&*bus, &topic, reader)
-                    .unwrap()
-                    .with_late(LateSamples::of(&scenario, Signal::Command, "follower"));
-                input.expect(accepted_ticks(grid.get()));
-                input
-            })
-        };
+    let open = {
+        let (bus, topic, scenario, grid) = (bus.clone(), topic.clone(), scenario.clone(), grid.clone());
+        Rc::new(move || {
+            let mut input = Input::<B, RateCommand>::open(&*bus, &topic, reader)
+                .unwrap()
+                .with_late(LateSamples::for_signal(&scenario, Signal::Command, "follower"));
+            input.expect(accepted_ticks(grid.get()));
+            input
+        })
+    };
     let looks = schedule.looks.clone().into_iter();
     let reading = Rc::new(RefCell::new(Reading { input: open(), committed: Default::default(), looks }));
     let look = {
@@ -212,9 +211,9 @@ fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader:
     let life = Rc::new(life);
     let bus = Interleaved { bus: bus.clone(), life: life.clone() };
     let writer = |generation, next_tick| {
-        let faults = Disturbance::of(&scenario, "controller", "follower", 1, next_tick);
+        let faults = Disturbance::for_signal(&scenario, "controller", "follower", 1, next_tick);
         let output = Output::<_, RateCommand>::open(&bus, &topic, 1, generation, &ledger.reopened(), extent);
-        output.unwrap().with_voids(lossless).disturbed(faults)
+        output.unwrap().with_markers(lossless).disturbed(faults)
     };
     let (mut generation, mut output) = (1, writer(1, 0));
     output.warm_up().unwrap();
@@ -226,7 +225,7 @@ fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader:
         match turn {
             Turn::Miss if !lossless => {}
             Turn::Miss | Turn::Void => {
-                output.stage_void(tick);
+                output.stage_marker(tick);
                 output.dispatch().unwrap();
                 output.finish().unwrap();
             }

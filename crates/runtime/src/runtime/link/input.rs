@@ -3,7 +3,7 @@
 //! Samples of generation 0 are warm-up: they pass through the link and go no further. Must not let a sample that its guard
 //! does not believe be seen.
 
-use super::kept::Kept;
+use super::retained::RetainedSamples;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
 use crate::clock::{Grid, monotonic_ns};
 use crate::role::{AcceptAll, Guard, Refusal};
@@ -41,7 +41,7 @@ pub enum AcceptedTicks {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Newest {
     /// It is at hand.
-    AtHand,
+    Usable,
     /// It was of the tick that was due, and is not believed.
     Rejected,
     /// There is none, or it was a void, or it was displaced by one of no use.
@@ -58,7 +58,7 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = AcceptAll> {
     /// Whatever arrives displaces what was at hand, usable or not.
     newest: Newest,
     /// The generation of a sample that was taken for a predecessor's: if the next says the same, it is to be believed.
-    doubted: Option<u64>,
+    suspect_generation: Option<u64>,
     /// Whether what arrives may be what a predecessor of this end has counted already.
     pub(super) repeated: bool,
     recovery: Option<Recovery<S>>,
@@ -69,7 +69,7 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = AcceptAll> {
 /// Goes on by what the writer keeps after a death at either end of the link, until the link is known to bring just what comes
 /// next: by itself it may lack something, or repeat it.
 struct Recovery<S: Carried + ?Sized> {
-    kept: Kept,
+    kept: RetainedSamples,
     /// Whether it goes on so at present.
     active: bool,
     /// The sample that was found last, if that is the one that was taken last.
@@ -114,22 +114,22 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn watch(bus: &B, topic: &Topic, reader: Reader) -> Result<Self, BusError> {
-        Self::watch_many(bus, topic, 1, reader)
+    pub fn open(bus: &B, topic: &Topic, reader: Reader) -> Result<Self, BusError> {
+        Self::open_many(bus, topic, 1, reader)
     }
 
     /// The same for a signal of so many bodies.
     ///
     /// # Errors
     /// [`BusError::Open`].
-    pub fn watch_many(bus: &B, topic: &Topic, bodies: usize, reader: Reader) -> Result<Self, BusError> {
+    pub fn open_many(bus: &B, topic: &Topic, bodies: usize, reader: Reader) -> Result<Self, BusError> {
         Ok(Self {
             port: S::reader(bus, topic, reader, bodies)?,
             guard: AcceptAll,
             accepted_ticks: AcceptedTicks::Unknown,
             last: None,
             newest: Newest::None,
-            doubted: None,
+            suspect_generation: None,
             repeated: false,
             recovery: None,
             late: None,
@@ -138,9 +138,10 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
     }
 
     /// The same with a guard.
-    pub fn guarded<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
-        let Self { port, accepted_ticks, last, newest, doubted, repeated, recovery, late, counters, .. } = self;
-        Input { port, guard, accepted_ticks, last, newest, doubted, repeated, recovery, late, counters }
+    pub fn with_guard<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
+        let Self { port, accepted_ticks, last, newest, suspect_generation, repeated, recovery, late, counters, .. } =
+            self;
+        Input { port, guard, accepted_ticks, last, newest, suspect_generation, repeated, recovery, late, counters }
     }
 
     /// The same where a scripted fault sends samples late.
@@ -149,7 +150,7 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
     }
 
     /// The same with what the writer of a signal of so many bodies keeps; a successor begins with that.
-    pub fn recovering(self, kept: Option<Kept>, bodies: usize, successor: bool) -> Self {
+    pub fn with_recovery(self, kept: Option<RetainedSamples>, bodies: usize, successor: bool) -> Self {
         let recovery = kept.map(|kept| Recovery {
             active: successor && kept.is_used(),
             kept,
@@ -176,7 +177,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     pub fn seek(&mut self, tick: u64) -> Result<Seek, BusError> {
         loop {
             match (self.last, self.newest) {
-                (Some((last, _)), Newest::AtHand) if last == tick => return Ok(Seek::Found),
+                (Some((last, _)), Newest::Usable) if last == tick => return Ok(Seek::Found),
                 (Some((last, _)), Newest::Rejected) if last == tick => return Ok(Seek::Rejected),
                 (Some((last, _)), _) if last >= tick => return Ok(Seek::Passed),
                 _ => {}
@@ -194,7 +195,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     #[inline]
     pub fn advance(&mut self) -> Result<bool, BusError> {
         while self.take()? {
-            if self.newest == Newest::AtHand {
+            if self.newest == Newest::Usable {
                 return Ok(true);
             }
         }
@@ -294,12 +295,12 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             self.counters.stray();
             return Newest::None;
         }
-        if generation < known && self.doubted.replace(generation) != Some(generation) {
+        if generation < known && self.suspect_generation.replace(generation) != Some(generation) {
             self.last = Some((stamp.tick, known));
             self.counters.rejected(stamp.tick, Refusal::Stamp);
             return Newest::Rejected;
         }
-        self.doubted = None;
+        self.suspect_generation = None;
         self.last = Some((stamp.tick, generation));
         if stamp.generation & NO_SAMPLE != 0 {
             self.counters.void(stamp.tick);
@@ -310,7 +311,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         let sample = recovered.map_or(self.port.current(), |recovery| Some(recovery.sample.borrow()));
         if sample.is_some_and(|sample| self.guard.accepts(sample)) {
             self.counters.received(stamp.tick);
-            return Newest::AtHand;
+            return Newest::Usable;
         }
         let refusal = sample.map_or(Refusal::Other, |sample| self.guard.refusal(sample));
         self.counters.rejected(stamp.tick, refusal);
@@ -358,7 +359,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
     /// The sample at hand, if there is one that can be used.
     #[inline]
     pub fn sample(&self) -> Option<&S> {
-        self.current().filter(|_| self.newest == Newest::AtHand)
+        self.current().filter(|_| self.newest == Newest::Usable)
     }
 
     /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
@@ -405,7 +406,7 @@ impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
 impl<B: Bus, S: Carried + ?Sized, G: Persist> Persist for Input<B, S, G> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.last.persist(words);
-        self.doubted.persist(words);
+        self.suspect_generation.persist(words);
         self.guard.persist(words);
     }
 }

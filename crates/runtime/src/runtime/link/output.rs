@@ -4,7 +4,7 @@
 //! sent that is not committed, and what is committed and was perhaps not sent is sent by a successor: readers tell a repeated
 //! sample by its tick. A void stands for a sample that does not exist, where everybody waits for inputs. Must not commit.
 
-use super::kept::Kept;
+use super::retained::RetainedSamples;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
 use crate::fault::Delivery;
 use crate::runtime::disturb::Disturbance;
@@ -27,16 +27,16 @@ pub struct Output<B: Bus, S: Carried + ?Sized> {
     /// Whether the port holds that sample already.
     filled: bool,
     /// Whether a void takes the place of a sample that does not go out.
-    voids: bool,
+    markers: bool,
     /// Whether samples are shown first, and published when there is time.
-    shows: bool,
+    writes_latest: bool,
     /// Whether one is shown and not published.
-    shown: bool,
+    unpublished: bool,
     disturbance: Option<Box<Disturbance<S>>>,
     counters: WriteCounters,
     /// How many samples have been sent, for a successor.
     progress: Option<Slots>,
-    kept: Option<Kept>,
+    kept: Option<RetainedSamples>,
     /// Whether it continues a predecessor and has sent nothing yet.
     succeeds: bool,
 }
@@ -71,37 +71,37 @@ impl Staged {
 
     /// How many samples go out.
     #[inline]
-    fn samples(&self, voids: bool) -> u64 {
-        let void = voids && matches!(self.kind, Self::WITHHELD | Self::ABSENT);
-        self.late + self.copies + u64::from(void)
+    fn samples(&self, markers: bool) -> u64 {
+        let marker = markers && matches!(self.kind, Self::WITHHELD | Self::ABSENT);
+        self.late + self.copies + u64::from(marker)
     }
 
     /// Counts it, the content of the sample given.
     #[inline]
-    fn count(&mut self, counters: &mut WriteCounters, content: &[u8], voids: bool) {
-        self.before += self.samples(voids);
+    fn count(&mut self, counters: &mut WriteCounters, content: &[u8], markers: bool) {
+        self.before += self.samples(markers);
         (self.late, self.copies) = (0, 0);
         match std::mem::take(&mut self.kind) {
             Self::SAMPLE => counters.enter(self.tick, content),
-            Self::WITHHELD | Self::ABSENT => counters.enter_void(self.tick, voids),
+            Self::WITHHELD | Self::ABSENT => counters.enter_void(self.tick, markers),
             _ => {}
         }
     }
 }
 
-/// How far a run goes, and how many samples are [kept](Kept): what decides how much a writing end keeps in a ledger.
+/// How far a run goes, and how many samples are [kept](RetainedSamples): what decides how much a writing end keeps in a ledger.
 #[derive(Debug, Clone, Copy)]
 pub struct Extent {
     /// The last tick.
     pub last_tick: u64,
     /// How many samples are kept.
-    pub kept_samples: u64,
+    pub retained_samples: u64,
 }
 
 impl Extent {
     /// Words of the ledger beside the record, for samples of so many words.
     pub fn words(self, length: usize) -> usize {
-        1 + WriteCounters::words(self.last_tick) + Kept::words(self.kept_samples, length)
+        1 + WriteCounters::words(self.last_tick) + RetainedSamples::words(self.retained_samples, length)
     }
 }
 
@@ -120,16 +120,16 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     ) -> Result<Self, BusError> {
         let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
         let counters = WriteCounters::open(ledger, extent.last_tick);
-        let kept = Kept::open(ledger, extent.kept_samples, S::length(bodies));
+        let kept = RetainedSamples::open(ledger, extent.retained_samples, S::length(bodies));
         Ok(Self {
             port: S::writer(bus, topic, bodies, generation)?,
             generation,
             staged: Staged::default(),
             sample: S::blank(bodies),
             filled: false,
-            voids: false,
-            shows: false,
-            shown: false,
+            markers: false,
+            writes_latest: false,
+            unpublished: false,
             disturbance: None,
             counters,
             progress,
@@ -139,13 +139,13 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     }
 
     /// With voids in the place of samples that do not go out, for readers that wait for every tick.
-    pub fn with_voids(self, voids: bool) -> Self {
-        Self { voids, ..self }
+    pub fn with_markers(self, markers: bool) -> Self {
+        Self { markers, ..self }
     }
 
     /// Whose samples are shown to readers of the newest at first, and sent to the others by [`finish`](Self::finish).
-    pub fn shown_first(self) -> Self {
-        Self { shows: true, ..self }
+    pub fn latest_first(self) -> Self {
+        Self { writes_latest: true, ..self }
     }
 
     /// With scripted faults.
@@ -215,8 +215,8 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     }
 
     /// Says that there is no sample for this tick, where readers wait for one: an input was missing.
-    pub fn stage_void(&mut self, tick: u64) {
-        let kind = if self.voids { Staged::ABSENT } else { Staged::NOTHING };
+    pub fn stage_marker(&mut self, tick: u64) {
+        let kind = if self.markers { Staged::ABSENT } else { Staged::NOTHING };
         self.staged = Staged { before: self.staged.before, tick, kind, ..Staged::default() };
     }
 
@@ -233,9 +233,9 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             let sample: &S = self.sample.borrow();
             kept.keep(self.staged.before, sample.words().iter().copied());
         }
-        if self.shows {
+        if self.writes_latest {
             self.port.show()?;
-            self.shown = true;
+            self.unpublished = true;
         } else {
             self.port.deliver()?;
             hooks::at(Failpoint::Sent);
@@ -270,12 +270,12 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         // What was made in an earlier life goes out in this one, also where a scripted fault has broken the generation.
         let lives = if kind == Staged::ABSENT { 0 } else { made.generation ^ self.generation };
         let own: Stamp = bytemuck::cast(self.staged.stamp);
-        let void = if kind == Staged::ABSENT {
+        let marker = if kind == Staged::ABSENT {
             Stamp { tick, generation: self.generation | NO_SAMPLE, ..Stamp::default() }
         } else {
             Stamp { generation: made.generation | NO_SAMPLE, ..made }
         };
-        for index in self.already_sent()..self.staged.samples(self.voids) {
+        for index in self.already_sent()..self.staged.samples(self.markers) {
             self.port.prepare()?;
             let late =
                 self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
@@ -292,7 +292,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                     }
                     None => {
                         slot.words_mut().fill(0);
-                        *slot.stamp_mut() = void;
+                        *slot.stamp_mut() = marker;
                     }
                 }
                 // Before anybody sees it.
@@ -320,7 +320,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     /// [`BusError::Send`].
     #[inline]
     pub fn finish(&mut self) -> Result<(), BusError> {
-        if std::mem::take(&mut self.shown) {
+        if std::mem::take(&mut self.unpublished) {
             self.port.publish()?;
             hooks::at(Failpoint::Sent);
             self.sent(1);
@@ -328,7 +328,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if let Some(disturbance) = &mut self.disturbance {
             disturbance.forget(self.staged.late);
         }
-        self.staged.count(&mut self.counters, self.sample.borrow().content(), self.voids);
+        self.staged.count(&mut self.counters, self.sample.borrow().content(), self.markers);
         self.port.prepare()
     }
 
@@ -394,16 +394,16 @@ pub fn written(
     words: &mut impl Words,
     service: &str,
     length: usize,
-    voids: bool,
+    markers: bool,
     (ledger, extent): (&Ledger, Extent),
 ) -> LinkWritten {
     ledger.take(1);
     let (mut counters, mut staged) = (WriteCounters::open(ledger, extent.last_tick), Staged::default());
-    ledger.take(Kept::words(extent.kept_samples, length));
+    ledger.take(RetainedSamples::words(extent.retained_samples, length));
     let mut sample = vec![0_u64; length];
     counters.persist(words);
     staged.persist(words);
     sample.persist(words);
-    staged.count(&mut counters, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], voids);
+    staged.count(&mut counters, &bytemuck::cast_slice(&sample)[size_of::<Stamp>()..], markers);
     counters.report(service)
 }

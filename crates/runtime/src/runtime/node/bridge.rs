@@ -2,10 +2,10 @@
 //!
 //! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
 
+use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
 use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
-use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Command, Measurement, Rig, Truth};
@@ -66,22 +66,22 @@ impl<R: Rig> Reply<R> {
 }
 
 impl<R: Rig, B: Bus> BridgeNode<R, B> {
-    pub fn open(rig: &R, index: usize, link: Box<DeviceLink>, seat: &Seat<'_, B>) -> Result<Self, BusError> {
-        let (scenario, body) = (seat.scenario, &rig.bodies()[index]);
-        let measurement = seat.output(body, Signal::Measurement)?;
-        let truth = seat.output(body, Signal::Truth)?;
-        let command = seat.input(body, Signal::Command, rig.command_guard(index))?;
+    pub fn open(rig: &R, index: usize, link: Box<DeviceLink>, context: &NodeContext<'_, B>) -> Result<Self, BusError> {
+        let (scenario, body) = (context.scenario, &rig.bodies()[index]);
+        let measurement = context.output(body, Signal::Measurement)?;
+        let truth = context.output(body, Signal::Truth)?;
+        let command = context.input(body, Signal::Command, rig.command_guard(index))?;
         Ok(Self {
             link,
             command,
             measurement,
             truth,
-            clock: seat.clock,
+            clock: context.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
             counters: TickCounters::default(),
-            interruptions: seat.interruptions(),
-            ledger: seat.ledger.reopened(),
+            interruptions: context.interruptions(),
+            ledger: context.ledger.reopened(),
             asked: false,
             asked_ns: 0,
             command_origin_ns: None,
@@ -190,8 +190,8 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
     #[cold]
     fn miss(&mut self) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
-        self.measurement.stage_void(tick);
-        self.truth.stage_void(tick);
+        self.measurement.stage_marker(tick);
+        self.truth.stage_marker(tick);
         self.counters.pass(true);
         commit(self);
         self.measurement.dispatch()?;

@@ -100,7 +100,7 @@ pub trait Node {
     /// How many words its state takes.
     fn state_words(&mut self) -> usize;
     /// Of several roles that are driven as one, the node of this role.
-    fn of(&self, _role: RoleId) -> Option<&dyn Node> {
+    fn member(&self, _role: RoleId) -> Option<&dyn Node> {
         None
     }
     /// The counters of its device's serial line, if it has one.

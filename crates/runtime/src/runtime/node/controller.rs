@@ -1,10 +1,10 @@
 //! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
 
+use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
 use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
 use super::ports::driven;
-use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Carried, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::control::Watchdog;
@@ -14,7 +14,7 @@ use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
-use crate::runtime::share::{Computed, Computer};
+use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
@@ -50,9 +50,9 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         (body, command): (&BodyInfo, Output<B, L::Command>),
         law: L,
         guard: G,
-        seat: &Seat<'_, B>,
+        context: &NodeContext<'_, B>,
     ) -> Result<Self, BusError> {
-        let measurement = seat.input(body, Signal::Measurement, guard)?;
+        let measurement = context.input(body, Signal::Measurement, guard)?;
         let controller = Controller::new(law);
         let missed = MissedTicks::default();
         Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
@@ -82,7 +82,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         // What is not used now will never be, and must not fill the link.
         self.measurement.seek(tick)?;
         self.ready = false;
-        self.command.stage_void(tick);
+        self.command.stage_marker(tick);
         Ok(())
     }
 
@@ -95,23 +95,23 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         silent: bool,
         (clock, began_ns): (Clock, u64),
         starved: &mut bool,
-        computed: Option<(&Computer, usize)>,
+        computed: Option<(&SampleSource, usize)>,
     ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
         if silent {
             // There is to be no command: none is missed.
             let _ = self.missed.before(estimate.stamp().tick);
         }
-        self.ready &= !silent && computed.is_none_or(|(computing, index)| computing.has(index));
+        self.ready &= !silent && computed.is_none_or(|(source, index)| source.has(index));
         let Some(measurement) = self.measurement.sample().filter(|_| self.ready) else {
-            self.command.stage_void(estimate.stamp().tick);
+            self.command.stage_marker(estimate.stamp().tick);
             return Ok(began_ns);
         };
         let (controller, sent_ns) = (&mut self.controller, &mut self.sent_ns);
         self.command.stage(|sample| {
             controller.step(estimate, measurement, sample);
-            if let Some((computing, index)) = computed {
-                computing.write(index, sample.words_mut());
+            if let Some((source, index)) = computed {
+                source.write(index, sample.words_mut());
             }
             *sent_ns = clock.now_ns();
             sample.stamp_mut().sent_ns = *sent_ns;
@@ -196,28 +196,28 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     interruptions: Interruptions,
     ledger: Ledger,
     /// What computes the commands in the place of the laws, if that is somebody else.
-    computing: Option<Computer>,
+    source: Option<SampleSource>,
     /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
     look: usize,
     stages: Stages,
 }
 
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computer>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, context: &NodeContext<'_, B>, source: Option<SampleSource>) -> Result<Self, BusError> {
         let bodies = |fleets: bool| driven(rig.bodies()).filter(move |(_, body)| body.fleet.is_some() == fleets);
         // In the order of the counters: everything written, then everything read; fleets last.
-        let written = |(_, body)| seat.output(body, Signal::Command);
+        let written = |(_, body)| context.output(body, Signal::Command);
         let commands: Vec<Output<B, Command<R>>> = bodies(false).map(written).collect::<Result<_, _>>()?;
-        let written = |(_, body)| seat.output(body, Signal::Command);
+        let written = |(_, body)| context.output(body, Signal::Command);
         let fleet_commands: Vec<Output<B, FleetCommand<R>>> = bodies(true).map(written).collect::<Result<_, _>>()?;
-        let estimate = seat.input(&rig.bodies()[0], Signal::Estimate, rig.estimate_guard())?;
+        let estimate = context.input(&rig.bodies()[0], Signal::Estimate, rig.estimate_guard())?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
-            Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), seat)
+            Channel::open(index, (body, command), rig.law(index), rig.measurement_guard(index, true), context)
         };
         let channels = bodies(false).zip(commands).map(channel).collect::<Result<_, BusError>>()?;
         let channel = |((index, body), command): ((usize, &BodyInfo), _)| {
             let fleet = rig.fleet(index)?;
-            Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), seat))
+            Some(Channel::open(index, (body, command), fleet.law(), fleet.measurement_guard(), context))
         };
         let fleets = bodies(true).zip(fleet_commands).filter_map(channel).collect::<Result<_, BusError>>()?;
         Ok(Self {
@@ -225,12 +225,12 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             estimate,
             channels,
             fleets,
-            clock: seat.clock,
+            clock: context.clock,
             counters: TickCounters::default(),
-            watchdog: Watchdog::new(seat.scenario.watch),
-            interruptions: seat.interruptions(),
-            ledger: seat.ledger.reopened(),
-            computing,
+            watchdog: Watchdog::new(context.scenario.watch),
+            interruptions: context.interruptions(),
+            ledger: context.ledger.reopened(),
+            source,
             look: 0,
             stages: Stages::default(),
         })
@@ -245,7 +245,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, NodeError> {
         if self.estimate.seek(self.counters.next())? == Seek::NotYet {
-            if let Some(tick) = self.computing.as_ref().and_then(Computer::lacks) {
+            if let Some(tick) = self.source.as_ref().and_then(SampleSource::lacks) {
                 self.offer(tick, overdue)?;
             } else if self.clock == Clock::Monotonic {
                 // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
@@ -284,8 +284,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         for channel in &mut self.channels {
             complete &= channel.gather(tick)?;
         }
-        if let Some(computing) = self.computing.as_mut().filter(|_| complete || overdue) {
-            computing.offer(std::iter::once(None).chain(self.channels.iter().map(Channel::words)));
+        if let Some(source) = self.source.as_mut().filter(|_| complete || overdue) {
+            source.offer(std::iter::once(None).chain(self.channels.iter().map(Channel::words)));
         }
         Ok(())
     }
@@ -383,25 +383,25 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
         }
-        if let Some(computing) = &mut self.computing {
+        if let Some(source) = &mut self.source {
             let singles = self.channels.iter().map(Channel::words);
             let fleets = self.fleets.iter().map(Channel::words);
             let estimate = std::iter::once(self.estimate.sample().map(Message::words));
-            match computing.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
-                Computed::Done => {
-                    began_ns = computing.asked_ns(stamp.tick).unwrap_or(began_ns);
+            match source.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
+                Progress::Done => {
+                    began_ns = source.asked_ns(stamp.tick).unwrap_or(began_ns);
                     // A device that makes the estimate too was asked before that was sent.
-                    if !computing.makes_estimate() {
+                    if !source.makes_estimate() {
                         self.stages.received_ns = began_ns;
                     }
                 }
-                Computed::Waiting => return Ok(Poll::Waiting),
-                Computed::Missed => {
+                Progress::Waiting => return Ok(Poll::Waiting),
+                Progress::Missed => {
                     self.skip_to(stamp.tick + 1);
                     return Ok(Poll::Missed);
                 }
             }
-            if computing.restarted() {
+            if source.restarted() {
                 self.counters.disturbed(stamp.tick);
             }
         }
@@ -413,7 +413,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let clock = self.clock;
         let mut starved = false;
         for (index, channel) in self.channels.iter_mut().enumerate() {
-            let computed = self.computing.as_ref().map(|computing| (computing, index));
+            let computed = self.source.as_ref().map(|source| (source, index));
             began_ns = channel.execute(estimate, silent, (clock, began_ns), &mut starved, computed)?;
             if self.watchdog.active() && channel.ready {
                 Self::watch_command(&mut self.watchdog, stamp.tick, channel.command.last());
@@ -457,7 +457,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.estimate.expect(AcceptedTicks::Due(grid));
-            self.computing.iter_mut().for_each(|computing| computing.start(grid));
+            self.source.iter_mut().for_each(|source| source.start(grid));
             self.channels.iter_mut().for_each(|channel| channel.measurement.expect(AcceptedTicks::Due(grid)));
             self.fleets.iter_mut().for_each(|fleet| fleet.measurement.expect(AcceptedTicks::Due(grid)));
         }
@@ -497,7 +497,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let tick = self.counters.next();
-        if self.computing.as_ref().is_some_and(Computer::pending) {
+        if self.source.as_ref().is_some_and(SampleSource::pending) {
             // What it waits for comes over a line.
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
         } else if self.lacks_estimate() {
@@ -566,17 +566,17 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn stages(&self) -> Vec<StageReport> {
         let Stages { hop, step, age, .. } = &self.stages;
         let mut stages = StageReport::all(&[("hop", hop), ("step", step), ("age", age)]);
-        let line = self.computing.as_ref().and_then(Computer::line);
+        let line = self.source.as_ref().and_then(SampleSource::line);
         stages.extend(line.into_iter().flat_map(|(_, serial)| StageReport::all(&[("serial", &serial)])));
         stages
     }
 
     fn line(&self) -> Option<LineCounters> {
-        self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
+        self.source.as_ref().and_then(SampleSource::line).map(|(counters, _)| counters)
     }
 
     fn outages(&self) -> Vec<Outage> {
-        self.computing.as_ref().map_or_else(Vec::new, Computer::outages)
+        self.source.as_ref().map_or_else(Vec::new, SampleSource::outages)
     }
 }
 

@@ -219,7 +219,7 @@ impl Node for GroupNode {
         self.members.last().map_or_else(Vec::new, |member| member.node.stages())
     }
 
-    fn of(&self, role: RoleId) -> Option<&dyn Node> {
+    fn member(&self, role: RoleId) -> Option<&dyn Node> {
         self.members.iter().find(|member| member.role == role).map(|member| &*member.node as &dyn Node)
     }
 }

@@ -1,9 +1,9 @@
 //! An observer on a bus: the leader's measurement in, the estimate out.
 
+use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
 use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
-use super::seat::{LOOK_NS, Seat};
 use crate::bus::{Bus, BusError, Signal};
 use crate::clock::{Clock, Grid, monotonic_ns, sleep_until};
 use crate::rig::{Estimate, Measurement, Rig};
@@ -12,7 +12,7 @@ use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
 use crate::runtime::role_id::RoleId;
-use crate::runtime::share::{Computed, Computer};
+use crate::runtime::sample_source::{Progress, SampleSource};
 use crate::sample::Message;
 use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
@@ -38,7 +38,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     interruptions: Interruptions,
     ledger: Ledger,
     /// What computes the estimate in the place of the observer, if that is somebody else.
-    computing: Option<Computer>,
+    source: Option<SampleSource>,
     instants: Instants,
     missed: MissedTicks,
     hop: Latency,
@@ -47,18 +47,18 @@ pub struct ObserverNode<R: Rig, B: Bus> {
 }
 
 impl<R: Rig, B: Bus> ObserverNode<R, B> {
-    pub fn open(rig: &R, seat: &Seat<'_, B>, computing: Option<Computer>) -> Result<Self, BusError> {
+    pub fn open(rig: &R, context: &NodeContext<'_, B>, source: Option<SampleSource>) -> Result<Self, BusError> {
         let leader = &rig.bodies()[0];
-        let estimate = seat.output(leader, Signal::Estimate)?;
+        let estimate = context.output(leader, Signal::Estimate)?;
         Ok(Self {
-            observer: Observer::new(rig.estimator(), seat.scenario.tick_s()),
-            measurement: seat.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
+            observer: Observer::new(rig.estimator(), context.scenario.tick_s()),
+            measurement: context.input(leader, Signal::Measurement, rig.measurement_guard(0, false))?,
             estimate,
-            clock: seat.clock,
+            clock: context.clock,
             counters: TickCounters::default(),
-            interruptions: seat.interruptions(),
-            ledger: seat.ledger.reopened(),
-            computing,
+            interruptions: context.interruptions(),
+            ledger: context.ledger.reopened(),
+            source,
             instants: Instants::default(),
             missed: MissedTicks::default(),
             hop: Latency::default(),
@@ -75,28 +75,28 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         if self.interruptions.misses(stamp.tick) {
             return self.miss(stamp.tick);
         }
-        if let Some(computing) = &mut self.computing {
-            match computing.tick(stamp.tick, [measurement.map(Message::words)].into_iter())? {
-                Computed::Done => received = computing.asked_ns(stamp.tick).unwrap_or(received),
-                Computed::Waiting => return Ok(Poll::Waiting),
-                Computed::Missed => {
+        if let Some(source) = &mut self.source {
+            match source.tick(stamp.tick, [measurement.map(Message::words)].into_iter())? {
+                Progress::Done => received = source.asked_ns(stamp.tick).unwrap_or(received),
+                Progress::Waiting => return Ok(Poll::Waiting),
+                Progress::Missed => {
                     self.skip_to(stamp.tick + 1);
                     return Ok(Poll::Missed);
                 }
             }
-            if computing.restarted() {
+            if source.restarted() {
                 self.counters.disturbed(stamp.tick);
             }
         }
-        let (observer, computing, clock) = (&mut self.observer, &self.computing, self.clock);
+        let (observer, source, clock) = (&mut self.observer, &self.source, self.clock);
         let mut done = 0;
         self.estimate.stage(|sample| {
             match measurement {
                 Some(measurement) => observer.step(measurement, sample),
                 None => observer.reject(&stamp, sample),
             }
-            if let Some(computing) = computing {
-                computing.write(0, sample.words_mut());
+            if let Some(source) = source {
+                source.write(0, sample.words_mut());
             }
             done = clock.now_ns();
             sample.stamp_mut().sent_ns = done;
@@ -115,7 +115,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         let next = self.counters.next();
         for tick in next..=self.measurement.last_tick().unwrap_or(next) {
             self.counters.pass(self.interruptions.misses(tick));
-            self.send_void(tick)?;
+            self.send_marker(tick)?;
         }
         Ok(Poll::Waiting)
     }
@@ -125,7 +125,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
     fn miss(&mut self, tick: u64) -> Result<Poll, NodeError> {
         self.skip_to(tick);
         self.counters.pass(true);
-        self.send_void(tick)?;
+        self.send_marker(tick)?;
         Ok(Poll::Missed)
     }
 
@@ -139,8 +139,8 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         }
     }
 
-    fn send_void(&mut self, tick: u64) -> Result<(), NodeError> {
-        self.estimate.stage_void(tick);
+    fn send_marker(&mut self, tick: u64) -> Result<(), NodeError> {
+        self.estimate.stage_marker(tick);
         commit(self);
         self.estimate.dispatch()?;
         Ok(self.estimate.finish()?)
@@ -167,7 +167,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         if self.clock == Clock::Monotonic {
             self.measurement.expect(AcceptedTicks::Due(grid));
-            self.computing.iter_mut().for_each(|computing| computing.start(grid));
+            self.source.iter_mut().for_each(|source| source.start(grid));
         }
         self.estimate.dispatch()?;
         self.estimate.finish()?;
@@ -198,7 +198,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
-        if self.computing.as_ref().is_some_and(Computer::pending) {
+        if self.source.as_ref().is_some_and(SampleSource::pending) {
             // What it waits for comes over a line.
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
         } else {
@@ -252,17 +252,17 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn stages(&self) -> Vec<StageReport> {
         let mut stages = StageReport::all(&[("hop", &self.hop), ("step", &self.step), ("age", &self.age)]);
-        let line = self.computing.as_ref().and_then(Computer::line);
+        let line = self.source.as_ref().and_then(SampleSource::line);
         stages.extend(line.into_iter().flat_map(|(_, serial)| StageReport::all(&[("serial", &serial)])));
         stages
     }
 
     fn line(&self) -> Option<LineCounters> {
-        self.computing.as_ref().and_then(Computer::line).map(|(counters, _)| counters)
+        self.source.as_ref().and_then(SampleSource::line).map(|(counters, _)| counters)
     }
 
     fn outages(&self) -> Vec<Outage> {
-        self.computing.as_ref().map_or_else(Vec::new, Computer::outages)
+        self.source.as_ref().map_or_else(Vec::new, SampleSource::outages)
     }
 }
 

@@ -1,17 +1,17 @@
 //! A plant on a bus: command in; measurement, then truth out; then the body moves on.
 
+use super::context::NodeContext;
 use super::contract::{Node, Poll, RunCondition};
 use super::missed::MissedTicks;
 use super::persistent::{Inherited, Persistent, commit, commit_last, length, restore};
-use super::seat::Seat;
 use crate::bus::{Bus, BusError, Carried, Reader, Signal};
 use crate::clock::{Clock, Grid};
 use crate::rig::{BodyInfo, DelayLine, Due};
 use crate::role::{Body, CommandEvent, Guard, Plant};
-use crate::runtime::compute::Computing;
 use crate::runtime::disturb::Interruptions;
 use crate::runtime::error::NodeError;
 use crate::runtime::link::{AcceptedTicks, Input, Output, Seek};
+use crate::runtime::role_function::FunctionRole;
 use crate::runtime::role_id::RoleId;
 use crate::sample::{Message, Stamp};
 use crate::state::{Persist, Words};
@@ -19,12 +19,12 @@ use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, 
 use std::borrow::{Borrow, BorrowMut};
 
 /// A body whose samples links carry: one, or a fleet.
-pub trait Hosted: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
+pub trait LinkedBody: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
 
-impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> Hosted for P {}
+impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> LinkedBody for P {}
 
 /// A plant with its links and counters.
-pub struct PlantNode<P: Hosted, G, B: Bus> {
+pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     plant: Plant<P>,
     command: Option<Input<B, P::Command, G>>,
     /// What has come and is not due, where a command does not act at the tick after its own.
@@ -38,7 +38,7 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     interruptions: Interruptions,
     ledger: Ledger,
     /// What computes the samples in the place of the body, if that is somebody else.
-    computing: Option<Computing>,
+    function: Option<FunctionRole>,
     inherited: Inherited,
     /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
     unfinished: Option<u64>,
@@ -52,22 +52,22 @@ pub struct PlantNode<P: Hosted, G, B: Bus> {
     step: Latency,
 }
 
-impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
+impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     pub fn open(
         body: P,
         guard: G,
         info: &BodyInfo,
-        seat: &Seat<'_, B>,
-        computing: Option<Computing>,
+        context: &NodeContext<'_, B>,
+        function: Option<FunctionRole>,
     ) -> Result<Self, BusError> {
-        let scenario = seat.scenario;
-        let measurement = seat.output(info, Signal::Measurement)?;
-        let truth = seat.output(info, Signal::Truth)?;
+        let scenario = context.scenario;
+        let measurement = context.output(info, Signal::Measurement)?;
+        let truth = context.output(info, Signal::Truth)?;
         let delay_ticks = scenario.actuation_delay_ticks;
         // Where several commands may come before one is due, the newest is not enough.
         let (delayed, bodies) = (delay_ticks > 1, info.bodies());
         let reader = if delayed { Reader::Scorer } else { Reader::Role };
-        let command = info.driven.then(|| seat.input_of(info, Signal::Command, guard, reader)).transpose()?;
+        let command = info.driven.then(|| context.input_of(info, Signal::Command, guard, reader)).transpose()?;
         let line = (delayed && info.driven).then(|| DelayLine::new(delay_ticks, || P::Command::blank(bodies)));
         Ok(Self {
             plant: Plant::new(body, scenario.actuation(info.driven), scenario.tick_s()),
@@ -75,13 +75,13 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             line,
             measurement,
             truth,
-            clock: seat.clock,
+            clock: context.clock,
             grid: Grid { epoch_ns: 0, period_ns: scenario.period_ns },
             last_tick: scenario.last_tick,
             counters: TickCounters::default(),
-            interruptions: seat.interruptions(),
-            ledger: seat.ledger.reopened(),
-            computing,
+            interruptions: context.interruptions(),
+            ledger: context.ledger.reopened(),
+            function,
             inherited: Inherited::Nothing,
             unfinished: None,
             behind: 0,
@@ -165,8 +165,8 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     #[cold]
     fn miss(&mut self) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
-        self.measurement.stage_void(tick);
-        self.truth.stage_void(tick);
+        self.measurement.stage_marker(tick);
+        self.truth.stage_marker(tick);
         self.counters.pass(true);
         self.behind += 1;
         commit(self);
@@ -185,11 +185,11 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
 
     fn stage_truth(&mut self, tick: u64) -> Result<(), NodeError> {
         let (plant, clock, origin_ns) = (&self.plant, self.clock, self.grid.due_ns(tick));
-        let computing = &self.computing;
+        let function = &self.function;
         Ok(self.truth.stage(|sample| {
             plant.truth(&Stamp { tick, origin_ns, sent_ns: clock.now_ns(), ..Stamp::default() }, sample);
-            if let Some(computing) = computing {
-                computing.write_truth(sample.words_mut());
+            if let Some(function) = function {
+                function.write_truth(sample.words_mut());
             }
         })?)
     }
@@ -211,20 +211,20 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
             self.counters.safe();
         }
         let driven = self.command.is_some();
-        if let Some(computing) = &mut self.computing {
+        if let Some(function) = &mut self.function {
             let command = match due(self.command.as_mut(), self.line.as_ref(), tick)? {
                 Due::Here(command) if event == CommandEvent::Applied => Some(command),
                 _ => None,
             };
-            computing.tick(tick, &[command.map(Message::words)][..usize::from(driven)])?;
+            function.tick(tick, &[command.map(Message::words)][..usize::from(driven)])?;
         }
-        let (plant, computing, clock) = (&mut self.plant, &self.computing, self.clock);
+        let (plant, function, clock) = (&mut self.plant, &self.function, self.clock);
         let mut stamp = Stamp { tick, origin_ns: self.grid.due_ns(tick), ..Stamp::default() };
         self.measurement.stage(|sample| {
             stamp.sent_ns = clock.now_ns();
             plant.measure(&stamp, sample);
-            if let Some(computing) = computing {
-                computing.write(0, sample.words_mut());
+            if let Some(function) = function {
+                function.write(0, sample.words_mut());
             }
         })?;
         self.unfinished = Some(tick);
@@ -279,7 +279,7 @@ fn due<'a, S: Carried + ?Sized, G: Guard<S>, B: Bus>(
     })
 }
 
-impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G, B> {
+impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G, B> {
     fn time_triggered(&self) -> bool {
         true
     }
@@ -406,7 +406,7 @@ impl<P: Hosted, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P, G,
     }
 }
 
-impl<P: Hosted, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
+impl<P: LinkedBody, G: Persist, B: Bus> Persistent for PlantNode<P, G, B> {
     fn ledger(&self) -> &Ledger {
         &self.ledger
     }

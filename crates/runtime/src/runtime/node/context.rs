@@ -6,7 +6,7 @@ use crate::clock::{Clock, Grid};
 use crate::config::{BodyInfo, ClockKind, Settings};
 use crate::role::Guard;
 use crate::runtime::disturb::{Disturbance, Interruptions, LateSamples, extra_samples, late_samples};
-use crate::runtime::link::{AcceptedTicks, Extent, Input, Kept, Output};
+use crate::runtime::link::{AcceptedTicks, Extent, Input, Output, RetainedSamples};
 use crate::runtime::role_id::RoleId;
 use crate::runtime::window_ticks;
 use crate::state::{Persist, Restore};
@@ -16,7 +16,7 @@ use crate::telemetry::{Ledger, TickCounters};
 pub(super) const LOOK_NS: u64 = 50_000;
 
 /// What every node of a run shares.
-pub struct Seat<'a, B> {
+pub struct NodeContext<'a, B> {
     pub(super) bus: &'a B,
     pub(super) scenario: &'a Settings,
     pub(super) role: RoleId,
@@ -25,7 +25,7 @@ pub struct Seat<'a, B> {
     pub(super) clock: Clock,
 }
 
-impl<B: Bus> Seat<'_, B> {
+impl<B: Bus> NodeContext<'_, B> {
     pub(super) fn input<S, G: Guard<S>>(
         &self,
         body: &BodyInfo,
@@ -51,17 +51,17 @@ impl<B: Bus> Seat<'_, B> {
         S: Carried + ?Sized,
     {
         let topic = topic(self.scenario, &body.name, signal);
-        let mut input = Input::watch_many(self.bus, &topic, body.bodies(), reader)?
-            .recovering(self.kept(&topic), body.bodies(), self.generation > 1)
-            .with_late(LateSamples::of(self.scenario, signal, &body.name))
-            .guarded(guard);
+        let mut input = Input::open_many(self.bus, &topic, body.bodies(), reader)?
+            .with_recovery(self.kept(&topic), body.bodies(), self.generation > 1)
+            .with_late(LateSamples::for_signal(self.scenario, signal, &body.name))
+            .with_guard(guard);
         input.expect(accepted_ticks(self.scenario, None));
         Ok(input)
     }
 
     /// What the writer of a signal keeps.
-    fn kept(&self, topic: &Topic) -> Option<Kept> {
-        kept(self.scenario, topic, |writer| {
+    fn kept(&self, topic: &Topic) -> Option<RetainedSamples> {
+        retained_samples(self.scenario, topic, |writer| {
             let path = self.ledger.path()?.with_file_name(ledger_file(self.scenario, writer));
             Ledger::shared(&path, ledger_words(self.scenario, writer)).ok()
         })
@@ -80,31 +80,35 @@ impl<B: Bus> Seat<'_, B> {
             Signal::Truth => None,
             _ => {
                 let role = self.role.name(self.scenario);
-                Disturbance::of(self.scenario, role, &body.name, bodies, next_tick(&self.ledger))
+                Disturbance::for_signal(self.scenario, role, &body.name, bodies, next_tick(&self.ledger))
             }
         };
         // In a process with others whoever has a short way is served at once, and all others when the tick is done.
-        let alone = self.role.host(self.scenario).hosted(self.scenario).len() == 1;
-        let output = if alone { output } else { output.shown_first() };
-        Ok(output.with_voids(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
+        let alone = self.role.process_role(self.scenario).process_members(self.scenario).len() == 1;
+        let output = if alone { output } else { output.latest_first() };
+        Ok(output.with_markers(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
     }
 
     pub(super) fn interruptions(&self) -> Interruptions {
         let role = self.role.name(self.scenario);
-        Interruptions::of(self.scenario, role, self.generation, next_tick(&self.ledger))
+        Interruptions::for_role(self.scenario, role, self.generation, next_tick(&self.ledger))
     }
 }
 
 /// Where the samples of a signal are kept for the successors of its readers: in its writer's ledger, which `open` opens.
-pub fn kept(scenario: &Settings, topic: &Topic, open: impl Fn(RoleId) -> Option<Ledger>) -> Option<Kept> {
+pub fn retained_samples(
+    scenario: &Settings,
+    topic: &Topic,
+    open: impl Fn(RoleId) -> Option<Ledger>,
+) -> Option<RetainedSamples> {
     let extent = extent(scenario);
-    let writers = if extent.kept_samples == 0 { Vec::new() } else { RoleId::all(scenario) };
+    let writers = if extent.retained_samples == 0 { Vec::new() } else { RoleId::all(scenario) };
     writers.into_iter().find_map(|writer| {
         let written = ports(scenario, writer).writes;
         let index = written.iter().position(|port| port.topic == *topic)?;
         let (ledger, length) = (open(writer)?, words(&written[index]));
-        ledger.take(words_of(&written[..=index], extent) - Kept::words(extent.kept_samples, length));
-        Kept::open(&ledger, extent.kept_samples, length)
+        ledger.take(words_of(&written[..=index], extent) - RetainedSamples::words(extent.retained_samples, length));
+        RetainedSamples::open(&ledger, extent.retained_samples, length)
     })
 }
 
@@ -140,12 +144,12 @@ pub fn ledger_file(scenario: &Settings, role: RoleId) -> String {
 /// role may be ahead of what is scored, and a little longer: a tick is scored before its command is used. As links, twice that.
 pub(super) fn extent(scenario: &Settings) -> Extent {
     let lockstep = scenario.clock == ClockKind::Lockstep;
-    let kept_samples = if lockstep {
+    let retained_samples = if lockstep {
         2 * window_ticks(scenario) * (1 + extra_samples(scenario) as u64) + late_samples(scenario) as u64
     } else {
         0
     };
-    Extent { last_tick: scenario.last_tick, kept_samples }
+    Extent { last_tick: scenario.last_tick, retained_samples }
 }
 
 /// The tick that a role has not executed, by its ledger.

@@ -12,7 +12,7 @@ const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
 /// One tick of a role, to be computed.
 #[derive(Debug)]
-pub struct ComputedTick<'a> {
+pub struct TickSamples<'a> {
     /// Which.
     pub tick: u64,
     /// The samples that it reads, as words with their stamps, in the order of its seat; none where a sample is missing or was not
@@ -24,25 +24,25 @@ pub struct ComputedTick<'a> {
 }
 
 /// Computes what a role sends.
-pub trait Compute {
+pub trait RoleFunction {
     /// Computes one tick. It is waited for: in real time a tick that it takes too long for is late, as any other.
     ///
     /// # Errors
     /// Why it cannot go on; the role ends with that.
-    fn compute(&mut self, tick: ComputedTick<'_>) -> Result<(), String>;
+    fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String>;
 }
 
 /// A function with the samples that it fills.
-pub(crate) struct Computing {
-    compute: Box<dyn Compute>,
+pub(crate) struct FunctionRole {
+    compute: Box<dyn RoleFunction>,
     blank: Vec<Vec<u64>>,
     outputs: Vec<Vec<u64>>,
     /// Where a plant's measurement has what its truth has too: words from, words to, how many.
     common: Vec<(usize, usize, usize)>,
 }
 
-impl Computing {
-    pub fn new(compute: Box<dyn Compute>, ports: &Ports, valid: u64) -> Self {
+impl FunctionRole {
+    pub fn new(compute: Box<dyn RoleFunction>, ports: &Ports, valid: u64) -> Self {
         let blank: Vec<Vec<u64>> = ports
             .writes
             .iter()
@@ -65,7 +65,7 @@ impl Computing {
     pub fn tick(&mut self, tick: u64, inputs: &[Option<&[u64]>]) -> Result<(), NodeError> {
         self.outputs.iter_mut().zip(&self.blank).for_each(|(output, blank)| output.copy_from_slice(blank));
         let outputs = &mut self.outputs[..];
-        self.compute.compute(ComputedTick { tick, inputs, outputs }).map_err(|reason| NodeError::Computed { reason })
+        self.compute.compute(TickSamples { tick, inputs, outputs }).map_err(|reason| NodeError::Computed { reason })
     }
 
     /// Writes what was computed into a sample, after its stamp.

@@ -10,13 +10,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// So many samples in the ledger of their writer, each in the place of the one that many before it. Beside the words of a
 /// sample there is its number + 1, or 0 while they are written. The first that is sent has number 0.
 #[derive(Debug)]
-pub struct Kept {
+pub struct RetainedSamples {
     slots: Slots,
     samples: u64,
     length: usize,
 }
 
-impl Kept {
+impl RetainedSamples {
     /// Words of the ledger for so many samples of so many words.
     pub fn words(samples: u64, length: usize) -> usize {
         samples as usize * (1 + length)

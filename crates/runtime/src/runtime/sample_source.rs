@@ -4,9 +4,9 @@
 //! The roles stay the nodes that they are, with links, guards, watchdog and counters; only what they send comes from the
 //! device. Must not invent anything: what is not answered before the next tick is due is missed.
 
-use super::compute::Computing;
 use super::device::DeviceLink;
 use super::error::NodeError;
+use super::role_function::FunctionRole;
 use crate::clock::{Grid, monotonic_ns};
 use crate::sample::Stamp;
 use crate::serial::{Answer, LineCounters, MAX_CONTENT, Samples};
@@ -19,7 +19,7 @@ const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
 /// What became of a tick that somebody else computes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Computed {
+pub(crate) enum Progress {
     /// It is there, to be written.
     Done,
     /// It is not there yet: ask again.
@@ -29,14 +29,14 @@ pub(crate) enum Computed {
 }
 
 /// Who computes a role's samples in the place of our own.
-pub(crate) enum Computer {
+pub(crate) enum SampleSource {
     /// A function, which is waited for.
-    Function(Computing),
+    Function(FunctionRole),
     /// A device, which is asked until it has answered.
-    Device(Share),
+    Device(DeviceHandle),
 }
 
-impl Computer {
+impl SampleSource {
     /// Hands over the time grid; in real time.
     pub fn start(&mut self, grid: Grid) {
         if let Self::Device(share) = self {
@@ -50,11 +50,11 @@ impl Computer {
         &mut self,
         tick: u64,
         inputs: impl Iterator<Item = Option<&'a [u64]>>,
-    ) -> Result<Computed, NodeError> {
+    ) -> Result<Progress, NodeError> {
         match self {
             Self::Function(function) => {
                 let inputs: Vec<Option<&[u64]>> = inputs.collect();
-                function.tick(tick, &inputs).map(|()| Computed::Done)
+                function.tick(tick, &inputs).map(|()| Progress::Done)
             }
             Self::Device(share) => share.tick(tick, inputs),
         }
@@ -155,12 +155,12 @@ impl Part {
 }
 
 /// One role's share of a device.
-pub(crate) struct Share {
+pub(crate) struct DeviceHandle {
     exchange: Rc<RefCell<Exchange>>,
     part: Part,
 }
 
-impl Share {
+impl DeviceHandle {
     /// The only role of a device.
     pub fn all(link: Box<DeviceLink>) -> Self {
         Self { exchange: Rc::new(RefCell::new(Exchange::new(link))), part: Part::All }
@@ -172,7 +172,7 @@ impl Share {
         [Part::Observer, Part::Controller].map(|part| Self { exchange: Rc::clone(&exchange), part })
     }
 
-    fn tick<'a>(&mut self, tick: u64, inputs: impl Iterator<Item = Option<&'a [u64]>>) -> Result<Computed, NodeError> {
+    fn tick<'a>(&mut self, tick: u64, inputs: impl Iterator<Item = Option<&'a [u64]>>) -> Result<Progress, NodeError> {
         let (exchange, now_ns) = (&mut *self.exchange.borrow_mut(), monotonic_ns());
         if exchange.tick != Some(tick) {
             exchange.begin(tick);
@@ -184,13 +184,13 @@ impl Share {
         }
         exchange.look(now_ns)?;
         if exchange.answered {
-            return Ok(Computed::Done);
+            return Ok(Progress::Done);
         }
         let overdue = exchange.grid.is_some_and(|grid| now_ns >= grid.due_ns(tick + 1));
         if overdue {
             exchange.end();
         }
-        Ok(if overdue { Computed::Missed } else { Computed::Waiting })
+        Ok(if overdue { Progress::Missed } else { Progress::Waiting })
     }
 }
 
