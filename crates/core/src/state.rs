@@ -1,23 +1,24 @@
-//! What a state machine remembers from one step to the next, described once, field by field: the same description writes
-//! the state to words, reads it back, and counts the words.
+//! The state of a state machine, described once, field by field. The same description stores the state in words,
+//! restores it, and counts the words.
 //!
-//! A process that continues the work of another begins with the other's state. Must not allocate, nor know where the words
-//! are kept. What can be computed again from what is kept (a cache, a parameter) is not state.
+//! A restarted process continues from the stored state. This module must not allocate, nor know where the words are
+//! stored. Values that can be recomputed (caches, parameters) are not state.
 
 use nalgebra::SMatrix;
 
-/// Something whose state outlives the process that it runs in.
+/// A value whose state outlives its process.
 pub trait Persist {
-    /// Passes every field of the state through `words`: always as many, always in the same order, whatever their values.
+    /// Passes every field of the state through `words`: always the same number of words in the same order, whatever
+    /// the values.
     fn persist<W: Words>(&mut self, words: &mut W);
 }
 
-/// Where a state goes, or comes from.
+/// A visitor of the words of a state, which stores, restores or counts them.
 pub trait Words {
-    /// Passes one word: it is kept, or replaced by the one that was kept.
+    /// Visits one word: stores it, or replaces it by the stored one.
     fn word(&mut self, value: &mut u64);
 
-    /// Passes a number, bit by bit.
+    /// Visits a number, bit by bit.
     #[inline]
     fn number(&mut self, value: &mut f64) {
         let mut bits = value.to_bits();
@@ -25,14 +26,14 @@ pub trait Words {
         *value = f64::from_bits(bits);
     }
 
-    /// Passes a number that weighs what is estimated and is no part of it: a covariance.
+    /// Visits a number that weighs the estimate but is not part of it, such as a covariance.
     #[inline]
     fn weight(&mut self, value: &mut f64) {
         self.number(value);
     }
 }
 
-/// Passes the numbers of a state as [weights](Words::weight).
+/// A visitor that passes the numbers of a state on as [weights](Words::weight).
 #[derive(Debug)]
 pub struct Weights<'a, W>(pub &'a mut W);
 
@@ -48,7 +49,7 @@ impl<W: Words> Words for Weights<'_, W> {
     }
 }
 
-/// Counts words and changes nothing.
+/// A visitor that counts words and changes nothing.
 #[derive(Debug, Default)]
 pub struct Count(pub usize);
 
@@ -59,7 +60,7 @@ impl Words for Count {
     }
 }
 
-/// How many words a state takes.
+/// Returns the number of words of a state.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
@@ -72,7 +73,7 @@ pub fn length(state: &mut impl Persist) -> usize {
     count.0
 }
 
-/// Reads a state back from the words that it was written to; zeros follow the last.
+/// A visitor that restores a state from its words; missing words are zero.
 #[derive(Debug)]
 pub struct Restore<'a>(pub &'a [u64]);
 
@@ -128,7 +129,7 @@ impl<const R: usize, const C: usize> Persist for SMatrix<f64, R, C> {
     }
 }
 
-/// Whether it is there, and then itself, or its default.
+/// Stores a presence word, then the value or its default.
 impl<T: Persist + Default> Persist for Option<T> {
     #[inline]
     fn persist<W: Words>(&mut self, words: &mut W) {
@@ -154,7 +155,7 @@ macro_rules! persist_tuple {
 persist_tuple!(A: 0, B: 1);
 persist_tuple!(A: 0, B: 1, C: 2);
 
-/// Implements [`Persist`] for a type by the fields that are its state.
+/// Implements [`Persist`] for a type by visiting the listed fields.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
@@ -162,7 +163,7 @@ persist_tuple!(A: 0, B: 1, C: 2);
 ///     inertia_kg_m2: f64,
 ///     speed_rad_s: f64,
 /// }
-/// // The inertia is a parameter: a successor has it from the scenario.
+/// // The inertia is a parameter: it comes from the scenario, not from the state.
 /// corotate::persist_fields!(Motor, speed_rad_s);
 ///
 /// let mut motor = Motor { inertia_kg_m2: 0.1, speed_rad_s: 3.0 };
@@ -198,13 +199,13 @@ mod tests {
     type State = ((u64, bool), [f64; 2], (Option<Vector3<f64>>, Option<u64>));
 
     #[test]
-    fn what_was_kept_is_read_back_bit_by_bit_and_takes_as_many_words_as_are_counted() {
+    fn a_state_is_restored_bit_by_bit_and_has_the_counted_length() {
         let full = ((u64::MAX, true), [-0.0, f64::INFINITY], (Some(Vector3::new(1.0, 5e-324, -2.5)), Some(7)));
         let empty = ((0, false), [0.0; 2], (None, None));
         for mut state in [full, empty] as [State; 2] {
             let mut store = Store(Vec::new());
             state.persist(&mut store);
-            assert_eq!(store.0.len(), length(&mut state), "as long whatever is in it");
+            assert_eq!(store.0.len(), length(&mut state), "the length does not depend on the values");
             let mut read: State = if state == full { empty } else { full };
             read.persist(&mut Restore(&store.0));
             assert_eq!(read, state);

@@ -1,17 +1,18 @@
 //! Reductions of vectors of a few components, and a product with a matrix, as plain loops.
 //!
-//! nalgebra has them all, but over iterators and functions that are not marked inline: from another unit of code they are calls, and
-//! a step of the identifier took three times the instructions. Must give the same bits as nalgebra's.
+//! nalgebra's versions use iterators and functions that are not marked inline. From another codegen unit they compile
+//! to calls, and a step of the identifier took three times the instructions. The results must be bit-identical to
+//! nalgebra's.
 
 use nalgebra::{SMatrix, SVector};
 
-/// Every component zero.
+/// Returns the zero vector.
 #[inline]
 pub fn zeros<const N: usize>() -> SVector<f64, N> {
     SVector::from([0.0; N])
 }
 
-/// The largest magnitude of a component.
+/// Returns the largest magnitude of a component.
 #[inline]
 pub fn amax<const N: usize>(v: &SVector<f64, N>) -> f64 {
     let mut largest = v[0].abs();
@@ -21,19 +22,19 @@ pub fn amax<const N: usize>(v: &SVector<f64, N>) -> f64 {
     largest
 }
 
-/// The sum of the components.
+/// Returns the sum of the components.
 #[inline]
 pub fn sum<const N: usize>(v: &SVector<f64, N>) -> f64 {
     reduce(v, 0.0, |sum, x| sum + x)
 }
 
-/// The product of the components.
+/// Returns the product of the components.
 #[inline]
 pub fn product<const N: usize>(v: &SVector<f64, N>) -> f64 {
     reduce(v, 1.0, |product, x| product * x)
 }
 
-/// `a`·`v`, column by column.
+/// Returns `a`·`v`, summed column by column.
 #[inline]
 pub fn times<const N: usize>(a: &SMatrix<f64, N, N>, v: &SVector<f64, N>) -> SVector<f64, N> {
     let mut sum = zeros();
@@ -61,8 +62,8 @@ mod tests {
     use nalgebra::{Matrix3, Vector3};
 
     #[test]
-    fn the_bits_are_those_of_nalgebra() {
-        // Which of all NaN it is, Rust leaves open.
+    fn results_are_bit_identical_to_nalgebra() {
+        // Rust does not specify the bits of a NaN.
         let bits = |values: [f64; 3]| values.map(|value| if value.is_nan() { 1 } else { value.to_bits() });
         let values = [0.1, -0.0, 1e-300, -3.7e5, f64::INFINITY, f64::NAN];
         for picked in 0..values.len().pow(3) {

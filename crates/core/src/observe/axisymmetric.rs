@@ -1,24 +1,25 @@
 //! The invariant relation for the one coefficient of an axisymmetric body, \[SZ\](12)-(17).
 //!
-//! For a symmetry axis k and the transverse axes i, j (cyclic), I_i = I_j and a = (I_j − I_k)/I_i: the transverse component
-//! turns in the body by θ = atan2(ω_i, ω_j) at the rate θ̇ = a ω_k. The paper divides by ω_k; here it is the weight,
-//! ρ = |ω_k|, its sign goes into Δθ, and a body that does not spin is said not to excite. Must not unwrap an angle, and must
-//! not use a step that is long enough for θ to have turned by π.
+//! For a symmetry axis k and the transverse axes i, j (cyclic), I_i = I_j and a = (I_j − I_k)/I_i: the transverse
+//! component rotates in the body by θ = atan2(ω_i, ω_j) at the rate θ̇ = a ω_k. The paper divides by ω_k. Here ρ =
+//! |ω_k| is the weight, its sign goes into Δθ, and a body that does not spin counts as not exciting. The relation
+//! must not unwrap an angle, nor use a step in which θ may have rotated by π.
 
 use super::{Identification, Increment, RateSample};
 use crate::vector::zeros;
 use nalgebra::{Vector1, Vector3};
 
-/// The longest turn of the transverse component in one step that is safely told from its complement, rad (π is ambiguous).
+/// The largest rotation of the transverse component in one step, rad, that is distinguished from its complement (π is
+/// ambiguous).
 const MAX_TURN_RAD: f64 = 3.0;
 
-/// Below this a component counts as at rest whatever floor is asked for, rad/s.
+/// The smallest floor, rad/s: below it a component counts as at rest.
 const SMALLEST_FLOOR_RAD_S: f64 = 1e-9;
 
-/// Why there is no such relation.
+/// The reason why the relation does not exist.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum AxisymmetricError {
-    /// No axis with this number.
+    /// The axis number is invalid.
     #[error("axis {axis} does not exist; the axis of symmetry is 1, 2 or 3")]
     NoSuchAxis {
         /// The axis as given.
@@ -27,7 +28,7 @@ pub enum AxisymmetricError {
 }
 
 impl From<&AxisymmetricError> for &'static str {
-    /// Returns the stable name of the mistake.
+    /// Returns the stable name of the error.
     fn from(error: &AxisymmetricError) -> Self {
         match error {
             AxisymmetricError::NoSuchAxis { .. } => "no-such-axis",
@@ -35,8 +36,8 @@ impl From<&AxisymmetricError> for &'static str {
     }
 }
 
-/// The relation for a = (I_j − I_k)/I_i of a body that is symmetric about axis k: ρ = |ω_k|, rad/s, g = 0. Its filter's rate
-/// is per radian of spin. The ratio of the moments is I_k/I_i = 1 − a.
+/// The relation for a = (I_j − I_k)/I_i of a body that is symmetric about axis k: ρ = |ω_k|, rad/s, g = 0. Its
+/// filter's rate is per radian of spin. The ratio of the moments is I_k/I_i = 1 − a.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Axisymmetric {
     axes: [usize; 3],
@@ -60,10 +61,10 @@ impl Spin {
 }
 
 impl Axisymmetric {
-    /// The relation for symmetry axis `axis` (1 to 3; 3 in the paper) and noiseless sensors.
+    /// Creates the relation for the symmetry axis `axis` (1 to 3; 3 in the paper) and noiseless sensors.
     ///
-    /// A spin or a transverse component of at most `floor_rad_s` counts as not exciting; a floor below 1e-9 rad/s is raised
-    /// to that.
+    /// A spin or a transverse component of at most `floor_rad_s` counts as not exciting; a floor below 1e-9 rad/s is
+    /// raised to that value.
     ///
     /// # Errors
     /// [`AxisymmetricError`] if there is no such axis.
@@ -75,19 +76,20 @@ impl Axisymmetric {
         Ok(Self { axes: [axis % 3, (axis + 1) % 3, axis - 1], floor_rad_s, variance_rad2_s2: Vector3::zeros() })
     }
 
-    /// The same with the variance of each measured component, (rad/s)².
+    /// Returns the relation with the variance of each measured component, (rad/s)².
     #[must_use]
     pub fn with_variance(self, variance_rad2_s2: Vector3<f64>) -> Self {
         Self { variance_rad2_s2, ..self }
     }
 
-    /// The longest step, s, over which a free body with a spin of at most `spin_bound_rad_s` can be followed, whatever its a:
+    /// Returns the longest step, s, over which a free body with a spin of at most `spin_bound_rad_s` can be followed.
+    /// It holds for any a, because |a| ≤ 1 for every axisymmetric body.
     /// |a| ≤ 1 for every axisymmetric body.
     pub fn longest_step_s(&self, spin_bound_rad_s: f64) -> f64 {
         MAX_TURN_RAD / spin_bound_rad_s
     }
 
-    /// What the step of `dt_s` seconds from `from` to `to` tells about a.
+    /// Computes the increment of a over the step of `dt_s` seconds from `from` to `to`.
     ///
     /// The torque of `from` is held over the step. `dt_s` is positive and every input finite.
     #[inline]
@@ -97,13 +99,13 @@ impl Axisymmetric {
         // Exact: a held torque changes the spin linearly.
         let spun = 0.5 * dt_s * (ends[0].k + ends[1].k);
         let push = libm::sqrt(torque.i * torque.i + torque.j * torque.j) * dt_s;
-        // The transverse magnitude changes no faster than the torque pushes: it is never below this.
+        // The torque bounds the rate of the transverse magnitude, which therefore never falls below this value.
         let transverse = 0.5 * (ends[0].transverse() + ends[1].transverse() - push);
         let spins = ends[0].k.abs().min(ends[1].k.abs()) > self.floor_rad_s && ends[0].k * ends[1].k > 0.0;
         if !(spins && transverse > self.floor_rad_s) {
             return Identification::Unexcited;
         }
-        // Bounds the turn whatever a is: |a| ≤ 1.
+        // Bounds the rotation for any a, because |a| ≤ 1.
         if spun.abs() + push / transverse > MAX_TURN_RAD {
             return Identification::Ambiguous;
         }
@@ -130,21 +132,21 @@ impl Axisymmetric {
     }
 }
 
-/// Δθ between the ends, rad, below π in magnitude.
+/// Computes Δθ between the ends, rad, below π in magnitude.
 #[inline]
 fn turn([from, to]: &[Spin; 2]) -> f64 {
-    // From the differences: the small change is what carries the information.
+    // Computed from the differences: the small change carries the information.
     let cross = (to.i - from.i) * from.j - (to.j - from.j) * from.i;
     libm::atan2(cross, from.i * to.i + from.j * to.j)
 }
 
-/// What the torque alone adds to θ, rad: ∫(u_i ω_j − ω_i u_j)/(ω_i² + ω_j²) dt by Simpson's rule, the middle of the path by
-/// its cubic Hermite interpolation.
+/// Computes the torque's contribution to θ, rad: ∫(u_i ω_j − ω_i u_j)/(ω_i² + ω_j²) dt by Simpson's rule, with the
+/// middle of the path from its cubic Hermite interpolation.
 fn driven(ends: &[Spin; 2], torque: &Spin, dt_s: f64, turn: f64, spun: f64) -> f64 {
     let rate = |s: &Spin| (torque.i * s.j - s.i * torque.j) / (s.i * s.i + s.j * s.j);
     let [from, to] = ends;
     let outer = rate(from) + rate(to);
-    // Good to the second order in the step, which is enough for the slopes at the ends.
+    // Accurate to second order in the step, which is enough for the slopes at the ends.
     let a = (turn - 0.5 * dt_s * outer) / spun;
     let bend = |start: f64, end: f64, slopes: [f64; 2]| 0.5 * (start + end) + dt_s / 8.0 * (slopes[0] - slopes[1]);
     let middle = Spin {
@@ -162,7 +164,7 @@ mod tests {
 
     const STEP_S: f64 = 1e-2;
 
-    /// A body that is symmetric about an axis, with its a.
+    /// Returns a body that is symmetric about an axis, with its a.
     fn body(axis: usize, axial: f64) -> (RigidBody, f64) {
         let mut moments = [1.0; 3];
         moments[axis - 1] = axial;
@@ -182,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_tells_the_coefficient_for_any_axis_and_sign() {
+    fn a_step_yields_the_coefficient_for_any_axis_and_sign() {
         for axis in 1..=3 {
             for (axial, spin) in [(1.6, 0.8), (1.6, -0.8), (0.3, 0.8), (0.3, -0.8), (1.0, 0.5)] {
                 for torque in [Vector3::zeros(), Vector3::new(0.2, -0.3, 0.1)] {
@@ -200,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_spin_or_only_spins_does_not_excite() {
+    fn a_body_without_spin_or_without_nutation_does_not_excite() {
         let (body, _) = body(3, 1.6);
         for from in [[0.3, 0.4, 0.0], [0.3, 0.4, 1e-7], [0.3, 0.4, -1e-7], [0.0, 0.0, 0.8], [0.0; 3]] {
             let seen = observe(&body, 3, from.into(), Vector3::zeros(), STEP_S);
@@ -213,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_too_long_for_the_angle_is_not_used() {
+    fn a_step_too_long_for_the_angle_is_ambiguous() {
         let (body, a) = body(3, 1.6);
         let limit = Axisymmetric::new(3, 1e-6).unwrap().longest_step_s(0.8);
         let from = Vector3::new(0.3, 0.4, 0.8);
@@ -224,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn there_are_three_axes() {
+    fn other_axes_than_1_to_3_are_refused() {
         for axis in [0, 4] {
             assert_eq!(Axisymmetric::new(axis, 1e-6), Err(AxisymmetricError::NoSuchAxis { axis }));
         }

@@ -1,37 +1,39 @@
-//! The one filter behind all three papers, stepped exactly.
+//! The filter of all three papers, stepped exactly.
 //!
-//! An invariant relation φ̇ = ρ w, ẇ = g ties an unknown w to a measured potential φ. The filter
-//! ŵ' = g + λ(ρ ŵ − φ̇) has the error equation (w − ŵ)' = λ ρ (w − ŵ): \[D\](6)-(10), \[SZ\](4)-(8), \[S\](12)-(16) with their
-//! auxiliary variables eliminated, so that ŵ itself is the state and only *increments* of φ are ever needed.
+//! An invariant relation φ̇ = ρ w, ẇ = g ties an unknown w to a measured potential φ. The filter ŵ' = g + λ(ρ ŵ − φ̇)
+//! has the error equation (w − ŵ)' = λ ρ (w − ŵ): \[D\](6)-(10), \[SZ\](4)-(8), \[S\](12)-(16). The papers' auxiliary
+//! variables are eliminated, so that ŵ itself is the state and only *increments* of φ are needed.
 
 use super::Hurwitz;
 use crate::state::{Persist, Words};
 use crate::vector::zeros;
 use nalgebra::SVector;
 
-/// What an invariant relation learned about its unknown w over one step from 0 to h.
+/// The information of an invariant relation about its unknown w over one step from 0 to h.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Increment<const N: usize> {
-    /// ∫ρ w dt: the growth of the measured potential, a known input's share taken out.
+    /// ∫ρ w dt: the growth of the measured potential less the share of a known input.
     pub potential: SVector<f64, N>,
-    /// W = ∫ρ dt, never negative. Zero: the step tells nothing about w.
+    /// W = ∫ρ dt, never negative. At zero the step carries no information about w.
     pub weight: f64,
-    /// 1/W, so that equal ticks pay for one division only.
+    /// 1/W, stored so that equal ticks need only one division.
     pub inverse_weight: f64,
-    /// G(h) = ∫g dt: how far w drifted by what is known.
+    /// G(h) = ∫g dt: the known drift of w.
     pub drift: SVector<f64, N>,
     /// ∫ρ G dt: the part of the potential that the drift explains.
     pub drift_moment: SVector<f64, N>,
-    /// Variance of the potential at the end of the step, from the variances of what is measured; 0 without noise.
+    /// The variance of the potential at the end of the step, from the variances of the measured quantities; 0 without
+    /// noise.
     pub variance: SVector<f64, N>,
-    /// Variance of what the measurement at the end of the step adds to the drift of this step and the next; 0 without noise.
+    /// The variance that the measurement at the end of the step adds to the drift of this step and the next; 0
+    /// without noise.
     pub drift_variance: SVector<f64, N>,
-    /// Covariance of the two: both come from one measurement.
+    /// The covariance of potential and drift, which come from one measurement.
     pub drift_covariance: SVector<f64, N>,
 }
 
 impl<const N: usize> Increment<N> {
-    /// An increment without noise, from its four integrals.
+    /// Creates an increment without noise from its four integrals.
     #[inline]
     pub fn exact(
         potential: SVector<f64, N>,
@@ -53,20 +55,20 @@ impl<const N: usize> Increment<N> {
         }
     }
 
-    /// w at the end of the step as this step alone has it: what a filter that forgot everything else would say.
+    /// Returns w at the end of the step as this step alone determines it: the estimate of a filter without memory.
     #[inline]
     pub fn reconstruction(&self) -> SVector<f64, N> {
         self.start() + self.drift
     }
 
-    /// The same at the start of the step.
+    /// Returns w at the start of the step as this step alone determines it.
     #[inline]
     fn start(&self) -> SVector<f64, N> {
         (self.potential - self.drift_moment) * self.inverse_weight
     }
 }
 
-/// The length of a step, in time or in W, with its inverse: a division that equal steps pay for once.
+/// The length of a step, in time or in W, with its inverse, so that equal steps need only one division.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
     length: f64,
@@ -74,13 +76,13 @@ pub struct Span {
 }
 
 impl Span {
-    /// The length.
+    /// Returns the length.
     #[inline]
     pub fn length(&self) -> f64 {
         self.length
     }
 
-    /// One over the length.
+    /// Returns one over the length.
     #[inline]
     pub fn inverse(&self) -> f64 {
         self.inverse
@@ -94,24 +96,24 @@ impl From<f64> for Span {
     }
 }
 
-/// First-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, or as e^{𝒜W}, at any step size.
+/// A first-order filter of an unknown w in R^N: the error decays as e^{−rate·W}, or as e^{𝒜W}, at any step size.
 ///
-/// On numbers of your own: the slope of a line of which only points are measured. ρ = 1, so φ is the line itself, and its
-/// increment from one point to the next is the potential.
+/// An example with numbers of your own: the slope of a line that is measured at points. ρ = 1, so φ is the line
+/// itself, and its increment from one point to the next is the potential.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
 /// use corotate::nalgebra::Vector1;
 /// use corotate::observe::{Increment, InvariantFilter};
 ///
-/// let mut filter = InvariantFilter::new(Vector1::new(2.0), Vector1::new(0.0)); // 1/s, and the guess
+/// let mut filter = InvariantFilter::new(Vector1::new(2.0), Vector1::new(0.0)); // decay rate in 1/s, initial guess
 /// let line = |t: f64| 7.0 - 3.0 * t;
 /// for step in 0..500 {
 ///     let (t, h) = (f64::from(step) * 0.01, 0.01);
 ///     let potential = Vector1::new(line(t + h) - line(t));
 ///     filter.step(&Increment::exact(potential, h, Vector1::zeros(), Vector1::zeros()));
 /// }
-/// // After 5 s the error of the guess has fallen by e^-10.
+/// // After 5 s the error of the guess has decayed by e^-10.
 /// assert!((filter.estimate().x + 3.0).abs() < 3.1 * f64::exp(-10.0));
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -120,26 +122,26 @@ pub struct InvariantFilter<const N: usize> {
     estimate: SVector<f64, N>,
 }
 
-/// How the error decays.
+/// The law by which the error decays.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Decay<const N: usize> {
-    /// Each component by itself.
+    /// Each component decays by itself.
     Diagonal {
         rate: SVector<f64, N>,
-        /// e^{−rate·W} for the weight it was computed for: an equal tick pays for no exponential.
+        /// e^{−rate·W} for the weight in the first element: an equal tick needs no exponential.
         factor: (f64, SVector<f64, N>),
     },
-    /// All together. Its relation, the identifier's, has another weight at every step: nothing is kept.
+    /// The components are coupled. Nothing is cached: the identifier's relation has another weight at every step.
     Matrix(Hurwitz<N>),
 }
 
 impl<const N: usize> InvariantFilter<N> {
-    /// A filter with decay rates −λ (positive; per second where ρ = 1) and an initial guess in the unit of w.
+    /// Creates a filter with decay rates −λ (positive; 1/s where ρ = 1) and an initial guess in the unit of w.
     pub fn new(rate: SVector<f64, N>, guess: SVector<f64, N>) -> Self {
         Self { decay: Decay::Diagonal { rate, factor: (0.0, SVector::repeat(1.0)) }, estimate: guess }
     }
 
-    /// A filter whose error obeys δ̇ = ρ 𝒜 δ, \[SZ\](8), with an initial guess in the unit of w.
+    /// Creates a filter whose error obeys δ̇ = ρ 𝒜 δ, \[SZ\](8), with an initial guess in the unit of w.
     ///
     /// A diagonal 𝒜 is the same as [`InvariantFilter::new`] with the rates −𝒜_ii.
     pub fn with_matrix(matrix: Hurwitz<N>, guess: SVector<f64, N>) -> Self {
@@ -149,21 +151,21 @@ impl<const N: usize> InvariantFilter<N> {
         }
     }
 
-    /// The same filter, begun at another guess.
+    /// Returns the same filter with another initial guess.
     pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 
-    /// The estimate ŵ at the end of the last step.
+    /// Returns the estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {
         &self.estimate
     }
 
-    /// Moves the estimate over one step in which the relation held.
+    /// Advances the estimate over a step in which the relation held.
     ///
-    /// Exact: with w(s) = w0 + G(s) and w0 fixed by the potential, ŵ(h) = w(h) − e^{λW}(w0 − ŵ(0)) solves the filter's
-    /// equation, however long the step is.
+    /// The step is exact at any length: with w(s) = w0 + G(s) and w0 fixed by the potential, ŵ(h) = w(h) − e^{λW}(w0
+    /// − ŵ(0)) solves the filter's equation.
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
@@ -174,7 +176,7 @@ impl<const N: usize> InvariantFilter<N> {
         }
     }
 
-    /// Moves the estimate by its known drift alone, over a step that tells nothing about w.
+    /// Advances the estimate by its known drift alone, over a step without information about w.
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
@@ -187,10 +189,11 @@ impl<const N: usize> Persist for InvariantFilter<N> {
     }
 }
 
-/// A filter that takes a step like its last one without computing anything anew.
+/// A filter with a fast path for a step that equals its last one.
 pub trait StepAgain<const N: usize> {
-    /// Moves the estimate over a step of the same positive weight as the last, in which the relation held, and gives it;
-    /// `None`, and nothing done, for any other step. The same bits as by the filter's own step.
+    /// Advances the estimate over a step in which the relation held and whose positive weight equals the last one,
+    /// and returns the estimate. Returns `None` and changes nothing for any other step. The result is bit-identical
+    /// to that of the filter's own step.
     fn step_again(&mut self, increment: &Increment<N>) -> Option<&SVector<f64, N>>;
 }
 
@@ -209,7 +212,7 @@ impl<const N: usize> StepAgain<N> for InvariantFilter<N> {
 }
 
 impl<const N: usize> Decay<N> {
-    /// What is left of an error after a step of the given weight.
+    /// Returns the remaining error after a step of the given weight.
     #[inline]
     fn apply(&mut self, weight: f64, error: SVector<f64, N>) -> SVector<f64, N> {
         match self {
@@ -224,7 +227,7 @@ impl<const N: usize> Decay<N> {
     }
 }
 
-/// e^{−rate·W}.
+/// Computes e^{−rate·W}.
 #[cold]
 fn remainder<const N: usize>(rate: &SVector<f64, N>, weight: f64) -> SVector<f64, N> {
     rate.map(|rate| libm::exp(-rate * weight))
@@ -235,7 +238,7 @@ mod tests {
     use super::*;
     use nalgebra::{Matrix2, Vector1, Vector2};
 
-    /// w = 2 + 3s over a step of `h`, ρ = 1: the increment that a perfect relation reports.
+    /// Returns the increment of a perfect relation for w = `w0` + 3s over a step of `h`, ρ = 1.
     fn ramp(w0: f64, h: f64) -> Increment<1> {
         let moment = Vector1::new(1.5 * h * h);
         Increment::exact(Vector1::new(w0 * h) + moment, h, Vector1::new(3.0 * h), moment)
@@ -269,24 +272,25 @@ mod tests {
         assert_eq!(*filter.estimate(), Vector2::new(1.5, 2.25));
     }
     #[test]
-    fn a_diagonal_matrix_gives_the_bits_of_its_rates() {
+    fn a_diagonal_matrix_is_bit_identical_to_its_rates() {
         let rate = Vector2::new(5.0, 0.3);
         let matrix = Hurwitz::new(Matrix2::from_diagonal(&-rate)).unwrap();
         let guess = Vector2::new(0.1, -0.7);
-        let (mut one, mut other) = (InvariantFilter::new(rate, guess), InvariantFilter::with_matrix(matrix, guess));
+        let (mut by_rates, mut by_matrix) =
+            (InvariantFilter::new(rate, guess), InvariantFilter::with_matrix(matrix, guess));
         for step in 1..100 {
             let w = f64::from(step);
             let (potential, drift) = (Vector2::new(w.sin(), w.cos()), Vector2::new(0.1, 0.2) / w);
             let increment = Increment::exact(potential, 0.01 * (step % 7) as f64, drift, Vector2::zeros());
-            one.step(&increment);
-            other.step(&increment);
-            assert_eq!(one.estimate(), other.estimate());
+            by_rates.step(&increment);
+            by_matrix.step(&increment);
+            assert_eq!(by_rates.estimate(), by_matrix.estimate());
         }
     }
 
-    /// δ(W) = e^{−W} (cos 2W, −sin 2W): two components that exchange their errors while these decay.
+    /// δ(W) = e^{−W} (cos 2W, −sin 2W): two coupled components whose errors rotate while they decay.
     #[test]
-    fn a_matrix_turns_the_error_while_it_decays() {
+    fn a_matrix_rotates_the_error_while_it_decays() {
         let matrix = Hurwitz::new(Matrix2::new(-1.0, 2.0, -2.0, -1.0)).unwrap();
         let truth = Vector2::new(0.25, -0.5);
         let mut filter = InvariantFilter::with_matrix(matrix, truth - Vector2::new(1.0, 0.0));

@@ -1,35 +1,37 @@
-//! The Kalman filter of all three rates of a body, two of them measured, that converges from every guess.
+//! A Kalman filter of all three angular velocities of a body, two of them measured, that converges from every guess.
 //!
-//! A relation uses of two measured components only φ. Across φ, on which of its curves the motion runs, they tell as much
-//! again, and only a filter of the whole state keeps that. Linearised about its own estimate (the extended Kalman filter)
-//! such a filter may go astray. Linearised about the estimate of one that converges from everywhere it cannot: T. A.
-//! Johansen, T. I. Fossen, *The eXogenous Kalman filter (XKF)*, Int. J. Control 90(2), 2017. That one is here the relation's
-//! [`KalmanFilter`], whose equations are linear. It is asked only where the two contradict each other, because a raw
-//! measurement is the noisier point to linearise at.
+//! A relation uses only φ of the two measured components. The direction across φ (the curve on which the motion runs)
+//! carries as much information again, which only a filter of the whole state uses. Linearised about its own estimate
+//! (the extended Kalman filter), such a filter can diverge. Linearised about the estimate of a globally convergent
+//! filter, it cannot: T. A. Johansen, T. I. Fossen, *The eXogenous Kalman filter (XKF)*, Int. J. Control 90(2), 2017.
+//! Here that filter, the guard, is the relation's [`KalmanFilter`], whose equations are linear. It is used only where
+//! the two estimates contradict each other, because a raw measurement is the noisier point of linearisation.
 //!
-//! Must not let the whole state's estimate reach the relation's filter: the guard's convergence is its own.
+//! The estimate of the whole state must not enter the guard's filter: the guard converges on its own.
 
 use super::{HiddenRate, HiddenRateError, KalmanFilter, Observation, RateSample};
 use crate::model::{euler, rk4_step};
 use crate::state::{Persist, Weights, Words};
 use nalgebra::{Matrix3, Vector1, Vector3};
 
-/// How many of the guard's standard deviations the estimate may be away from it.
+/// The distance from the guard, in the guard's standard deviations, beyond which the estimate contradicts it.
 const CONTRADICTION: f64 = 4.0;
 
-/// Least density of the guard's unknown, (rad/s)²/s: it linearises φ at raw measurements, so its memory must be finite.
+/// The smallest density of the guard's unknown, (rad/s)²/s. The guard linearises φ at raw measurements, so its memory
+/// must be finite.
 const GUARD_DENSITY: f64 = 1e-10;
 
 /// The longest step of the linearisation, s.
 const MAX_STEP_S: f64 = 0.01;
 
-/// The most of them in one step of the filter: a long silence costs accuracy, never the tick.
+/// The largest number of linearisation steps in one step of the filter: a long gap costs accuracy, but not the
+/// deadline.
 const MAX_STEPS: f64 = 10_000.0;
 
-/// What the filter assumes of its sensors, of the body and of the guess.
+/// The assumed noise of the sensors, of the body and of the guess.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RateNoise {
-    /// Standard deviations of one measured sample, rad/s; the hidden component's is not read.
+    /// Standard deviations of one measured sample, rad/s; the hidden component's is not used.
     pub sensor_deviation_rad_s: Vector3<f64>,
     /// Density of the white noise that drives the hidden component, (rad/s)²/s; not negative.
     pub density: f64,
@@ -51,9 +53,10 @@ pub struct GuardedKalman {
 }
 
 impl GuardedKalman {
-    /// A filter for the hidden axis `axis` (1 to 3) of a body with the coefficients a of \[D\](2).
+    /// Creates a filter for the hidden axis `axis` (1 to 3) of a body with the coefficients a of \[D\](2).
     ///
-    /// `floor_rad_s` as in [`HiddenRate::new`], `first` is the first sample, `guess_rad_s` the hidden component in it.
+    /// `floor_rad_s` is as in [`HiddenRate::new`], `first` is the first sample, `guess_rad_s` is the hidden component
+    /// in it.
     ///
     /// # Errors
     /// [`HiddenRateError`] if there is no such axis or the body is a sphere.
@@ -79,20 +82,20 @@ impl GuardedKalman {
         Ok(Self { coefficients: *coefficients, hidden, relation, guard, noise, state, covariance })
     }
 
-    /// The angular velocity at the end of the last step, rad/s: also the measured components are filtered.
+    /// Returns the angular velocity at the end of the last step, rad/s. The measured components are filtered too.
     #[inline]
     pub fn estimate(&self) -> &Vector3<f64> {
         &self.state
     }
 
-    /// Standard deviation of the estimate as the assumed noise has it, rad/s.
+    /// Returns the standard deviation of the estimate under the assumed noise, rad/s.
     #[inline]
     pub fn deviation(&self) -> Vector3<f64> {
         self.covariance.diagonal().map(|variance| libm::sqrt(variance.max(0.0)))
     }
 
-    /// Moves the estimate over the step of `dt_s` seconds (positive) between two finite samples; the first is the one last
-    /// learned from. Returns whether the relation held over the step.
+    /// Advances the estimate over the step of `dt_s` seconds (positive) between two finite samples; `from` is the
+    /// last one used. Returns true if the relation held over the step.
     #[inline]
     pub fn step(&mut self, from: &RateSample, to: &RateSample, dt_s: f64) -> bool {
         self.predict(from, dt_s);
@@ -124,7 +127,8 @@ impl GuardedKalman {
         self.state = point + deviation;
     }
 
-    /// Where to linearise: at the own estimate, or where that is contradicted at what does not depend on it.
+    /// Returns the point of linearisation: the own estimate, or, where the guard contradicts it, the measurement with
+    /// the guard's.
     #[inline]
     fn point(&self, from: &RateSample) -> Vector3<f64> {
         let guard = self.guard.estimate().x;
@@ -137,7 +141,7 @@ impl GuardedKalman {
         point
     }
 
-    /// How a deviation from `x` moves over `h` seconds, to second order.
+    /// Computes the transition of a deviation from `x` over `h` seconds, to second order.
     #[inline]
     fn transition(&self, x: &Vector3<f64>, h: f64) -> Matrix3<f64> {
         let a = self.coefficients * h;
@@ -150,7 +154,8 @@ impl GuardedKalman {
         Matrix3::identity() + jacobian + jacobian * jacobian * 0.5
     }
 
-    /// Learns one measured component; Joseph's form, which no rounding makes indefinite.
+    /// Corrects the estimate by one measured component, in Joseph's form, which stays positive definite under
+    /// rounding.
     #[inline]
     fn correct(&mut self, index: usize, measured: f64) {
         let variance = self.noise.sensor_deviation_rad_s[index] * self.noise.sensor_deviation_rad_s[index];

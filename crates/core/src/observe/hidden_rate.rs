@@ -1,14 +1,15 @@
 //! The invariant relation for a component of a rigid body's angular velocity that no sensor measures, \[D\] section 3.
 //!
-//! For the hidden axis k and the measured axes i, j (cyclic) there is a function φ(ω_i, ω_j) with φ̇ = ω_k along the free
-//! motion. Its level curves depend on the signs of a_i and a_j: three conics, three functions, of which only the increment
-//! between two samples is ever formed. Must not choose a branch, unwrap an angle, or divide by what may vanish unasked.
+//! For the hidden axis k and the measured axes i, j (cyclic) there is a function φ(ω_i, ω_j) with φ̇ = ω_k along the
+//! free motion. The signs of a_i and a_j determine its level curves: three conics, three functions. Only the
+//! increment of φ between two samples is computed. The relation must not choose a branch, unwrap an angle, or divide
+//! by a value that may vanish without a check.
 
 use super::{Increment, Span, StepAgain, series};
 use crate::state::{Persist, Words, persist_fields};
 use nalgebra::{Vector1, Vector2, Vector3};
 
-/// How the measured components move in their plane, and thereby φ.
+/// The conic on which the measured components move, which determines φ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Conic {
     /// a_i·a_j < 0, the hidden axis has the largest or the smallest moment: φ = atan2(Ω ω_i, a_i ω_j)/Ω, \[D\](11).
@@ -21,16 +22,16 @@ pub enum Conic {
         /// Ω = √(a_i a_j), dimensionless.
         omega: f64,
     },
-    /// a_j = 0 ≠ a_i, an axisymmetric body with a transverse axis hidden: φ = ω_i/(a_i ω_j). Not in the paper.
+    /// a_j = 0 ≠ a_i, an axisymmetric body with a hidden transverse axis: φ = ω_i/(a_i ω_j). Not in the paper.
     ParabolicFirst,
     /// a_i = 0 ≠ a_j, the same with the measured axes exchanged: φ = ω_j/(a_j ω_i). Not in the paper.
     ParabolicSecond,
 }
 
-/// Why a component of the angular velocity cannot be observed from the other two.
+/// The reason why a component of the angular velocity cannot be observed from the other two.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HiddenRateError {
-    /// No axis with this number.
+    /// The axis number is invalid.
     #[error("axis {axis} does not exist; the axes are 1, 2 and 3")]
     NoSuchAxis {
         /// The axis as given.
@@ -48,7 +49,7 @@ pub enum HiddenRateError {
 }
 
 impl From<&HiddenRateError> for &'static str {
-    /// Returns the stable name of the mistake.
+    /// Returns the stable name of the error.
     fn from(error: &HiddenRateError) -> Self {
         match error {
             HiddenRateError::NoSuchAxis { .. } => "no-such-axis",
@@ -57,31 +58,34 @@ impl From<&HiddenRateError> for &'static str {
     }
 }
 
-/// The coefficients of two measured axes: one below the rounding of the other changes φ by less than rounding does and counts
-/// as zero, a parabola. Both below the rounding of the moments that they are made of are a sphere's.
+/// The relative size below which a coefficient of a measured axis counts as zero (a parabola): it changes φ by less
+/// than rounding does. If both are below the rounding of the moments from which they are computed, the body is a
+/// sphere.
 const ROUNDING: f64 = f64::EPSILON;
 
-/// The longest turn of (Ω ω_i, a_i ω_j) in one step that is safely told from its complement, rad (π is ambiguous).
+/// The largest rotation of (Ω ω_i, a_i ω_j) in one step, rad, that is distinguished from its complement (π is
+/// ambiguous).
 const MAX_TURN_RAD: f64 = 3.0;
 
-/// A branch of a hyperbola smaller than this part of the other is left out of φ.
+/// The smallest ratio of the hyperbola's branches at which the smaller one contributes to φ.
 const WEAKEST_BRANCH: f64 = 1.0 / 16.0;
 
-/// Without a torque. −0 is what changes no number that it is added to, so that the addition can be left out.
+/// The torque share of an undriven body. Adding −0 changes no number, so that the addition can be left out.
 const NO_PUSH: [f64; 2] = [-0.0; 2];
 
-/// What the relation sees at one instant.
+/// The inputs of the relation at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RateSample {
-    /// Angular velocity, rad/s; the hidden component is not read.
+    /// Angular velocity, rad/s; the hidden component is not used.
     pub rate_rad_s: Vector3<f64>,
-    /// Known torque over inertia held from this instant to the next, rad/s².
+    /// Known torque over inertia, held from this instant to the next, rad/s².
     pub torque_rad_s2: Vector3<f64>,
 }
 
 persist_fields!(RateSample, rate_rad_s, torque_rad_s2);
 
-/// A sample as one relation sees it. Made once, although two steps need it: the one that ends here and the next.
+/// The terms of the relation at one sample. Computed once and used by two steps: the one that ends at the sample and
+/// the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Regressor {
     /// The measured components ω_i and ω_j, rad/s.
@@ -94,13 +98,13 @@ pub struct Regressor {
     square: f64,
     /// a_k ω_i ω_j: ω̇_k of the free motion, rad/s².
     drift: f64,
-    /// a_k (a_i ω_j² + a_j ω_i²): how fast that changes for every unit of ω_k.
+    /// a_k (a_i ω_j² + a_j ω_i²): the derivative of `drift` per unit of ω_k.
     bend: f64,
-    /// Held from here on, of the axes i, j and k, rad/s².
+    /// The torque over inertia held from here on, on the axes i, j and k, rad/s².
     torque: [f64; 3],
 }
 
-/// The length of a step with the weights of Hermite's rule: equal steps pay for them once.
+/// The length of a step with the weights of Hermite's rule, computed once for equal steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Interval {
     span: Span,
@@ -108,12 +112,12 @@ pub struct Interval {
     sixth: f64,
     half: f64,
     twelfth: f64,
-    /// Of the values and slopes at both ends in ∫∫.
+    /// The weights of the values and slopes at both ends in ∫∫.
     moment: [f64; 4],
 }
 
 impl Interval {
-    /// The length, s.
+    /// Returns the length, s.
     #[inline]
     pub fn length(&self) -> f64 {
         self.span.length()
@@ -133,12 +137,12 @@ impl From<f64> for Interval {
     }
 }
 
-/// What one step tells about the hidden component.
+/// The result of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Observation {
     /// The relation held over the step.
     Seen(Increment<1>),
-    /// The measured components were too small to carry information: move by this drift (rad/s) and say so.
+    /// The measured components are too small to carry information: the estimate moves by this drift (rad/s) alone.
     Unobservable {
         /// ∫g dt by the model, rad/s.
         drift: Vector1<f64>,
@@ -181,12 +185,12 @@ pub struct HiddenRate {
     a: [f64; 3],
     conic: Conic,
     floor_rad_s: f64,
-    /// Variances of the two measured components, (rad/s)², where they are known.
+    /// The variances of the two measured components, (rad/s)², if they are known.
     variance: Option<[f64; 2]>,
     constants: Constants,
 }
 
-/// What is the same at every step.
+/// The constants of all steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Constants {
     /// Ω, or 1 on a parabola.
@@ -196,7 +200,7 @@ struct Constants {
     bend: [f64; 2],
     /// a_i/a_j.
     ratio: f64,
-    /// The least x² + y² that carries information, and the least |x ± y|.
+    /// The smallest x² + y² that carries information, and the smallest |x ± y|.
     floor: f64,
     floor_z: f64,
 }
@@ -209,13 +213,13 @@ impl Constants {
     }
 }
 
-/// Of two finite numbers; `f64::min` pays for more.
+/// Returns the lesser of two finite numbers; `f64::min` also handles NaN and costs more.
 #[inline(always)]
 fn lesser(x: f64, y: f64) -> f64 {
     if x < y { x } else { y }
 }
 
-/// The components i, j and k of a vector in the body's order, with `hidden` the index of k.
+/// Returns the components i, j and k of a vector in the body's order; `hidden` is the index of k.
 #[inline(always)]
 fn cyclic(vector: &Vector3<f64>, hidden: usize) -> [f64; 3] {
     match hidden {
@@ -226,9 +230,9 @@ fn cyclic(vector: &Vector3<f64>, hidden: usize) -> [f64; 3] {
 }
 
 impl HiddenRate {
-    /// The relation for hidden axis `axis` (1 to 3) of a body with the coefficients a of \[D\](2).
+    /// Creates the relation for the hidden axis `axis` (1 to 3) of a body with the coefficients a of \[D\](2).
     ///
-    /// Below `floor_rad_s` the measured components count as carrying no information.
+    /// Measured components below `floor_rad_s` count as carrying no information.
     ///
     /// # Errors
     /// [`HiddenRateError`] if there is no such axis or the body is a sphere.
@@ -254,10 +258,10 @@ impl HiddenRate {
         Ok(Self { hidden: axis - 1, a, conic, floor_rad_s, variance: None, constants })
     }
 
-    /// The same relation, telling with every increment how uncertain white measurement noise makes it.
+    /// Returns the relation with increments that include the variances of white measurement noise.
     ///
-    /// `sensor_deviation_rad_s` are the standard deviations of one sample's components; the hidden one is not read. An
-    /// increment's potential and drift are the same bits with and without.
+    /// `sensor_deviation_rad_s` are the standard deviations of one sample's components; the hidden one is not used.
+    /// The bits of an increment's potential and drift do not change.
     #[must_use]
     pub fn with_noise(mut self, sensor_deviation_rad_s: &Vector3<f64>) -> Self {
         let [i, j, _] = cyclic(sensor_deviation_rad_s, self.hidden);
@@ -265,36 +269,37 @@ impl HiddenRate {
         self
     }
 
-    /// Index of the hidden component, 0 to 2.
+    /// Returns the index of the hidden component, 0 to 2.
     #[inline]
     pub fn hidden(&self) -> usize {
         self.hidden
     }
 
-    /// Below this, rad/s, the measured components carry no information.
+    /// Returns the level, rad/s, below which the measured components carry no information.
     pub fn floor_rad_s(&self) -> f64 {
         self.floor_rad_s
     }
 
-    /// By how much the rounding of the samples may move the hidden component's estimate at `rate_rad_s` and steps of `dt_s`,
-    /// rad/s.
+    /// Returns the possible effect of the samples' rounding on the estimate of the hidden component at `rate_rad_s`
+    /// and steps of `dt_s`, rad/s.
     ///
-    /// Of \[D\](2), ω̇_i = a_i ω_j ω_k: in one step an error of δ in ω_k changes ω_i by a_i ω_j δ dt, which rounding hides where
-    /// it is below the last bit of ω_i; ω_j the same. What can be told is told by the axis that tells more. Rounding may fall the
-    /// same way at every step, so that no filter takes it out.
+    /// By \[D\](2), ω̇_i = a_i ω_j ω_k. In one step an error δ of ω_k changes ω_i by a_i ω_j δ dt, which is lost if
+    /// it is below the last bit of ω_i; the same holds for ω_j. The axis with the larger change sets the limit.
+    /// Rounding may have the same sign at every step, so that no filter removes it.
     pub fn rounding_rad_s(&self, rate_rad_s: &Vector3<f64>, dt_s: f64) -> f64 {
         let ([ai, aj, _], [i, j, _]) = (self.a, cyclic(rate_rad_s, self.hidden));
         ROUNDING / ((ai * j / i).abs().max((aj * i / j).abs()) * dt_s)
     }
 
-    /// Which conic the measured components move on.
+    /// Returns the conic on which the measured components move.
     pub fn conic(&self) -> Conic {
         self.conic
     }
 
-    /// The longest step, s, over which a hidden component of at most `rate_bound_rad_s` can be followed.
+    /// Returns the longest step, s, over which a hidden component of at most `rate_bound_rad_s` can be followed.
     ///
-    /// On an ellipse the phase turns by Ω ω_k dt and is known only up to whole turns; the other conics have no such limit.
+    /// On an ellipse the phase rotates by Ω ω_k dt and is known only up to full turns; the other conics have no such
+    /// limit.
     pub fn longest_step_s(&self, rate_bound_rad_s: f64) -> f64 {
         match self.conic {
             Conic::Elliptic { omega } => MAX_TURN_RAD / (omega * rate_bound_rad_s),
@@ -302,7 +307,7 @@ impl HiddenRate {
         }
     }
 
-    /// What the relation makes of a sample, whose components are finite.
+    /// Computes the terms of the relation at a sample whose components are finite.
     #[inline(always)]
     pub fn regressor(&self, sample: &RateSample) -> Regressor {
         let [i, j, _] = cyclic(&sample.rate_rad_s, self.hidden);
@@ -317,7 +322,7 @@ impl HiddenRate {
         Regressor { i, j, x, y, square: x * x + y * y, drift: self.a[2] * i * j, bend, torque }
     }
 
-    /// Passes what was made of a sample; see [`Persist`]. Of it, only what was measured is kept.
+    /// Persists the terms at a sample, see [`Persist`]. Only the measured values are stored.
     pub fn persist_regressor<W: Words>(&self, regressor: &mut Regressor, words: &mut W) {
         let Regressor { mut i, mut j, mut torque, .. } = *regressor;
         i.persist(words);
@@ -326,7 +331,7 @@ impl HiddenRate {
         *regressor = self.at([i, j], torque);
     }
 
-    /// A measured angular velocity with `estimate` in the place of the hidden component, rad/s.
+    /// Returns a measured angular velocity with `estimate` in place of the hidden component, rad/s.
     #[inline(always)]
     pub fn complete(&self, measured: &Vector3<f64>, estimate: f64) -> Vector3<f64> {
         match self.hidden {
@@ -336,7 +341,7 @@ impl HiddenRate {
         }
     }
 
-    /// The torque over inertia of a sample, rad/s².
+    /// Returns the torque over inertia of a sample, rad/s².
     pub fn torque(&self, regressor: &Regressor) -> Vector3<f64> {
         let [i, j, k] = regressor.torque;
         match self.hidden {
@@ -346,8 +351,8 @@ impl HiddenRate {
         }
     }
 
-    /// What the step over the interval (s, positive) from `from` to `to` tells, with `estimate` (rad/s) the estimate at its
-    /// start.
+    /// Computes the increment over the interval (s, positive) from `from` to `to`. `estimate` (rad/s) is the estimate
+    /// at its start.
     pub fn observe(
         &self,
         from: &Regressor,
@@ -369,14 +374,14 @@ impl HiddenRate {
         })
     }
 
-    /// Steps `filter`, which is at `estimate`, over a usual interval: short, undriven, seen, without noise, and as long as
-    /// the filter's last. Gives the new estimate and by how much the step's own reconstruction exceeds it, all rad/s;
-    /// `None`, and nothing done, for every other step.
+    /// The fast path: advances `filter`, which is at `estimate`, over a step that is short, undriven, observable, without
+    /// noise and as long as the filter's last one. Returns the new estimate and the excess of the step's own
+    /// reconstruction over it, both in rad/s. Returns `None` and changes nothing for any other step.
     ///
-    /// The same bits as [`HiddenRate::observe`] and the filter's step. Nothing in it is called, so that all of it stays in
-    /// registers.
+    /// The result is bit-identical to that of [`HiddenRate::observe`] and the filter's step. It calls no function, so
+    /// that all values stay in registers.
     #[inline(always)]
-    pub fn step_usual(
+    pub fn fast_step(
         &self,
         [from, to]: [&Regressor; 2],
         interval: &Interval,
@@ -398,8 +403,8 @@ impl HiddenRate {
         Observation::Unobservable { drift: Vector1::new(drift(from, to, push, interval, estimate).0) }
     }
 
-    /// Δφ between the ends and the share of the hyperbola's branch z₊ in it; `None` where the relation does not hold, or
-    /// `atan2` or `ln_1p` gives none.
+    /// Computes Δφ between the ends and the share of the hyperbola's branch z₊ in it. Returns `None` where the
+    /// relation does not hold, or where `atan2` or `ln_1p` returns `None`.
     #[inline(always)]
     fn growth(
         &self,
@@ -425,7 +430,7 @@ impl HiddenRate {
         }
     }
 
-    /// The same on a hyperbola.
+    /// Computes Δφ and the share on a hyperbola.
     #[inline(always)]
     fn logarithmic_growth(
         &self,
@@ -438,7 +443,7 @@ impl HiddenRate {
         if !(least.0 > self.constants.floor_z || least.1 > self.constants.floor_z) {
             return None;
         }
-        // A branch that a torque takes through zero is not to be integrated over: it has no share.
+        // A branch that the torque takes through zero must not be integrated over: it gets no share.
         let share = if least.1 < least.0 * WEAKEST_BRANCH {
             1.0
         } else if least.0 < least.1 * WEAKEST_BRANCH {
@@ -446,20 +451,21 @@ impl HiddenRate {
         } else {
             branch_share(from, to, self.constants.ratio)
         };
-        // From the differences, not as z'/z: the small change is what carries the information.
+        // Computed from the differences, not as z'/z: the small change carries the information.
         let (dx, dy) = (to.x - from.x, to.y - from.y);
         let growth = branch_growth(share, dx + dy, plus, ln_1p)? - branch_growth(1.0 - share, dx - dy, minus, ln_1p)?;
         Some((growth * self.constants.inverse_omega, share))
     }
 
-    /// Growth of top/(a·bottom), for the parabola.
+    /// Computes the growth of top/(a·bottom), for the parabola.
     #[inline(always)]
     fn quotient_growth(&self, bottom: f64, bottom_to: f64, top: f64, top_to: f64, a: f64) -> Option<(f64, f64)> {
         let seen = lesser(bottom.abs(), bottom_to.abs()) > self.floor_rad_s && bottom * bottom_to > 0.0;
         seen.then(|| ((top_to * bottom - top * bottom_to) / (a * bottom * bottom_to), 1.0))
     }
 
-    /// The part of Δφ that is not the torque's, and the torque's part in how the drift changes at the ends.
+    /// Returns Δφ less the torque's contribution, and the torque's contribution to the slopes of the drift at the
+    /// ends.
     fn undriven(&self, ends: [&Regressor; 2], share: f64, interval: &Interval, growth: f64) -> (f64, [f64; 2]) {
         let torque = &ends[0].torque;
         let gradients = ends.map(|end| self.gradient(end, share));
@@ -467,13 +473,13 @@ impl HiddenRate {
         (growth - self.torque_growth(ends, share, interval, rough), ends.map(|end| self.push(end, torque)))
     }
 
-    /// a_k (u_i ω_j + u_j ω_i), rad/s³.
+    /// Computes a_k (u_i ω_j + u_j ω_i), rad/s³.
     #[inline]
     fn push(&self, end: &Regressor, torque: &[f64; 3]) -> f64 {
         self.a[2] * (torque[0] * end.j + torque[1] * end.i)
     }
 
-    /// (∂φ/∂ω_i, ∂φ/∂ω_j) at one instant, s.
+    /// Computes (∂φ/∂ω_i, ∂φ/∂ω_j) at one instant, s.
     #[inline]
     fn gradient(&self, p: &Regressor, share: f64) -> [f64; 2] {
         let [ai, aj, _] = self.a;
@@ -490,7 +496,8 @@ impl HiddenRate {
         }
     }
 
-    /// ∫(φ_i u_i + φ_j u_j) dt by Simpson's rule, the middle of the path by its cubic Hermite interpolation.
+    /// Computes ∫(φ_i u_i + φ_j u_j) dt by Simpson's rule, with the middle of the path from its cubic Hermite
+    /// interpolation.
     #[inline]
     fn torque_growth(&self, [from, to]: [&Regressor; 2], share: f64, interval: &Interval, rough: f64) -> f64 {
         let (dt_s, torque) = (interval.length(), from.torque);
@@ -505,9 +512,9 @@ impl HiddenRate {
         dt_s * (ends_mean + 2.0 * torque_share([middle; 2], &torque)) * (1.0 / 3.0)
     }
 
-    /// The increment with the covariance of its potential φ and its drift, from that of the measured pair.
+    /// Returns the increment with the covariance of its potential φ and its drift, from that of the measured pair.
     ///
-    /// The drift feels a sample as the end of one step and as the start of the next, half a step's weight each.
+    /// A sample enters the drift as the end of one step and as the start of the next, with half a step's weight each.
     fn noisy(&self, exact: Increment<1>, to: &Regressor, share: f64, variance: [f64; 2]) -> Increment<1> {
         let step = self.a[2] * exact.weight;
         let (phi, drift) = (self.gradient(to, share), [step * to.j, step * to.i]);
@@ -521,14 +528,14 @@ impl HiddenRate {
     }
 }
 
-/// Whether a torque acts on the measured axes.
+/// Returns true if a torque acts on the measured axes.
 #[inline(always)]
 fn driven(from: &Regressor) -> bool {
-    // All bits but the signs.
+    // Compares all bits but the signs.
     (from.torque[0].to_bits() | from.torque[1].to_bits()) << 1 != 0
 }
 
-/// The increment whose potential grew by `potential`.
+/// Creates the increment whose potential grew by `potential`.
 #[inline(always)]
 fn increment(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interval, potential: f64) -> Increment<1> {
     let span = interval.span;
@@ -536,28 +543,28 @@ fn increment(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interv
     Increment::exact(Vector1::new(potential), span, Vector1::new(drift), Vector1::new(moment))
 }
 
-/// The mean over two instants of the rate φ_i u_i + φ_j u_j at which the torque feeds the potential.
+/// Computes the mean over two instants of φ_i u_i + φ_j u_j, the rate at which the torque changes the potential.
 #[inline]
 fn torque_share(gradients: [[f64; 2]; 2], torque: &[f64; 3]) -> f64 {
     let rate = |g: [f64; 2]| g[0] * torque[0] + g[1] * torque[1];
     0.5 * (rate(gradients[0]) + rate(gradients[1]))
 }
 
-/// g = a_k ω_i ω_j + u_k at the two ends of a step, rad/s².
+/// Computes g = a_k ω_i ω_j + u_k at the two ends of a step, rad/s².
 #[inline(always)]
 fn known_drift(from: &Regressor, to: &Regressor) -> [f64; 2] {
     [from.drift + from.torque[2], to.drift + from.torque[2]]
 }
 
-/// The hidden component at the two ends from its mean over the step, its drift g taken as linear.
+/// Computes the hidden component at the two ends from its mean over the step, for a linear drift g.
 #[inline(always)]
 fn hidden_at_ends(g: [f64; 2], interval: &Interval, mean: f64) -> [f64; 2] {
     let sixth = interval.sixth;
     [mean - sixth * (2.0 * g[0] + g[1]), mean + sixth * (g[0] + 2.0 * g[1])]
 }
 
-/// ∫g and ∫∫g over a step: g by its cubic Hermite polynomial through both ends, where it has the slopes ω_k · bend + `push`;
-/// `mean` is that of ω_k.
+/// Computes ∫g and ∫∫g over a step. g is the cubic Hermite polynomial through both ends with the slopes ω_k · bend +
+/// `push`; `mean` is the mean of ω_k.
 #[inline(always)]
 fn drift(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interval, mean: f64) -> (f64, f64) {
     let [g0, g1] = known_drift(from, to);
@@ -568,21 +575,22 @@ fn drift(from: &Regressor, to: &Regressor, push: [f64; 2], interval: &Interval, 
     (drift, (moment[0] * g0 + moment[1] * g1) + (moment[2] * s0 - moment[3] * s1))
 }
 
-/// What a branch of a hyperbola, z at the start of the step, adds to Ω Δφ by its `change`: `share` times the growth of ln z.
+/// Computes the contribution of one branch of a hyperbola to Ω Δφ: `share` times the growth of ln z, where z at the
+/// start of the step grows by `change`.
 #[inline(always)]
 fn branch_growth(share: f64, change: f64, z: f64, ln_1p: impl Fn(f64) -> Option<f64>) -> Option<f64> {
     if share == 0.0 {
         return Some(0.0);
     }
     let change = change / z;
-    // z never changes its sign along a free motion; if noise made it, there is no logarithm to take.
+    // z never changes its sign along a free motion; if noise changes it, the logarithm does not exist.
     if change > -1.0 { Some(share * ln_1p(change)?) } else { None }
 }
 
-/// The share of the branch z₊ in φ for which a disturbed measurement moves φ least; the branch z₋ has the rest. `ratio` is
-/// a_i/a_j.
+/// Computes the share of the branch z₊ in φ for which a disturbed measurement changes φ least; the branch z₋ has the
+/// rest. `ratio` is a_i/a_j.
 ///
-/// Either branch alone loses all its digits as Ω vanishes, their best mean none.
+/// As Ω vanishes, either branch alone loses all its digits, but their best mean loses none.
 #[inline(always)]
 fn branch_share(from: &Regressor, to: &Regressor, ratio: f64) -> f64 {
     let (x, y) = (from.x + to.x, from.y + to.y);
@@ -649,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn names_the_conic_of_every_axis() {
+    fn every_axis_has_its_conic() {
         let conic = |moments, axis| {
             HiddenRate::new(&Inertia::new(moments).unwrap().coefficients(), axis, 1e-6).map(|relation| relation.conic())
         };
@@ -658,14 +666,14 @@ mod tests {
         assert!(matches!(conic([1.0, 2.0, 2.5], 2), Ok(Conic::Hyperbolic { .. })));
         assert_eq!(conic([2.0, 1.5, 2.0], 3), Ok(Conic::ParabolicFirst));
         assert_eq!(conic([1.5, 2.0, 2.0], 3), Ok(Conic::ParabolicFirst).and(conic([1.5, 2.0, 2.0], 3)));
-        assert!(matches!(conic([1.0, 1.0, 1.6], 3), Ok(Conic::Elliptic { .. })), "symmetry axis hidden");
+        assert!(matches!(conic([1.0, 1.0, 1.6], 3), Ok(Conic::Elliptic { .. })), "hidden symmetry axis");
         assert_eq!(conic([1.0; 3], 3), Err(HiddenRateError::Sphere { axis: 3 }));
         assert_eq!(conic([1.0, 2.0, 2.5], 0), Err(HiddenRateError::NoSuchAxis { axis: 0 }));
         assert_eq!(conic([1.0, 2.0, 2.5], 4), Err(HiddenRateError::NoSuchAxis { axis: 4 }));
     }
 
     #[test]
-    fn known_torque_on_the_observed_body_does_not_move_the_floor() {
+    fn a_known_torque_does_not_raise_the_error_floor() {
         for (moments, axis) in [([1.0, 2.0, 2.5], 3), ([1.0, 2.5, 2.0], 3), ([2.0, 1.5, 2.0], 3), ([2.0, 2.0, 1.5], 1)]
         {
             let mut run = Run::new(moments, axis, [0.9, 0.7, 0.8]);
@@ -676,7 +684,7 @@ mod tests {
     }
 
     #[test]
-    fn nearly_equal_moments_cost_no_more_digits_than_rounding_explains() {
+    fn nearly_equal_moments_lose_only_the_digits_that_rounding_explains() {
         let start = [0.6, -0.4, 0.8];
         for exponent in [4, 6, 8, 10, 12] {
             let d = 10.0_f64.powi(-exponent);
@@ -694,7 +702,7 @@ mod tests {
     }
 
     #[test]
-    fn the_short_way_of_a_usual_step_gives_the_same_bits() {
+    fn the_fast_path_is_bit_identical() {
         for (moments, axis) in [([1.0, 2.0, 2.5], 3), ([1.0, 2.5, 2.0], 3), ([2.0, 1.5, 2.0], 3), ([2.0, 2.0, 1.5], 1)]
         {
             let mut run = Run::new(moments, axis, [0.9, 0.7, 0.8]);
@@ -705,7 +713,7 @@ mod tests {
                 run.step(1e-3);
                 let to = run.relation.regressor(&run.sample());
                 let estimate = short.estimate().x;
-                match run.relation.step_usual([&from, &to], &interval, estimate, &mut short) {
+                match run.relation.fast_step([&from, &to], &interval, estimate, &mut short) {
                     Some((estimate, _)) => {
                         usual += 1;
                         assert_eq!(estimate.to_bits(), run.filter.estimate().x.to_bits(), "{moments:?} {axis}");
@@ -726,7 +734,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_too_long_for_the_phase_is_not_used() {
+    fn a_step_too_long_for_the_phase_is_unobservable() {
         let mut run = Run::new([1.0, 2.0, 2.5], 3, [0.6, -0.4, 0.8]);
         run.filter = InvariantFilter::new(Vector1::new(RATE), Vector1::new(0.8));
         let limit = run.relation.longest_step_s(0.8);

@@ -1,35 +1,35 @@
-//! A decay matrix for the identifier, checked: every eigenvalue has a negative real part, \[SZ\](7)-(9).
+//! A checked decay matrix for the identifier: every eigenvalue has a negative real part, \[SZ\](7)-(9).
 //!
-//! Must not accept a matrix under which any error would stay or grow, nor allocate. The exponential is our own because
-//! nalgebra has it with `std` only: scaling, a Taylor polynomial, squaring. It needs no eigenvectors, so a defective matrix
-//! is no special case.
+//! It must not accept a matrix under which an error would stay or grow, nor allocate. The exponential is implemented
+//! here because nalgebra's needs `std`: scaling, a Taylor polynomial, squaring. It needs no eigenvectors, so a
+//! defective matrix is no special case.
 
 use crate::vector::times;
 use core::fmt;
 use nalgebra::allocator::Allocator;
 use nalgebra::{Complex, Const, DefaultAllocator, DimDiff, DimSub, SMatrix, SVector, Schur, U1};
 
-/// Eigenvalues are known to about this part of the matrix' Frobenius norm; one that is nearer to the imaginary axis may
-/// lie on it.
+/// The accuracy of the eigenvalues relative to the matrix' Frobenius norm; an eigenvalue nearer to the imaginary axis
+/// may lie on it.
 const EIGENVALUE_TOLERANCE: f64 = 64.0 * f64::EPSILON;
 
-/// A few QR sweeps per eigenvalue suffice; the bound is there so that a constructor always ends.
+/// The bound on QR sweeps. A few per eigenvalue suffice; the bound guarantees that the constructor ends.
 const MAX_SWEEPS: usize = 1000;
 
-/// The Taylor polynomial is used up to this norm, where its remainder is below a rounding: ½^15/15! = 2e-17.
+/// The largest norm for the Taylor polynomial, at which its remainder is below a rounding: ½^15/15! = 2e-17.
 const TAYLOR_NORM: f64 = 0.5;
 
-/// Degree of the Taylor polynomial.
+/// The degree of the Taylor polynomial.
 const TAYLOR_DEGREE: u32 = 14;
 
-/// Up to this norm a short polynomial will do, and its remainder is below a rounding: (1/64)⁷/7! = 5e-17.
+/// The largest norm for the short polynomial, at which its remainder is below a rounding: (1/64)⁷/7! = 5e-17.
 const SHORT_NORM: f64 = 1.0 / 64.0;
 
 /// 1/k for k from 6 down to 1.
 const SHORT_INVERSES: [f64; 6] = [1.0 / 6.0, 1.0 / 5.0, 1.0 / 4.0, 1.0 / 3.0, 1.0 / 2.0, 1.0];
 
-/// The slowest mode's exponent at which all of e^{𝒜W} is below the smallest double, however far from normal 𝒜 is: with the
-/// tolerance above, the powers of W that go with it stay below 1e200 up to N = 10.
+/// The exponent of the slowest mode at which all of e^{𝒜W} is below the smallest double, however far from normal 𝒜
+/// is: with the tolerance above, the accompanying powers of W stay below 1e200 up to N = 10.
 const VANISHED: f64 = 1200.0;
 
 /// The N eigenvalues of a real matrix, printed as a list.
@@ -49,7 +49,7 @@ impl<const N: usize> fmt::Display for Eigenvalues<N> {
     }
 }
 
-/// Why a matrix cannot be the decay of an error.
+/// The reason why a matrix is not a decay matrix.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HurwitzError<const N: usize> {
     /// An element is infinite or not a number.
@@ -70,7 +70,7 @@ pub enum HurwitzError<const N: usize> {
     NotHurwitz {
         /// All eigenvalues.
         eigenvalues: Eigenvalues<N>,
-        /// How accurately they are known; zero for a diagonal matrix.
+        /// The accuracy of the eigenvalues; zero for a diagonal matrix.
         tolerance: f64,
     },
     /// The eigenvalues could not be computed.
@@ -82,7 +82,7 @@ pub enum HurwitzError<const N: usize> {
 }
 
 impl<const N: usize> From<&HurwitzError<N>> for &'static str {
-    /// Returns the stable name of the mistake.
+    /// Returns the stable name of the error.
     fn from(error: &HurwitzError<N>) -> Self {
         match error {
             HurwitzError::NotFinite { .. } => "not-finite",
@@ -92,7 +92,7 @@ impl<const N: usize> From<&HurwitzError<N>> for &'static str {
     }
 }
 
-/// A real N×N matrix 𝒜 all of whose eigenvalues have a negative real part.
+/// A real N×N matrix 𝒜 whose eigenvalues all have a negative real part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hurwitz<const N: usize> {
     matrix: SMatrix<f64, N, N>,
@@ -105,13 +105,13 @@ pub struct Hurwitz<const N: usize> {
 }
 
 impl<const N: usize> Hurwitz<N> {
-    /// Checks a decay matrix; its unit is that of one over the relation's weight, 1/s where ρ = 1.
+    /// Checks a decay matrix. Its unit is one over that of the relation's weight, 1/s where ρ = 1.
     ///
-    /// A diagonal matrix is judged exactly. Otherwise an eigenvalue whose real part is negative by no more than the
-    /// accuracy of the computation is refused too; note that multiple eigenvalues are known to few digits.
+    /// A diagonal matrix is checked exactly. Otherwise an eigenvalue whose real part is negative by no more than the
+    /// accuracy of the computation is rejected too. Multiple eigenvalues are known to few digits only.
     ///
     /// # Errors
-    /// [`HurwitzError`] names the element that is no number, or says all eigenvalues.
+    /// [`HurwitzError`] contains the element that is not finite, or all eigenvalues.
     pub fn new(matrix: SMatrix<f64, N, N>) -> Result<Self, HurwitzError<N>>
     where
         Const<N>: DimSub<U1>,
@@ -126,7 +126,8 @@ impl<const N: usize> Hurwitz<N> {
         let (eigenvalues, tolerance) = if diagonal {
             (matrix.diagonal().map(|value| Complex::new(value, 0.0)), 0.0)
         } else {
-            // Scaled, or the squares in norms and discriminants of extreme matrices leave the range of a double.
+            // Scaled, because the squares in norms and discriminants of extreme matrices exceed the range of a
+            // double.
             let scale = matrix.amax();
             let scaled = matrix / scale;
             let schur = Schur::try_new(scaled, f64::EPSILON, MAX_SWEEPS).ok_or(HurwitzError::NoEigenvalues)?;
@@ -141,27 +142,28 @@ impl<const N: usize> Hurwitz<N> {
         }
     }
 
-    /// The matrix 𝒜 as given.
+    /// Returns the matrix 𝒜.
     pub fn matrix(&self) -> &SMatrix<f64, N, N> {
         &self.matrix
     }
 
-    /// Its eigenvalues, in no particular order; multiple ones are known to few digits unless 𝒜 is diagonal.
+    /// Returns the eigenvalues in no particular order; multiple ones are known to few digits unless 𝒜 is diagonal.
     pub fn eigenvalues(&self) -> &Eigenvalues<N> {
         &self.eigenvalues
     }
 
-    /// The greatest real part of an eigenvalue, negative: the exponent of the slowest decay.
+    /// Returns the largest real part of an eigenvalue, negative: the exponent of the slowest decay.
     pub fn abscissa(&self) -> f64 {
         self.abscissa
     }
 
-    /// The diagonal, if nothing is beside it: the form that the paper finally takes, \[SZ\](10).
+    /// Returns the diagonal if the matrix is diagonal, which is the paper's final form, \[SZ\](10).
     pub fn diagonal(&self) -> Option<SVector<f64, N>> {
         self.diagonal.then(|| self.matrix.diagonal())
     }
 
-    /// e^{𝒜W}·`error` for a finite `weight` W ≥ 0: for the short steps of a loop by a series on the vector alone.
+    /// Computes e^{𝒜W}·`error` for a finite `weight` W ≥ 0; for the short steps of a loop by a series on the vector
+    /// alone.
     #[inline]
     pub fn decayed(&self, weight: f64, error: &SVector<f64, N>) -> SVector<f64, N> {
         if self.norm * weight > SHORT_NORM {
@@ -170,10 +172,10 @@ impl<const N: usize> Hurwitz<N> {
         SHORT_INVERSES.iter().fold(*error, |sum, inverse| error + times(&self.matrix, &sum) * (weight * inverse))
     }
 
-    /// e^{𝒜W} for a finite `weight` W ≥ 0; the identity for 0.
+    /// Computes e^{𝒜W} for a finite `weight` W ≥ 0; the identity for 0.
     ///
-    /// Exact to rounding for a diagonal matrix. Otherwise the error is what a rounding of 𝒜's own elements causes: in relation
-    /// to the norm about ε·‖𝒜‖W, more if 𝒜 is far from normal. What lies below the smallest double is zero.
+    /// Exact to rounding for a diagonal matrix. Otherwise the error is that of rounding the elements of 𝒜: relative
+    /// to the norm about ε·‖𝒜‖W, more if 𝒜 is far from normal. Values below the smallest double are zero.
     pub fn exp(&self, weight: f64) -> SMatrix<f64, N, N> {
         if self.diagonal {
             SMatrix::from_diagonal(&self.matrix.diagonal().map(|value| libm::exp(value * weight)))
@@ -185,12 +187,12 @@ impl<const N: usize> Hurwitz<N> {
     }
 }
 
-/// ‖X‖₁, the largest sum of a column.
+/// Returns ‖X‖₁, the largest absolute column sum.
 fn norm<const N: usize>(x: &SMatrix<f64, N, N>) -> f64 {
     x.column_iter().map(|column| column.iter().map(|value| value.abs()).sum()).fold(0.0, f64::max)
 }
 
-/// e^X by scaling and squaring. ‖X‖ is bounded by the caller, or the loop would lose all digits before it ends.
+/// Computes e^X by scaling and squaring. The caller bounds ‖X‖: otherwise the loop would lose all digits.
 fn exponential<const N: usize>(x: SMatrix<f64, N, N>) -> SMatrix<f64, N, N> {
     let (mut scaled, mut norm, mut squarings) = (x, norm(&x), 0_u32);
     while norm > TAYLOR_NORM {
@@ -212,12 +214,12 @@ mod tests {
     use super::*;
     use nalgebra::{Matrix1, Matrix2, Matrix3};
 
-    /// The greatest difference of two matrices; what is not a number is infinitely wrong.
+    /// Returns the largest difference of two matrices; infinite for a NaN.
     fn distance<const N: usize>(left: &SMatrix<f64, N, N>, right: &SMatrix<f64, N, N>) -> f64 {
         (left - right).iter().map(|d| if d.is_nan() { f64::INFINITY } else { d.abs() }).fold(0.0, f64::max)
     }
 
-    /// A rotation with no special angles: what is similar to a matrix by it has the same eigenvalues and no zeros.
+    /// Rotates a matrix by no special angles: the eigenvalues stay, and no element is zero.
     fn turned(matrix: Matrix3<f64>) -> Matrix3<f64> {
         let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
         turn * matrix * turn.transpose()
@@ -251,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_does_not_decay_and_says_the_eigenvalues() {
+    fn a_matrix_without_decay_is_refused_with_its_eigenvalues() {
         let rotation = turned(Matrix3::new(0.0, 2.0, 0.0, -2.0, 0.0, 0.0, 0.0, 0.0, -1.0));
         let growing = turned(Matrix3::new(-1.0, 5.0, 1.0, 0.0, 0.5, 2.0, 0.0, 0.0, -3.0));
         let nilpotent = turned(jordan(0.0, 0.0)[0]);
@@ -267,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_is_no_number() {
+    fn an_element_that_is_not_finite_is_refused() {
         for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             let mut matrix = -Matrix3::identity();
             matrix[(0, 2)] = value;
@@ -277,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn knows_its_eigenvalues() {
+    fn the_eigenvalues_are_accurate() {
         let spiral = Hurwitz::new(turned(Matrix3::new(-1.0, 2.0, 0.0, -2.0, -1.0, 0.0, 0.0, 0.0, -0.25))).unwrap();
         let mut found: Vec<_> = spiral.eigenvalues().0.iter().map(|value| (value.re, value.im)).collect();
         found.sort_by(|left, right| left.partial_cmp(right).unwrap());
@@ -300,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn the_exponential_of_defective_and_of_turning_matrices_is_known() {
+    fn the_exponential_of_defective_and_rotating_matrices_is_accurate() {
         for weight in [0.0, 1e-6, 0.02, 0.7, 5.0, 60.0] {
             let [block, power] = jordan(weight, -1.5);
             let spiral = Matrix3::new(-1.0, 2.0, 0.0, -2.0, -1.0, 0.0, 0.0, 0.0, -0.25);
@@ -315,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn however_long_the_step_the_exponential_vanishes() {
+    fn the_exponential_vanishes_after_long_steps() {
         let matrix = turned(Matrix3::new(-1e-3, 1e9, 0.0, 0.0, -2.0, 1e6, 0.0, 0.0, -1e4));
         let hurwitz = Hurwitz::new(matrix).unwrap();
         assert!(hurwitz.exp(1e5).iter().all(|value| value.is_finite()));

@@ -1,42 +1,44 @@
-//! The invariant relation for the inertia of a rigid body whose angular velocity is fully measured, \[SZ\](1)-(11).
+//! The invariant relation for the inertia of a rigid body whose angular velocity is measured completely,
+//! \[SZ\](1)-(11).
 //!
 //! The unknown is a = (a1, a2, a3) of \[SZ\](1), the same as \[D\](2): φ_i = ½ s ω_i² with s = sign(ω1 ω2 ω3) obeys
-//! φ̇_i = |ω1 ω2 ω3| a_i. The signs printed in (5), (10) and (11) do not fit together; \[SZ\](7) and (8) are what is meant.
-//! Condition (У), ω1 ω2 ω3 bounded away from zero, holds for no free asymmetric body: two components change their signs
-//! again and again, and φ jumps. So only increments of φ between two samples are formed, none of them across a jump. Must
-//! not carry a branch or a sign from one step to the next, nor use a step whose jump it cannot place.
+//! φ̇_i = |ω1 ω2 ω3| a_i. The signs printed in (5), (10) and (11) are inconsistent; \[SZ\](7) and (8) are correct.
+//! Condition (У), ω1 ω2 ω3 bounded away from zero, holds for no free asymmetric body: two components change their
+//! signs repeatedly, and φ jumps. So only increments of φ between two samples are computed, none of them across a
+//! jump. The relation must not carry a branch or a sign from one step to the next, nor use a step whose jump it
+//! cannot locate.
 //!
-//! Only the ratios of the moments of inertia can be known from a torque-free motion, or from torque over inertia.
+//! A torque-free motion, or torque over inertia, determines only the ratios of the moments of inertia.
 
 use super::{Increment, RateSample};
 use crate::model::closure;
 use crate::vector::{product, zeros};
 use nalgebra::Vector3;
 
-/// Below this mean of |ω1 ω2 ω3| over a step, (rad/s)³, a potential over a weight is rounding only.
+/// The smallest mean of |ω1 ω2 ω3| over a step, (rad/s)³, at which potential over weight is more than rounding.
 const SMALLEST_FLOOR_RAD3_S3: f64 = 1e-12;
 
-/// A step with a change of sign is used if the estimate explains the motion over it up to this part. Else the path
-/// between the samples, and on it the place of the change, is not known well enough.
+/// The largest unexplained part of the motion at which a step with a change of sign is used. Beyond it the path
+/// between the samples, and with it the location of the change, is not known well enough.
 const UNEXPLAINED: f64 = 0.05;
 
-/// Halvings that place a zero of a cubic on [0, 1] to the last bit.
+/// The number of halvings that locate a zero of a cubic on [0, 1] to the last bit.
 const HALVINGS: u32 = 53;
 
-/// What one step tells about an unknown constant of the body. In any but the first case the estimate is to stay as it is.
+/// The information of one step about an unknown constant of the body. Only `Excited` changes the estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Identification<const N: usize> {
-    /// The relation held over the step. The weight is the excitation ∫ρ dt that the step adds.
+    /// The relation held over the step. The weight is the excitation ∫ρ dt of the step.
     Excited(Increment<N>),
-    /// The body moved in a way that does not depend on the unknown: a component is at rest, or nearly.
+    /// The motion does not depend on the unknown: a component is at rest, or nearly.
     Unexcited,
-    /// The body moved, but what it did between the two samples is not certain: the step is too long for the motion, or
-    /// the estimate does not yet explain the motion well enough to place a change of sign.
+    /// The motion between the two samples is uncertain: the step is too long, or the estimate does not yet explain
+    /// the motion well enough to locate a change of sign.
     Ambiguous,
 }
 
 impl<const N: usize> Identification<N> {
-    /// The excitation W = ∫ρ dt of the step; zero for a step that is not used. Errors decay as e^{λ ΣW}.
+    /// Returns the excitation W = ∫ρ dt of the step; zero for a step that is not used. Errors decay as e^{λ ΣW}.
     pub fn excitation(&self) -> f64 {
         match self {
             Self::Excited(increment) => increment.weight,
@@ -47,7 +49,7 @@ impl<const N: usize> Identification<N> {
 
 /// The relation for (a1, a2, a3): ρ = |ω1 ω2 ω3|, (rad/s)³, g = 0. Its filter's rates are in s²/rad³.
 ///
-/// What a body's own tumbling tells of its moments of inertia:
+/// The ratios of a body's moments of inertia from its free tumbling:
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
@@ -73,7 +75,7 @@ impl<const N: usize> Identification<N> {
 /// assert!((ratios.second - 2.0).abs() < 1e-6 && (ratios.third - 2.5).abs() < 1e-6);
 /// ```
 ///
-/// One step of h seconds is good to the fifth order in h, so the settled estimate is to the fourth.
+/// The error of one step of h seconds is of fifth order in h, that of the settled estimate of fourth order.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InertiaRelation {
     floor_rad3_s3: f64,
@@ -81,28 +83,29 @@ pub struct InertiaRelation {
 }
 
 impl InertiaRelation {
-    /// The relation for noiseless sensors.
+    /// Creates the relation for noiseless sensors.
     ///
-    /// A step over which |ω1 ω2 ω3| is below `floor_rad3_s3` on average counts as not exciting; a floor below 1e-12
-    /// (rad/s)³ is raised to that. With noisy sensors choose it above what noise makes of a component at rest.
+    /// A step with a mean |ω1 ω2 ω3| below `floor_rad3_s3` counts as not exciting; a floor below 1e-12 (rad/s)³ is
+    /// raised to that value. With noisy sensors choose a floor above the noise of a component at rest.
     pub fn new(floor_rad3_s3: f64) -> Self {
         Self { floor_rad3_s3: floor_rad3_s3.max(SMALLEST_FLOOR_RAD3_S3), variance_rad2_s2: Vector3::zeros() }
     }
 
-    /// The same with the variance of each measured component, (rad/s)².
+    /// Returns the relation with the variance of each measured component, (rad/s)².
     #[must_use]
     pub fn with_variance(self, variance_rad2_s2: Vector3<f64>) -> Self {
         Self { variance_rad2_s2, ..self }
     }
 
-    /// What the step of `dt_s` seconds from `from` to `to` tells, with `estimate` the estimate of a at its start.
+    /// Computes the increment of a over the step of `dt_s` seconds from `from` to `to`. `estimate` is the estimate of
+    /// a at its start.
     ///
     /// The torque of `from` is held over the step. `dt_s` is positive and every input finite.
     #[inline]
     pub fn observe(&self, from: &RateSample, to: &RateSample, dt_s: f64, estimate: &Vector3<f64>) -> Identification<3> {
         let path = Path::new(from, to, dt_s, estimate);
         let whole = path.whole();
-        // Also for a weight that is not a number. Before any look at signs: those of a component at rest are noise.
+        // False also for a NaN weight. Checked before the signs, because the sign of a component at rest is noise.
         let excites = |piece: &Piece| piece.weight > self.floor_rad3_s3 * dt_s;
         if !excites(&whole) {
             return Identification::Unexcited;
@@ -125,25 +128,28 @@ impl InertiaRelation {
     }
 }
 
-/// What a piece of a step adds. The potential is good if no sign changes inside; the weight is roughly, even otherwise.
+/// The increment over a piece of a step. The potential is valid if no sign changes inside; the weight is approximate
+/// otherwise.
 struct Piece {
     potential: Vector3<f64>,
     weight: f64,
 }
 
-/// How often the components of the angular velocity change their signs during a step.
+/// The sign changes of the angular velocity's components during a step.
 enum SignChanges {
-    /// No component does.
+    /// No component changes its sign.
     None,
-    /// One component does once.
+    /// One component changes its sign once.
     One(usize),
-    /// More than that may happen.
+    /// More changes are possible.
     Unclear,
 }
 
-/// The motion between two samples: per component the cubic with the measured ends and the slopes that the estimate implies.
+/// The motion between two samples: per component the cubic with the measured ends and the slopes given by the
+/// estimate.
 struct Path {
-    /// Its four control points, rad/s. The cubic stays in their hull and has at most as many zeros as they change signs.
+    /// The four control points, rad/s. The cubic stays in their hull and has at most as many zeros as they have sign
+    /// changes.
     control: [Vector3<f64>; 4],
     /// Torque over inertia, rad/s².
     torque: Vector3<f64>,
@@ -154,7 +160,7 @@ struct Path {
 impl Path {
     #[inline]
     fn new(from: &RateSample, to: &RateSample, dt_s: f64, estimate: &Vector3<f64>) -> Self {
-        // No body has |a_i| > 1: whatever the initial guess, the path stays sensible.
+        // No body has |a_i| > 1; the limit keeps the path bounded for any initial guess.
         let estimate = estimate.map(|a| a.clamp(-1.0, 1.0));
         let torque = from.torque_rad_s2;
         let [start, end] = [from.rate_rad_s, to.rate_rad_s];
@@ -168,7 +174,7 @@ impl Path {
         Self { control, torque, estimate, dt_s }
     }
 
-    /// The angular velocity at the part `t` of the step, rad/s; at its ends exactly the measured one.
+    /// Returns the angular velocity at the fraction `t` of the step, rad/s; exactly the measured one at the ends.
     #[inline]
     fn at(&self, t: f64) -> Vector3<f64> {
         let left = 1.0 - t;
@@ -176,40 +182,41 @@ impl Path {
         b0 * (left * left * left) + b1 * (3.0 * left * left * t) + b2 * (3.0 * left * t * t) + b3 * (t * t * t)
     }
 
-    /// Potential and weight of the whole step, whose ends need not be computed.
+    /// Computes potential and weight of the whole step, whose ends are given.
     #[inline]
     fn whole(&self) -> Piece {
         self.between(self.control[0], self.at(0.5), self.control[3], 1.0)
     }
 
-    /// Potential and weight between two parts of the step.
+    /// Computes potential and weight between two fractions of the step.
     #[inline]
     fn piece(&self, begin: f64, end: f64) -> Piece {
         self.between(self.at(begin), self.at(0.5 * (begin + end)), self.at(end), end - begin)
     }
 
-    /// Potential and weight of a `part` of the step, the potential with the sign that holds in the middle.
+    /// Computes potential and weight of a `part` of the step. The potential has the sign of the middle.
     #[inline]
     fn between(&self, from: Vector3<f64>, middle: Vector3<f64>, to: Vector3<f64>, part: f64) -> Piece {
         let sixth = self.dt_s * part * (1.0 / 6.0);
-        // Simpson's rule, exact for the cubics themselves.
+        // Simpson's rule is exact for the cubics.
         let turned = (from + middle * 4.0 + to) * sixth;
         let (first, central, last) = (product(&from), product(&middle), product(&to));
         let weight = (first.abs() + 4.0 * central.abs() + last.abs()) * sixth;
         let sign = 1.0_f64.copysign(central);
-        // From the difference, not as a difference of squares: the small change is what carries the information.
+        // Computed from the difference, not as a difference of squares: the small change carries the information.
         let energy = (to - from).component_mul(&(to + from)) * 0.5;
         Piece { potential: (energy - self.torque.component_mul(&turned)) * sign, weight }
     }
 
-    /// The sum of the pieces before and after a change of sign.
+    /// Returns the sum of the pieces before and after a change of sign.
     #[inline(never)]
     fn split(&self, at: f64) -> Piece {
         let [before, after] = [self.piece(0.0, at), self.piece(at, 1.0)];
         Piece { potential: before.potential + after.potential, weight: before.weight + after.weight }
     }
 
-    /// Which components change their signs, by Descartes' rule for control points: none or one is certain.
+    /// Returns the sign changes of the components by Descartes' rule for control points: zero or one change is
+    /// certain.
     #[inline]
     fn sign_changes(&self) -> SignChanges {
         let mut found = SignChanges::None;
@@ -223,7 +230,7 @@ impl Path {
         found
     }
 
-    /// How often the control points of a component change their sign; a zero has none.
+    /// Counts the sign changes of a component's control points; a zero has no sign.
     #[inline]
     fn control_changes(&self, axis: usize) -> u32 {
         let (mut changes, mut last) = (0, 0.0);
@@ -235,7 +242,7 @@ impl Path {
         changes
     }
 
-    /// Whether the estimate explains the motion from one sample to the other, and thus also in between.
+    /// Returns true if the estimate explains the motion from one sample to the other, and therefore in between.
     #[inline(never)]
     fn is_explained(&self) -> bool {
         let [from, middle, to] = [0.0, 0.5, 1.0].map(|t| velocity(&self.estimate, &self.at(t), &self.torque));
@@ -244,7 +251,7 @@ impl Path {
         unexplained.norm_squared() <= UNEXPLAINED * UNEXPLAINED * moved.norm_squared()
     }
 
-    /// The part of the step at which a component with exactly one change of sign is zero.
+    /// Returns the fraction of the step at which a component with exactly one change of sign is zero.
     #[inline(never)]
     fn zero(&self, axis: usize) -> f64 {
         let start = self.control.iter().map(|point| point[axis]).find(|value| *value != 0.0).unwrap_or(0.0);
@@ -261,27 +268,27 @@ impl Path {
     }
 }
 
-/// Euler's equations \[SZ\](1) with torque over inertia, rad/s².
+/// Computes Euler's equations \[SZ\](1) with torque over inertia, rad/s².
 #[inline]
 fn velocity(a: &Vector3<f64>, rate: &Vector3<f64>, torque: &Vector3<f64>) -> Vector3<f64> {
     a.component_mul(&rate.yzx()).component_mul(&rate.zxy()) + torque
 }
 
-/// Moments of inertia as parts of the first one; more cannot be known without a known torque in N m.
+/// Moments of inertia relative to the first one; the absolute values require a known torque in N m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InertiaRatios {
     /// I2/I1.
     pub second: f64,
     /// I3/I1.
     pub third: f64,
-    /// a1 + a2 + a3 + a1·a2·a3: zero for every body, so the distance from it says how consistent the three estimates are.
+    /// a1 + a2 + a3 + a1·a2·a3: zero for every body, so it measures the inconsistency of the three estimates.
     pub closure: f64,
 }
 
-/// Why three coefficients are not those of a body.
+/// The reason why three coefficients belong to no body.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum InertiaRatioError {
-    /// The moments that fit best are not all positive, or not finite.
+    /// The best-fitting moments are not all positive and finite.
     #[error(
         "a = ({}, {}, {}) belongs to no body: the moments of inertia would be as {} : {} : {}; the estimate has not \
          converged, or nothing excites it", .a.x, .a.y, .a.z, .moments.x, .moments.y, .moments.z
@@ -289,17 +296,17 @@ pub enum InertiaRatioError {
     NoBody {
         /// The coefficients as given.
         a: Vector3<f64>,
-        /// What fits them best, up to a common factor.
+        /// The best-fitting moments, up to a common factor.
         moments: Vector3<f64>,
     },
 }
 
 impl InertiaRatios {
-    /// The ratios that belong to estimated coefficients a of \[SZ\](1).
+    /// Computes the ratios from estimated coefficients a of \[SZ\](1).
     ///
-    /// I2/I1 = (1 + a1)/(1 − a2) and I3/I1 = (1 + a1·a2)/(1 − a2), or what follows from these by renaming the axes: all three
-    /// forms agree if the closure is zero, but each is 0/0 for a flat plate across one of the axes. The one farthest from
-    /// that is taken.
+    /// I2/I1 = (1 + a1)/(1 − a2) and I3/I1 = (1 + a1·a2)/(1 − a2), or the forms that follow by renaming the axes. All
+    /// three forms agree if the closure is zero, but each is 0/0 for a flat plate across one of the axes. The form
+    /// farthest from 0/0 is used.
     ///
     /// # Errors
     /// [`InertiaRatioError`] if the moments are not all positive and finite.
@@ -341,13 +348,13 @@ mod tests {
         RigidBody::new(&Inertia::new(moments).unwrap())
     }
 
-    /// The samples at both ends of a step of a body.
+    /// Returns the samples at both ends of a step of a body.
     fn step(body: &RigidBody, from: [f64; 3], torque: [f64; 3], dt_s: f64) -> [RateSample; 2] {
         let [from, torque] = [from, torque].map(Vector3::from);
         [from, body.flow(&from, &torque, dt_s)].map(|rate| RateSample { rate_rad_s: rate, torque_rad_s2: torque })
     }
 
-    /// The greatest |Δφ/W − a|, infinite unless the step was used.
+    /// Returns the largest |Δφ/W − a|; infinite if the step is not used.
     fn miss(seen: &Identification<3>, body: &RigidBody) -> f64 {
         match seen {
             Identification::Excited(increment) => (increment.potential / increment.weight - body.coefficients()).norm(),
@@ -356,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_tells_the_coefficients() {
+    fn a_step_yields_the_coefficients() {
         let body = body([1.0, 2.0, 2.5]);
         let relation = InertiaRelation::new(1e-9);
         for torque in [[0.0; 3], [0.2, -0.3, 0.1]] {
@@ -369,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_with_a_change_of_sign_tells_the_same_when_split() {
+    fn a_step_split_at_a_change_of_sign_yields_the_coefficients() {
         let body = body([1.0, 2.0, 2.5]);
         let relation = InertiaRelation::new(1e-9);
         for torque in [[0.0; 3], [0.2, -0.3, 0.1]] {
@@ -380,13 +387,13 @@ mod tests {
             assert!(miss(&seen, &body) < 1e-6, "{torque:?}: {seen:?}");
             let unsure = relation.observe(&from, &to, 1e-2, &Vector3::zeros());
             if torque == [0.0; 3] {
-                assert_eq!(unsure, Identification::Ambiguous, "the path is not known yet");
+                assert_eq!(unsure, Identification::Ambiguous, "the path is not yet known");
             }
         }
     }
 
     #[test]
-    fn a_sign_that_changes_twice_is_not_guessed_at() {
+    fn a_double_change_of_sign_is_ambiguous() {
         let relation = InertiaRelation::new(1e-9);
         let twice = relation.observe(&sample([0.1, 0.1, 1.0]), &sample([-0.1, -0.1, 1.0]), 0.1, &Vector3::zeros());
         assert_eq!(twice, Identification::Ambiguous);
@@ -410,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn the_variance_of_the_potential_is_that_of_half_a_square() {
+    fn the_potential_has_the_variance_of_half_a_square() {
         let relation = InertiaRelation::new(1e-9).with_variance(Vector3::new(1e-6, 2e-6, 3e-6));
         let [from, to] = step(&body([1.0, 2.0, 2.5]), [0.6, 0.4, 0.8], [0.0; 3], 1e-2);
         let Identification::Excited(increment) = relation.observe(&from, &to, 1e-2, &Vector3::zeros()) else {
@@ -421,7 +428,7 @@ mod tests {
     }
 
     #[test]
-    fn the_estimate_settles_over_changes_of_sign() {
+    fn the_estimate_converges_over_changes_of_sign() {
         let body = body([1.0, 2.0, 2.5]);
         let mut filter = InvariantFilter::new(Vector3::repeat(RATE), Vector3::zeros());
         let relation = InertiaRelation::new(1e-9);
@@ -438,8 +445,8 @@ mod tests {
     }
 
     #[test]
-    fn the_ratios_are_those_of_the_moments() {
-        // Flat plates across each axis too, where one form each is 0/0.
+    fn the_ratios_equal_those_of_the_moments() {
+        // Includes flat plates across each axis, where one form each is 0/0.
         for moments in
             [[1.0, 2.0, 2.5], [2.5, 1.0, 2.0], [1.0, 1.0, 1.0], [1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [2.0, 3.0, 1.0]]
         {
@@ -451,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn coefficients_of_no_body_have_no_ratios() {
+    fn impossible_coefficients_have_no_ratios() {
         for a in [[5.0, 5.0, 5.0], [-1.0, -1.0, -1.0], [f64::NAN, 0.0, 0.0], [f64::INFINITY, 0.0, 0.0]] {
             let refusal = InertiaRatios::new(&a.into());
             assert!(matches!(refusal, Err(InertiaRatioError::NoBody { .. })), "{a:?}: {refusal:?}");

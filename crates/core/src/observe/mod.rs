@@ -1,6 +1,7 @@
-//! Observers by the method of invariant relations: one filter, and one relation per unknown.
+//! Observers by the method of invariant relations: one relation per unknown, and filters that work with any relation.
 //!
-//! Pure: no clock, no I/O, no allocation, no logging. Must not see the truth, nor remember more than the filter's state.
+//! Pure: no clock, no I/O, no allocation, no logging. An observer must not see the truth, nor store more than its
+//! filter's state.
 
 mod axisymmetric;
 mod filter;

@@ -1,35 +1,36 @@
-//! The invariant relation for the velocity of a body in a central field of which only the position is measured,
+//! The invariant relation for the velocity of a body in a central field whose position alone is measured,
 //! \[S\](4)-(16).
 //!
-//! In inertial axes x = r cos θ, y = r sin θ the unknown is (vx, vy), its potential the position itself, and its drift the
-//! acceleration γ(r, θ, U) of \[S\](10). The printed (9) has L1 for L2 in Γ22; as the auxiliary variables z of (12)-(16) are
-//! eliminated here, neither appears. Must not see a measured velocity.
+//! In inertial axes x = r cos θ, y = r sin θ the unknown is (vx, vy), its potential is the position itself, and its
+//! drift is the acceleration γ(r, θ, U) of \[S\](10). The printed (9) has L1 for L2 in Γ22; the auxiliary variables z
+//! of (12)-(16) are eliminated here, so that neither appears. The relation must not see a measured velocity.
 
 use super::Increment;
 use crate::state::persist_fields;
 use nalgebra::Vector2;
 
-/// What the relation sees at one instant.
+/// The inputs of the relation at one instant.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct OrbitSample {
     /// Distance from the centre, du; positive.
     pub r: f64,
-    /// Angle, rad. Its rounding is noise of the position: it grows where the angle grows on from turn to turn.
+    /// Angle, rad. Its rounding acts as position noise, which grows if the angle counts full turns.
     pub theta: f64,
-    /// Known thrust (Ur, Uθ), du/s²: its polar components are held from this instant to the next and turn with the body.
+    /// Known thrust (Ur, Uθ), du/s². Its polar components are held from this instant to the next and rotate with the
+    /// body.
     pub thrust: Vector2<f64>,
 }
 
 persist_fields!(OrbitSample, r, theta, thrust);
 
-/// Velocity in inertial axes from its polar components, \[S\](4). `polar` is (Vr, Vθ); any one unit.
+/// Converts a velocity from polar components `polar` (Vr, Vθ) to inertial axes, \[S\](4), in the same unit.
 #[inline]
 pub fn to_inertial(theta: f64, polar: &Vector2<f64>) -> Vector2<f64> {
     let (sin, cos) = libm::sincos(theta);
     Vector2::new(polar.x * cos - polar.y * sin, polar.x * sin + polar.y * cos)
 }
 
-/// Polar components (Vr, Vθ) of a velocity in inertial axes, \[S\](5).
+/// Converts a velocity from inertial axes to polar components (Vr, Vθ), \[S\](5), in the same unit.
 #[inline]
 pub fn to_polar(theta: f64, inertial: &Vector2<f64>) -> Vector2<f64> {
     let (sin, cos) = libm::sincos(theta);
@@ -54,28 +55,29 @@ struct End {
 }
 
 impl OrbitVelocity {
-    /// The relation in a field with gravitational parameter `mu`, du³/s², for sensors without noise.
+    /// Creates the relation in a field with the gravitational parameter `mu`, du³/s², for sensors without noise.
     pub fn new(mu: f64) -> Self {
         Self { mu, variance_r: 0.0, variance_theta: 0.0 }
     }
 
-    /// The same for sensors whose noise has these variances, du² and rad².
+    /// Returns the relation for sensors whose noise has these variances, du² and rad².
     pub fn with_variance(self, variance_r: f64, variance_theta: f64) -> Self {
         Self { variance_r, variance_theta, ..self }
     }
 
-    /// What the step of `dt_s` seconds from `from` to `to` tells about (vx, vy), du/s.
+    /// Computes the increment of (vx, vy), du/s, over the step of `dt_s` seconds from `from` to `to`.
     ///
     /// `dt_s` and both distances are positive, every input finite. The drift is interpolated by its cubic Hermite
-    /// polynomial, so the relation errs by the fourth order of the step. A thrust that changed within the step (ticks were
-    /// missed) disturbs the estimate as any acceleration would that is not known, and the disturbance decays.
+    /// polynomial, so the error is of fourth order in the step. A thrust that changed within the step (ticks were
+    /// missed) disturbs the estimate like any unknown acceleration, and the disturbance decays.
     #[inline]
     pub fn observe(&self, from: &OrbitSample, to: &OrbitSample, dt_s: f64) -> Increment<2> {
         let thrust = &from.thrust;
         let ends = [self.end(from, thrust), self.end(to, thrust)];
         let (g0, g1) = (ends[0].acceleration, ends[1].acceleration);
         let potential = ends[1].radial * ends[1].r - ends[0].radial * ends[0].r;
-        // The velocity at the ends if the acceleration were linear: wrong by the third order, in the slopes only.
+        // The velocities at the ends for a linear acceleration: the error is of third order and enters the slopes
+        // only.
         let mean = potential / dt_s;
         let slope0 = self.slope(&ends[0], &(mean - (g0 * 2.0 + g1) * (dt_s / 6.0)), thrust);
         let slope1 = self.slope(&ends[1], &(mean + (g0 + g1 * 2.0) * (dt_s / 6.0)), thrust);
@@ -85,7 +87,7 @@ impl OrbitVelocity {
         Increment { variance: self.variance(&ends[1]), ..Increment::exact(potential, dt_s, drift, moment) }
     }
 
-    /// γ of \[S\](10) at one end, and what it is made of.
+    /// Computes γ of \[S\](10) at one end, with its parts.
     #[inline]
     fn end(&self, sample: &OrbitSample, thrust: &Vector2<f64>) -> End {
         let (sin, cos) = libm::sincos(sample.theta);
@@ -94,7 +96,7 @@ impl OrbitVelocity {
         End { r, radial, transverse, acceleration }
     }
 
-    /// γ̇ at one end, for a body there with `velocity` (du/s).
+    /// Computes γ̇ at one end, for a body there with `velocity` (du/s).
     #[inline]
     fn slope(&self, end: &End, velocity: &Vector2<f64>, thrust: &Vector2<f64>) -> Vector2<f64> {
         let (approach, turn) = (velocity.dot(&end.radial) / end.r, velocity.dot(&end.transverse) / end.r);
@@ -102,7 +104,7 @@ impl OrbitVelocity {
         end.radial * (2.0 * pull * approach - turn * thrust.y) + end.transverse * (turn * (thrust.x - pull))
     }
 
-    /// Variance of (x, y), du²: x = r cos θ, y = r sin θ to first order.
+    /// Computes the variance of (x, y), du², from x = r cos θ, y = r sin θ to first order.
     #[inline]
     fn variance(&self, end: &End) -> Vector2<f64> {
         let square = |v: &Vector2<f64>| v.component_mul(v);
@@ -121,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn polar_and_inertial_axes_turn_into_each_other() {
+    fn polar_and_inertial_conversions_are_inverse() {
         let v = Vector2::new(0.3, -0.7);
         assert!((to_polar(2.1, &to_inertial(2.1, &v)) - v).amax() < 1e-16);
         assert!(
@@ -130,7 +132,8 @@ mod tests {
         );
     }
 
-    /// A quarter of the pull: were it not turned with the body, the floor would be nowhere near.
+    /// A thrust of a quarter of the gravity: if it did not rotate with the body, the error would stay far above the
+    /// floor.
     #[test]
     fn known_thrust_does_not_move_the_floor() {
         let field = CentralField::new(1.0, 0.05, 50.0).unwrap();

@@ -1,6 +1,6 @@
-//! One type for the filters of either order, so that an estimator holds what its scenario chose.
+//! One type for the filters of either order, so that an estimator can hold the one that its scenario selects.
 //!
-//! Must not compute anything itself: each filter answers for its own mathematics.
+//! It must not compute anything itself: each filter implements its own mathematics.
 
 use super::{Increment, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use crate::state::{Persist, Words};
@@ -11,14 +11,14 @@ use nalgebra::SVector;
 pub enum Filter<const N: usize> {
     /// The papers' filter: exponential decay, for measurements without noise.
     First(InvariantFilter<N>),
-    /// Constant poles of second order: little noise passes, the bandwidth is chosen.
+    /// Constant second-order poles: passes little noise, with a chosen bandwidth.
     Second(SecondOrderFilter<N>),
-    /// Gains of the Kalman filter: the noise is known, the bandwidth follows.
+    /// The Kalman filter's gains: the noise is known and determines the bandwidth.
     Kalman(KalmanFilter<N>),
 }
 
 impl<const N: usize> Filter<N> {
-    /// Moves the estimate over one step in which the relation held.
+    /// Advances the estimate over a step in which the relation held.
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         match self {
@@ -28,7 +28,8 @@ impl<const N: usize> Filter<N> {
         }
     }
 
-    /// Moves the estimate by its known drift alone (unit of w), over a step of weight `weight` that tells nothing about w.
+    /// Advances the estimate by its known drift alone (unit of w), over a step of weight `weight` without information
+    /// about w.
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>, weight: f64) {
         match self {
@@ -38,7 +39,7 @@ impl<const N: usize> Filter<N> {
         }
     }
 
-    /// The same filter, begun at another guess.
+    /// Returns the same filter with another initial guess.
     pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         match self {
             Self::First(filter) => Self::First(filter.with_guess(guess)),
@@ -47,7 +48,7 @@ impl<const N: usize> Filter<N> {
         }
     }
 
-    /// The estimate ŵ at the end of the last step.
+    /// Returns the estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {
         match self {
@@ -57,7 +58,7 @@ impl<const N: usize> Filter<N> {
         }
     }
 
-    /// Standard deviation of the estimate in the unit of w, where the filter knows it.
+    /// Returns the standard deviation of the estimate in the unit of w, if the filter computes it.
     #[inline]
     pub fn deviation(&self) -> Option<SVector<f64, N>> {
         match self {

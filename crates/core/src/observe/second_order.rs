@@ -1,25 +1,26 @@
-//! Filters of second order: they hold an estimate φ̂ of the potential beside ŵ and let both follow what is measured.
+//! Second-order filters: they estimate the potential (φ̂) together with ŵ, and both follow the measurement.
 //!
-//! In (φ, w) an invariant relation φ̇ = ρ w, ẇ = g is a *linear* double integrator with a known input, whatever the body
-//! does, so a filter with constant gains and the Kalman filter both converge from every guess. The papers' filter of first
-//! order passes white noise of φ to ŵ at the gain |λ|; these integrate it once more. Beyond the papers.
+//! In (φ, w) an invariant relation φ̇ = ρ w, ẇ = g is a *linear* double integrator with a known input, whatever the
+//! body does. So a filter with constant gains and the Kalman filter both converge from every guess. The papers'
+//! first-order filter passes white noise of φ to ŵ with the gain |λ|; these filters integrate it once more. Not in
+//! the papers.
 //!
-//! Components are decoupled: the filter of each is scalar. Must not store φ itself, of which only increments are known:
-//! the state is the residual r = φ − φ̂.
+//! Components are decoupled: each has a scalar filter. φ itself must not be stored, because only its increments are
+//! known: the state is the residual r = φ − φ̂.
 
 use super::{Increment, StepAgain, series};
 use crate::state::{Persist, Weights, Words, persist_fields};
 use crate::vector::zeros;
 use nalgebra::SVector;
 
-/// Second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
+/// A second-order filter with constant poles: the error obeys ë + 2ζωₙė + ωₙ²e = 0 in W, at any step size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SecondOrderFilter<const N: usize> {
     bandwidth: SVector<f64, N>,
     damping: f64,
     estimate: SVector<f64, N>,
     residual: SVector<f64, N>,
-    /// The gains for the weight they were computed for: an equal tick pays for no exponential.
+    /// The gains for the stored weight: an equal tick needs no exponential.
     gains: Gains<N>,
 }
 
@@ -31,25 +32,25 @@ struct Gains<const N: usize> {
 }
 
 impl<const N: usize> SecondOrderFilter<N> {
-    /// A filter with the bandwidths ωₙ (positive; rad per unit of W, rad/s where ρ = 1), the damping ratio ζ (positive;
-    /// 1/√2 gives the flattest response) and an initial guess in the unit of w.
+    /// Creates a filter with the bandwidths ωₙ (positive; rad per unit of W, rad/s where ρ = 1), the damping ratio ζ
+    /// (positive; 1/√2 gives the flattest response) and an initial guess in the unit of w.
     pub fn new(bandwidth: SVector<f64, N>, damping: f64, guess: SVector<f64, N>) -> Self {
         let none = Gains { weight: 0.0, potential: SVector::zeros(), unknown: SVector::zeros() };
         Self { bandwidth, damping, estimate: guess, residual: SVector::zeros(), gains: none }
     }
 
-    /// The same filter, begun at another guess.
+    /// Returns the same filter with another initial guess.
     pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 
-    /// The estimate ŵ at the end of the last step.
+    /// Returns the estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {
         &self.estimate
     }
 
-    /// Moves the estimate over one step in which the relation held.
+    /// Advances the estimate over a step in which the relation held.
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
@@ -62,9 +63,9 @@ impl<const N: usize> SecondOrderFilter<N> {
         }
     }
 
-    /// Moves the estimate by its known drift alone, over a step that tells nothing about w.
+    /// Advances the estimate by its known drift alone, over a step without information about w.
     ///
-    /// How far φ went meanwhile stays unknown. So φ̂ starts anew at the next measured φ: its residual is zero.
+    /// The change of φ over the step stays unknown, so φ̂ restarts at the next measured φ with a residual of zero.
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>) {
         self.estimate += drift;
@@ -104,10 +105,10 @@ impl<const N: usize> StepAgain<N> for SecondOrderFilter<N> {
     }
 }
 
-/// (K1, K2·W) that put the poles of one step to z = e^s, s = x(−ζ ± √(ζ² − 1)), x = ωₙW.
+/// Computes (K1, K2·W) that place the poles of one step at z = e^s, s = x(−ζ ± √(ζ² − 1)), x = ωₙW.
 ///
-/// The step takes (r, e) to ((1 − K1)(r + W e), e − K2(r + W e)): its determinant is 1 − K1 = z₁z₂ and its trace
-/// 2 − K1 − K2·W = z₁ + z₂, so K1 = 1 − z₁z₂ and K2·W = (1 − z₁)(1 − z₂), here without cancellation.
+/// The step maps (r, e) to ((1 − K1)(r + W e), e − K2(r + W e)): its determinant is 1 − K1 = z₁z₂ and its trace 2 −
+/// K1 − K2·W = z₁ + z₂, so K1 = 1 − z₁z₂ and K2·W = (1 − z₁)(1 − z₂), here without cancellation.
 fn place(x: f64, damping: f64) -> (f64, f64) {
     let root = x * libm::sqrt((damping * damping - 1.0).abs());
     let potential = -libm::expm1(-2.0 * damping * x);
@@ -120,25 +121,27 @@ fn place(x: f64, damping: f64) -> (f64, f64) {
     (potential, unknown)
 }
 
-/// Second-order filter with the gains of the Kalman filter: noise of the measurement and of the model's drift weighed.
+/// A second-order filter with the Kalman filter's gains, which weigh the noise of the measurement and of the model's
+/// drift.
 ///
-/// Measurement noise comes with each [`Increment`], also the part that enters the drift. The optimum among the filters that
-/// see only the relation; what the measured components tell beyond φ it does not use.
+/// Each [`Increment`] carries its measurement noise, including the part in the drift. The filter is optimal among
+/// those that use only the relation; it does not use the information in the measured components beyond φ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KalmanFilter<const N: usize> {
     density: SVector<f64, N>,
     estimate: SVector<f64, N>,
     residual: SVector<f64, N>,
     covariance: [Covariance; N],
-    /// Whether φ̂ is tied to a measured φ. It is not before the first step, nor after one that told nothing.
+    /// True if φ̂ is tied to a measured φ: not before the first step, nor after a step without information.
     based: bool,
 }
 
 impl<const N: usize> KalmanFilter<N> {
-    /// A filter for an unknown that wanders with the density `density` (not negative; (unit of w)² per unit of W, so per
-    /// second where ρ = 1), with an initial guess of the standard deviation `deviation` (unit of w).
+    /// Creates a filter for an unknown that drifts randomly with the density `density` (not negative; (unit of w)²
+    /// per unit of W, so per second where ρ = 1), with an initial guess of the standard deviation `deviation` (unit
+    /// of w).
     ///
-    /// Density zero is a perfect model: the memory then grows without end.
+    /// Density zero is a perfect model: the memory then grows without limit.
     pub fn new(density: SVector<f64, N>, guess: SVector<f64, N>, deviation: SVector<f64, N>) -> Self {
         let covariance = core::array::from_fn(|index| Covariance {
             potential: 0.0,
@@ -148,24 +151,24 @@ impl<const N: usize> KalmanFilter<N> {
         Self { density, estimate: guess, residual: SVector::zeros(), covariance, based: false }
     }
 
-    /// The same filter, begun at another guess.
+    /// Returns the same filter with another initial guess.
     pub fn with_guess(self, guess: SVector<f64, N>) -> Self {
         Self { estimate: guess, ..self }
     }
 
-    /// The estimate ŵ at the end of the last step.
+    /// Returns the estimate ŵ at the end of the last step.
     #[inline]
     pub fn estimate(&self) -> &SVector<f64, N> {
         &self.estimate
     }
 
-    /// Standard deviation of the estimate, in the unit of w, as the assumed noise has it.
+    /// Returns the standard deviation of the estimate under the assumed noise, in the unit of w.
     #[inline]
     pub fn deviation(&self) -> SVector<f64, N> {
         SVector::from_fn(|index, _| libm::sqrt(self.covariance[index].unknown()))
     }
 
-    /// Moves the estimate over one step in which the relation held.
+    /// Advances the estimate over a step in which the relation held.
     #[inline]
     pub fn step(&mut self, increment: &Increment<N>) {
         if increment.weight > 0.0 {
@@ -178,10 +181,10 @@ impl<const N: usize> KalmanFilter<N> {
         }
     }
 
-    /// Moves the estimate by its known drift alone, over a step of weight `weight` that tells nothing about w.
+    /// Advances the estimate by its known drift alone, over a step of weight `weight` without information about w.
     ///
-    /// How far φ went meanwhile stays unknown. So φ̂ starts anew at the next measured φ: its residual is zero, and its
-    /// uncertainty that of one measurement, tied to nothing before.
+    /// The change of φ over the step stays unknown, so φ̂ restarts at the next measured φ: its residual is zero, and
+    /// its variance is that of one measurement, independent of all before.
     #[inline]
     pub fn predict(&mut self, drift: &SVector<f64, N>, weight: f64) {
         self.estimate += drift;
@@ -198,7 +201,8 @@ impl<const N: usize> KalmanFilter<N> {
         let variance = increment.variance[index];
         let mut covariance = self.covariance[index];
         if !self.based {
-            // φ at the start was measured as φ at the end is: the noise of neighbouring samples differs little.
+            // φ at the start has the measurement noise of φ at the end: neighbouring samples have nearly the same
+            // noise.
             covariance.potential = variance;
         }
         covariance.transport(weight, self.density[index]);
@@ -206,7 +210,8 @@ impl<const N: usize> KalmanFilter<N> {
             - (weight * self.estimate[index] + increment.drift_moment[index]);
         let mut estimate = self.estimate[index] + increment.drift[index];
         if variance > 0.0 {
-            // The drift's noise is partly the innovation's own: that part is taken out, the rest adds to the model's.
+            // The drift's noise correlates with the innovation's: that part is removed, and the rest adds to the
+            // model's noise.
             let regression = increment.drift_covariance[index] / variance;
             estimate -= regression * innovation;
             covariance.slope += regression;
@@ -231,26 +236,27 @@ impl<const N: usize> Persist for KalmanFilter<N> {
 
 persist_fields!(Covariance, potential, slope, rest);
 
-/// Covariance of the errors of (φ̂, ŵ) as L·D·Lᵀ: every operation adds and multiplies what is not negative, so that no
-/// rounding can take its positivity.
+/// The covariance of the errors of (φ̂, ŵ) as L·D·Lᵀ. Every operation adds and multiplies non-negative numbers, so
+/// rounding cannot make it indefinite.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Covariance {
     /// Var φ.
     potential: f64,
-    /// Cov(φ, w)/Var φ: the error of ŵ that an error of φ̂ lets expect.
+    /// Cov(φ, w)/Var φ: the expected error of ŵ per unit of the error of φ̂.
     slope: f64,
-    /// Var w once φ is known.
+    /// Var w given φ.
     rest: f64,
 }
 
 impl Covariance {
-    /// Var w.
+    /// Returns Var w.
     #[inline]
     fn unknown(&self) -> f64 {
         self.potential * self.slope * self.slope + self.rest
     }
 
-    /// Moves it over a step of the double integrator of weight `w`, with white noise of density `q` on the unknown.
+    /// Propagates the covariance over a step of the double integrator of weight `w`, with white noise of density `q`
+    /// on the unknown.
     #[inline]
     fn transport(&mut self, w: f64, q: f64) {
         let Self { potential, slope, rest } = *self;
@@ -258,20 +264,21 @@ impl Covariance {
         let grown = potential * (1.0 + turn) * (1.0 + turn) + w * w * rest + q * w * w * w / 3.0;
         if grown > 0.0 {
             let cross = potential * (1.0 + turn) * slope + w * rest + q * w * w / 2.0;
-            // Without noise the determinant stays: the motion has determinant one.
+            // Without noise the determinant stays, because the transition has determinant one.
             let mixed = potential * ((1.0 + 0.5 * turn) * (1.0 + 0.5 * turn) + turn * turn / 12.0) + w * w * rest / 3.0;
             let determinant = potential * rest + q * w * mixed + q * q * w * w * w * w / 12.0;
             *self = Self { potential: grown, slope: cross / grown, rest: determinant / grown };
         }
     }
 
-    /// Learns from a measurement of φ of the given variance; returns the gain of φ̂, `slope` times which is that of ŵ.
+    /// Updates the covariance by a measurement of φ of the given variance. Returns the gain of φ̂; that of ŵ is
+    /// `slope` times as large.
     #[inline]
     fn measure(&mut self, variance: f64) -> f64 {
         let total = self.potential + variance;
         if total > 0.0 {
             let gain = self.potential / total;
-            // Slope and rest condition on φ: learning about φ leaves them as they are.
+            // Slope and rest are conditional on φ, so a measurement of φ leaves them unchanged.
             self.potential = gain * variance;
             gain
         } else {
@@ -304,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn the_errors_poles_are_the_designed_ones_at_any_step() {
+    fn the_error_has_the_designed_poles_at_any_step() {
         for (damping, bandwidth) in [(0.5, 0.7), (1.0, 0.7), (2.0, 0.7), (0.1, 3.0)] {
             for weight in [1e-3, 0.1, 3.0] {
                 let mut filter = SecondOrderFilter::new(Vector1::new(bandwidth), damping, Vector1::new(0.5));
@@ -324,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_over_five_decades_do_not_excite_it() {
+    fn weights_over_five_decades_do_not_destabilise_the_filter() {
         let mut normal = normals(3);
         for damping in [0.3, core::f64::consts::FRAC_1_SQRT_2, 1.5] {
             let mut filter = SecondOrderFilter::new(Vector1::new(2.0), damping, Vector1::new(-50.0));
@@ -344,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn a_blind_step_moves_by_the_drift_and_forgets_the_potential() {
+    fn a_step_without_information_moves_by_the_drift_and_resets_the_potential() {
         let mut filter = SecondOrderFilter::new(Vector2::new(2.0, 1.0), 0.7, Vector2::new(0.5, 0.25));
         let exact = Increment::exact(Vector2::new(0.3, 0.1), 0.1, Vector2::zeros(), Vector2::zeros());
         filter.step(&exact);
@@ -354,7 +361,8 @@ mod tests {
         assert_eq!(filter.residual, Vector2::zeros());
     }
 
-    /// An unknown that wanders with the assumed density, seen through noise, unseen for 5 s: errors over deviations.
+    /// Returns the error over the deviation of the estimate at three ticks: the unknown drifts with the assumed
+    /// density, is measured with noise, and is not measured for 5 s.
     fn normalised_errors(seed: u64) -> [f64; 3] {
         let (h, mut normal) = (0.02, normals(seed));
         let (mut phi, mut w) = (0.0, 3.0 + 0.5 * normal());
@@ -362,9 +370,9 @@ mod tests {
         let mut seen = phi + VARIANCE.sqrt() * normal();
         let mut normalised = [0.0; 3];
         for tick in 1..=800 {
-            let (kick, other) = (normal(), normal());
+            let (kick, second) = (normal(), normal());
             // The exact covariance of (∫w, w) under white noise.
-            phi += h * w + (DENSITY * h * h * h).sqrt() * (0.5 * kick + other / 12.0_f64.sqrt());
+            phi += h * w + (DENSITY * h * h * h).sqrt() * (0.5 * kick + second / 12.0_f64.sqrt());
             w += (DENSITY * h).sqrt() * kick;
             let now = phi + VARIANCE.sqrt() * normal();
             if (300..550).contains(&tick) {
@@ -381,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn it_knows_its_own_error_before_during_and_after_a_blind_gap() {
+    fn the_deviation_is_consistent_before_during_and_after_a_gap() {
         const RUNS: u64 = 2000;
         let mut squares = [0.0; 3];
         for seed in 0..RUNS {
@@ -389,12 +397,12 @@ mod tests {
                 *square += value * value / RUNS as f64;
             }
         }
-        // One in the mean; its standard error is √(2/2000) = 0.032.
+        // The mean is 1; its standard error is √(2/2000) = 0.032.
         assert!(squares.iter().all(|square| (square - 1.0).abs() < 0.12), "{squares:?}");
     }
 
     #[test]
-    fn the_covariance_is_that_of_the_textbook() {
+    fn the_covariance_equals_the_textbook_equations() {
         let (w, q, r) = (0.3, 0.02, 0.5);
         let mut covariance = Covariance { potential: 0.7, slope: -0.4, rest: 0.2 };
         let (a, b, c) = (0.7, -0.28, covariance.unknown());
@@ -409,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn no_rounding_takes_the_covariances_positivity() {
+    fn rounding_leaves_the_covariance_positive() {
         let mut filter = KalmanFilter::new(Vector1::zeros(), Vector1::new(0.0), Vector1::new(1e8));
         for tick in 0..200_000 {
             filter.step(&increment(2e-3, 1e-3, 1e-14));
@@ -420,7 +428,7 @@ mod tests {
     }
 
     #[test]
-    fn without_noise_and_without_doubt_nothing_is_divided_by_zero() {
+    fn zero_noise_and_zero_deviation_do_not_divide_by_zero() {
         let mut filter = KalmanFilter::new(Vector1::zeros(), Vector1::new(0.5), Vector1::zeros());
         filter.step(&increment(2e-3, 1e-3, 0.0));
         assert_eq!((filter.estimate().x, filter.deviation().x), (0.5, 0.0));

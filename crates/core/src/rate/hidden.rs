@@ -123,7 +123,7 @@ impl Estimator for HiddenObserver {
 
     /// As long as the last one, with all that is needed in the measurement.
     #[inline(always)]
-    fn step_usual(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
+    fn fast_step(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
         let ([x, y, z], [u, v, w]) = (measurement.omega_rad_s, measurement.applied_rad_s2);
         // 0·x is 0 unless x is not finite. A sum that is not finite, of numbers that are, goes the long way.
         let finite = ((x + y) + (z + u) + (v + w)) * 0.0 == 0.0;
@@ -134,8 +134,8 @@ impl Estimator for HiddenObserver {
         let to = self.relation.regressor(&sample);
         let (ends, estimate) = ([&self.last, &to], self.filter.estimate().x);
         let done = match &mut self.filter {
-            Filter::First(filter) => self.relation.step_usual(ends, &self.interval, estimate, filter),
-            Filter::Second(filter) => self.relation.step_usual(ends, &self.interval, estimate, filter),
+            Filter::First(filter) => self.relation.fast_step(ends, &self.interval, estimate, filter),
+            Filter::Second(filter) => self.relation.fast_step(ends, &self.interval, estimate, filter),
             Filter::Kalman(_) => None,
         };
         let Some((estimate, innovation)) = done else { return false };

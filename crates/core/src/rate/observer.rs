@@ -51,9 +51,9 @@ impl Estimator for RateObserver {
     }
 
     #[inline(always)]
-    fn step_usual(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
+    fn fast_step(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
         match self {
-            Self::Hidden(observer) => observer.step_usual(measurement, dt_s, out),
+            Self::Hidden(observer) => observer.fast_step(measurement, dt_s, out),
             _ => false,
         }
     }

@@ -1,38 +1,38 @@
-//! The controller: the estimate and one follower's measurement of the same tick in, that follower's command out.
+//! The controller: computes a follower's command from the estimate and that follower's measurement of the same tick.
 //!
-//! Must not pair samples of different ticks, and must not see the truth.
+//! It must not combine samples of different ticks, and must not see the truth.
 
 use crate::sample::{Message, Sample};
 use crate::state::{Persist, Words};
 
 /// The control law of one rig for one follower.
 pub trait Law {
-    /// What it knows of the leader.
+    /// The estimate of the leader's state.
     type Estimate: Sample;
-    /// What it knows of the follower.
+    /// The follower's measurement.
     type Measurement: Message + ?Sized;
-    /// What it decides.
+    /// The follower's command.
     type Command: Message + ?Sized;
 
-    /// Writes the command, everything but the stamp.
+    /// Writes the command, but not the stamp.
     fn command(&mut self, estimate: &Self::Estimate, measurement: &Self::Measurement, out: &mut Self::Command);
 }
 
-/// A law with its follower's stamp discipline.
+/// A law for one follower that also stamps its commands.
 #[derive(Debug)]
 pub struct Controller<L> {
     law: L,
 }
 
 impl<L: Law> Controller<L> {
-    /// A controller for one follower.
+    /// Creates a controller for one follower.
     pub fn new(law: L) -> Self {
         Self { law }
     }
 
-    /// Turns estimate k and measurement k into command k. The caller fills the stamp's `generation` and `sent_ns`.
+    /// Computes command k from estimate k and measurement k. The caller sets the stamp's `generation` and `sent_ns`.
     ///
-    /// The command continues the estimate's chain: its origin is the leader's measurement.
+    /// The command's origin is that of the estimate: the leader's measurement.
     #[inline(always)]
     pub fn step(&mut self, estimate: &L::Estimate, measurement: &L::Measurement, out: &mut L::Command) {
         debug_assert_eq!(estimate.stamp().tick, measurement.stamp().tick);

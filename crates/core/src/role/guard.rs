@@ -1,48 +1,48 @@
-//! What the receiving end checks of a sample before anything is made of it: numbers, range, and how fast they change.
+//! The reader's check of a sample before it is used: finite numbers, range, rate of change.
 //!
-//! Must not repair anything: a sample is believed whole or not at all. Must not refuse for ever what was right: the change
-//! that is allowed grows with the time since the last sample that was believed, and a body that moves beyond its range as its
-//! equations of motion say is believed after [`SUSPECT_SAMPLES`] samples.
+//! A guard must not repair anything: it accepts or rejects a whole sample. It must not reject correct samples for
+//! ever. The permitted change grows with the time since the last accepted sample, and a body that moves beyond its
+//! range according to its equations of motion is accepted after [`SUSPECT_SAMPLES`] samples.
 
 use crate::sample::Stamp;
 use crate::state::{Persist, Words, persist_fields};
 
-/// Judges the samples of one signal, in the order of their ticks.
+/// A check of the samples of one signal, in the order of their ticks.
 pub trait Guard<S: ?Sized> {
-    /// Whether the sample is to be believed. One that is becomes what the next are compared with.
+    /// Returns true if the sample is accepted. Later samples are compared with the last accepted one.
     fn accepts(&mut self, sample: &S) -> bool;
 
-    /// Returns why the sample that was just judged is not accepted; called for such samples only.
+    /// Returns the reason why the sample just checked was rejected. Called for rejected samples only.
     fn refusal(&self, _sample: &S) -> Refusal {
         Refusal::Other
     }
 }
 
-/// Why a sample is not accepted.
+/// The reason why a sample is rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
-    /// A number is infinite or none.
+    /// A number is infinite or NaN.
     NotFinite,
     /// A value lies beyond its bound.
     OutOfRange,
     /// A value changed faster than the body can.
     TooFast,
-    /// A value stayed the same to the last bit for too long.
+    /// A value stayed bit-identical for too long.
     Stuck,
-    /// A component that the reader needs is absent.
+    /// A component that the reader needs is missing.
     Incomplete,
-    /// The stamp's tick or generation cannot be.
+    /// The stamp's tick or generation is impossible.
     Stamp,
-    /// By a guard that gives no reason.
+    /// The guard gives no reason.
     Other,
 }
 
 impl Refusal {
-    /// All of them, in the order of their counters.
+    /// All reasons, in the order of their counters.
     pub const ALL: [Self; 7] =
         [Self::NotFinite, Self::OutOfRange, Self::TooFast, Self::Stuck, Self::Incomplete, Self::Stamp, Self::Other];
 
-    /// The key in `summary.json`.
+    /// Returns the key in `summary.json`.
     pub fn name(self) -> &'static str {
         match self {
             Self::NotFinite => "not_finite",
@@ -55,13 +55,13 @@ impl Refusal {
         }
     }
 
-    /// The reason why values fail a bound on their magnitude.
+    /// Returns the reason why values fail a bound on their magnitude.
     pub fn of_values(values: &[f64]) -> Self {
         if values.iter().all(|value| value.is_finite()) { Self::OutOfRange } else { Self::NotFinite }
     }
 }
 
-/// Believes everything: for those who watch and do not act.
+/// A guard that accepts every sample, for readers that observe and do not act.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AcceptAll;
 
@@ -74,39 +74,40 @@ impl<S: ?Sized> Guard<S> for AcceptAll {
     }
 }
 
-/// What N components of a body can be. Units are those of the components, and ticks.
+/// Physical limits of N components, in the units of the components and in ticks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds<const N: usize> {
     /// The largest magnitude.
     pub magnitude: [f64; N],
-    /// The largest change per tick; +inf where nothing bounds it.
+    /// The largest change per tick; +∞ where it is unbounded.
     pub slew_per_tick: [f64; N],
-    /// What may be added to a change however short the time: the noise of two samples.
+    /// The additional change permitted over any time: the noise of two samples.
     pub allowance: [f64; N],
-    /// So often in a row a component may be the same to the last bit; then it is stuck.
+    /// The number of consecutive bit-identical repetitions after which a component counts as stuck.
     pub repeats: u64,
 }
 
-/// After a gap of so many ticks in what was believed, a sample must also continue what came just before it.
+/// The longest gap between accepted samples, in ticks, after which a sample need not also continue the one just
+/// before it.
 const SHORT_GAP_TICKS: u64 = 2;
 
-/// Components that are checked against their bounds and against the last ones believed.
+/// A check of components against their bounds and against the last accepted ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlausibilityCheck<const N: usize> {
     bounds: Bounds<N>,
-    /// Per component, the last value that was believed, and its tick.
-    believed: [f64; N],
-    believed_tick: [Option<u64>; N],
-    /// The sample before, believed or not, and how often its components have been repeated.
+    /// The last accepted value per component, and its tick.
+    accepted: [f64; N],
+    accepted_tick: [Option<u64>; N],
+    /// The previous sample, accepted or not, and the number of repetitions of each component.
     before: [f64; N],
     before_tick: u64,
     repeated: [u64; N],
-    /// Whether that one was believed.
-    trusted: bool,
-    /// Bit i set: component i of that sample was believed. Its `believed_tick` is `before_tick` then, which is not kept up: see
-    /// [`spell_out`](Self::spell_out).
+    /// True if the previous sample was accepted.
+    before_accepted: bool,
+    /// Bit i is set if component i of the previous sample was accepted. Its `accepted_tick` is then `before_tick` and
+    /// is not stored: see [`store_current_ticks`](Self::store_current_ticks).
     current: u64,
-    /// Why the last sample that was not believed was not.
+    /// The reason why the last rejected sample was rejected.
     refusal: Refusal,
 }
 
@@ -114,31 +115,31 @@ impl<const N: usize> PlausibilityCheck<N> {
     /// The bits of all components.
     const ALL: u64 = (1 << N) - 1;
 
-    /// Nothing is known yet: the first value of a component is checked for its magnitude only.
+    /// Creates a check without history: it checks only the magnitude of each component's first value.
     pub fn new(bounds: Bounds<N>) -> Self {
         Self {
             bounds,
-            believed: [0.0; N],
-            believed_tick: [None; N],
+            accepted: [0.0; N],
+            accepted_tick: [None; N],
             before: [f64::NAN; N],
             before_tick: 0,
             repeated: [0; N],
-            trusted: true,
+            before_accepted: true,
             current: 0,
             refusal: Refusal::Other,
         }
     }
 
-    /// Whether those components of a sample that `valid` has a bit for are possible; if so they are remembered.
+    /// Returns true if the components selected by the bits of `valid` are possible, and records them then.
     ///
-    /// A sender that has been started anew speaks of the same body: its samples are compared with those before.
+    /// Samples of a restarted sender are compared with those before the restart: they describe the same body.
     #[inline]
     pub fn accepts(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) -> bool {
         self.accepts_within(stamp, values, valid, |bounds, i, _, ticks| bounds.slew_per_tick[i] * ticks)
     }
 
-    /// The same where the change that is possible depends on where the body was: `change` tells that of a component, from
-    /// the bounds, all components and the number of ticks.
+    /// Like [`accepts`](Self::accepts), for a body whose possible change depends on its state. `change` computes that
+    /// of a component from the bounds, its index, all components and the number of ticks.
     #[inline]
     pub fn accepts_within(
         &mut self,
@@ -147,14 +148,14 @@ impl<const N: usize> PlausibilityCheck<N> {
         valid: u64,
         change: impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
     ) -> bool {
-        // As a rule the same components were believed a tick ago, and are now: what follows says the same at greater length.
+        // Fast path: the same components were accepted one tick ago. `accepts_any` would give the same result.
         let valid = valid & Self::ALL;
-        let next = self.trusted && valid == self.current && self.before_tick.checked_add(1) == Some(stamp.tick);
+        let next = self.before_accepted && valid == self.current && self.before_tick.checked_add(1) == Some(stamp.tick);
         let near = |i: usize| {
-            let bound = self.bounds.allowance[i] + change(&self.bounds, i, &self.believed, 1.0);
-            valid >> i & 1 == 0 || self.in_range(i, values[i]) && (values[i] - self.believed[i]).abs() <= bound
+            let bound = self.bounds.allowance[i] + change(&self.bounds, i, &self.accepted, 1.0);
+            valid >> i & 1 == 0 || self.in_range(i, values[i]) && (values[i] - self.accepted[i]).abs() <= bound
         };
-        // Not `(0..N).all(near)`, which is a call per component: see `vector`.
+        // Not `(0..N).all(near)`, which compiles to a call per component: see `vector`.
         let mut all_near = next && self.bounds.repeats == u64::MAX;
         for i in 0..N {
             all_near = all_near && near(i);
@@ -162,7 +163,7 @@ impl<const N: usize> PlausibilityCheck<N> {
         if all_near {
             for (i, &value) in values.iter().enumerate() {
                 if valid >> i & 1 == 1 {
-                    self.believed[i] = value;
+                    self.accepted[i] = value;
                 }
             }
             (self.before, self.before_tick) = (*values, stamp.tick);
@@ -171,7 +172,7 @@ impl<const N: usize> PlausibilityCheck<N> {
         self.accepts_any(stamp, values, valid, change)
     }
 
-    /// Apart, so that the short way has nothing to keep for it.
+    /// The general path, not inlined so that the fast path saves no registers for it.
     #[inline(never)]
     fn accepts_any(
         &mut self,
@@ -180,7 +181,7 @@ impl<const N: usize> PlausibilityCheck<N> {
         valid: u64,
         change: impl Fn(&Bounds<N>, usize, &[f64; N], f64) -> f64,
     ) -> bool {
-        self.spell_out();
+        self.store_current_ticks();
         let counts = self.bounds.repeats != u64::MAX;
         let mut refusal = None;
         for (i, &value) in values.iter().enumerate() {
@@ -193,69 +194,70 @@ impl<const N: usize> PlausibilityCheck<N> {
             refusal = match () {
                 () if !self.in_range(i, value) => Some(Refusal::of_values(&[value])),
                 () if self.repeated[i] > self.bounds.repeats => Some(Refusal::Stuck),
-                () if !self.reached(i, value, stamp.tick, &change) => Some(Refusal::TooFast),
+                () if !self.can_reach(i, value, stamp.tick, &change) => Some(Refusal::TooFast),
                 () => None,
             };
         }
-        let believed = refusal.is_none();
+        let accepted = refusal.is_none();
         self.refusal = refusal.unwrap_or(self.refusal);
-        if believed {
+        if accepted {
             self.record_accepted(stamp, values, valid);
         }
-        (self.before, self.before_tick, self.trusted) = (*values, stamp.tick, believed);
+        (self.before, self.before_tick, self.before_accepted) = (*values, stamp.tick, accepted);
         self.set_current();
-        believed
+        accepted
     }
 
-    /// Remembers a sample that was found to be right in another way.
+    /// Records a sample that was accepted by another check.
     #[inline]
     pub fn record_accepted(&mut self, stamp: &Stamp, values: &[f64; N], valid: u64) {
-        self.spell_out();
+        self.store_current_ticks();
         for i in (0..N).filter(|i| valid >> i & 1 == 1) {
-            (self.believed[i], self.believed_tick[i]) = (values[i], Some(stamp.tick));
+            (self.accepted[i], self.accepted_tick[i]) = (values[i], Some(stamp.tick));
         }
-        self.trusted = true;
+        self.before_accepted = true;
         self.set_current();
     }
 
-    /// Brings up to date what is implied as long as the same components are believed, one sample after the other.
-    fn spell_out(&mut self) {
+    /// Stores the ticks that `current` implies.
+    fn store_current_ticks(&mut self) {
         for i in (0..N).filter(|i| self.current >> i & 1 == 1) {
-            self.believed_tick[i] = Some(self.before_tick);
+            self.accepted_tick[i] = Some(self.before_tick);
         }
     }
 
     fn set_current(&mut self) {
-        let current = |i: &usize| self.believed_tick[*i] == Some(self.before_tick);
+        let current = |i: &usize| self.accepted_tick[*i] == Some(self.before_tick);
         self.current = (0..N).filter(current).fold(0, |current, i| current | 1 << i);
     }
 
-    /// Why the last sample that was not believed was not.
+    /// Returns the reason why the last rejected sample was rejected.
     pub fn refusal(&self) -> Refusal {
         self.refusal
     }
 
-    /// The bounds that it judges by.
+    /// Returns the bounds.
     pub fn bounds(&self) -> &Bounds<N> {
         &self.bounds
     }
 
-    /// Whether all components lie in their range. What is not a number does not.
+    /// Returns true if all components lie in their range. NaN lies in no range.
     #[inline]
     pub fn contains(&self, values: &[f64; N]) -> bool {
         (0..N).all(|i| self.in_range(i, values[i]))
     }
 
-    /// What is not a number is in no range.
+    /// Returns true if a component lies in its range. NaN lies in no range.
     #[inline]
     fn in_range(&self, i: usize, value: f64) -> bool {
         value.abs() <= self.bounds.magnitude[i]
     }
 
-    /// Whether a component can have come to a value from where it was last believed to be. As the time grows so does what can
-    /// be reached, and noise comes to be possible; so after doubts it must have come smoothly, too.
+    /// Returns true if a component can have reached a value since it was last accepted. The reachable range grows
+    /// with time until it would admit noise, so after a rejected sample the value must also continue the previous
+    /// one.
     #[inline]
-    fn reached(
+    fn can_reach(
         &self,
         i: usize,
         value: f64,
@@ -266,44 +268,45 @@ impl<const N: usize> PlausibilityCheck<N> {
             let ticks = tick.saturating_sub(since).max(1) as f64;
             (value - from[i]).abs() <= self.bounds.allowance[i] + change(&self.bounds, i, from, ticks)
         };
-        self.believed_tick[i].is_none_or(|since| {
-            let smooth = self.trusted || tick.saturating_sub(since) <= SHORT_GAP_TICKS;
-            within(&self.believed, since) && (smooth || within(&self.before, self.before_tick))
+        self.accepted_tick[i].is_none_or(|since| {
+            let smooth = self.before_accepted || tick.saturating_sub(since) <= SHORT_GAP_TICKS;
+            within(&self.accepted, since) && (smooth || within(&self.before, self.before_tick))
         })
     }
 }
 
 impl<const N: usize> Persist for PlausibilityCheck<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
-        self.spell_out();
-        self.believed.persist(words);
-        self.believed_tick.persist(words);
+        self.store_current_ticks();
+        self.accepted.persist(words);
+        self.accepted_tick.persist(words);
         self.before.persist(words);
         self.before_tick.persist(words);
         self.repeated.persist(words);
-        self.trusted.persist(words);
+        self.before_accepted.persist(words);
         self.set_current();
     }
 }
 
-/// So many samples in a row of a body beyond its range are not believed, however right they are.
+/// The number of consecutive samples of a body beyond its range that are rejected even if they are correct.
 pub const SUSPECT_SAMPLES: u64 = 8;
-/// Of the way that a body moves, so much may be other than its equations say: its inertia is not known exactly.
+/// The permitted mismatch, as a part of the body's path: its inertia is not known exactly.
 const MISMATCH: f64 = 0.25;
 
-/// Tells a body that moves beyond its range from a sensor that lies: the body moves as its equations and what is applied to
-/// it say.
+/// A check that distinguishes a body beyond its range from a faulty sensor: the body moves according to its equations
+/// and the applied input.
 ///
-/// It is followed from a sample on, for [`SUSPECT_SAMPLES`] samples, and then from the last of them: small differences do not add up,
-/// and a lie that hides in noise at first does not stay hidden. What stops following is doubted anew.
+/// The motion is predicted from one sample over [`SUSPECT_SAMPLES`] samples, then from the last of them. Small
+/// differences do not add up, and an error that is hidden by noise at first does not stay hidden. After a deviation
+/// the check restarts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionCheck<const N: usize> {
-    /// Where the body is at `next_tick` if it follows.
+    /// The predicted state at `next_tick`.
     next: [f64; N],
     next_tick: u64,
-    /// How far it has moved since the sample that it is followed from.
+    /// The length of the path since the sample at which the prediction started.
     path: f64,
-    /// How many samples have followed; 0 if none is followed.
+    /// The number of consistent samples; 0 while the check is inactive.
     samples: u64,
 }
 
@@ -314,20 +317,20 @@ impl<const N: usize> Default for MotionCheck<N> {
 }
 
 impl<const N: usize> MotionCheck<N> {
-    /// Whether a body is being followed.
+    /// Returns true while a motion is being checked.
     #[inline]
     pub fn active(&self) -> bool {
         self.samples > 0
     }
 
-    /// Follows no body any more.
+    /// Ends the check.
     #[inline]
     pub fn stop(&mut self) {
         self.samples = 0;
     }
 
-    /// Whether a body that was sampled at this tick has been found to move as it must. `allowance` is the noise of two
-    /// samples; `flow` tells where it is one tick later. Call it with every sample as long as it is [active](Self::active).
+    /// Returns true once the motion has been consistent for long enough. `allowance` is the noise of two samples;
+    /// `flow` computes the state one tick later. Call it with every sample while the check is [active](Self::active).
     pub fn is_consistent(
         &mut self,
         tick: u64,
@@ -338,12 +341,12 @@ impl<const N: usize> MotionCheck<N> {
         let near = |i: usize| (values[i] - self.next[i]).abs() <= allowance[i] + MISMATCH * self.path;
         let follows = self.active() && tick == self.next_tick && (0..N).all(near);
         self.samples = if follows { self.samples + 1 } else { 1 };
-        let anew = self.samples % SUSPECT_SAMPLES == 1;
-        let from = if anew { *values } else { self.next };
+        let restart = self.samples % SUSPECT_SAMPLES == 1;
+        let from = if restart { *values } else { self.next };
         self.next = flow(&from);
         self.next_tick = tick + 1;
         let moved = from.iter().zip(&self.next).map(|(from, next)| (next - from) * (next - from)).sum::<f64>();
-        self.path = if anew { 0.0 } else { self.path } + libm::sqrt(moved);
+        self.path = if restart { 0.0 } else { self.path } + libm::sqrt(moved);
         self.samples > SUSPECT_SAMPLES
     }
 }
@@ -370,9 +373,9 @@ mod tests {
         guard.accepts(&Stamp { tick, generation: 1, ..Stamp::default() }, &values, valid)
     }
 
-    /// Where repetitions are counted, the short way is not taken: it says the same, whatever comes.
+    /// With a finite `repeats` the fast path is disabled.
     #[test]
-    fn the_short_way_says_what_the_long_one_says() {
+    fn the_fast_path_gives_the_result_of_the_general_one() {
         let mut random = rand_pcg::Pcg64::new(7, 7);
         let mut draw = move |below: u64| {
             use rand_pcg::rand_core::Rng;
@@ -387,7 +390,7 @@ mod tests {
             })
         };
         let (mut short, mut long) = (guard(u64::MAX), guard(u64::MAX - 1));
-        let (mut tick, mut values, mut believed) = (0, [0.0; 3], 0);
+        let (mut tick, mut values, mut accepted_samples) = (0, [0.0; 3], 0);
         for _ in 0..100_000 {
             tick += if draw(50) == 0 { draw(5) } else { 1 };
             for value in &mut values {
@@ -401,58 +404,61 @@ mod tests {
                 _ => {}
             }
             let valid = if draw(20) == 0 { draw(8) } else { 7 };
-            let told = accepts(&mut short, tick, shown, valid);
-            assert_eq!(told, accepts(&mut long, tick, shown, valid), "tick {tick}, {shown:?}");
-            believed += u64::from(told);
+            let accepted = accepts(&mut short, tick, shown, valid);
+            assert_eq!(accepted, accepts(&mut long, tick, shown, valid), "tick {tick}, {shown:?}");
+            accepted_samples += u64::from(accepted);
             long.repeated = [0; 3];
-            short.spell_out();
-            // As text: what is not a number is unequal to itself.
+            short.store_current_ticks();
+            // Compared as text, because NaN is unequal to itself.
             assert_eq!(format!("{:?}", PlausibilityCheck { bounds: long.bounds, ..short }), format!("{long:?}"));
         }
-        assert!((10_000..95_000).contains(&believed), "{believed}");
+        assert!((10_000..95_000).contains(&accepted_samples), "{accepted_samples}");
     }
 
     #[test]
-    fn what_is_no_number_or_out_of_range_is_not_believed() {
+    fn samples_that_are_not_finite_or_out_of_range_are_rejected() {
         for wrong in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 2.1, -2.1, f64::MAX] {
             for component in 0..3 {
                 let mut values = [0.5; 3];
                 values[component] = wrong;
                 assert!(!accepts(&mut guard(), 0, values, 7), "{wrong}");
-                assert!(accepts(&mut guard(), 0, values, 7 & !(1 << component)), "what is not valid is not looked at");
+                assert!(
+                    accepts(&mut guard(), 0, values, 7 & !(1 << component)),
+                    "components that are not valid are not checked"
+                );
             }
         }
         assert!(accepts(&mut guard(), 0, [2.0, -2.0, 0.0], 7));
     }
 
     #[test]
-    fn a_jump_is_refused_until_there_was_time_for_it() {
+    fn a_jump_is_rejected_until_enough_time_has_passed() {
         let mut guard = guard();
         assert!(accepts(&mut guard, 0, [0.0; 3], 7));
         assert!(accepts(&mut guard, 1, [0.0109, 0.0, 1.9], 7), "slew and allowance");
         let jump = [0.5, 0.0, 0.0];
         let first = (2..100).find(|tick| accepts(&mut guard, *tick, jump, 7));
         assert_eq!(first, Some(50), "(0.5 - 0.0109 - 0.001) / 0.01 = 48.8 ticks after tick 1");
-        assert!(accepts(&mut guard, 51, jump, 7), "and from then on at once");
+        assert!(accepts(&mut guard, 51, jump, 7), "then at once");
     }
 
     #[test]
-    fn every_flip_of_an_exponent_or_sign_is_seen_and_the_next_good_sample_is_believed() {
+    fn every_exponent_or_sign_flip_is_detected_and_the_next_good_sample_accepted() {
         let (value, mut refused) = (0.6, 0);
         for bit in 0..64 {
             let mut guard = guard();
             assert!(accepts(&mut guard, 0, [value; 3], 7));
             let wrong = f64::from_bits(f64::to_bits(value) ^ 1 << bit);
-            let believed = accepts(&mut guard, 1, [wrong, value, value], 7);
-            assert_eq!(believed, (wrong - value).abs() <= 0.011, "bit {bit}: {wrong}");
-            refused += u32::from(!believed);
+            let accepted = accepts(&mut guard, 1, [wrong, value, value], 7);
+            assert_eq!(accepted, (wrong - value).abs() <= 0.011, "bit {bit}: {wrong}");
+            refused += u32::from(!accepted);
             assert!(accepts(&mut guard, 2, [value; 3], 7), "bit {bit}");
         }
-        assert!(refused >= 12, "eleven bits of exponent, and the sign: {refused}");
+        assert!(refused >= 12, "eleven exponent bits and the sign: {refused}");
     }
 
     #[test]
-    fn a_new_life_of_the_sender_speaks_of_the_same_body() {
+    fn samples_of_a_restarted_sender_continue_those_before() {
         let mut guard = guard();
         assert!(accepts(&mut guard, 5, [0.0; 3], 7));
         let stamp = |tick| Stamp { tick, generation: 2, ..Stamp::default() };
@@ -460,18 +466,18 @@ mod tests {
     }
 
     #[test]
-    fn a_guard_that_is_restored_judges_as_the_one_before() {
-        let (mut one, samples) = (guard(), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.301)]);
+    fn a_restored_guard_has_the_same_state() {
+        let (mut guard, samples) = (self::guard(), [(0, 0.0), (1, 0.3), (2, 0.3), (3, 0.301)]);
         for (tick, value) in samples {
-            accepts(&mut one, tick, [value; 3], 7);
+            accepts(&mut guard, tick, [value; 3], 7);
         }
         let mut kept = Vec::new();
-        one.persist(&mut Kept(&mut kept));
-        let mut other = guard();
-        other.persist(&mut crate::state::Restore(&kept));
-        // Why a sample was refused is asked at once or never.
-        other.refusal = one.refusal;
-        assert_eq!(one, other);
+        guard.persist(&mut Kept(&mut kept));
+        let mut restored = self::guard();
+        restored.persist(&mut crate::state::Restore(&kept));
+        // The reason is not persistent: it is read only right after a rejection.
+        restored.refusal = guard.refusal;
+        assert_eq!(guard, restored);
     }
 
     struct Kept<'a>(&'a mut Vec<u64>);
@@ -483,35 +489,35 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_not_believed_because_it_has_lasted() {
+    fn noise_is_rejected_however_long_it_lasts() {
         let mut guard = guard();
         assert!(accepts(&mut guard, 0, [0.0; 3], 7));
         let wild = |tick: u64| if tick.is_multiple_of(2) { 0.2 } else { -0.2 };
-        let believed = (1..500).filter(|tick| accepts(&mut guard, *tick, [wild(*tick), 0.0, 0.0], 7)).count();
-        assert_eq!(believed, 0, "it could have been reached, but no body moves so");
+        let accepted = (1..500).filter(|tick| accepts(&mut guard, *tick, [wild(*tick), 0.0, 0.0], 7)).count();
+        assert_eq!(accepted, 0, "within reach, but no body moves like this");
         let good = (500..510).find(|tick| accepts(&mut guard, *tick, [0.1, 0.0, 0.0], 7));
-        assert_eq!(good, Some(501), "the second one continues the first");
+        assert_eq!(good, Some(501), "the second sample continues the first");
     }
 
     #[test]
-    fn a_short_gap_needs_no_second_sample_and_a_lost_one_is_no_doubt() {
+    fn after_a_short_gap_or_lost_samples_one_good_sample_is_accepted() {
         let mut guard = guard();
         assert!(accepts(&mut guard, 0, [0.0; 3], 7) && !accepts(&mut guard, 1, [1.0; 3], 7));
         assert!(accepts(&mut guard, 2, [0.0; 3], 7));
-        assert!(accepts(&mut guard, 100, [0.5, 0.0, 0.0], 7), "nothing came in between");
+        assert!(accepts(&mut guard, 100, [0.5, 0.0, 0.0], 7), "no rejected sample in between");
     }
 
     #[test]
-    fn what_is_stuck_is_believed_for_a_while_only() {
+    fn a_stuck_component_is_accepted_for_a_limited_time() {
         let mut guard = PlausibilityCheck::new(Bounds { repeats: 3, ..guard().bounds });
-        let believed = (0..10).filter(|tick| accepts(&mut guard, *tick, [0.5; 3], 7)).count();
-        assert_eq!(believed, 4, "the first, and three repetitions");
-        assert!(!accepts(&mut guard, 10, [0.501, 0.501, 0.5], 7), "one component is stuck still");
+        let accepted = (0..10).filter(|tick| accepts(&mut guard, *tick, [0.5; 3], 7)).count();
+        assert_eq!(accepted, 4, "the first, and three repetitions");
+        assert!(!accepts(&mut guard, 10, [0.501, 0.501, 0.5], 7), "one component is still stuck");
         assert!(accepts(&mut guard, 11, [0.502, 0.502, 0.501], 7), "it moves again");
     }
 
     #[test]
-    fn what_is_refused_has_its_reason() {
+    fn a_rejected_sample_has_its_reason() {
         let mut guard = PlausibilityCheck::new(Bounds { repeats: 2, ..guard().bounds });
         assert!(accepts(&mut guard, 0, [0.5; 3], 7));
         for (tick, value, reason) in [

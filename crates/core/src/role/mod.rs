@@ -1,7 +1,7 @@
 //! Plant, observer and controller as plain state machines: samples in, samples out.
 //!
-//! No clock, no I/O, no allocation, no logging: time is the tick in a sample's stamp. The same machines run in one thread,
-//! in lockstep and in real time; that is why all three give the same bits.
+//! They have no clock, no I/O, no allocation and no logging: their time is the tick in a sample's stamp. The same
+//! state machines run in one thread, in lockstep and in real time, and therefore give the same bits in all three.
 
 mod controller;
 mod guard;

@@ -1,6 +1,6 @@
-//! An observer by the method of invariant relations, of any relation: what the papers do, for a body of your own.
+//! An observer for any invariant relation: the papers' method for a body of your own.
 //!
-//! Must not know what is measured.
+//! It must not depend on the meaning of the measured quantities.
 
 use super::Estimator;
 use crate::observe::{Increment, InvariantFilter};
@@ -8,22 +8,22 @@ use crate::sample::{Sample, status};
 use crate::state::{Persist, Words};
 use nalgebra::SVector;
 
-/// A relation that ties N unknowns to what is measured: ∫ρ w dt = φ(now) − φ(last), \[D\](6)-(10).
+/// A relation that ties N unknowns w to measured quantities: ∫ρ w dt = φ(now) − φ(last), \[D\](6)-(10).
 pub trait InvariantRelation<const N: usize> {
-    /// What is measured.
+    /// The measured quantities.
     type Measurement: Sample;
-    /// What is known by it.
+    /// The measured quantities with the unknowns.
     type Estimate: Sample;
 
-    /// What the step of `dt_s` seconds from one measurement to the next tells of the unknowns.
+    /// Computes the increment of the relation over a step of `dt_s` seconds from one measurement to the next.
     fn increment(&self, last: &Self::Measurement, now: &Self::Measurement, dt_s: f64) -> Increment<N>;
-    /// Writes the estimate, everything but the stamp: what was measured last, the unknowns, the status bits.
+    /// Writes the estimate from the last measurement, the unknowns and the status bits, but not the stamp.
     fn write(&self, last: &Self::Measurement, unknowns: &SVector<f64, N>, status: u64, out: &mut Self::Estimate);
 }
 
-/// The observer of a relation's unknowns, of first order: their error decays at the given rates.
+/// A first-order observer of a relation's unknowns. The error of each decays at its given rate.
 ///
-/// Without a usable measurement it stays where it is.
+/// Without a usable measurement the estimate stays.
 #[derive(Debug, Clone)]
 pub struct RelationObserver<R: InvariantRelation<N>, const N: usize> {
     relation: R,
@@ -34,7 +34,8 @@ pub struct RelationObserver<R: InvariantRelation<N>, const N: usize> {
 }
 
 impl<R: InvariantRelation<N>, const N: usize> RelationObserver<R, N> {
-    /// An observer with its decay rates (positive; 1/s where ρ = 1) and its guess, in the units of the unknowns.
+    /// Creates an observer with its decay rates (positive; 1/s where ρ = 1) and its guess, in the units of the
+    /// unknowns.
     pub fn new(relation: R, decay_rates: [f64; N], guess: [f64; N]) -> Self {
         let filter = InvariantFilter::new(decay_rates.into(), guess.into());
         Self { relation, guess: guess.into(), filter, last: R::Measurement::default(), status: status::INITIAL }

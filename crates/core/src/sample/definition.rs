@@ -1,19 +1,19 @@
-//! The layout of a sample as a ROS 2 message definition, which recordings carry.
+//! The layout of a sample as a ROS 2 message definition, as recordings store it.
 //!
-//! A sample's bytes are the body of that message in little-endian CDR: every field is naturally aligned, so nothing is
-//! transformed. Must not know files.
+//! The bytes of a sample are the body of that message in little-endian CDR: every field is naturally aligned, so no
+//! conversion is needed. This module must not depend on files.
 
 use super::{Field, FieldKind, Stamp};
 use std::fmt::Write;
 
-/// The encoding of definitions, by its name in MCAP.
+/// The MCAP name of the encoding of definitions.
 pub const SCHEMA_ENCODING: &str = "ros2msg";
-/// The encoding of messages, by its name in MCAP.
+/// The MCAP name of the encoding of messages.
 pub const MESSAGE_ENCODING: &str = "cdr";
-/// What comes before the body of a message: little-endian CDR, no options.
+/// The CDR header before the body of a message: little-endian, no options.
 pub const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
 
-/// Makes a sample's bytes the message that they are the body of.
+/// Writes the message whose body is `body` into `message`.
 pub fn frame(body: &[u8], message: &mut Vec<u8>) {
     message.clear();
     message.extend_from_slice(&CDR_HEADER);
@@ -23,35 +23,35 @@ pub fn frame(body: &[u8], message: &mut Vec<u8>) {
 /// One field of a recorded layout.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Column {
-    /// Its name; the unit is its last part.
+    /// The name; the unit is its last part.
     pub name: String,
-    /// The type of its elements.
+    /// The type of the elements.
     pub kind: FieldKind,
-    /// How many elements.
+    /// The number of elements.
     pub count: usize,
-    /// Bytes from the start of the sample.
+    /// The offset from the start of the sample, bytes.
     pub offset: usize,
 }
 
 impl Column {
-    /// The names of its elements: its own, or with an index for each.
+    /// Returns the names of the elements: the column's name, with an index if there are several.
     pub fn elements(&self) -> impl Iterator<Item = String> + '_ {
-        let one = self.count == 1;
-        (0..self.count).map(move |index| if one { self.name.clone() } else { format!("{}[{index}]", self.name) })
+        let scalar = self.count == 1;
+        (0..self.count).map(move |index| if scalar { self.name.clone() } else { format!("{}[{index}]", self.name) })
     }
 }
 
 /// The layout of a sample.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
-    /// Name and version.
+    /// The name and version.
     pub type_name: String,
-    /// All fields, the stamp's first.
+    /// All fields, those of the stamp first.
     pub columns: Vec<Column>,
 }
 
 impl Layout {
-    /// The layout of a sample of ours.
+    /// Creates the layout of a sample with these fields after the stamp.
     pub fn from_fields(type_name: &str, fields: &[Field]) -> Self {
         let column = |field: &Field| Column {
             name: field.name.to_owned(),
@@ -62,16 +62,17 @@ impl Layout {
         Self { type_name: type_name.to_owned(), columns: Stamp::FIELDS.iter().chain(fields).map(column).collect() }
     }
 
-    /// Reads a message definition that [`definition`](Self::definition) wrote; none if it is of another kind.
+    /// Parses a message definition written by [`definition`](Self::definition). Returns `None` if it is invalid or
+    /// describes another kind of message.
     pub fn parse(definition: &str) -> Option<Self> {
         let type_name = definition.lines().next()?.strip_prefix("# ")?.to_owned();
         let (mut columns, mut offset) = (Vec::new(), 0_usize);
         let lines = definition.lines().map(|line| line.split_once('#').map_or(line, |(code, _)| code).trim());
         for line in lines.filter(|line| !line.is_empty()) {
-            let (of, name) = line.split_once(' ')?;
-            let (element, count) = match of.split_once('[') {
+            let (element_type, name) = line.split_once(' ')?;
+            let (element, count) = match element_type.split_once('[') {
                 Some((element, count)) => (element, count.strip_suffix(']')?.parse().ok()?),
-                None => (of, 1_usize),
+                None => (element_type, 1_usize),
             };
             let kind = match element {
                 "uint64" => FieldKind::U64,
@@ -85,12 +86,12 @@ impl Layout {
         (stamped == Stamp::FIELDS.len()).then_some(Self { type_name, columns })
     }
 
-    /// The length of a sample, bytes.
+    /// Returns the length of a sample, bytes.
     pub fn size(&self) -> usize {
         self.columns.iter().map(|column| 8 * column.count).sum()
     }
 
-    /// The message definition (`ros2msg`). Its first line is the sample's own name.
+    /// Returns the message definition (`ros2msg`). Its first line is the type name of the sample.
     pub fn definition(&self) -> String {
         let mut text = format!("# {}\n", self.type_name);
         for Column { name, kind, count, .. } in &self.columns {
@@ -99,13 +100,13 @@ impl Layout {
                 FieldKind::F64 => "float64",
             };
             let array = if *count == 1 { String::new() } else { format!("[{count}]") };
-            // Writing to a string does not fail.
+            // Writing to a string cannot fail.
             let _ = writeln!(text, "{kind}{array} {name}");
         }
         text
     }
 
-    /// The message's name: `corotate/rigid-body/truth/v1` is `corotate/msg/RigidBodyTruthV1`.
+    /// Returns the message name: `corotate/rigid-body/truth/v1` is `corotate/msg/RigidBodyTruthV1`.
     pub fn message_name(&self) -> String {
         let words = self.type_name.split(['/', '-']).skip(1);
         let capital = |word: &str| {
@@ -115,7 +116,7 @@ impl Layout {
         format!("corotate/msg/{}", words.map(capital).collect::<String>())
     }
 
-    /// The layout on one line, for people.
+    /// Returns the layout as one readable line.
     pub fn words(&self) -> String {
         let word = |column: &Column| match column.count {
             1 => column.name.clone(),
@@ -126,7 +127,7 @@ impl Layout {
     }
 }
 
-/// The topic under which a service's samples are recorded: a name that ROS accepts.
+/// Returns the topic under which a service's samples are recorded: a valid ROS name.
 pub fn topic_of(service: &str) -> String {
     format!("/{}", service.replace('-', "_"))
 }
@@ -137,7 +138,7 @@ mod tests {
     use crate::sample::{OrbitMeasurement, RateEstimate, Sample};
 
     #[test]
-    fn a_definition_reads_back_as_the_layout_that_it_was_made_of() {
+    fn a_parsed_definition_equals_its_layout() {
         for layout in [
             Layout::from_fields(RateEstimate::TYPE_NAME, RateEstimate::FIELDS),
             Layout::from_fields(OrbitMeasurement::TYPE_NAME, OrbitMeasurement::FIELDS),
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn another_definition_is_none_of_ours() {
+    fn foreign_definitions_are_refused() {
         for text in ["", "uint64 tick", "# x\nuint64 tick\n", "# x\nstring name", "# x\nuint64[9999999999999999999] a"]
         {
             assert!(Layout::parse(text).is_none(), "{text}");

@@ -1,35 +1,37 @@
-//! Samples of a fleet: many bodies of the rig `rigid-body` in one process. Their length is that of the fleet.
+//! Samples of a fleet: many bodies of the rig `rigid-body` in one process. Their length depends on the number of
+//! bodies.
 //!
-//! A header, then vectors of three components as structures of arrays: component 1 of every body, component 2 of every body,
-//! component 3. Everything is a word of 8 bytes, so the bytes are those of a message whose arrays have that fixed length.
+//! A sample is a header followed by vectors of three components as structures of arrays: component 1 of every body,
+//! component 2 of every body, component 3 of every body. Every element is a word of 8 bytes, so the bytes equal those
+//! of a message with arrays of that fixed length.
 
 use super::{Field, FieldKind, LayoutName, Message, Stamp};
 use bytemuck::TransparentWrapper;
 use core::fmt;
 use core::marker::PhantomData;
 
-/// Components of a vector.
+/// The number of components of a vector.
 const AXES: usize = 3;
-/// Words before the arrays: the stamp, the number of bodies, the status.
+/// The number of words before the arrays: the stamp, the number of bodies, the status.
 const HEADER: usize = size_of::<Stamp>() / size_of::<u64>() + 2;
 const BODIES: usize = HEADER - 2;
 const STATUS: usize = HEADER - 1;
 
 type Words = [u64];
 
-/// What a fleet's sample holds besides its header.
+/// The contents of a fleet's sample after its header.
 pub trait FleetLayout: fmt::Debug + Send + Sync + 'static {
-    /// Name and version of the layout, unique among all samples.
+    /// The name and version of the layout, unique among all samples.
     const TYPE_NAME: &'static str;
-    /// The names of its vectors, in order; the unit is the last part of each.
+    /// The names of the vectors, in order; the unit is the last part of each.
     const VECTORS: &'static [&'static str];
-    /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
+    /// [`LAYOUT`](Self::LAYOUT) as computed at compile time.
     const LAYOUT_NAME: LayoutName = LayoutName::for_fleet(Self::TYPE_NAME, Self::VECTORS);
     /// The type name with a hash of the vectors.
     const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 }
 
-/// A sample of a fleet, in place.
+/// A sample of a fleet, used in place.
 #[repr(transparent)]
 #[derive(TransparentWrapper)]
 #[transparent(Words)]
@@ -38,15 +40,15 @@ pub struct FleetSample<L: FleetLayout> {
     words: Words,
 }
 
-/// The states of all bodies as they really are. For recording and scoring only: no controller opens it.
+/// The true states of all bodies. For recording and scoring only: no controller opens it.
 ///
 /// `omega_rad_s`: angular velocities, rad/s; `applied_rad_s2`: control accelerations held from this tick on, rad/s².
 pub type FleetTruth = FleetSample<TruthLayout>;
-/// What the sensors and actuators of all bodies report at a tick; every component is measured.
+/// The readings of the sensors and actuators of all bodies at a tick; every component is measured.
 ///
 /// `omega_rad_s`: angular velocities, rad/s; `applied_rad_s2`: control accelerations held from this tick on, rad/s².
 pub type FleetMeasurement = FleetSample<MeasurementLayout>;
-/// What the actuators of all bodies are to apply from the next tick on.
+/// The commands of all actuators from the next tick on.
 ///
 /// `acceleration_rad_s2`: control accelerations (torque over inertia), rad/s².
 pub type FleetCommand = FleetSample<CommandLayout>;
@@ -69,12 +71,12 @@ layout!(MeasurementLayout = "corotate/rigid-fleet/measurement/v1" ["omega_rad_s"
 layout!(CommandLayout = "corotate/rigid-fleet/command/v1"["acceleration_rad_s2"]);
 
 impl<L: FleetLayout> FleetSample<L> {
-    /// How long a sample of so many bodies is, words.
+    /// Returns the length of a sample of `bodies` bodies, words.
     pub const fn length(bodies: usize) -> usize {
         HEADER + L::VECTORS.len() * AXES * bodies
     }
 
-    /// The fields after the stamp, in order, of a sample of so many bodies.
+    /// Returns the fields after the stamp, in order, of a sample of `bodies` bodies.
     pub fn fields(bodies: usize) -> impl Iterator<Item = Field> {
         let word = size_of::<u64>();
         let header = [("bodies", BODIES), ("status", STATUS)].into_iter();
@@ -88,17 +90,17 @@ impl<L: FleetLayout> FleetSample<L> {
         header.chain(L::VECTORS.iter().enumerate().map(vector))
     }
 
-    /// A sample in its words.
+    /// Returns the words as a sample.
     ///
     /// # Panics
-    /// If they are not as many as those of some number of bodies, [`length`](Self::length).
+    /// If the length is not the [`length`](Self::length) of a sample.
     #[inline]
     pub fn over(words: &[u64]) -> &Self {
         assert!(Self::fits(words.len()), "a fleet's sample is a header and whole vectors");
         Self::wrap_ref(words)
     }
 
-    /// The same, to be written.
+    /// Returns the words as a mutable sample.
     ///
     /// # Panics
     /// As [`over`](Self::over).
@@ -113,48 +115,48 @@ impl<L: FleetLayout> FleetSample<L> {
         length.checked_sub(HEADER).is_some_and(|values| values.is_multiple_of(L::VECTORS.len() * AXES))
     }
 
-    /// How many bodies it has room for.
+    /// Returns the number of bodies that the sample has room for.
     #[inline]
     pub fn bodies(&self) -> usize {
         (self.words.len() - HEADER) / (L::VECTORS.len() * AXES)
     }
 
-    /// For how many bodies its sender says that it is.
+    /// Returns the number of bodies in the header, as its sender wrote it.
     #[inline]
     pub fn declared_bodies(&self) -> u64 {
         self.words[BODIES]
     }
 
-    /// Bits of [`status`](super::status), which are those of all bodies.
+    /// Returns the bits of [`status`](super::status), which apply to all bodies.
     #[inline]
     pub fn status(&self) -> u64 {
         self.words[STATUS]
     }
 
-    /// Writes the header's status and number of bodies.
+    /// Writes the status and the number of bodies into the header.
     #[inline]
     pub fn set_status(&mut self, status: u64) {
         self.words[BODIES] = self.bodies() as u64;
         self.words[STATUS] = status;
     }
 
-    /// The components of a vector by its place in the layout, each for every body.
+    /// Returns the three components of the vector with this index in the layout, each for every body.
     #[inline]
     pub fn vector(&self, index: usize) -> [&[f64]; AXES] {
         let bodies = self.bodies();
         let values: &[f64] = bytemuck::cast_slice(&self.words[HEADER + index * AXES * bodies..][..AXES * bodies]);
-        let (first, others) = values.split_at(bodies);
-        let (second, third) = others.split_at(bodies);
+        let (first, rest) = values.split_at(bodies);
+        let (second, third) = rest.split_at(bodies);
         [first, second, third]
     }
 
-    /// The same, to be written.
+    /// Returns the mutable components of the vector with this index in the layout, each for every body.
     #[inline]
     pub fn vector_mut(&mut self, index: usize) -> [&mut [f64]; AXES] {
         let bodies = self.bodies();
         let words = &mut self.words[HEADER + index * AXES * bodies..][..AXES * bodies];
-        let (first, others) = bytemuck::cast_slice_mut(words).split_at_mut(bodies);
-        let (second, third) = others.split_at_mut(bodies);
+        let (first, rest) = bytemuck::cast_slice_mut(words).split_at_mut(bodies);
+        let (second, third) = rest.split_at_mut(bodies);
         [first, second, third]
     }
 }
@@ -211,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn every_value_has_a_place_of_its_own_and_the_table_tells_which() {
+    fn every_value_is_at_the_offset_of_its_field() {
         let mut words = [0; FleetTruth::length(5)];
         let sample = FleetTruth::over_mut(&mut words);
         sample.stamp_mut().tick = 7;
@@ -230,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn other_lengths_are_no_samples() {
+    fn only_whole_vectors_fit() {
         let lengths: Vec<usize> = (0..20).filter(|length| FleetTruth::fits(*length)).collect();
         assert_eq!(lengths, [6, 12, 18]);
     }

@@ -1,16 +1,16 @@
 //! The name of a sample's layout: the type name with a hash of the fields.
 //!
-//! A layout that is changed without a new version in its type name has another hash, so ends that were built from different
-//! sources do not meet. Computed by the compiler. Must not depend on how a sample travels.
+//! A layout that changes without a new version in its type name has another hash, so that programs built from
+//! different sources cannot connect. The hash is computed at compile time. It must not depend on the transport.
 
 use super::{Field, FieldKind, Stamp};
 
-/// The longest type name, bytes.
+/// The maximum length of a type name, bytes.
 const TYPE_NAME_MAX: usize = 200;
-/// `#` and eight hexadecimal digits.
+/// The length of `#` and eight hexadecimal digits.
 const SUFFIX: usize = 9;
 
-/// A type name, `#`, and the hash of the layout.
+/// A layout name: the type name, `#`, and the hash of the layout.
 #[derive(Debug, Clone, Copy)]
 pub struct LayoutName {
     bytes: [u8; TYPE_NAME_MAX + SUFFIX],
@@ -18,7 +18,7 @@ pub struct LayoutName {
 }
 
 impl LayoutName {
-    /// The name of a layout of one size.
+    /// Creates the name of a fixed-size layout.
     ///
     /// # Panics
     /// If the type name is longer than 200 bytes.
@@ -26,7 +26,7 @@ impl LayoutName {
         Self::new(type_name, Hash::new().text(type_name).fields(&Stamp::FIELDS).fields(fields))
     }
 
-    /// The name of a fleet's layout, which has these vectors.
+    /// Creates the name of a fleet's layout with these vectors.
     ///
     /// # Panics
     /// As [`from_fields`](Self::from_fields).
@@ -54,22 +54,22 @@ impl LayoutName {
         Self { bytes, length: name.len() + SUFFIX }
     }
 
-    /// The name as a text.
+    /// Returns the name as text.
     pub const fn as_str(&self) -> &str {
         match core::str::from_utf8(self.bytes.split_at(self.length).0) {
             Ok(text) => text,
-            // It was made of a text.
+            // Unreachable: the bytes come from a `str`.
             Err(_) => "",
         }
     }
 }
 
-/// The type name in the name of a layout; all of it where there is no hash.
+/// Returns the type name in a layout name; all of the text if it has no hash.
 pub fn type_name_of(layout: &str) -> &str {
     layout.split_once('#').map_or(layout, |(type_name, _)| type_name)
 }
 
-/// FNV-1a, 64 bits.
+/// The 64-bit FNV-1a hash.
 #[derive(Clone, Copy)]
 struct Hash(u64);
 
@@ -99,7 +99,7 @@ impl Hash {
             self = self.byte(bytes[index]);
             index += 1;
         }
-        // No byte of UTF-8: where one text ends and the next begins counts too.
+        // 0xff is not a byte of UTF-8, so the boundary between two texts counts too.
         self.byte(0xff)
     }
 
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_differs_in_a_layout_differs_in_its_name() {
+    fn different_layouts_have_different_names() {
         use FieldKind::{F64, U64};
         let layouts = [
             LayoutName::from_fields("x/y/v1", &[field("a", 32, F64, 1), field("b", 40, F64, 1)]),
@@ -145,9 +145,9 @@ mod tests {
         assert!(names.iter().all(|name| type_name_of(name).len() == 6 && name.len() == 6 + SUFFIX), "{names:?}");
     }
 
-    /// Devices and foreign programs have the names of our layouts in their sources.
+    /// The sources of devices and foreign programs contain the names of our layouts.
     #[test]
-    fn the_names_of_shipped_layouts_stay_as_they_are() {
+    fn the_names_of_shipped_layouts_do_not_change() {
         use super::super::{RateCommand, RateMeasurement, RateTruth, Sample};
         assert_eq!(RateCommand::LAYOUT, "corotate/rigid-body/command/v2#ff8ce508");
         assert_eq!(RateMeasurement::LAYOUT, "corotate/rigid-body/measurement/v1#bcfd8b41");

@@ -1,8 +1,8 @@
-//! What travels between roles: fixed-size plain data, the same bytes in memory, on the wire and in a recording.
+//! The samples that roles exchange: fixed-size plain data, the same bytes in memory, on the wire and in a recording.
 //!
-//! Every sample is a `repr(C)` struct of `u64` and `f64` without padding, begins with a [`Stamp`], and carries a versioned
-//! type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of layout changes the
-//! version in the name. Must not know how samples travel.
+//! Every sample is a `repr(C)` struct of `u64` and `f64` without padding, begins with a [`Stamp`], and has a
+//! versioned type name. Its bytes are the little-endian CDR body of the message with the same fields. A change of
+//! layout changes the version in the name. Samples must not depend on the transport.
 
 #[cfg(feature = "std")]
 mod definition;
@@ -22,17 +22,18 @@ pub use orbit::{OrbitCommand, OrbitEstimate, OrbitMeasurement, OrbitTruth};
 pub use rigid::{RateCommand, RateEstimate, RateMeasurement, RateTruth};
 pub use run::{Health, Phase, RoleState, Schedule};
 
-/// What every sample begins with.
+/// The header of every sample.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Stamp {
-    /// The tick k whose instant T_k this sample belongs to.
+    /// The tick k; the sample belongs to the instant T_k.
     pub tick: u64,
-    /// How often the sender has started in this run, from 1. 0 marks a warm-up sample, which no role uses.
+    /// The number of the sender's starts in this run, from 1. 0 marks a warm-up sample, which no role uses.
     pub generation: u64,
-    /// When the tick was due at the body whose measurement began this chain, ns on the monotonic clock. Copied along.
+    /// The due time of the tick at the body whose measurement began this chain, ns on the monotonic clock. Copied
+    /// from input to output.
     pub origin_ns: u64,
-    /// When the sample was handed to the link, ns on the monotonic clock.
+    /// The time at which the sample was handed to the link, ns on the monotonic clock.
     pub sent_ns: u64,
 }
 
@@ -45,7 +46,8 @@ impl Stamp {
         Self::field("sent_ns", core::mem::offset_of!(Self, sent_ns)),
     ];
 
-    /// Whether it is of a warm-up sample. A sample of a later tick is none, though a fault has broken its generation.
+    /// Returns true for a warm-up sample. A sample of a later tick is not one, even if a fault has cleared its
+    /// generation.
     #[inline]
     pub fn is_warm_up(&self) -> bool {
         (self.tick, self.generation) == (0, 0)
@@ -56,13 +58,14 @@ impl Stamp {
     }
 }
 
-/// Set in a stamp's generation: of this tick there is no sample, and there will be none. A void.
+/// The bit of a stamp's generation that marks a no-sample marker: there is no sample of this tick, and there will not be
+/// one.
 ///
-/// Where everybody waits for inputs (lockstep, one thread), a sample that is missing would stop the loop; a void stands in
-/// its place. Readers count it and treat the tick as they treat a sample that was lost. Real time needs none.
+/// Roles that wait for their inputs (lockstep, one thread) would stop at a missing sample; the marker takes its
+/// place. Readers count it and treat the tick like one whose sample was lost. Real time does not need it.
 pub const NO_SAMPLE: u64 = 1 << 63;
 
-/// The type of one field's elements.
+/// The type of a field's elements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FieldKind {
     /// Unsigned 64-bit integer.
@@ -71,24 +74,24 @@ pub enum FieldKind {
     F64,
 }
 
-/// Where one field lies within a sample.
+/// The location of one field in a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Field {
-    /// Its name; the unit is its last part.
+    /// The name; the unit is its last part.
     pub name: &'static str,
-    /// Bytes from the start of the sample.
+    /// The offset from the start of the sample, bytes.
     pub offset: usize,
-    /// The type of its elements.
+    /// The type of the elements.
     pub kind: FieldKind,
-    /// How many elements: 1 for a scalar.
+    /// The number of elements: 1 for a scalar.
     pub count: usize,
 }
 
-/// A type that a sample may have as a field: 8-byte elements, so that natural alignment leaves no padding.
+/// A type permitted as a sample's field: 8-byte elements, so that natural alignment leaves no padding.
 pub trait FieldType {
     /// The type of the elements.
     const KIND: FieldKind;
-    /// How many.
+    /// The number of elements.
     const COUNT: usize;
 }
 
@@ -107,36 +110,37 @@ impl<T: FieldType, const N: usize> FieldType for [T; N] {
     const COUNT: usize = N * T::COUNT;
 }
 
-/// What travels on a link, whatever its length: words of 8 bytes, a stamp at the start.
+/// Data of any length that a link carries: words of 8 bytes, a stamp at the start.
 pub trait Message: core::fmt::Debug + Send + Sync {
-    /// The stamp.
+    /// Returns the stamp.
     fn stamp(&self) -> &Stamp;
-    /// The stamp, to be written.
+    /// Returns the stamp for writing.
     fn stamp_mut(&mut self) -> &mut Stamp;
-    /// All of it.
+    /// Returns all words, those of the stamp first.
     fn words(&self) -> &[u64];
-    /// All of it, to be written.
+    /// Returns all words for writing.
     fn words_mut(&mut self) -> &mut [u64];
 
-    /// The bytes of everything but the stamp: what the state hash covers.
+    /// Returns the bytes after the stamp, which the state hash covers.
     #[inline]
     fn content(&self) -> &[u8] {
         &bytemuck::cast_slice(self.words())[size_of::<Stamp>()..]
     }
 }
 
-/// A sample: plain bytes, a stamp at the start, a versioned name, a table of its fields.
+/// A fixed-size sample: plain bytes, a stamp at the start, a versioned name, a table of its fields.
 pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
-    /// Name and version of the layout, unique among all samples.
+    /// The name and version of the layout, unique among all samples.
     const TYPE_NAME: &'static str;
     /// The fields after the stamp, in order.
     const FIELDS: &'static [Field];
-    /// [`LAYOUT`](Self::LAYOUT), as the compiler makes it.
+    /// [`LAYOUT`](Self::LAYOUT) as computed at compile time.
     const LAYOUT_NAME: LayoutName = LayoutName::from_fields(Self::TYPE_NAME, Self::FIELDS);
-    /// The type name with a hash of the fields: by it the ends of links, seats and devices know that they mean the same.
+    /// The type name with a hash of the fields. Links, seat descriptions and devices compare it to detect different
+    /// layouts.
     const LAYOUT: &'static str = Self::LAYOUT_NAME.as_str();
 
-    /// Whether all of its numbers are numbers, and finite.
+    /// Returns true if all floating-point fields are finite.
     fn finite(&self) -> bool {
         let words = self.words();
         let mut numbers = Self::FIELDS.iter().filter(|field| field.kind == FieldKind::F64);
@@ -146,8 +150,8 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
         numbers.all(finite)
     }
 
-    /// Takes over everything but the stamp from the bytes that [`content`](Message::content) gave elsewhere; false, and
-    /// nothing changed, if they are not as many.
+    /// Copies everything after the stamp from the [`content`](Message::content) of another sample. Returns false and
+    /// changes nothing if the lengths differ.
     fn set_content(&mut self, content: &[u8]) -> bool {
         let own = &mut bytemuck::bytes_of_mut(self)[size_of::<Stamp>()..];
         let fits = own.len() == content.len();
@@ -158,32 +162,35 @@ pub trait Sample: Message + bytemuck::Pod + Default + PartialEq {
     }
 }
 
-/// Bytes of a sample's content.
+/// Returns the length of a sample's content, bytes.
 pub const fn content_length<S: Sample>() -> usize {
     size_of::<S>() - size_of::<Stamp>()
 }
 
-/// Copies every field of `from` into the field of the same name and kind in `to`, if there is one; the stamps stay.
+/// Copies every field of `from` into the field of `to` with the same name, type and length, if there is one. The
+/// stamps stay.
 pub fn copy_fields<A: Sample, B: Sample>(from: &A, to: &mut B) {
     let (source, target) = (bytemuck::bytes_of(from), bytemuck::bytes_of_mut(to));
     for field in A::FIELDS {
-        let same = |other: &&Field| (other.name, other.kind, other.count) == (field.name, field.kind, field.count);
-        if let Some(other) = B::FIELDS.iter().find(same) {
+        let same = |candidate: &&Field| {
+            (candidate.name, candidate.kind, candidate.count) == (field.name, field.kind, field.count)
+        };
+        if let Some(matching) = B::FIELDS.iter().find(same) {
             let length = 8 * field.count;
-            target[other.offset..][..length].copy_from_slice(&source[field.offset..][..length]);
+            target[matching.offset..][..length].copy_from_slice(&source[field.offset..][..length]);
         }
     }
 }
 
-/// Defines a sample: its name, its type name with a version, and its fields, of `f64`, `u64` or arrays of them.
+/// Defines a sample: its name, its versioned type name, and its fields of `f64`, `u64` or arrays of them.
 ///
-/// `Pod` refuses padding at compile time; the size is the sum of the fields and a multiple of 8. A field's unit is the last
-/// part of its name.
+/// `Pod` rejects padding at compile time. The size is the sum of the fields and a multiple of 8. A field's unit is
+/// the last part of its name.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
 /// corotate::sample! {
-///     /// What a motor's sensors report.
+///     /// The sensor readings of a motor.
 ///     MotorMeasurement = "motor/Measurement/v1" {
 ///         /// Angular velocity, rad/s.
 ///         speed_rad_s: f64,
@@ -204,7 +211,7 @@ macro_rules! sample {
         #[derive(Debug, Clone, Copy, Default, PartialEq, $crate::bytemuck::Pod, $crate::bytemuck::Zeroable)]
         #[bytemuck(crate = "corotate::bytemuck")]
         pub struct $name {
-            /// When, in which life of the sender, and for which tick.
+            /// The tick, the sender's generation and the times of the sample.
             pub stamp: $crate::sample::Stamp,
             $($(#[$field_doc])* pub $field: $ty,)+
         }
@@ -257,34 +264,35 @@ macro_rules! sample {
 }
 pub use crate::sample;
 
-/// Bits of a sample's status word.
+/// The bits of a sample's status word.
 pub mod status {
-    /// The plant had no command for this tick in time and holds the last one.
+    /// The plant received no command for this tick in time and holds the last one.
     pub const HOLDING: u64 = 1 << 0;
     /// The plant applies its safe command.
     pub const SAFE: u64 = 1 << 1;
     /// The estimate is the configured guess: nothing has been observed yet.
     pub const INITIAL: u64 = 1 << 2;
-    /// The motion did not reveal the unknown since the last sample: the estimate moved by the model alone.
+    /// The motion carried no information about the unknown since the last sample: the estimate advanced by the model
+    /// alone.
     pub const UNOBSERVABLE: u64 = 1 << 3;
-    /// The measurement lacked a component that the observer needs, or was not finite: the estimate went on by the model
-    /// alone, or is the previous one where the model is being learned.
+    /// The measurement lacked a required component or was not finite. The estimate advanced by the model alone, or
+    /// stayed if the model is still being learned.
     pub const UNUSABLE: u64 = 1 << 4;
-    /// The observer learns the body's inertia from all components.
+    /// The observer learns the body's inertia while all components are measured.
     pub const LEARNING: u64 = 1 << 5;
-    /// A component that used to be measured is supplied by the observer.
+    /// The observer supplies a component that is no longer measured.
     pub const AXIS_LOST: u64 = 1 << 6;
-    /// The component was lost before the inertia had been learned: bounded, but not to be trusted.
+    /// The component was lost before the inertia had been learned: the estimate is bounded but not reliable.
     pub const DEGRADED: u64 = 1 << 7;
     /// The motion does not excite the identifier.
     pub const NOT_EXCITED: u64 = 1 << 8;
-    /// The body met an end of its model (it hit something, or left for good) and is frozen at its last good state.
+    /// The body reached a limit of its model (a collision or an escape) and is frozen at its last valid state.
     pub const FAULT: u64 = 1 << 9;
-    /// The input of this tick was there and was not believed: not finite, of a wrong life of its sender, or physically
+    /// The input of this tick arrived but was not accepted: not finite, of an impossible generation, or physically
     /// impossible. It is treated as missing.
     pub const REJECTED: u64 = 1 << 10;
 
-    /// Every bit with its name.
+    /// All bits with their names.
     pub const NAMES: [(&str, u64); 11] = [
         ("holding", HOLDING),
         ("safe", SAFE),
@@ -308,7 +316,7 @@ mod tests {
         let mut next = 0;
         for field in Stamp::FIELDS {
             assert_eq!(field.offset, next, "{} follows its predecessor", field.name);
-            assert!(S::FIELDS.iter().all(|other| other.name != field.name), "{}: {}", S::TYPE_NAME, field.name);
+            assert!(S::FIELDS.iter().all(|content| content.name != field.name), "{}: {}", S::TYPE_NAME, field.name);
             next += 8 * field.count;
         }
         assert_eq!(next, size_of::<Stamp>(), "the fields fill the stamp");
@@ -328,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn content_goes_from_sample_to_sample_whole_or_not_at_all() {
+    fn set_content_copies_all_or_nothing() {
         let sent = RateCommand { acceleration_rad_s2: [1.0, 2.0, 3.0], ..RateCommand::default() };
         let mut received = RateCommand { stamp: Stamp { tick: 7, ..Stamp::default() }, ..RateCommand::default() };
         assert!(!received.set_content(&sent.content()[1..]) && received.acceleration_rad_s2 == [0.0; 3]);
@@ -337,9 +345,10 @@ mod tests {
         assert_eq!(content_length::<RateCommand>(), sent.content().len());
     }
 
-    /// What a device measures completely is its truth, in every rig: each field of the truth is one of the measurement.
+    /// In every rig each field of the truth is also a field of the measurement, so a device that measures its whole
+    /// state reports its truth.
     #[test]
-    fn fields_of_one_name_are_copied() {
+    fn fields_of_equal_name_are_copied() {
         let measured = RateMeasurement {
             omega_rad_s: [1.0, 2.0, 3.0],
             applied_rad_s2: [4.0, 5.0, 6.0],

@@ -1,34 +1,35 @@
-//! Samples by which the launcher and the roles of a run agree on its phases. The same in every rig.
+//! Samples that coordinate the phases of a run between the launcher and the roles. The same for every rig.
 
 use super::sample;
 
 sample! {
-    /// The launcher's word to all roles. The stamp's tick counts the announcements.
+    /// The phase of the run, published by the launcher to all roles. The stamp's tick counts the announcements.
     Schedule = "corotate/run/schedule/v1" {
-        /// A [`Phase`] as a number.
+        /// The number of a [`Phase`].
         phase: u64,
-        /// T_0 on the monotonic clock, ns; meaningful from [`Phase::Run`] on, in real time.
+        /// T_0 on the monotonic clock, ns; valid from [`Phase::Run`] on, in real time.
         epoch_ns: u64,
-        /// Ticks up to this one have been seen by the slowest consumer (lockstep).
+        /// The last tick that the slowest consumer has read (lockstep).
         credit_tick: u64,
     }
 }
 
 sample! {
-    /// A role's word to the launcher. The stamp's tick is the next one that the role will execute.
+    /// The heartbeat of a role, published to the launcher. The stamp's tick is the next one that the role will
+    /// execute.
     Health = "corotate/run/health/v1" {
-        /// A [`RoleState`] as a number.
+        /// The number of a [`RoleState`].
         state: u64,
-        /// Ticks executed.
+        /// The number of ticks executed.
         executed: u64,
-        /// Ticks missed.
+        /// The number of ticks missed.
         missed: u64,
-        /// Privileges that were asked for and not granted.
+        /// The number of privileges requested and not granted.
         denied: u64,
     }
 }
 
-/// Where a run stands.
+/// The phase of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u64)]
 pub enum Phase {
@@ -36,41 +37,41 @@ pub enum Phase {
     Gather = 0,
     /// Roles exercise their links with samples of generation 0.
     WarmUp = 1,
-    /// The epoch is set; ticks run.
+    /// The epoch is set; roles execute ticks.
     Run = 2,
-    /// Roles end after the tick at hand.
+    /// Roles end after the current tick.
     Stop = 3,
 }
 
 impl Phase {
-    /// Every phase with its name.
+    /// All phases with their names.
     pub const NAMES: [(&str, Self); 4] =
         [("gather", Self::Gather), ("warm_up", Self::WarmUp), ("run", Self::Run), ("stop", Self::Stop)];
 
-    /// The phase with this number; an unknown number reads as [`Phase::Stop`], the safe one.
+    /// Returns the phase with this number; an unknown number yields [`Phase::Stop`], the safe one.
     pub fn from_number(number: u64) -> Self {
         Self::NAMES.into_iter().find(|(_, phase)| *phase as u64 == number).map_or(Self::Stop, |(_, phase)| phase)
     }
 }
 
-/// Where a role stands.
+/// The state of a role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u64)]
 pub enum RoleState {
-    /// Not heard of yet.
+    /// No heartbeat has been received.
     Absent = 0,
     /// All links are open.
     Open = 1,
-    /// All links have been exercised; waits for the epoch.
+    /// All links have been exercised; the role waits for the epoch.
     Ready = 2,
-    /// Ticks run.
+    /// The role executes ticks.
     Running = 3,
-    /// The last tick is done and the report written.
+    /// The last tick is done and the report is written.
     Done = 4,
 }
 
 impl RoleState {
-    /// Every state with its name.
+    /// All states with their names.
     pub const NAMES: [(&str, Self); 5] = [
         ("absent", Self::Absent),
         ("open", Self::Open),
@@ -79,7 +80,7 @@ impl RoleState {
         ("done", Self::Done),
     ];
 
-    /// The state with this number; an unknown number reads as [`RoleState::Absent`].
+    /// Returns the state with this number; an unknown number yields [`RoleState::Absent`].
     pub fn from_number(number: u64) -> Self {
         Self::NAMES.into_iter().find(|(_, state)| *state as u64 == number).map_or(Self::Absent, |(_, state)| state)
     }
