@@ -97,7 +97,7 @@ pub fn run_foxglove(seat: &FoxgloveSeat, terminated: &AtomicBool) -> Result<(), 
         .map_err(|source| FoxgloveError::Join { source })?;
     let ended = show(seat, &scenario, &domain, &mut links, terminated);
     with_realtime_priority(|| drop(links));
-    domain.forget();
+    domain.remove_if_over();
     ended
 }
 

@@ -245,7 +245,7 @@ pub(super) fn status_word(pid: i32, key: &str) -> Option<u64> {
 /// What a domain's files take of shared memory, bytes.
 fn shared_bytes(domain: &Domain) -> u64 {
     let own = domain
-        .in_shared_memory()
+        .shared_memory_files()
         .chain(fs::read_dir(domain.shared("")).into_iter().flatten().flatten().map(|entry| entry.path()));
     own.filter_map(|path| fs::metadata(path).ok()).map(|data| data.blocks() * 512).sum()
 }

@@ -13,7 +13,7 @@ mod trial;
 pub use machine::{Demand, Machine};
 pub use trial::Trial;
 
-use crate::bus::domain::{Abandoned, DomainError, Found};
+use crate::bus::domain::{AbandonedFiles, DomainError, FoundDomain};
 use crate::runtime::{priority_remedy, refused_priority};
 use crate::telemetry::Host;
 use serde::Serialize;
@@ -130,7 +130,7 @@ impl fmt::Display for Diagnosis {
 }
 
 /// What is left of runs whose launcher was killed. Where others can write, nobody knows whose it is.
-pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
+pub fn leftovers(domains: Result<Vec<FoundDomain>, DomainError>) -> Check {
     let name = "leftover domains";
     let domains = match domains {
         Ok(domains) => domains,
@@ -140,7 +140,7 @@ pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
             return Check::bad("run directory", problem, remedy);
         }
     };
-    let dead: Vec<&Found> = domains.iter().filter(|found| !found.alive).collect();
+    let dead: Vec<&FoundDomain> = domains.iter().filter(|found| !found.alive).collect();
     let running = domains.len() - dead.len();
     match dead.first() {
         None => Check::ok(name, format!("none ({running} running)")),
@@ -153,8 +153,8 @@ pub fn leftovers(domains: Result<Vec<Found>, DomainError>) -> Check {
 }
 
 /// Returns the line on leftovers of dead runs in shared memory; none if there are none.
-pub fn left_in_shared_memory(left: Abandoned) -> Option<Check> {
-    let Abandoned { runs, files, bytes } = left;
+pub fn left_in_shared_memory(left: AbandonedFiles) -> Option<Check> {
+    let AbandonedFiles { runs, files, bytes } = left;
     let found = format!(
         "{files} files ({:.1} MiB) of {runs} dead runs whose directory is gone",
         bytes as f64 / f64::from(1 << 20)
@@ -192,7 +192,7 @@ mod tests {
 
     #[test]
     fn the_dead_are_told_and_the_living_are_not_blamed() {
-        let found = |alive| Found { root: "/run/corotate/00000000".into(), alive, made: None };
+        let found = |alive| FoundDomain { root: "/run/corotate/00000000".into(), alive, made: None };
         assert_eq!(leftovers(Ok(vec![found(true)])).verdict, Verdict::Ok);
         let check = leftovers(Ok(vec![found(true), found(false)]));
         assert!(check.verdict == Verdict::Warn && check.found.starts_with("1 of dead runs"), "{check:?}");

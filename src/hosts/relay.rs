@@ -190,7 +190,7 @@ pub fn run_relay(seat: &RelaySeat, terminated: &AtomicBool) -> Result<(), RelayE
         if plan.own == plan.hub { write(&relay_report_path(domain.root(), own), &text) } else { Ok(()) }
     });
     drop((relay, bus));
-    domain.forget();
+    domain.remove_if_over();
     written
 }
 

@@ -192,7 +192,7 @@ pub fn janitor(
     let mut gone = Vec::new();
     for pause_ms in [0, 50, 500] {
         std::thread::sleep(Duration::from_millis(pause_ms));
-        gone.iter().for_each(Domain::forget);
+        gone.iter().for_each(Domain::remove_if_over);
         gone.extend(domain::remove_dead_domains().unwrap_or_default());
     }
     Ok(())

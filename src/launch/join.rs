@@ -65,7 +65,7 @@ pub fn join(
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
     };
-    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
+    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.with_opening_limit(startup_limit);
     let mut relay = RelayWatch::start(Some(seat), hub, scenario, domain)?;
     while !relay.ready()? {
         if launch.signal.load(Ordering::Relaxed) != 0 {

@@ -80,7 +80,7 @@ pub(super) fn run(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcom
         ClockKind::Realtime => hold_low_latency_idle(&scenario.realtime),
         _ => (None, Vec::new()),
     };
-    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.within(startup_limit);
+    let bus = IoxBus::enter(domain, "launcher", depths(scenario))?.with_opening_limit(startup_limit);
     let mut supervisor = Supervisor::start(scenario, launch, domain, &bus, &mut janitor)?;
     let mut scorer = open_scorer(scenario, &bus).map_err(|error| supervisor.blame(error.into()))?;
     let signal = supervisor.run_phases(&mut *scorer, launch, &grants).map_err(|error| supervisor.blame(error))?;

@@ -145,7 +145,7 @@ impl RecorderWatch {
     /// Whether there is one that takes samples, or is about to: from its first word on.
     fn active(&self) -> bool {
         let records = (RoleState::Ready..RoleState::Done).contains(&self.state());
-        records && self.problem.is_none() && self.health.written()
+        records && self.problem.is_none() && self.health.has_writer()
     }
 
     fn state(&self) -> RoleState {

@@ -219,7 +219,7 @@ impl Member {
             if self.host.is_none() {
                 self.occupant.look(trace.writer(), before, trace.newest().1, now_ns);
             }
-            if !self.health.written() && told != self.last && self.state() < RoleState::Done {
+            if !self.health.has_writer() && told != self.last && self.state() < RoleState::Done {
                 self.last = told;
                 self.silent_ns = 0;
             }
@@ -306,7 +306,7 @@ impl Member {
     /// Whether nothing more will come of it, though it need not have come to its last tick: it is seen by its samples alone,
     /// and none is due.
     pub fn spent(&self) -> bool {
-        self.over && self.trace.is_some() && !self.health.written()
+        self.over && self.trace.is_some() && !self.health.has_writer()
     }
 
     /// Returns the incident of an external role whose program has been replaced by another: once, when that sends.
@@ -336,7 +336,7 @@ impl Member {
     pub fn lingers(&mut self) -> bool {
         match &mut self.process {
             Some(process) => process.ended().is_none(),
-            None => self.external && !self.lost && self.health.written(),
+            None => self.external && !self.lost && self.health.has_writer(),
         }
     }
 
@@ -388,7 +388,7 @@ impl Member {
     /// `launch.external_timeout_s`, which in real time is the limit of a role that is alive. One that is only seen by its samples
     /// may have missed its last ticks in real time: then it is done, if it is still there once its remains would have been removed.
     fn fell_silent(&mut self, scenario: &Scenario, janitor: &mut Janitor) -> Option<Failure> {
-        let (state, tells) = (self.state(), self.health.written());
+        let (state, tells) = (self.state(), self.health.has_writer());
         let present = tells || self.trace.as_ref().is_some_and(Trace::written);
         let left = || ("left", "it left before its last tick".to_owned());
         let panic = panic_path(janitor.root(), &self.name);

@@ -104,7 +104,7 @@ impl Trace {
 
     /// Whether all signals have a writer.
     pub fn written(&self) -> bool {
-        self.signals.iter().all(|traced| traced.end.written())
+        self.signals.iter().all(|traced| traced.end.has_writer())
     }
 
     /// The first sample that keeps others waiting, as of the last [look](Self::look). `next_tick` tells where a role stands,

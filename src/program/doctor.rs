@@ -4,7 +4,7 @@ use super::hosts::{self, KeyArguments};
 use super::output::{Ended, Exit, Failure, fail, say};
 use super::scenario::{Change, load};
 use super::signals::catch_signals;
-use crate::bus::domain::{DomainError, abandoned, domains, remove_dead_domains};
+use crate::bus::domain::{DomainError, domains, remove_dead_domains, scan_abandoned};
 use crate::doctor::{Check, Demand, Diagnosis, Machine, Trial, Verdict, left_in_shared_memory, leftovers, refused};
 use crate::hosts::Address;
 use crate::launch::{Launch, Progress, run};
@@ -66,9 +66,9 @@ pub fn doctor(arguments: &Arguments) -> Ended {
     }
     checks.push(leftovers(cleared.and_then(|_| domains())));
     if arguments.clean {
-        abandoned(true);
+        scan_abandoned(true);
     }
-    checks.extend(left_in_shared_memory(abandoned(false)));
+    checks.extend(left_in_shared_memory(scan_abandoned(false)));
     let trial = match (arguments.seconds > 0).then(|| attempt(arguments)).transpose() {
         Ok(trial) => trial,
         Err(Unmeasured::Exit(exit)) => return Err(exit),

@@ -66,7 +66,7 @@ pub fn run_recorder(seat: &RecorderSeat, terminated: &AtomicBool) -> Result<Reco
     let _ = write_whole(&path, &text);
     let _ = line.say(RoleState::Done, u64::MAX);
     drop((line, bus));
-    domain.forget();
+    domain.remove_if_over();
     Ok(report)
 }
 

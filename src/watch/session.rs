@@ -117,7 +117,7 @@ impl Session {
         if let Some(joined) = self.joined.take() {
             with_realtime_priority(|| drop(joined));
             self.model.ended = true;
-            self.domain.forget();
+            self.domain.remove_if_over();
         }
     }
 }

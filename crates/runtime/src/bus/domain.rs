@@ -205,7 +205,7 @@ impl OwnedDomain {
                 return Err(DomainError::TooLong { path: root });
             }
             // The lock comes first: a domain without a lock that is held counts as dead.
-            let Some(lock) = lock(&lock_path(&root), Lock::New)? else { continue };
+            let Some(lock) = lock(&lock_path(&root), LockMode::New)? else { continue };
             // Removed again if it cannot be completed.
             let mut owned = Self { domain: Domain { root }, _lock: lock, _shared: None };
             let root = owned.domain.root();
@@ -259,7 +259,7 @@ impl Domain {
         let made = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&count);
         made.and_then(|mut file| file.write_all(bytemuck::bytes_of(&NO_NODES)))
             .map_err(|error| failed(&count, error))?;
-        let shared = Path::new(SHARED_MEMORY).join(format!("{}-{}", self.mark(), random_id()?));
+        let shared = Path::new(SHARED_MEMORY).join(format!("{}-{}", self.name_stem(), random_id()?));
         let link = self.root.join(OWN_SHARED);
         symlink(&shared, &link).map_err(|error| failed(&link, error))?;
         DirBuilder::new().mode(0o700).create(&shared).map_err(|error| failed(&shared, error))?;
@@ -288,20 +288,20 @@ impl Domain {
     }
 
     /// Removes what a process that left late has made anew in a domain that is gone.
-    pub fn forget(&self) {
+    pub fn remove_if_over(&self) {
         if !self.exists() {
             self.remove();
         }
     }
 
     /// What the names of all its files in shared memory begin with.
-    fn mark(&self) -> String {
+    fn name_stem(&self) -> String {
         format!("{PREFIX}{}", self.root.file_name().unwrap_or_default().to_string_lossy())
     }
 
     /// What the names of the transport's files in shared memory begin with.
     pub fn prefix(&self) -> String {
-        self.mark() + "_"
+        self.name_stem() + "_"
     }
 
     /// Where a file of ours lies in shared memory that goes with the domain.
@@ -311,11 +311,11 @@ impl Domain {
 
     /// What is the domain's in shared memory: the transport's files, and the directory of our own. What another user has put
     /// there under such a name is not.
-    pub fn in_shared_memory(&self) -> impl Iterator<Item = PathBuf> {
-        let (mark, user) = (self.mark(), user());
+    pub fn shared_memory_files(&self) -> impl Iterator<Item = PathBuf> {
+        let (stem, user) = (self.name_stem(), user());
         let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
         entries
-            .filter(move |entry| entry.file_name().to_string_lossy().starts_with(&mark))
+            .filter(move |entry| entry.file_name().to_string_lossy().starts_with(&stem))
             .filter(move |entry| entry.metadata().is_ok_and(|file| file.uid() == user))
             .map(|entry| entry.path())
     }
@@ -340,7 +340,7 @@ impl Domain {
 
     /// Removes what is the domain's in shared memory.
     fn remove_shared(&self) {
-        self.in_shared_memory().for_each(|path| {
+        self.shared_memory_files().for_each(|path| {
             let _ = fs::remove_file(&path).or_else(|_| fs::remove_dir_all(path));
         });
     }
@@ -351,7 +351,7 @@ impl Domain {
         let _ = fs::remove_dir_all(&self.root);
         // What could not be removed stays marked, for the next run of this user.
         let gone = matches!(self.root.try_exists(), Ok(false));
-        if gone && self.in_shared_memory().next().is_none() {
+        if gone && self.shared_memory_files().next().is_none() {
             let _ = fs::remove_file(lock_path(&self.root));
         }
         // The directory of all domains goes with the last; it is not empty while another run lives.
@@ -369,7 +369,7 @@ pub fn remove_dead_domains() -> Result<Vec<Domain>, PrivacyError> {
 
 /// Files of a dead run in shared memory whose domain directory is gone, as that of a container.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Abandoned {
+pub struct AbandonedFiles {
     /// Runs.
     pub runs: usize,
     /// Files of theirs.
@@ -380,16 +380,16 @@ pub struct Abandoned {
 
 /// Finds what dead runs of this user have left in shared memory while the directories of their domains are gone, and removes it if
 /// `clean` says so.
-pub fn abandoned(clean: bool) -> Abandoned {
+pub fn scan_abandoned(clean: bool) -> AbandonedFiles {
     let mut ids: Vec<String> = entries(Path::new(SHARED_MEMORY)).filter_map(|path| id_of(&path)).collect();
     ids.sort();
     ids.dedup();
-    let mut all = Abandoned::default();
+    let mut all = AbandonedFiles::default();
     for id in ids {
         let domain = Domain { root: base().join(id) };
         // Held until all is removed: a launcher that is only beginning does not get these locks, and begins anew.
         let Some(_locks) = domain.lock_abandoned() else { continue };
-        for path in domain.in_shared_memory() {
+        for path in domain.shared_memory_files() {
             let within = entries(&path).chain([path]).filter_map(|path| fs::symlink_metadata(path).ok());
             for file in within.filter(Metadata::is_file) {
                 all.files += 1;
@@ -431,7 +431,7 @@ impl Domain {
             return None;
         }
         let mut locks = Vec::new();
-        for path in self.in_shared_memory() {
+        for path in self.shared_memory_files() {
             let about = fs::symlink_metadata(&path).ok()?;
             if !about.is_dir() {
                 continue;
@@ -457,7 +457,7 @@ impl Domain {
         }
         if locks.is_empty() {
             let age = |path: PathBuf| fs::symlink_metadata(path).ok()?.modified().ok()?.elapsed().ok();
-            return self.in_shared_memory().all(|path| age(path).is_some_and(|age| age > BEGUN)).then_some(locks);
+            return self.shared_memory_files().all(|path| age(path).is_some_and(|age| age > BEGUN)).then_some(locks);
         }
         Some(locks)
     }
@@ -465,7 +465,7 @@ impl Domain {
 
 /// A domain that was found, of a run or of what is left of one.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Found {
+pub struct FoundDomain {
     /// Its directory.
     pub root: PathBuf,
     /// Whether its launcher is alive.
@@ -478,18 +478,18 @@ pub struct Found {
 ///
 /// # Errors
 /// [`DomainError::Privacy`].
-pub fn domains() -> Result<Vec<Found>, DomainError> {
-    Ok(private_base()?.map_or(Vec::new(), |base| found(&base)))
+pub fn domains() -> Result<Vec<FoundDomain>, DomainError> {
+    Ok(private_base()?.map_or(Vec::new(), |base| find_domains(&base)))
 }
 
-fn found(base: &Path) -> Vec<Found> {
+fn find_domains(base: &Path) -> Vec<FoundDomain> {
     let find = |path: PathBuf| {
         let made = fs::metadata(&path).and_then(|lock| lock.modified()).ok();
         // Whoever holds the lock is alive; one that is ours now was nobody's, and is let go of at once.
-        let alive = !matches!(lock(&path, Lock::Existing), Ok(Some(_)));
-        Found { root: path.with_extension(""), alive, made }
+        let alive = !matches!(lock(&path, LockMode::Existing), Ok(Some(_)));
+        FoundDomain { root: path.with_extension(""), alive, made }
     };
-    let mut found: Vec<Found> = locks(base).map(find).collect();
+    let mut found: Vec<FoundDomain> = locks(base).map(find).collect();
     found.sort_by_key(|found| std::cmp::Reverse(found.made));
     found
 }
@@ -529,19 +529,19 @@ pub fn require_files(needed: u64) -> Result<(), DomainError> {
 
 fn remove_dead(base: &Path) -> Vec<Domain> {
     let remove = |path: PathBuf| {
-        let _held = lock(&path, Lock::Existing).ok().flatten()?;
+        let _held = lock(&path, LockMode::Existing).ok().flatten()?;
         let domain = Domain { root: path.with_extension("") };
         domain.remove();
         Some(domain)
     };
     let mut removed: Vec<Domain> = locks(base).filter_map(remove).collect();
-    removed.extend(remade(base).inspect(Domain::remove));
+    removed.extend(recreated(base).inspect(Domain::remove));
     removed
 }
 
 /// Domains that are gone and were made anew by somebody who joined too late, and was killed: a launcher makes the lock before
 /// the directory, and removes it after.
-fn remade(base: &Path) -> impl Iterator<Item = Domain> {
+fn recreated(base: &Path) -> impl Iterator<Item = Domain> {
     let entries = fs::read_dir(base).into_iter().flatten().flatten();
     let named = entries.map(|entry| entry.path()).filter(|root| root.file_name().is_some_and(is_id));
     named.filter(|root| matches!(lock_path(root).try_exists(), Ok(false))).map(|root| Domain { root })
@@ -557,15 +557,15 @@ fn lock_path(root: &Path) -> PathBuf {
 
 /// Whether a lock is to be made or taken over.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Lock {
+enum LockMode {
     New,
     Existing,
 }
 
 /// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
-fn lock(path: &Path, lock: Lock) -> Result<Option<File>, DomainError> {
+fn lock(path: &Path, lock: LockMode) -> Result<Option<File>, DomainError> {
     let mut options = OpenOptions::new();
-    options.write(true).create_new(lock == Lock::New).mode(0o600);
+    options.write(true).create_new(lock == LockMode::New).mode(0o600);
     let file = match files::open_with(path, &mut options, OFlags::NOFOLLOW) {
         Err(error) if matches!(error.kind(), io::ErrorKind::AlreadyExists | io::ErrorKind::NotFound) => {
             return Ok(None);
@@ -576,7 +576,7 @@ fn lock(path: &Path, lock: Lock) -> Result<Option<File>, DomainError> {
         Ok(named) => Ok(named.then_some(file)),
         Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(None),
         Err(source) => {
-            if lock == Lock::New {
+            if lock == LockMode::New {
                 let _ = fs::remove_file(path);
             }
             Err(DomainError::Lock { path: path.to_owned(), source })
@@ -615,7 +615,7 @@ mod tests {
     fn what_a_dead_run_left_in_shared_memory_is_found_without_its_directory() {
         let elsewhere = tempfile::tempdir().unwrap();
         let domain = Domain { root: elsewhere.path().join(random_id().unwrap()) };
-        let left = || domain.in_shared_memory().count();
+        let left = || domain.shared_memory_files().count();
         let lock = domain.make_shared().unwrap_err();
         assert!(matches!(lock, DomainError::Create { .. }), "its directory is not there yet: {lock}");
         domain.remove_shared();
@@ -632,10 +632,10 @@ mod tests {
         fs::write(lock_path(domain.root()), b"").unwrap();
         assert!(domain.lock_abandoned().is_none(), "its base is there");
         fs::remove_file(lock_path(domain.root())).unwrap();
-        let found = abandoned(false);
+        let found = scan_abandoned(false);
         assert!(found.runs >= 1 && found.files >= 2 && found.bytes > 0, "{found:?}");
         assert_eq!(left(), 2);
-        abandoned(true);
+        scan_abandoned(true);
         assert_eq!(left(), 0);
         // Without its directory a file may be a launcher's that is only beginning.
         let young = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
@@ -655,9 +655,9 @@ mod tests {
         fs::create_dir(at("2")).unwrap();
         symlink("/dev/zero", at("3")).unwrap();
         let _socket = std::os::unix::net::UnixListener::bind(at("4")).unwrap();
-        assert!(found(base.path()).is_empty() && remove_dead(base.path()).is_empty());
+        assert!(find_domains(base.path()).is_empty() && remove_dead(base.path()).is_empty());
         for name in ["1", "2", "3", "4"] {
-            assert!(!matches!(lock(&at(name), Lock::Existing), Ok(Some(_))), "{name}");
+            assert!(!matches!(lock(&at(name), LockMode::Existing), Ok(Some(_))), "{name}");
             assert!(fs::symlink_metadata(at(name)).is_ok());
         }
     }
@@ -671,10 +671,11 @@ mod tests {
         let mut held = None;
         for root in [&dead, &living] {
             fs::create_dir(root).unwrap();
-            held = lock(&lock_path(root), Lock::New).unwrap();
+            held = lock(&lock_path(root), LockMode::New).unwrap();
         }
-        let alive =
-            |root: &PathBuf| found(base.path()).into_iter().find(|found| found.root == *root).map(|one| one.alive);
+        let alive = |root: &PathBuf| {
+            find_domains(base.path()).into_iter().find(|found| found.root == *root).map(|one| one.alive)
+        };
         assert_eq!((alive(&dead), alive(&living)), (Some(false), Some(true)));
         remove_dead(base.path());
         assert_eq!((alive(&dead), alive(&living)), (None, Some(true)));

@@ -17,9 +17,9 @@ pub(super) use service::{Ipc, enter};
 pub use single::{IoxReader, IoxWriter};
 
 use self::latest::LatestWriter;
-use self::opening::{Connections, Refusal};
+use self::opening::{Connections, OpenFailure};
 use self::service::{Wire, config};
-use self::single::{Current, Lane, NO_KEY};
+use self::single::{Current, LatestChannel, NO_KEY};
 use super::domain::Domain;
 use super::notifier::Notifiers;
 use super::{Bus, BusError, Depths, Reader, Signal, Topic};
@@ -43,7 +43,7 @@ impl IoxBus {
     /// # Errors
     /// [`BusError::Domain`].
     pub fn enter(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
-        Self::over(domain, name, depths, Notifiers::open(domain), true)
+        Self::with_notifiers(domain, name, depths, Notifiers::open(domain), true)
     }
 
     /// The same for one who only looks: of the signals nothing is made, and one that nobody has opened is an error.
@@ -51,41 +51,41 @@ impl IoxBus {
     /// # Errors
     /// [`BusError::Domain`].
     pub fn join(domain: &Domain, name: &str, depths: Depths) -> Result<Self, BusError> {
-        Self::over(domain, name, depths, Notifiers::join(domain), false)
+        Self::with_notifiers(domain, name, depths, Notifiers::join(domain), false)
     }
 
-    fn over(
+    fn with_notifiers(
         domain: &Domain,
         name: &str,
         depths: Depths,
         notifiers: io::Result<Notifiers>,
-        makes: bool,
+        creates: bool,
     ) -> Result<Self, BusError> {
-        cause::hear();
+        cause::capture_errors();
         let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
         let notifiers = notifiers.map_err(|error| failed(format!("{error}; {}", remedy(&error))))?;
         let node = Rc::new(enter(domain.root(), domain, name).map_err(failed)?);
-        Ok(Self { node, notifiers, depths, makes, domain: domain.clone(), opening_ns: OPENING_NS })
+        Ok(Self { node, notifiers, depths, creates, domain: domain.clone(), opening_ns: OPENING_NS })
     }
 
     /// The same, with another limit on how long an opening may take.
-    pub fn within(self, limit: Duration) -> Self {
+    pub fn with_opening_limit(self, limit: Duration) -> Self {
         Self { opening_ns: limit.as_nanos() as u64, ..self }
     }
 
     /// Whether a signal has a fast lane: where only the newest sample counts.
-    fn has_lane(&self, topic: &Topic) -> bool {
+    fn has_latest_channel(&self, topic: &Topic) -> bool {
         let for_roles = matches!(topic.signal, Signal::Measurement | Signal::Estimate | Signal::Command);
         for_roles && self.depths.role == 1
     }
 
     fn service<S: Sample>(&self, topic: &Topic, end: &'static str) -> Result<PortFactory<Ipc, Wire<S>, ()>, BusError> {
         self.open(topic, end, || {
-            let builder = self.builder::<Wire<S>>(topic, &Qos::of(topic.signal, self.depths))?;
-            let opened = if self.makes {
-                builder.open_or_create().map_err(Refusal::from)
+            let builder = self.builder::<Wire<S>>(topic, &Qos::for_signal(topic.signal, self.depths))?;
+            let opened = if self.creates {
+                builder.open_or_create().map_err(OpenFailure::from)
             } else {
-                builder.open().map_err(Refusal::from)
+                builder.open().map_err(OpenFailure::from)
             };
             opened.map_err(|refusal| self.explain(refusal, topic, S::LAYOUT))
         })
@@ -97,11 +97,11 @@ impl IoxBus {
         end: &'static str,
     ) -> Result<PortFactory<Ipc, [fleet::Word<L>], ()>, BusError> {
         self.open(topic, end, || {
-            let builder = self.builder::<[fleet::Word<L>]>(topic, &Qos::of_fleet(topic.signal, self.depths))?;
-            let opened = if self.makes {
-                builder.open_or_create().map_err(Refusal::from)
+            let builder = self.builder::<[fleet::Word<L>]>(topic, &Qos::for_fleet(topic.signal, self.depths))?;
+            let opened = if self.creates {
+                builder.open_or_create().map_err(OpenFailure::from)
             } else {
-                builder.open().map_err(Refusal::from)
+                builder.open().map_err(OpenFailure::from)
             };
             opened.map_err(|refusal| self.explain(refusal, topic, L::LAYOUT))
         })
@@ -111,8 +111,8 @@ impl IoxBus {
         &self,
         topic: &Topic,
         qos: &Qos,
-    ) -> Result<Builder<P, (), Ipc>, Refusal> {
-        let name: ServiceName = topic.to_string().as_str().try_into().map_err(Refusal::never)?;
+    ) -> Result<Builder<P, (), Ipc>, OpenFailure> {
+        let name: ServiceName = topic.to_string().as_str().try_into().map_err(OpenFailure::never)?;
         Ok(self
             .node
             .service_builder(&name)
@@ -155,21 +155,21 @@ impl Bus for IoxBus {
     type FleetReader<L: FleetLayout> = IoxFleetReader<L>;
 
     fn writer<S: Sample>(&self, topic: &Topic, generation: u64) -> Result<IoxWriter<S>, BusError> {
-        let lane = || self.open(topic, "writer", || LatestWriter::create(&self.node, topic, generation));
-        let latest = self.has_lane(topic).then(lane).transpose()?;
+        let channel = || self.open(topic, "writer", || LatestWriter::create(&self.node, topic, generation));
+        let latest = self.has_latest_channel(topic).then(channel).transpose()?;
         let service = self.service::<S>(topic, "writer")?;
         let publisher = self.open(topic, "writer", || {
             let connections = Connections::default();
             let builder = service.publisher_builder().max_loaned_samples(1);
             let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
-            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+            connections.check(builder.set_degradation_handler(connections.failure_handler()).create()?)
         })?;
         Ok(IoxWriter {
             publisher,
             latest,
             loan: None,
-            shown: None,
-            notifier: self.notifiers.of(topic),
+            unpublished: None,
+            notifier: self.notifiers.notifier_for(topic),
             topic: topic.clone(),
         })
     }
@@ -180,16 +180,28 @@ impl Bus for IoxBus {
         let subscriber = self.open(topic, "reader", || {
             let connections = Connections::default();
             let builder = service.subscriber_builder().buffer_size(depth);
-            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+            connections.check(builder.set_degradation_handler(connections.failure_handler()).create()?)
         })?;
         // Who reads every sample has no use for the latest.
-        let lane = match reader {
-            Reader::Role if self.has_lane(topic) => Lane::Wanted { generation: 1 },
-            _ => Lane::None,
+        let latest_channel = match reader {
+            Reader::Role if self.has_latest_channel(topic) => LatestChannel::Wanted { generation: 1 },
+            _ => LatestChannel::None,
         };
-        let (node, notifier, topic) = (self.node.clone(), self.notifiers.of(topic), topic.clone());
-        let (current, shown, pending, newest) = (Current::None, [NO_KEY; 2], None, (0, 0));
-        Ok(IoxReader { node, service, subscriber, current, shown, pending, newest, lane, idle: 0, notifier, topic })
+        let (node, notifier, topic) = (self.node.clone(), self.notifiers.notifier_for(topic), topic.clone());
+        let (current, channel_keys, pending, newest) = (Current::None, [NO_KEY; 2], None, (0, 0));
+        Ok(IoxReader {
+            node,
+            service,
+            subscriber,
+            current,
+            channel_keys,
+            pending,
+            newest,
+            latest_channel,
+            idle: 0,
+            notifier,
+            topic,
+        })
     }
 
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<IoxFleetWriter<L>, BusError> {
@@ -226,7 +238,7 @@ mod tests {
     #[test]
     fn the_transport_makes_nothing_that_is_open_to_others() {
         let domain = OwnedDomain::create(0).unwrap();
-        let shared = || domain.domain().in_shared_memory().map(|path| (path.metadata().unwrap(), path));
+        let shared = || domain.domain().shared_memory_files().map(|path| (path.metadata().unwrap(), path));
         let before: Vec<_> = shared().map(|(_, path)| path).collect();
         let first = enter(domain.domain().root(), domain.domain(), "first").unwrap();
         assert_eq!(shared().map(|(_, path)| path).collect::<Vec<_>>(), before, "a node alone makes no file");
@@ -258,9 +270,9 @@ mod tests {
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let mut newest = theirs.reader::<RateTruth>(&topic(), Reader::Role).unwrap();
         let mut every = theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
-        assert!(!newest.written());
+        assert!(!newest.has_writer());
         let mut writer = ours.writer::<RateTruth>(&topic(), 1).unwrap();
-        assert!(newest.written());
+        assert!(newest.has_writer());
         assert!(!newest.advance().unwrap() && !every.advance().unwrap());
         for tick in 0..5 {
             writer.prepare().unwrap();

@@ -8,12 +8,12 @@ use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
 /// One reader's waiting samples, the newest last; beyond the depth the oldest gives way.
-struct Waiting<S> {
+struct ReaderQueue<S> {
     samples: VecDeque<S>,
     depth: usize,
 }
 
-type Queue<S> = Rc<RefCell<Waiting<S>>>;
+type Queue<S> = Rc<RefCell<ReaderQueue<S>>>;
 /// The queues of a signal's readers. One whose reader is gone goes to the next reader, with what waits in it: a role that
 /// is built anew takes its predecessor's place.
 type Queues<S> = Rc<RefCell<Vec<Queue<S>>>>;
@@ -42,12 +42,12 @@ impl MemoryBus {
     }
 
     fn read<T: 'static>(&self, topic: &Topic, reader: Reader, type_name: &str) -> Result<MemoryReader<T>, BusError> {
-        let depth = self.depths.of(reader);
+        let depth = self.depths.for_reader(reader);
         let queues = self.queues(topic, "reader", type_name)?;
         let orphan = |queue: &&Queue<T>| Rc::strong_count(queue) == 1 && queue.borrow().depth == depth;
         let found = queues.borrow().iter().find(orphan).cloned();
         let queue = found.unwrap_or_else(|| {
-            let queue: Queue<T> = Rc::new(RefCell::new(Waiting { samples: VecDeque::with_capacity(depth), depth }));
+            let queue: Queue<T> = Rc::new(RefCell::new(ReaderQueue { samples: VecDeque::with_capacity(depth), depth }));
             queues.borrow_mut().push(queue.clone());
             queue
         });
@@ -91,7 +91,7 @@ impl Bus for MemoryBus {
 
 /// Hands a sample to every reader.
 #[inline]
-fn hand_out<T: Clone>(queues: &Queues<T>, sample: &T) {
+fn push_to_all<T: Clone>(queues: &Queues<T>, sample: &T) {
     for queue in queues.borrow().iter() {
         let mut queue = queue.borrow_mut();
         if queue.samples.len() == queue.depth {
@@ -116,7 +116,7 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
 
     #[inline]
     fn deliver(&mut self) -> Result<(), BusError> {
-        hand_out(&self.queues, &self.slot);
+        push_to_all(&self.queues, &self.slot);
         Ok(())
     }
 
@@ -153,7 +153,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for MemoryFleetWriter<L> {
 
     fn deliver(&mut self) -> Result<(), BusError> {
         if let Some(chunk) = self.chunks.get(self.filled) {
-            hand_out(&self.queues, chunk);
+            push_to_all(&self.queues, chunk);
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ mod words;
 pub use carried::{Carried, FleetBuffer};
 pub use names::{Signal, Topic};
 pub use port::Port;
-pub use words::{AnyBus, Ends, ReadWords, WordReader, WordWriter, WriteWords};
+pub use words::{AnyBus, EndOpeners, ReadWords, WordReader, WordWriter, WriteWords};
 
 use crate::sample::{FleetLayout, FleetSample, Sample};
 
@@ -87,7 +87,7 @@ pub struct Depths {
 
 impl Depths {
     /// For this kind of reader.
-    pub fn of(&self, reader: Reader) -> usize {
+    pub fn for_reader(&self, reader: Reader) -> usize {
         match reader {
             Reader::Role => self.role,
             Reader::Scorer => self.scorer,
@@ -167,7 +167,7 @@ pub trait Write<S: ?Sized> {
     ///
     /// # Errors
     /// [`BusError::Send`].
-    fn show(&mut self) -> Result<(), BusError> {
+    fn write_latest(&mut self) -> Result<(), BusError> {
         self.deliver()
     }
     /// Sends what was only shown, if anything was.
@@ -209,7 +209,7 @@ pub trait Read<S: ?Sized> {
     fn current(&self) -> Option<&S>;
     /// Whether somebody has the writing end open; one that was killed has until its remains are cleared. Within one thread it
     /// is always open.
-    fn written(&self) -> bool {
+    fn has_writer(&self) -> bool {
         true
     }
     /// The process that has the writing end open; none within one thread.

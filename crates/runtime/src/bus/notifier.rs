@@ -63,7 +63,7 @@ impl Notifiers {
     }
 
     /// The notifier of a signal.
-    pub fn of(&self, topic: &Topic) -> Notifier {
+    pub fn notifier_for(&self, topic: &Topic) -> Notifier {
         // XXH3 with seed 0 of the service's name: every build of this program must find the same.
         let hash = xxh3_64(topic.to_string().as_bytes());
         let (home, owner) = (hash as usize % NOTIFIERS, (hash >> 32) as u32 | 1);
@@ -148,14 +148,14 @@ mod tests {
         let (notifies, waits) = (domain.domain().clone(), domain.domain().clone());
         let (said, heard) = std::sync::mpsc::channel();
         let ringer = std::thread::spawn(move || {
-            let notifier = Notifiers::open(&notifies).unwrap().of(&topic("b"));
+            let notifier = Notifiers::open(&notifies).unwrap().notifier_for(&topic("b"));
             notifier.notify();
             while heard.try_recv().is_err() {
                 notifier.notify();
                 std::thread::yield_now();
             }
         });
-        let notifier = Notifiers::open(&waits).unwrap().of(&topic("b"));
+        let notifier = Notifiers::open(&waits).unwrap().notifier_for(&topic("b"));
         for _ in 0..200 {
             notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(false)).unwrap();
         }
@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn nobody_sleeps_over_news_or_longer_than_told() {
         let domain = OwnedDomain::create(0).unwrap();
-        let notifier = Notifiers::open(domain.domain()).unwrap().of(&topic("b"));
+        let notifier = Notifiers::open(domain.domain()).unwrap().notifier_for(&topic("b"));
         notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(true)).unwrap();
         notifier.sleep(0, || Ok::<_, Infallible>(false)).unwrap();
         assert_eq!(notifier.sleep(0, || Err(7)), Err(7));
@@ -177,7 +177,8 @@ mod tests {
     fn when_no_bell_is_left_signals_share() {
         let domain = OwnedDomain::create(0).unwrap();
         let notifiers = Notifiers::open(domain.domain()).unwrap();
-        let indices: Vec<usize> = (0..2 * NOTIFIERS).map(|n| notifiers.of(&topic(&n.to_string())).index).collect();
+        let indices: Vec<usize> =
+            (0..2 * NOTIFIERS).map(|n| notifiers.notifier_for(&topic(&n.to_string())).index).collect();
         assert!(indices.iter().all(|index| *index < NOTIFIERS * STRIDE));
     }
 
@@ -185,8 +186,8 @@ mod tests {
     fn the_bells_of_a_signal_are_one_for_every_process() {
         let domain = OwnedDomain::create(0).unwrap();
         let (one, other) = (Notifiers::open(domain.domain()).unwrap(), Notifiers::open(domain.domain()).unwrap());
-        let indices: Vec<usize> = (0..400).map(|n| one.of(&topic(&n.to_string())).index).collect();
-        assert_eq!(indices, (0..400).map(|n| other.of(&topic(&n.to_string())).index).collect::<Vec<_>>());
+        let indices: Vec<usize> = (0..400).map(|n| one.notifier_for(&topic(&n.to_string())).index).collect();
+        assert_eq!(indices, (0..400).map(|n| other.notifier_for(&topic(&n.to_string())).index).collect::<Vec<_>>());
         let distinct: std::collections::HashSet<usize> = indices.iter().copied().collect();
         assert_eq!(distinct.len(), indices.len(), "none is shared");
     }
@@ -195,7 +196,7 @@ mod tests {
     #[test]
     fn a_signal_has_the_same_place_in_every_build() {
         let domain = OwnedDomain::create(0).unwrap();
-        let notifier = Notifiers::open(domain.domain()).unwrap().of(&topic("b"));
+        let notifier = Notifiers::open(domain.domain()).unwrap().notifier_for(&topic("b"));
         // XXH3-64 of "corotate/s/b/estimate", by the reference implementation.
         const HASH: u64 = 0x4c41_63f9_45f3_9fcc;
         assert_eq!(notifier.index, HASH as usize % NOTIFIERS * STRIDE);

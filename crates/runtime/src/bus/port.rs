@@ -1,7 +1,7 @@
 //! A signal as data: its place, the layout of its samples, and what opens its ends without knowing their type.
 
 use super::iox::Qos;
-use super::{AnyBus, BusError, Carried, Depths, Ends, Reader, Topic, WordReader, WordWriter};
+use super::{AnyBus, BusError, Carried, Depths, EndOpeners, Reader, Topic, WordReader, WordWriter};
 use crate::sample::Field;
 
 /// One signal as it travels: where, and what its bytes mean.
@@ -20,23 +20,23 @@ pub struct Port {
     /// Whether it tells of a fleet, and travels as a slice of words.
     pub fleet: bool,
     bodies: usize,
-    ends: Ends,
+    ends: EndOpeners,
 }
 
 impl Port {
     /// The signal of a kind of sample, of a single body or of a fleet of so many.
-    pub fn of<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Self {
+    pub fn new<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Self {
         let bodies = fleet.unwrap_or(1);
         let size = S::length(bodies) * size_of::<u64>();
         let (type_name, layout) = (S::type_name(), S::layout());
-        let (fields, ends) = (S::fields(bodies), Ends::of::<S>());
+        let (fields, ends) = (S::fields(bodies), EndOpeners::for_sample::<S>());
         Self { topic, type_name, layout, size, fields, fleet: fleet.is_some(), bodies, ends }
     }
 
     /// What to ask of its service.
     pub fn qos(&self, depths: Depths) -> Qos {
         let signal = self.topic.signal;
-        if self.fleet { Qos::of_fleet(signal, depths) } else { Qos::of(signal, depths) }
+        if self.fleet { Qos::for_fleet(signal, depths) } else { Qos::for_signal(signal, depths) }
     }
 
     /// Opens it for reading, as words.

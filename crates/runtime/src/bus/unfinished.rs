@@ -45,7 +45,8 @@ impl Domain {
             |file: &Metadata| file.is_file() && (file.len() == 0 || file.permissions().mode() & READABLE == 0);
         let of_services = |file: &Metadata| file.permissions().mode() & WRITABLE != 0;
         let services = fs::read_dir(self.root().join("services")).into_iter().flatten().flatten();
-        let files = self.in_shared_memory().map(|path| (path, true)).chain(services.map(|entry| (entry.path(), false)));
+        let files =
+            self.shared_memory_files().map(|path| (path, true)).chain(services.map(|entry| (entry.path(), false)));
         let begun = files.filter_map(|(path, shared)| {
             let file = fs::symlink_metadata(&path).ok()?;
             let begun = if shared { in_shared_memory(&file) } else { of_services(&file) };

@@ -36,8 +36,8 @@ pub trait ReadWords {
     /// # Errors
     /// [`BusError::Receive`].
     fn next(&mut self) -> Result<Option<&[u64]>, BusError>;
-    /// Whether somebody has the writing end open, as [`Read::written`].
-    fn written(&self) -> bool;
+    /// Whether somebody has the writing end open, as [`Read::has_writer`].
+    fn has_writer(&self) -> bool;
     /// The process that has it open, as [`Read::writer`].
     fn writer(&self) -> Option<WriterProcess>;
     /// Sleeps until there may be a next sample, at most until `until_ns`, as [`Read::sleep`].
@@ -70,14 +70,14 @@ pub type WordWriter = Box<dyn WriteWords>;
 
 /// Opens the ends of signals that carry one kind of sample.
 #[derive(Debug, Clone, Copy)]
-pub struct Ends {
+pub struct EndOpeners {
     read: fn(AnyBus<'_>, &Topic, usize, Reader) -> Result<WordReader, BusError>,
     write: fn(AnyBus<'_>, &Topic, usize) -> Result<WordWriter, BusError>,
 }
 
-impl Ends {
+impl EndOpeners {
     /// Those of a kind of sample.
-    pub fn of<S: Carried + ?Sized>() -> Self {
+    pub fn for_sample<S: Carried + ?Sized>() -> Self {
         let read = |bus: AnyBus<'_>, topic: &Topic, bodies, reader| -> Result<WordReader, BusError> {
             Ok(match bus {
                 AnyBus::Memory(bus) => Box::new(End::<_, S>(S::reader(bus, topic, reader, bodies)?, PhantomData)),
@@ -124,8 +124,8 @@ impl<T: Read<S>, S: Carried + ?Sized> ReadWords for End<T, S> {
         Ok(if self.0.advance()? { self.0.current().map(|sample| sample.words()) } else { None })
     }
 
-    fn written(&self) -> bool {
-        self.0.written()
+    fn has_writer(&self) -> bool {
+        self.0.has_writer()
     }
 
     fn writer(&self) -> Option<WriterProcess> {

@@ -35,7 +35,7 @@ pub trait WordView {
 impl<R: Rig> WordView for R {
     fn signals(&self, scenario: &str) -> Vec<Port> {
         let topic = |body: &str, signal| Topic { scenario: scenario.to_owned(), body: body.to_owned(), signal };
-        let estimate = Port::of::<Estimate<R>>(topic(&self.bodies()[0].name, Signal::Estimate), None);
+        let estimate = Port::new::<Estimate<R>>(topic(&self.bodies()[0].name, Signal::Estimate), None);
         let of_body = |body: &BodyInfo| {
             let command = topic(&body.name, Signal::Command);
             let command = body.driven.then(|| either::<Command<R>, FleetCommand<R>>(command, body.fleet));
@@ -96,7 +96,7 @@ impl<R: Rig> WordView for R {
 
 /// The signal of a single body, or of a fleet.
 fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
-    if fleet.is_some() { Port::of::<Many>(topic, fleet) } else { Port::of::<One>(topic, None) }
+    if fleet.is_some() { Port::new::<Many>(topic, fleet) } else { Port::new::<One>(topic, None) }
 }
 
 /// Reads words as the sample that they are; none if they are not as many.

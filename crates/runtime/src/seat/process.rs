@@ -282,7 +282,7 @@ pub fn join_complete(directory: &Path) -> Result<(Domain, Scenario), RoleError> 
     let (domain, scenario) = join(directory)?;
     // Only hosts that joined a run have a clock to be corrected.
     if clock_path(&domain).exists() {
-        domain.forget();
+        domain.remove_if_over();
         return Err(RoleError::Part(domain.root().to_owned()));
     }
     Ok((domain, scenario))
@@ -325,7 +325,7 @@ pub(super) fn in_domain(
         write_report(domain, report)
     });
     drop(bus);
-    domain.forget();
+    domain.remove_if_over();
     served
 }
 

@@ -25,35 +25,35 @@ const SERIOUS: [i32; 11] = [
 ];
 
 thread_local! {
-    static LAST: Cell<Option<i32>> = const { Cell::new(None) };
+    static LAST_SERIOUS: Cell<Option<i32>> = const { Cell::new(None) };
     /// The last error of any kind, by which a word that tells nothing is made clearer.
-    static ANY: Cell<Option<i32>> = const { Cell::new(None) };
+    static LAST_ANY: Cell<Option<i32>> = const { Cell::new(None) };
 }
 
-struct Ear;
+struct ErrorCapture;
 
-impl Log for Ear {
+impl Log for ErrorCapture {
     fn log(&self, _: LogLevel, _: Arguments<'_>, _: Arguments<'_>) {
         let code = io::Error::last_os_error().raw_os_error();
-        ANY.set(code);
+        LAST_ANY.set(code);
         if code.is_some_and(|code| SERIOUS.contains(&code)) {
-            LAST.set(code);
+            LAST_SERIOUS.set(code);
         }
     }
 }
 
 /// From now on the transport's failures are heard, and not printed: what matters comes back as an error.
-pub fn hear() {
-    set_logger(&Ear);
+pub fn capture_errors() {
+    set_logger(&ErrorCapture);
     set_log_level(LogLevel::Debug);
 }
 
 /// Forgets what was heard. What is called next has causes of its own.
-pub fn forget() {
+pub fn reset() {
     // The error at hand is forgotten too, by one that is no cause: a name that cannot be there.
     let _ = std::fs::metadata("");
-    LAST.set(None);
-    ANY.set(None);
+    LAST_SERIOUS.set(None);
+    LAST_ANY.set(None);
 }
 
 /// Why the transport failed: the error of the system behind it and what to do about it, else `otherwise`.
@@ -62,7 +62,7 @@ pub fn reason(otherwise: impl FnOnce() -> String) -> String {
         let error = io::Error::from_raw_os_error(code);
         format!("{error}; {}", remedy(&error))
     };
-    let (serious, any) = (LAST.take(), ANY.take());
+    let (serious, any) = (LAST_SERIOUS.take(), LAST_ANY.take());
     serious.map(told).unwrap_or_else(|| {
         let words = otherwise();
         let vague = ["Internal", "UnableTo", "Insufficient"].iter().any(|word| words.contains(word));

@@ -2,7 +2,7 @@
 
 use super::cause;
 use super::opening::{Connections, IoxBus};
-use super::service::{Ipc, buffer_size, is_written, writer};
+use super::service::{Ipc, buffer_size, has_writer, writer};
 use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Reader, Topic, Write, WriterProcess};
 use crate::sample::{FleetLayout, FleetSample};
@@ -52,9 +52,9 @@ impl<L: FleetLayout> IoxFleetWriter<L> {
             let connections = Connections::default();
             let builder = service.publisher_builder().initial_max_slice_len(length).max_loaned_samples(1);
             let builder = builder.backpressure_strategy(BackpressureStrategy::DiscardData);
-            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+            connections.check(builder.set_degradation_handler(connections.failure_handler()).create()?)
         })?;
-        Ok(Self { publisher, loan: None, length, notifier: bus.notifiers.of(topic), topic: topic.clone() })
+        Ok(Self { publisher, loan: None, length, notifier: bus.notifiers.notifier_for(topic), topic: topic.clone() })
     }
 
     fn loan(&self) -> Result<SampleMut<Ipc, [Word<L>], ()>, BusError> {
@@ -127,10 +127,17 @@ impl<L: FleetLayout> IoxFleetReader<L> {
         let subscriber = bus.open(topic, "reader", || {
             let connections = Connections::default();
             let builder = service.subscriber_builder().buffer_size(depth);
-            connections.whole(builder.set_degradation_handler(connections.watch()).create()?)
+            connections.check(builder.set_degradation_handler(connections.failure_handler()).create()?)
         })?;
         let length = FleetSample::<L>::length(bodies);
-        Ok(Self { service, subscriber, current: None, length, notifier: bus.notifiers.of(topic), topic: topic.clone() })
+        Ok(Self {
+            service,
+            subscriber,
+            current: None,
+            length,
+            notifier: bus.notifiers.notifier_for(topic),
+            topic: topic.clone(),
+        })
     }
 
     #[cold]
@@ -160,8 +167,8 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
         self.current.as_ref().map(|sample| FleetSample::over(Word::peel_slice(sample.payload())))
     }
 
-    fn written(&self) -> bool {
-        is_written(&self.service)
+    fn has_writer(&self) -> bool {
+        has_writer(&self.service)
     }
 
     fn writer(&self) -> Option<WriterProcess> {

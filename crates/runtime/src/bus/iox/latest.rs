@@ -5,7 +5,7 @@
 //! blackboard that its writer died on cannot be written again while anybody reads it, so each generation of a writer has
 //! one of its own.
 
-use super::opening::Refusal;
+use super::opening::OpenFailure;
 use super::service::{Ipc, MAX_NODES, MAX_READERS, Wire};
 use crate::bus::Topic;
 use crate::sample::Sample;
@@ -22,16 +22,16 @@ pub struct LatestWriter<S: Sample>(EntryHandleMut<Ipc, u64, Wire<S>>);
 
 impl<S: Sample> LatestWriter<S> {
     /// A new lane, of the writer's `generation`.
-    pub fn create(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Result<Self, Refusal> {
+    pub fn create(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Result<Self, OpenFailure> {
         let service = node
-            .service_builder(&name(topic, generation).map_err(Refusal::never)?)
+            .service_builder(&name(topic, generation).map_err(OpenFailure::never)?)
             .blackboard_creator::<u64>()
             .max_readers(MAX_READERS)
             .max_nodes(MAX_NODES)
             .add::<Wire<S>>(KEY, Wire(S::zeroed()))
             .create()?;
-        let writer = service.writer_builder().create().map_err(Refusal::never)?;
-        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(Refusal::never)
+        let writer = service.writer_builder().create().map_err(OpenFailure::never)?;
+        writer.entry::<Wire<S>>(&KEY).map(Self).map_err(OpenFailure::never)
     }
 
     /// Puts a sample there.

@@ -36,7 +36,7 @@ pub struct IoxBus {
     pub(super) notifiers: Notifiers,
     pub(super) depths: Depths,
     /// Whether a signal that nobody has opened yet is made.
-    pub(super) makes: bool,
+    pub(super) creates: bool,
     pub(super) domain: Domain,
     /// For how long an opening tries again, ns.
     pub(super) opening_ns: u64,
@@ -49,24 +49,24 @@ impl IoxBus {
         &self,
         topic: &Topic,
         end: &'static str,
-        mut attempt: impl FnMut() -> Result<T, Refusal>,
+        mut attempt: impl FnMut() -> Result<T, OpenFailure>,
     ) -> Result<T, BusError> {
         let begun_ns = monotonic_ns();
         loop {
-            cause::forget();
+            cause::reset();
             let refusal = match attempt() {
                 Ok(opened) => {
                     let mapped = self.domain.require_own_mappings();
                     return mapped
                         .map(|()| opened)
-                        .map_err(|error| self.failed_to_open(topic, end, Refusal::never(error)));
+                        .map_err(|error| self.failed_to_open(topic, end, OpenFailure::never(error)));
                 }
                 Err(refusal) => refusal,
             };
-            let limit_ns = match refusal.passes {
-                Passes::Never | Passes::NeverOfOtherType => 0,
-                Passes::WhenFinished => self.opening_ns,
-                Passes::WhenVacated => VACATE_NS.min(self.opening_ns),
+            let limit_ns = match refusal.retry {
+                Retry::Never | Retry::NeverForOtherType => 0,
+                Retry::WhenFinished => self.opening_ns,
+                Retry::WhenVacated => VACATE_NS.min(self.opening_ns),
             };
             if monotonic_ns() - begun_ns >= limit_ns {
                 return Err(self.failed_to_open(topic, end, refusal));
@@ -75,15 +75,15 @@ impl IoxBus {
         }
     }
 
-    fn failed_to_open(&self, topic: &Topic, end: &'static str, refusal: Refusal) -> BusError {
-        let Refusal { mut reason, passes } = refusal;
-        if passes == Passes::WhenFinished {
+    fn failed_to_open(&self, topic: &Topic, end: &'static str, refusal: OpenFailure) -> BusError {
+        let OpenFailure { mut reason, retry } = refusal;
+        if retry == Retry::WhenFinished {
             let limit_s = self.opening_ns as f64 / 1e9;
             let unfinished =
                 self.domain.unfinished().iter().map(|path| format!(" {}", path.display())).collect::<String>();
             let files = if unfinished.is_empty() { String::new() } else { format!("; unfinished:{unfinished}") };
             reason = format!("{reason} for {limit_s} s: the process that creates it makes no progress{files}");
-        } else if passes != Passes::NeverOfOtherType {
+        } else if retry != Retry::NeverForOtherType {
             let remedy = format!("is another process of this run its {end}, or of another version?");
             reason = cause::reason(|| format!("{reason}; {remedy}"));
         }
@@ -91,8 +91,8 @@ impl IoxBus {
     }
 
     /// Adds to a refusal what a signal's samples are in the run and in this program, if that is why.
-    pub(super) fn explain(&self, refusal: Refusal, topic: &Topic, ours: &str) -> Refusal {
-        if refusal.passes != Passes::NeverOfOtherType {
+    pub(super) fn explain(&self, refusal: OpenFailure, topic: &Topic, ours: &str) -> OpenFailure {
+        if refusal.retry != Retry::NeverForOtherType {
             return refusal;
         }
         let theirs = self.type_of(topic).unwrap_or_else(|| "another type".to_owned());
@@ -105,7 +105,7 @@ impl IoxBus {
             "its samples are `{theirs}` in this run and `{ours}` in this program: {cause}; build all programs of the run from one \
              source, and raise the version in a type name whenever its fields change"
         );
-        Refusal { reason, ..refusal }
+        OpenFailure { reason, ..refusal }
     }
 
     /// The type of a signal's samples in this run, as far as it is known.
@@ -121,10 +121,10 @@ impl IoxBus {
 
 /// Whether what keeps something from being opened may pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Passes {
+pub(super) enum Retry {
     Never,
     /// Not at all: the signal carries another type.
-    NeverOfOtherType,
+    NeverForOtherType,
     /// Once somebody else has finished what he makes, or this process the handling of a signal.
     WhenFinished,
     /// Once the remains of a dead process are put away.
@@ -133,44 +133,44 @@ pub(super) enum Passes {
 
 /// Why something could not be opened.
 #[derive(Debug)]
-pub(super) struct Refusal {
+pub(super) struct OpenFailure {
     reason: String,
-    passes: Passes,
+    retry: Retry,
 }
 
-impl Refusal {
-    pub(super) fn new(error: impl fmt::Debug, passes: Passes) -> Self {
-        Self { reason: format!("{error:?}"), passes }
+impl OpenFailure {
+    pub(super) fn new(error: impl fmt::Debug, retry: Retry) -> Self {
+        Self { reason: format!("{error:?}"), retry }
     }
 
     pub(super) fn never(error: impl fmt::Debug) -> Self {
-        Self::new(error, Passes::Never)
+        Self::new(error, Retry::Never)
     }
 }
 
-impl From<PublishSubscribeOpenError> for Refusal {
+impl From<PublishSubscribeOpenError> for OpenFailure {
     fn from(error: PublishSubscribeOpenError) -> Self {
         use PublishSubscribeOpenError as Error;
         Self::new(
             error,
             match error {
-                Error::Interrupt | Error::HangsInCreation | Error::IsMarkedForDestruction => Passes::WhenFinished,
-                Error::ExceedsMaxNumberOfNodes => Passes::WhenVacated,
-                Error::IncompatibleTypes => Passes::NeverOfOtherType,
-                _ => Passes::Never,
+                Error::Interrupt | Error::HangsInCreation | Error::IsMarkedForDestruction => Retry::WhenFinished,
+                Error::ExceedsMaxNumberOfNodes => Retry::WhenVacated,
+                Error::IncompatibleTypes => Retry::NeverForOtherType,
+                _ => Retry::Never,
             },
         )
     }
 }
 
-impl From<PublishSubscribeOpenOrCreateError> for Refusal {
+impl From<PublishSubscribeOpenOrCreateError> for OpenFailure {
     fn from(error: PublishSubscribeOpenOrCreateError) -> Self {
         use PublishSubscribeCreateError as Create;
         use PublishSubscribeOpenOrCreateError as Error;
         match error {
             // What is not there is made: it has not been for so long that somebody else was making it.
             Error::PublishSubscribeOpenError(PublishSubscribeOpenError::DoesNotExist) => {
-                Self::new(error, Passes::WhenFinished)
+                Self::new(error, Retry::WhenFinished)
             }
             Error::PublishSubscribeOpenError(error) => error.into(),
             Error::PublishSubscribeCreateError(
@@ -179,31 +179,31 @@ impl From<PublishSubscribeOpenOrCreateError> for Refusal {
                 | Create::HangsInCreation
                 | Create::IsBeingCreatedByAnotherInstance,
             )
-            | Error::SystemInFlux => Self::new(error, Passes::WhenFinished),
+            | Error::SystemInFlux => Self::new(error, Retry::WhenFinished),
             Error::PublishSubscribeCreateError(_) => Self::never(error),
         }
     }
 }
 
-impl From<BlackboardCreateError> for Refusal {
+impl From<BlackboardCreateError> for OpenFailure {
     fn from(error: BlackboardCreateError) -> Self {
         use BlackboardCreateError as Error;
         let begun = matches!(error, Error::Interrupt | Error::HangsInCreation | Error::IsBeingCreatedByAnotherInstance);
-        Self::new(error, if begun { Passes::WhenFinished } else { Passes::Never })
+        Self::new(error, if begun { Retry::WhenFinished } else { Retry::Never })
     }
 }
 
-impl From<PublisherCreateError> for Refusal {
+impl From<PublisherCreateError> for OpenFailure {
     fn from(error: PublisherCreateError) -> Self {
         let taken = error == PublisherCreateError::ExceedsMaxSupportedPublishers;
-        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+        Self::new(error, if taken { Retry::WhenVacated } else { Retry::Never })
     }
 }
 
-impl From<SubscriberCreateError> for Refusal {
+impl From<SubscriberCreateError> for OpenFailure {
     fn from(error: SubscriberCreateError) -> Self {
         let taken = error == SubscriberCreateError::ExceedsMaxSupportedSubscribers;
-        Self::new(error, if taken { Passes::WhenVacated } else { Passes::Never })
+        Self::new(error, if taken { Retry::WhenVacated } else { Retry::Never })
     }
 }
 
@@ -216,7 +216,9 @@ pub(super) struct Connections {
 
 impl Connections {
     /// What the transport is to call if it cannot connect.
-    pub(super) fn watch(&self) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
+    pub(super) fn failure_handler(
+        &self,
+    ) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
         let failed = self.failed.clone();
         move |_, _| {
             failed.store(true, Ordering::Relaxed);
@@ -225,12 +227,12 @@ impl Connections {
     }
 
     /// The end, if it is connected.
-    pub(super) fn whole<T>(&self, end: T) -> Result<T, Refusal> {
+    pub(super) fn check<T>(&self, end: T) -> Result<T, OpenFailure> {
         if self.failed.load(Ordering::Relaxed) {
-            return Err(Refusal {
+            return Err(OpenFailure {
                 reason: "not connected to every process that has it open (is /dev/shm full?)".to_owned(),
                 // Whoever leaves, or dies, meanwhile is put away soon.
-                passes: Passes::WhenVacated,
+                retry: Retry::WhenVacated,
             });
         }
         Ok(end)
@@ -246,7 +248,7 @@ mod tests {
     use std::time::Duration;
 
     /// Opens by attempts that are refused until so many have been made; returns how many were.
-    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> Refusal) -> (u32, Result<(), BusError>) {
+    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> OpenFailure) -> (u32, Result<(), BusError>) {
         let mut made = 0;
         let attempt = || {
             made += 1;
@@ -262,7 +264,7 @@ mod tests {
         let bus = bus(&domain);
         let interrupted = || PublishSubscribeOpenOrCreateError::from(PublishSubscribeOpenError::Interrupt).into();
         assert!(matches!(attempts(&bus, 2, interrupted), (3, Ok(()))));
-        let (made, refused) = attempts(&bus, 2, || Refusal::never("a signal called Interrupt"));
+        let (made, refused) = attempts(&bus, 2, || OpenFailure::never("a signal called Interrupt"));
         assert!(made == 1 && refused.is_err());
     }
 
@@ -273,7 +275,7 @@ mod tests {
         let gone = || {
             let connections = Connections::default();
             connections.failed.store(true, Ordering::Relaxed);
-            connections.whole(()).unwrap_err()
+            connections.check(()).unwrap_err()
         };
         assert!(matches!(attempts(&bus, 2, gone), (3, Ok(()))));
     }
@@ -281,7 +283,7 @@ mod tests {
     #[test]
     fn an_opening_has_a_limit_and_names_the_file_that_it_waits_for() {
         let domain = OwnedDomain::create(0).unwrap();
-        let bus = bus(&domain).within(Duration::from_millis(50));
+        let bus = bus(&domain).with_opening_limit(Duration::from_millis(50));
         let path = Path::new(SHARED_MEMORY).join(domain.domain().prefix() + "begun");
         std::fs::write(&path, "").unwrap();
         let (_, refused) = attempts(&bus, u32::MAX, || PublishSubscribeOpenError::HangsInCreation.into());

@@ -64,7 +64,7 @@ pub struct Qos {
 
 impl Qos {
     /// That of a signal on links of these depths.
-    pub fn of(signal: Signal, depths: Depths) -> Self {
+    pub fn for_signal(signal: Signal, depths: Depths) -> Self {
         Self {
             max_publishers: 1,
             max_subscribers: if signal == Signal::Schedule { MAX_SCHEDULE_READERS } else { MAX_READERS },
@@ -77,14 +77,14 @@ impl Qos {
     }
 
     /// That of a fleet's signal.
-    pub fn of_fleet(signal: Signal, depths: Depths) -> Self {
-        Self { max_subscribers: MAX_FLEET_READERS, ..Self::of(signal, depths) }
+    pub fn for_fleet(signal: Signal, depths: Depths) -> Self {
+        Self { max_subscribers: MAX_FLEET_READERS, ..Self::for_signal(signal, depths) }
     }
 }
 
 /// How many samples of a signal may wait for a reader.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
-    depths.of(reader).min(deepest(signal, depths))
+    depths.for_reader(reader).min(deepest(signal, depths))
 }
 
 /// What roles say of themselves and hear from the launcher is said again and again.
@@ -118,7 +118,7 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
 }
 
 /// Whether a service has a writer. One that was killed is one until its remains are cleared.
-pub(super) fn is_written<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> bool {
+pub(super) fn has_writer<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> bool {
     service.dynamic_config().number_of_publishers() > 0
 }
 
@@ -150,7 +150,7 @@ pub(super) fn config(root: &std::path::Path, domain: &Domain) -> Result<Config, 
 
 pub(in crate::bus) fn enter(root: &std::path::Path, domain: &Domain, name: &str) -> Result<Node<Ipc>, String> {
     let config = config(root, domain)?;
-    cause::forget();
+    cause::reset();
     NodeBuilder::new()
         .name(&name.try_into().map_err(|error| format!("{error:?}"))?)
         .config(&config)

@@ -2,7 +2,7 @@
 
 use super::cause;
 use super::latest::{LatestReader, LatestWriter};
-use super::service::{Ipc, Wire, is_written, writer};
+use super::service::{Ipc, Wire, has_writer, writer};
 use crate::bus::notifier::Notifier;
 use crate::bus::{BusError, Read, Topic, Write, WriterProcess};
 use crate::sample::{NO_SAMPLE, Sample};
@@ -21,7 +21,7 @@ pub struct IoxWriter<S: Sample> {
     pub(super) latest: Option<LatestWriter<S>>,
     pub(super) loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
     /// What was shown in the lane and is not sent.
-    pub(super) shown: Option<SampleMut<Ipc, Wire<S>, ()>>,
+    pub(super) unpublished: Option<SampleMut<Ipc, Wire<S>, ()>>,
     pub(super) notifier: Notifier,
     pub(super) topic: Topic,
 }
@@ -77,15 +77,15 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
     }
 
     #[inline]
-    fn show(&mut self) -> Result<(), BusError> {
+    fn write_latest(&mut self) -> Result<(), BusError> {
         self.publish()?;
-        self.shown = self.filled();
+        self.unpublished = self.filled();
         if self.latest.is_none() { self.publish() } else { Ok(()) }
     }
 
     #[inline]
     fn publish(&mut self) -> Result<(), BusError> {
-        self.shown.take().map_or(Ok(()), |sample| self.queue(sample))
+        self.unpublished.take().map_or(Ok(()), |sample| self.queue(sample))
     }
 
     /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
@@ -110,12 +110,12 @@ pub struct IoxReader<S: Sample> {
     pub(super) node: Rc<Node<Ipc>>,
     pub(super) service: PortFactory<Ipc, Wire<S>, ()>,
     pub(super) subscriber: Subscriber<Ipc, Wire<S>, ()>,
-    pub(super) lane: Lane<S>,
+    pub(super) latest_channel: LatestChannel<S>,
     /// Looks at the lane that found nothing.
     pub(super) idle: u32,
     pub(super) current: Current<S>,
     /// Generation and tick of the last two samples that the lane has had, the newer first.
-    pub(super) shown: [(u64, u64); 2],
+    pub(super) channel_keys: [(u64, u64); 2],
     /// Taken from the queue before a sleep, and not told of yet.
     pub(super) pending: Option<Received<Ipc, Wire<S>, ()>>,
     /// Generation and tick of the last sample told of.
@@ -126,7 +126,7 @@ pub struct IoxReader<S: Sample> {
 
 /// A reader's fast lane.
 #[allow(clippy::large_enum_variant, reason = "there is one per reader, and it is looked at at every tick")]
-pub(super) enum Lane<S: Sample> {
+pub(super) enum LatestChannel<S: Sample> {
     /// There is none.
     None,
     /// It is to be looked for: that of a writer of this generation.
@@ -150,8 +150,8 @@ pub(super) const NO_KEY: (u64, u64) = (u64::MAX, u64::MAX);
 /// A writer serves the lane before the queue, so the queue may still hold the sample before the one in the lane. Keys do not
 /// tell the order of the two: the one in the lane may be late by a scripted fault.
 #[inline]
-fn is_overtaken<S: Sample>(lane: &Lane<S>, shown: &[(u64, u64); 2], key: (u64, u64)) -> bool {
-    shown.contains(&key) || matches!(lane, Lane::Open(latest) if key <= self::key(latest.sample()))
+fn is_overtaken<S: Sample>(channel: &LatestChannel<S>, channel_keys: &[(u64, u64); 2], key: (u64, u64)) -> bool {
+    channel_keys.contains(&key) || matches!(channel, LatestChannel::Open(latest) if key <= self::key(latest.sample()))
 }
 
 /// Where the sample at hand is.
@@ -179,15 +179,17 @@ impl<S: Sample> IoxReader<S> {
                 },
             };
             let key = key(&received.payload().0);
-            if !is_overtaken(&self.lane, &self.shown, key) {
+            if !is_overtaken(&self.latest_channel, &self.channel_keys, key) {
                 break (received, key);
             }
         };
         let (generation, _) = key;
-        match &mut self.lane {
-            Lane::Open(latest) if generation > latest.generation() => self.lane = Lane::Wanted { generation },
+        match &mut self.latest_channel {
+            LatestChannel::Open(latest) if generation > latest.generation() => {
+                self.latest_channel = LatestChannel::Wanted { generation }
+            }
             // Warm-up tells nothing of its writer.
-            Lane::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
+            LatestChannel::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
             _ => {}
         }
         self.newest = key;
@@ -199,12 +201,12 @@ impl<S: Sample> IoxReader<S> {
 impl<S: Sample> Read<S> for IoxReader<S> {
     #[inline]
     fn advance(&mut self) -> Result<bool, BusError> {
-        if let Lane::Open(latest) = &mut self.lane
+        if let LatestChannel::Open(latest) = &mut self.latest_channel
             && self.pending.is_none()
         {
             if latest.advance() {
                 let key = key(latest.sample());
-                self.shown = [key, self.shown[0]];
+                self.channel_keys = [key, self.channel_keys[0]];
                 let before = std::mem::replace(&mut self.newest, key);
                 self.current = Current::InLane;
                 // The queue may have been faster, and the lane may take one sample for two.
@@ -220,15 +222,15 @@ impl<S: Sample> Read<S> for IoxReader<S> {
 
     #[inline]
     fn current(&self) -> Option<&S> {
-        match (&self.current, &self.lane) {
+        match (&self.current, &self.latest_channel) {
             (Current::Queued(sample), _) => Some(&sample.payload().0),
-            (Current::InLane, Lane::Open(latest)) => Some(latest.sample()),
+            (Current::InLane, LatestChannel::Open(latest)) => Some(latest.sample()),
             _ => None,
         }
     }
 
-    fn written(&self) -> bool {
-        is_written(&self.service)
+    fn has_writer(&self) -> bool {
+        has_writer(&self.service)
     }
 
     fn writer(&self) -> Option<WriterProcess> {
@@ -236,9 +238,9 @@ impl<S: Sample> Read<S> for IoxReader<S> {
     }
 
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError> {
-        let Self { subscriber, lane, shown, idle, pending, notifier, topic, .. } = self;
+        let Self { subscriber, latest_channel: channel, channel_keys, idle, pending, notifier, topic, .. } = self;
         let failed = |reason| BusError::Receive { service: topic.to_string(), reason };
-        let Lane::Open(latest) = &*lane else {
+        let LatestChannel::Open(latest) = &*channel else {
             return notifier.sleep(until_ns, || {
                 subscriber.has_samples().map_err(|error| failed(cause::reason(|| format!("{error:?}"))))
             });
@@ -248,7 +250,8 @@ impl<S: Sample> Read<S> for IoxReader<S> {
             while !latest.has_news() && pending.is_none() {
                 match subscriber.receive() {
                     Ok(Some(sample)) => {
-                        *pending = Some(sample).filter(|sample| !is_overtaken(lane, shown, key(&sample.payload().0)))
+                        *pending =
+                            Some(sample).filter(|sample| !is_overtaken(channel, channel_keys, key(&sample.payload().0)))
                     }
                     Ok(None) => return Ok(false),
                     Err(error) => return Err(failed(cause::reason(|| format!("{error:?}")))),
@@ -266,12 +269,12 @@ impl<S: Sample> Read<S> for IoxReader<S> {
         let _ = self.subscriber.update_connections();
         // Whoever looks once per tick would find a new writer of the signal only after so many ticks.
         self.idle = u32::MAX;
-        if let Lane::Wanted { generation } = self.lane {
+        if let LatestChannel::Wanted { generation } = self.latest_channel {
             match LatestReader::open(&self.node, &self.topic, generation) {
-                Some(latest) => self.lane = Lane::Open(latest),
+                Some(latest) => self.latest_channel = LatestChannel::Open(latest),
                 // Where there is none there will be none: a lane is made before its signal. But before the first sample it
                 // is not known whose to look for.
-                None if self.newest != (0, 0) => self.lane = Lane::None,
+                None if self.newest != (0, 0) => self.latest_channel = LatestChannel::None,
                 None => {}
             }
         }
@@ -306,7 +309,7 @@ mod tests {
         send(&mut writer, 0, 1);
         assert!(reader.advance().unwrap());
         reader.refresh();
-        assert!(matches!(reader.lane, Lane::Open(_)));
+        assert!(matches!(reader.latest_channel, LatestChannel::Open(_)));
         for tick in 1..20 {
             send(&mut writer, tick, 1);
             assert!(reader.advance().unwrap());
@@ -331,25 +334,25 @@ mod tests {
             let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
             send(&mut writer, 1, 1);
             reader.refresh();
-            let mut told = Vec::new();
+            let mut received = Vec::new();
             let mut look = |reader: &mut IoxReader<RateCommand>| {
                 reader.refresh();
                 if sleeps {
                     reader.sleep(monotonic_ns()).unwrap();
                 }
                 while reader.advance().unwrap() {
-                    told.push(reader.current().unwrap().stamp.tick);
+                    received.push(reader.current().unwrap().stamp.tick);
                 }
             };
             look(&mut reader);
             for tick in [5, 3, 6, 4, 7] {
                 writer.fill(|sample| (sample.stamp.tick, sample.stamp.generation) = (tick, 1)).unwrap();
-                writer.show().unwrap();
+                writer.write_latest().unwrap();
                 (0..3).for_each(|_| look(&mut reader));
                 writer.publish().unwrap();
                 (0..3).for_each(|_| look(&mut reader));
             }
-            assert_eq!(told, [1, 5, 3, 6, 4, 7], "each once, with sleeps: {sleeps}");
+            assert_eq!(received, [1, 5, 3, 6, 4, 7], "each once, with sleeps: {sleeps}");
         }
     }
 
@@ -387,7 +390,7 @@ mod tests {
                 assert!(!reader.advance().unwrap(), "once");
             }
             reader.refresh();
-            assert!(!reader.advance().unwrap(), "what is in the lane now was in the queue");
+            assert!(!reader.advance().unwrap(), "what is in the channel now was in the queue");
         }
     }
 }

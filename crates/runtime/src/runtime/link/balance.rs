@@ -94,7 +94,7 @@ impl<S, W: Write<S>> Write<S> for InterleavedWriter<W> {
 
     fn deliver(&mut self) -> Result<(), BusError> {
         if self.life.step() {
-            self.writer.show()?;
+            self.writer.write_latest()?;
             (self.life.between)();
         }
         if self.life.step() { self.writer.publish() } else { Ok(()) }

@@ -234,7 +234,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             kept.keep(self.staged.before, sample.words().iter().copied());
         }
         if self.writes_latest {
-            self.port.show()?;
+            self.port.write_latest()?;
             self.unpublished = true;
         } else {
             self.port.deliver()?;

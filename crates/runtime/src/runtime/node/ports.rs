@@ -52,8 +52,8 @@ pub fn ports(settings: &Settings, role: RoleId) -> Ports {
     Ports {
         writes,
         reads,
-        health: Port::of::<Health>(topic(settings, role.name(settings), Signal::Health), None),
-        schedule: Port::of::<Schedule>(topic(settings, "run", Signal::Schedule), None),
+        health: Port::new::<Health>(topic(settings, role.name(settings), Signal::Health), None),
+        schedule: Port::new::<Schedule>(topic(settings, "run", Signal::Schedule), None),
     }
 }
 
