@@ -8,7 +8,7 @@ use super::targets::{Target, Verdict};
 use crate::files;
 use crate::launch::plain;
 use crate::system::utc;
-use crate::telemetry::Host;
+use crate::telemetry::MachineInfo;
 use crate::telemetry::{Grant, write_hgrm};
 use serde::Serialize;
 use std::fmt::Write as _;
@@ -28,7 +28,7 @@ pub struct Results {
     started_utc: String,
     /// Whether this was a smoke run, whose figures mean nothing.
     pub quick: bool,
-    host: Host,
+    host: MachineInfo,
     /// The scenario that was measured.
     pub scenario: String,
     /// Why no target is judged; nothing if all are.
@@ -62,7 +62,7 @@ impl Results {
             revision: env!("COROTATE_REVISION"),
             started_utc: utc(started),
             quick: bench.quick,
-            host: Host::this(),
+            host: MachineInfo::local(),
             privileges,
             scenario: bench.scenarios.first().map_or("", |(name, _)| *name).to_owned(),
             targets: targets.map(verdict).collect(),

@@ -15,7 +15,7 @@ pub use trial::Trial;
 
 use crate::bus::domain::{AbandonedFiles, DomainError, FoundDomain};
 use crate::runtime::{priority_remedy, refused_priority};
-use crate::telemetry::Host;
+use crate::telemetry::MachineInfo;
 use serde::Serialize;
 use std::fmt;
 use std::path::Path;
@@ -79,7 +79,7 @@ impl Check {
 #[derive(Debug, Clone, Serialize)]
 pub struct Diagnosis {
     schema: &'static str,
-    host: Host,
+    host: MachineInfo,
     /// The scenario whose demands the machine is held to.
     pub scenario: String,
     /// True if the scenario was run and no line is bad; none if no line is bad and it was not run.
@@ -96,7 +96,7 @@ impl Diagnosis {
         checks.extend(trial.iter().map(Trial::check));
         let bad = checks.iter().any(|check| check.verdict == Verdict::Bad);
         let fit = if bad { Some(false) } else { trial.as_ref().map(|_| true) };
-        Self { schema: SCHEMA, host: Host::this(), scenario: scenario.to_owned(), fit, checks, trial }
+        Self { schema: SCHEMA, host: MachineInfo::local(), scenario: scenario.to_owned(), fit, checks, trial }
     }
 
     /// The report as one line of JSON.

@@ -17,7 +17,7 @@ use crate::runtime::RoleId;
 use crate::scenario::{Scenario, claims};
 use crate::serial::LineCounters;
 use crate::system::utc;
-use crate::telemetry::{Grant, Host, RoleReport, WatchReport, write_hgrm, write_hlog};
+use crate::telemetry::{Grant, MachineInfo, RoleReport, WatchReport, write_hgrm, write_hlog};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
@@ -48,7 +48,7 @@ pub struct Summary {
     /// The time at which it was started.
     pub started_utc: String,
     /// The machine.
-    pub host: Host,
+    pub host: MachineInfo,
     /// Roles that had no process of their own, with the role in whose process they were.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub hosted: BTreeMap<String, String>,
@@ -173,7 +173,7 @@ impl Summary {
             tick_hz: 1e9 / scenario.period_ns as f64,
             last_tick: scenario.last_tick,
             started_utc: utc(started),
-            host: Host::this(),
+            host: MachineInfo::local(),
             hosted: hosted(scenario),
             domain: outcome.domain.clone(),
             signal: outcome.signal,

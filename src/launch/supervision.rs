@@ -493,7 +493,7 @@ impl Member {
         // A state that kills must not be inherited for ever.
         let begins_anew = again && self.generation > 1 && now_ns.saturating_sub(self.started_ns) < DISTRUSTED_NS;
         if begins_anew {
-            self.books().for_each(|(_, ledger)| ledger.distrust());
+            self.books().for_each(|(_, ledger)| ledger.discard_state());
         }
         let action = if again { Action::Restarted } else { Action::Stopped };
         self.lost = !again;

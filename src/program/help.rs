@@ -7,7 +7,7 @@ use super::output::{Ended, Exit, Failure, fail, say};
 use super::shipped::{name, scenarios, words_given};
 use crate::bus::iox;
 use crate::files;
-use crate::telemetry::Host;
+use crate::telemetry::MachineInfo;
 use clap::{ColorChoice, ValueEnum};
 use clap_complete::Shell;
 use std::fmt::Write;
@@ -119,7 +119,7 @@ fn about_build() -> String {
     let built: Vec<&str> = names(true).collect();
     // The hooks are for tests alone.
     let absent: Vec<&str> = names(false).filter(|name| *name != "hooks").collect();
-    let host = Host::this();
+    let host = MachineInfo::local();
     format!(
         "revision  {}\nfeatures  {}\niceoryx2  {}\ntarget    {}\nhost      {}, {}, {} cores",
         env!("COROTATE_REVISION"),

@@ -9,7 +9,7 @@ use crate::runtime::{RoleId, ports};
 use crate::sample::Layout;
 use crate::scenario::Scenario;
 use crate::system::utc;
-use crate::telemetry::{Host, RoleReport};
+use crate::telemetry::{MachineInfo, RoleReport};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -250,7 +250,7 @@ fn json(value: &impl Serialize) -> String {
 
 /// What the file says of its run.
 fn about(scenario: &Scenario) -> BTreeMap<String, String> {
-    let (host, text) = (Host::this(), scenario.to_toml());
+    let (host, text) = (MachineInfo::local(), scenario.to_toml());
     let entries = [
         ("schema", SCHEMA.to_owned()),
         ("version", env!("CARGO_PKG_VERSION").to_owned()),

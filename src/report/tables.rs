@@ -7,7 +7,7 @@ use crate::analysis::{Claim, Reach, apart, digits};
 use crate::hosts::{HostReport, LinkEnd, Silence};
 use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, exact, reasons, short};
 use crate::rig::{ConditionReport, Figure};
-use crate::telemetry::{Host, Percentiles, Ticks};
+use crate::telemetry::{MachineInfo, Percentiles, Ticks};
 
 /// A scripted fault as it stands in the scenario.
 #[derive(Debug)]
@@ -379,7 +379,7 @@ fn told_of_loop(certificate: &Claim) -> String {
 pub fn machine(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let info = source.recording.as_ref().map(|recording| recording.info());
-    let told = |text: &String| serde_json::from_str::<Host>(text).ok();
+    let told = |text: &String| serde_json::from_str::<MachineInfo>(text).ok();
     let recorded = info.and_then(|info| told(&info.host));
     if let Some(host) = source.summary.as_ref().map(|summary| &summary.host).or(recorded.as_ref()) {
         blocks.push(Block::Text(format!("{}: {}, {} cores, {}.", host.name, host.cpu, host.cores, host.kernel)));

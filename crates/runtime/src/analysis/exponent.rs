@@ -43,7 +43,7 @@ impl<R: Rig> Analysis<'_, R> {
     pub fn exponent(&self, ideal: &R) -> Exponent {
         let begun = |start| {
             self.rig
-                .alone(self.index, start, false)
+                .isolated(self.index, start, false)
                 .map(|rig| Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks))
         };
         let (mut here, mut there) = (Vec::new(), Vec::new());

@@ -93,7 +93,7 @@ pub(crate) fn of_rig<R: Rig>(rig: &R, scenario: &Settings) -> Vec<Claim> {
 
 impl<R: Rig> Analysis<'_, R> {
     fn claim(&self, body: &str, certificate: Option<&CertificateReport>) -> Claim {
-        let (rate, floors) = match self.rig.alone(self.index, Start::Settled, false) {
+        let (rate, floors) = match self.rig.isolated(self.index, Start::Settled, false) {
             None => (Err("this rig does not tell where its loop is settled".to_owned()), Vec::new()),
             Some(settled) => {
                 let exponent = self.exponent(&settled);
@@ -134,7 +134,7 @@ impl<R: Rig> Analysis<'_, R> {
 
     /// When each limit of the scenario is reached, from its error at the start.
     fn reaches(&self, rate_per_s: f64, floors: &[f64]) -> Vec<Reach> {
-        let Some(rig) = self.rig.alone(self.index, Start::Given, false) else {
+        let Some(rig) = self.rig.isolated(self.index, Start::Given, false) else {
             return Vec::new();
         };
         let mut start = vec![0.0; floors.len()];
@@ -163,7 +163,7 @@ impl<R: Rig> Analysis<'_, R> {
     fn floors(&self, ticks: u64) -> Vec<f64> {
         let mut floors = vec![0.0; self.rig.metrics().len()];
         let mut values = floors.clone();
-        if let Some(rig) = self.rig.alone(self.index, Start::Settled, true) {
+        if let Some(rig) = self.rig.isolated(self.index, Start::Settled, true) {
             let mut chain = Chain::new(&rig, self.tick_s, self.scenario.actuation_delay_ticks);
             let (mut output, mut size) = (Vec::new(), None);
             for tick in 0..ticks {
@@ -184,7 +184,7 @@ impl<R: Rig> Analysis<'_, R> {
     /// Whether the scenario's own start leads where the rate speaks of. Where rounding alone is left, one that does may end at
     /// another floor than the settled loop; `floors` become its own.
     fn arrives(&self, rate_per_s: f64, floors: &mut [f64]) -> Result<(), String> {
-        let Some(rig) = self.rig.alone(self.index, Start::Given, true) else {
+        let Some(rig) = self.rig.isolated(self.index, Start::Given, true) else {
             return Ok(());
         };
         let (mut chain, mut guards) =

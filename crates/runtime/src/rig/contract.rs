@@ -123,7 +123,7 @@ pub trait Rig: Clone + Send + Sync + 'static {
     }
     /// This rig with no other driven body than the one with this index, and that a single one, begun there, with or without
     /// noise: for the analysis of its loop. None if the rig cannot tell where that is settled.
-    fn alone(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
+    fn isolated(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
         None
     }
     /// What is proven of the closed loop, one entry per driven body.
@@ -167,7 +167,7 @@ pub struct Monitor<R: Rig> {
     /// Its name, with its unit as the last part; the key of its bound is `<name>_max`.
     pub name: &'static str,
     /// How it is told.
-    pub of: Watched<R>,
+    pub watched: Watched<R>,
     /// Why it cannot be watched in this scenario, if so.
     pub absent: fn(&R) -> Option<&'static str>,
 }

@@ -134,12 +134,12 @@ impl OrbitRig {
 const MONITORS: [Monitor<OrbitRig>; 2] = [
     Monitor {
         name: "energy_drift",
-        of: Watched::Constant(|rig, estimate| rig.field.energy(&estimated(estimate))),
+        watched: Watched::Constant(|rig, estimate| rig.field.energy(&estimated(estimate))),
         absent: OrbitRig::no_constant,
     },
     Monitor {
         name: "momentum_drift",
-        of: Watched::Constant(|_, estimate| estimated(estimate).momentum()),
+        watched: Watched::Constant(|_, estimate| estimated(estimate).momentum()),
         absent: OrbitRig::no_constant,
     },
 ];
@@ -296,7 +296,7 @@ impl Rig for OrbitRig {
         })
     }
 
-    fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
+    fn isolated(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
         let mut rig = Self {
             bodies: pair(&self.bodies, index),
             initial: pair(&self.initial, index),

@@ -158,12 +158,12 @@ impl Ledger {
     }
 
     /// Lets the next generation keep the counters and nothing else: the state may be what its predecessors died of.
-    pub fn distrust(&self) {
+    pub fn discard_state(&self) {
         self.word(Self::ANEW).store(self.generation() + 1, Ordering::Relaxed);
     }
 
     /// Whether the present generation is to begin without its predecessor's state.
-    pub fn distrusted(&self) -> bool {
+    pub fn discards_state(&self) -> bool {
         self.word(Self::ANEW).load(Ordering::Relaxed) == self.generation()
     }
 
@@ -366,13 +366,13 @@ mod tests {
     fn only_the_generation_that_follows_is_distrusted() {
         let ledger = Ledger::private(0);
         ledger.enter();
-        assert!(!ledger.distrusted());
-        ledger.distrust();
-        assert!(!ledger.distrusted());
+        assert!(!ledger.discards_state());
+        ledger.discard_state();
+        assert!(!ledger.discards_state());
         ledger.enter();
-        assert!(ledger.distrusted());
+        assert!(ledger.discards_state());
         ledger.enter();
-        assert!(!ledger.distrusted());
+        assert!(!ledger.discards_state());
     }
 
     /// Whoever reads while somebody writes gets one record whole.

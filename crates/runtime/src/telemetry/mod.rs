@@ -2,13 +2,13 @@
 //!
 //! Everything is allocated before the loop and only counted in it; export and arithmetic come after. Must not log.
 
-mod books;
+mod counters;
 mod export;
 mod handover;
 mod hash;
-mod host;
 mod latency;
 mod ledger;
+mod machine;
 mod report;
 
 /// What [`handover`] is made of.
@@ -16,13 +16,13 @@ mod atomic {
     pub use std::sync::atomic::{AtomicU64, Ordering, fence};
 }
 
-pub use books::{ReadCounters, TickCounters, WriteCounters};
+pub use counters::{ReadCounters, TickCounters, WriteCounters};
 pub use export::{write_hgrm, write_hlog};
 pub(crate) use handover::{find, keep};
 pub use hash::{Checkpoints, StateHash, combine};
-pub use host::Host;
 pub use latency::number_or_nan;
 pub use latency::{Latency, MAX_LATENCY_NS, Percentiles, Tallies};
 pub use latency::{quantile, sorted};
 pub use ledger::{Ledger, LedgerError, Slots, Store};
+pub use machine::MachineInfo;
 pub use report::{Grant, LinkRead, LinkWritten, Outage, RoleReport, StageReport, Ticks, WatchReport, WatchedReport};

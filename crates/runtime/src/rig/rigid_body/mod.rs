@@ -183,19 +183,19 @@ impl RigidBodyRig {
 const MONITORS: [Monitor<RigidBodyRig>; 4] = [
     Monitor {
         name: "energy_drift",
-        of: Watched::Constant(|_, estimate: &RateEstimate| {
+        watched: Watched::Constant(|_, estimate: &RateEstimate| {
             0.5 * Vector3::from(estimate.omega_rad_s).dot(&momentum(estimate))
         }),
         absent: RigidBodyRig::uncontrolled,
     },
     Monitor {
         name: "momentum_drift",
-        of: Watched::Constant(|_, estimate| momentum(estimate).norm()),
+        watched: Watched::Constant(|_, estimate| momentum(estimate).norm()),
         absent: RigidBodyRig::uncontrolled,
     },
     Monitor {
         name: "innovation_rad_s",
-        of: Watched::Small(|_, estimate: &RateEstimate| estimate.innovation_rad_s),
+        watched: Watched::Small(|_, estimate: &RateEstimate| estimate.innovation_rad_s),
         absent: |rig| {
             let kalman = matches!(rig.observer, ObserverDesign::Hidden { filter: FilterDesign::Kalman(_), .. });
             rig.uncontrolled().or(kalman.then_some("is not published by the Kalman filter"))
@@ -203,7 +203,7 @@ const MONITORS: [Monitor<RigidBodyRig>; 4] = [
     },
     Monitor {
         name: "lyapunov_rad2_s2",
-        of: Watched::Commanded(|command| RigidBodyRig::lyapunov(command).map(|(v, _)| v)),
+        watched: Watched::Commanded(|command| RigidBodyRig::lyapunov(command).map(|(v, _)| v)),
         absent: |rig| {
             let fleets = rig.bodies[1..].iter().all(|body| body.fleet.is_some());
             let second = rig.certificate.is_none().then_some("is published with the first-order filter only");
@@ -362,7 +362,7 @@ impl Rig for RigidBodyRig {
         (first..end).for_each(|metric| out[metric - first] = value(metric));
     }
 
-    fn alone(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
+    fn isolated(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
         // What is proven and computed of a loop is about a leader that moves freely.
         if self.playback.is_some() {
             return None;

@@ -83,7 +83,7 @@ impl Staged {
         (self.late, self.copies) = (0, 0);
         match std::mem::take(&mut self.kind) {
             Self::SAMPLE => counters.enter(self.tick, content),
-            Self::WITHHELD | Self::ABSENT => counters.enter_void(self.tick, markers),
+            Self::WITHHELD | Self::ABSENT => counters.enter_without_sample(self.tick, markers),
             _ => {}
         }
     }

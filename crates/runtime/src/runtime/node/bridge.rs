@@ -219,7 +219,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.counters.began_anew();
+            self.counters.restarted_without_state();
         }
         self.command.expect_repeats();
         Ok(())

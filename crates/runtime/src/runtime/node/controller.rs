@@ -350,7 +350,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         let Some(estimate) = self.estimate.sample() else { return };
         let tick = estimate.stamp().tick;
         for (quantity, monitor) in R::monitors().iter().enumerate() {
-            match monitor.of {
+            match monitor.watched {
                 Watched::Constant(of) if self.watchdog.watches(quantity, tick) => {
                     self.watchdog.constant(quantity, tick, of(&self.rig, estimate));
                 }
@@ -366,7 +366,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
     #[inline]
     fn watch_command(watchdog: &mut Watchdog, tick: u64, command: &Command<R>) {
         for (quantity, monitor) in R::monitors().iter().enumerate() {
-            if let Watched::Commanded(of) = monitor.of
+            if let Watched::Commanded(of) = monitor.watched
                 && watchdog.watches(quantity, tick)
                 && let Some(value) = of(command)
             {
@@ -446,7 +446,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.counters.began_anew();
+            self.counters.restarted_without_state();
         }
         self.estimate.expect_repeats();
         self.channels.iter_mut().for_each(|channel| channel.measurement.expect_repeats());

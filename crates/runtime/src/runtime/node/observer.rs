@@ -158,7 +158,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn restore(&mut self) -> Result<(), LedgerError> {
         if restore(self)? == Inherited::Counters {
-            self.counters.began_anew();
+            self.counters.restarted_without_state();
         }
         self.measurement.expect_repeats();
         Ok(())

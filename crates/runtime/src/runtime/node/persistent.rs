@@ -68,7 +68,7 @@ pub(super) fn restore(node: &mut impl Persistent) -> Result<Inherited, LedgerErr
     let Some(record) = ledger.record() else { return Ok(Inherited::Nothing) };
     let mut words = Restore(&record);
     node.counters(&mut words);
-    if ledger.distrusted() {
+    if ledger.discards_state() {
         return Ok(Inherited::Counters);
     }
     node.state(&mut words);

@@ -292,7 +292,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         self.inherited = restore(self)?;
         self.command.iter_mut().for_each(Input::expect_repeats);
         if self.inherited == Inherited::Counters {
-            self.counters.began_anew();
+            self.counters.restarted_without_state();
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// A machine.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Host {
+pub struct MachineInfo {
     /// Its name.
     pub name: String,
     /// Release and version of its kernel.
@@ -15,9 +15,9 @@ pub struct Host {
     pub cpu: String,
 }
 
-impl Host {
+impl MachineInfo {
     /// This machine.
-    pub fn this() -> Self {
+    pub fn local() -> Self {
         let system = rustix::system::uname();
         let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));

@@ -76,7 +76,7 @@ impl TickCounters {
     }
 
     /// Counts a life that began without the state of the one before: nothing from here on is as it would have been.
-    pub fn began_anew(&mut self) {
+    pub fn restarted_without_state(&mut self) {
         self.anew += 1;
         self.disturbed(self.next);
     }
@@ -137,7 +137,7 @@ impl WriteCounters {
     }
 
     /// Enters a tick of which there is no sample: a void was sent in its place, or nothing was.
-    pub fn enter_void(&mut self, tick: u64, sent: bool) {
+    pub fn enter_without_sample(&mut self, tick: u64, sent: bool) {
         *(if sent { &mut self.void } else { &mut self.skipped }) += 1;
         self.cover(tick);
     }
