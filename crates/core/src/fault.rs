@@ -1,7 +1,7 @@
-//! Scripted faults: what goes wrong with a role or with what it sends, and when, as a function of seed and tick alone.
+//! Scripted faults of a role or of its samples. Kind and ticks are a function of seed and tick alone.
 //!
-//! Pure: the same fault gives the same bits under every clock and in every life of a role. Must not send, wait or count; the
-//! runtime does that with what is decided here.
+//! Pure: the same fault gives the same bits under every clock and after every restart of a role. This module must not
+//! send, wait or count; the runtime applies its decisions.
 
 mod delay;
 mod occurrence;
@@ -12,124 +12,124 @@ pub use occurrence::{Channel, FaultSequence, Occurrence, Pattern, WINDOW_MAX, We
 use crate::model::Noise;
 use crate::sample::{Field, FieldKind, Message, Stamp};
 
-/// Bytes of one word: every element of a sample is one.
+/// The size of a word, bytes: every element of a sample is one.
 const WORD: usize = 8;
-/// Words of the stamp, with which every sample begins.
+/// The number of words of the stamp at the start of every sample.
 const STAMP: usize = size_of::<Stamp>() / WORD;
 
 /// One scripted fault.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fault {
-    /// The first tick at which it may act.
+    /// The first tick at which the fault may act.
     pub from_tick: u64,
-    /// For how many ticks it may.
+    /// The number of ticks during which it may act.
     pub ticks: u64,
-    /// On which of these it does; a [`FaultSequence`] tells.
+    /// The ticks among these at which it acts; evaluated by a [`FaultSequence`].
     pub occurrence: Occurrence,
-    /// What its draws follow from, beside the tick.
+    /// The seed of its draws; they depend on seed and tick alone.
     pub seed: u64,
-    /// What goes wrong.
+    /// The kind of fault.
     pub action: Action,
 }
 
-/// What goes wrong.
+/// The kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Action {
-    /// The content of a sample, before it is handed to the link.
+    /// A fault in the content of a sample, before the sample is handed to the link.
     Content(ContentFault),
-    /// The way of a sample.
+    /// A fault in the delivery of a sample.
     Transport(Transport),
-    /// The role itself, before it executes the tick.
+    /// A fault of the role itself, before it executes the tick.
     Role(Interruption),
 }
 
-/// What happens to a sample on its way.
+/// A kind of delivery fault.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Transport {
-    /// It is never sent.
+    /// The sample is never sent.
     Drop,
-    /// It is sent twice.
+    /// The sample is sent twice.
     Duplicate,
-    /// It is sent late.
+    /// The sample is sent late.
     Delay(Delay),
 }
 
-/// What has happened to one sample on its way.
+/// The faulty delivery of one sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// It is never sent.
+    /// The sample is never sent.
     Dropped,
-    /// It is sent twice.
+    /// The sample is sent twice.
     Twice,
-    /// It is sent so many ticks late, at least 1.
+    /// The sample is sent this number of ticks late, at least 1.
     Late(u64),
 }
 
-/// What happens to a role.
+/// A kind of role fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interruption {
-    /// It does nothing for so long, ns.
+    /// The role does nothing for a while.
     Stall {
-        /// The time.
+        /// The duration, ns.
         ns: u64,
     },
-    /// Its process is killed, in its first life only.
+    /// The role's process is killed, in its first generation only.
     Kill,
-    /// It does not execute the tick.
+    /// The role does not execute the tick.
     Miss,
 }
 
-/// What happens to the content of a sample, and to which words of it.
+/// A change of a sample's content, with the affected words.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ContentFault {
-    /// What happens.
+    /// The change.
     pub change: Change,
-    /// The words it happens to.
+    /// The affected words.
     pub words: Words,
 }
 
 /// Consecutive words of 8 bytes of a sample, counted from its start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Words {
-    /// The first.
+    /// The index of the first word.
     pub first: usize,
-    /// How many, at least 1.
+    /// The number of words, at least 1.
     pub count: usize,
 }
 
 impl Words {
-    /// Everything but the stamp of a sample of so many bytes.
+    /// Returns all words after the stamp of a sample of `size` bytes.
     pub fn content(size: usize) -> Self {
         Self { first: STAMP, count: size / WORD - STAMP }
     }
 }
 
-/// How words change.
+/// A kind of change of words.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Change {
-    /// They stay as they were in the last sample.
+    /// The words keep their values of the previous sample.
     Freeze,
-    /// They become this number: one that is none, one that is infinite, or one that no body has.
+    /// The words become this number: NaN, infinity, or a value that no body has.
     Set(f64),
-    /// One bit of one of them is inverted: this one, or a drawn one. 0 is the least significant.
+    /// One bit of one word is inverted: this bit, or a drawn one. 0 is the least significant.
     Flip(Option<u32>),
     /// White noise of this standard deviation is added.
     Noise(f64),
-    /// They become 0 and are marked as not valid in this word: bit i for the i-th word after the stamp.
+    /// The words become 0 and are marked as not valid in the word `valid`: bit i for the i-th word after the stamp.
     Lose {
-        /// The word that holds the bits.
+        /// The index of the word that holds the valid bits.
         valid: usize,
     },
 }
 
 impl Fault {
-    /// Whether it changes contents.
-    pub fn tampers(&self) -> bool {
+    /// Returns true if the fault changes the content of samples.
+    pub fn alters_content(&self) -> bool {
         matches!(self.action, Action::Content(_))
     }
 
-    /// What happens on its way to the sample of `tick`, where it is a fault of that kind: nothing, if it is
-    /// in time nevertheless.
+    /// Returns the faulty delivery of the sample of `tick`. `None` for other kinds of fault, or if the sample is in
+    /// time nevertheless.
     pub fn delivery(&self, tick: u64) -> Option<Delivery> {
         match self.action {
             Action::Transport(Transport::Drop) => Some(Delivery::Dropped),
@@ -141,8 +141,8 @@ impl Fault {
         }
     }
 
-    /// Changes the content of the sample of `tick`, where it is a fault of that kind. `last` is the sample sent before.
-    pub fn tamper<S: Message + ?Sized>(&self, tick: u64, sample: &mut S, last: &S) {
+    /// Changes the content of the sample of `tick` if the fault is of that kind. `last` is the sample sent before.
+    pub fn alter_content<S: Message + ?Sized>(&self, tick: u64, sample: &mut S, last: &S) {
         let Action::Content(ContentFault { change, words }) = self.action else { return };
         let (last, sample) = (last.words(), sample.words_mut());
         let range = words.first..words.first + words.count;
@@ -168,14 +168,14 @@ impl Fault {
         }
     }
 
-    /// A number for this fault, tick and purpose, and for nothing else.
+    /// Draws a number that is specific to this fault, tick and purpose.
     fn draw(&self, tick: u64, purpose: u64) -> u64 {
         mix(mix(self.seed ^ purpose.rotate_left(48)) ^ tick)
     }
 }
 
-/// The word of a sample at which a field begins, its number of elements and their kind; of the stamp, `tick` and
-/// `generation` are fields too. `fields` are those after the stamp.
+/// Returns the words and the type of the field `name`. `fields` are those after the stamp; `tick` and `generation` of
+/// the stamp are found too.
 pub fn field(fields: &[Field], name: &str) -> Option<(Words, FieldKind)> {
     let stamp = [("tick", 0), ("generation", 1)].into_iter().find(|(known, _)| *known == name);
     let of_stamp = stamp.map(|(_, first)| (Words { first, count: 1 }, FieldKind::U64));
@@ -186,12 +186,13 @@ pub fn field(fields: &[Field], name: &str) -> Option<(Words, FieldKind)> {
     of_stamp.or_else(of_content)
 }
 
-/// A seed for the fault of this number in a scenario's list: adding one changes no other's draws.
+/// Returns the seed of the fault with this number in a scenario's list. An additional fault does not change the draws
+/// of others.
 pub fn seed(scenario: u64, number: u64) -> u64 {
     mix(mix(scenario) ^ number.rotate_left(32))
 }
 
-/// The finaliser of SplitMix64: every bit of the result depends on every bit of the argument.
+/// Computes the finaliser of SplitMix64: every bit of the result depends on every bit of the argument.
 pub fn mix(value: u64) -> u64 {
     let value = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let value = (value ^ value >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -199,7 +200,7 @@ pub fn mix(value: u64) -> u64 {
     value ^ value >> 31
 }
 
-/// A draw as a number in \[0, 1).
+/// Converts a draw to a number in \[0, 1).
 pub fn unit(draw: u64) -> f64 {
     (draw >> 11) as f64 / (1_u64 << 53) as f64
 }
@@ -226,7 +227,7 @@ mod tests {
 
     fn tampered(fault: &Fault, tick: u64) -> RateMeasurement {
         let mut tampered = sample();
-        fault.tamper(tick, &mut tampered, &RateMeasurement { omega_rad_s: [9.0; 3], ..sample() });
+        fault.alter_content(tick, &mut tampered, &RateMeasurement { omega_rad_s: [9.0; 3], ..sample() });
         tampered
     }
 
@@ -235,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn every_change_does_what_it_says_and_nothing_else() {
+    fn every_change_affects_only_its_words() {
         let second = Words { first: omega().first + 1, count: 1 };
         assert_eq!(tampered(&fault(Change::Freeze, second), 10).omega_rad_s, [0.1, 9.0, 0.3]);
         assert_eq!(tampered(&fault(Change::Set(5.0), second), 10).omega_rad_s, [0.1, 5.0, 0.3]);
@@ -250,12 +251,12 @@ mod tests {
     }
 
     #[test]
-    fn draws_follow_from_seed_and_tick_alone() {
+    fn draws_depend_on_seed_and_tick_alone() {
         let flip = fault(Change::Flip(None), Words::content(size_of::<RateMeasurement>()));
         assert_eq!(tampered(&flip, 10), tampered(&flip, 10));
-        let other = Fault { seed: seed(8, 0), ..flip.clone() };
+        let reseeded = Fault { seed: seed(8, 0), ..flip.clone() };
         let differ = |a: &Fault, b: &Fault| (0..64).filter(|tick| tampered(a, *tick) != tampered(b, *tick)).count();
-        assert!(differ(&flip, &other) > 50);
+        assert!(differ(&flip, &reseeded) > 50);
         assert!(differ(&flip, &Fault { seed: seed(7, 1), ..flip.clone() }) > 50);
         let changed = |tick| {
             let (before, after) = (sample(), tampered(&flip, tick));
@@ -269,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_are_found_by_name_those_of_the_stamp_too() {
+    fn fields_of_content_and_stamp_are_found_by_name() {
         assert_eq!(field(RateMeasurement::FIELDS, "tick"), Some((Words { first: 0, count: 1 }, FieldKind::U64)));
         assert_eq!(
             field(RateMeasurement::FIELDS, "applied_rad_s2"),

@@ -1,30 +1,32 @@
-//! The proof obligations of the synchronising law, as numbers: \[D\](15)-(19), the exact condition, and the sampled loop.
+//! The proof obligations of the synchronising law as numbers: \[D\](15)-(19), the exact condition, and the sampled
+//! loop.
 //!
-//! Must only report; whether a condition that fails is an error is for its reader to decide.
+//! The certificate only reports; its reader decides which failed condition is an error.
 
 use crate::vector::sum;
 use nalgebra::Vector3;
 
-/// A sampled axis with |k|·h above this answers visibly slower or rings; warned about well before it is unstable.
+/// The |k|·h above which a sampled axis is visibly slower or rings; it is reported well before the axis becomes
+/// unstable.
 const COMFORTABLE_GAIN_STEP: f64 = 0.25;
 
-/// One sufficient condition: what is there, what is needed.
+/// One sufficient condition, with its actual and its required value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Condition {
-    /// The quantity that the designer chose.
+    /// The actual value.
     pub value: f64,
-    /// What it must exceed.
+    /// The value that it must exceed.
     pub required: f64,
 }
 
 impl Condition {
-    /// Whether the value exceeds what is required.
+    /// Returns true if the value exceeds the required one.
     pub fn holds(&self) -> bool {
         self.value > self.required
     }
 }
 
-/// What is proven of one follower's synchronisation with a leader whose axis k is hidden.
+/// The certificate of one follower's synchronisation with a leader whose axis k is hidden.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Certificate {
     /// M, the bound on the leader's angular velocity, rad/s.
@@ -34,22 +36,22 @@ pub struct Certificate {
     /// −λ > M²/4·max(a_i²/|k_i|, a_j²/|k_j|) + |k_k|/4, 1/s: necessary and sufficient for V̇ < 0 wherever |ω| ≤ M, where
     /// V = ½(|e|² + ε²) of \[D\](15). The Schur complement of the error system (14).
     pub exact: Condition,
-    /// The slowest exponent of the error, 1/s: min(|k_1|, |k_2|, |k_3|, −λ). The error decays so in any case, since the
+    /// The slowest exponent of the error, 1/s: min(|k_1|, |k_2|, |k_3|, −λ). It holds unconditionally, because the
     /// observer's error does not depend on the others.
     pub rate_per_s: f64,
-    /// Largest |k|·h: with d ticks of delay that the law does not predict over an axis obeys z^(d+1) − z^d + |k|h = 0 and is
-    /// stable below 2 sin(π/(4d + 2)): 1 for one tick, 2 for none.
+    /// The largest |k|·h. With d unpredicted ticks of delay an axis obeys z^(d+1) − z^d + |k|h = 0 and is stable
+    /// below 2 sin(π/(4d + 2)): 1 for one tick, 2 for none.
     pub gain_step: Condition,
-    /// What multiplies −e_i² and −ε² in the bound on V̇ of \[D\](18), 1/s.
+    /// The factors of −e_i² and −ε² in the bound on V̇ of \[D\](18), 1/s.
     slopes: Vector3<f64>,
     hidden_slope: f64,
 }
 
 impl Certificate {
-    /// The certificate of a loop with tick `tick_s`.
+    /// Computes the certificate of a loop with tick `tick_s`.
     ///
-    /// `coefficients` are the a of \[D\](2), `hidden_axis` is 1 to 3, `gain_per_s` = −k and `decay_rate_per_s` = −λ are
-    /// positive, `rate_bound_rad_s` is M; `unpredicted_ticks` is the delay, or 0 where the law predicts over it.
+    /// `coefficients` are the a of \[D\](2), `hidden_axis` is 1 to 3, `gain_per_s` = −k and `decay_rate_per_s` = −λ
+    /// are positive, `rate_bound_rad_s` is M, `unpredicted_ticks` is the delay, or 0 if the law predicts over it.
     pub fn new(
         coefficients: &Vector3<f64>,
         hidden_axis: usize,
@@ -84,8 +86,8 @@ impl Certificate {
         }
     }
 
-    /// V = ½(|e|² + ε²) of \[D\](15), rad²/s², and the bound on V̇ of \[D\](18), rad²/s³, for the errors e = p − ω and
-    /// ε = ω_k − ω̂_k, rad/s.
+    /// Computes V = ½(|e|² + ε²) of \[D\](15), rad²/s², and the bound on V̇ of \[D\](18), rad²/s³, for the errors e =
+    /// p − ω and ε = ω_k − ω̂_k, rad/s.
     #[inline]
     pub fn lyapunov(&self, error: &Vector3<f64>, hidden_error: f64) -> (f64, f64) {
         let square = error.component_mul(error);
@@ -93,7 +95,7 @@ impl Certificate {
         (0.5 * (sum(&square) + hidden), -self.slopes.dot(&square) - self.hidden_slope * hidden)
     }
 
-    /// The condition of the sampled loop alone, which needs no observer: see the field of this name.
+    /// Computes the condition of the sampled loop, which needs no observer: see the field of this name.
     pub fn gain_step(gain_per_s: &Vector3<f64>, tick_s: f64, unpredicted_ticks: u64) -> Condition {
         let value = match unpredicted_ticks {
             0 => 2.0,
@@ -103,7 +105,7 @@ impl Certificate {
         Condition { value, required: gain_per_s.max() * tick_s }
     }
 
-    /// Whether the tick is so coarse that the sampled loop visibly differs from the continuous one.
+    /// Returns true if the tick is so coarse that the sampled loop visibly differs from the continuous one.
     pub fn coarse_tick(&self) -> bool {
         self.gain_step.required > COMFORTABLE_GAIN_STEP
     }
@@ -114,7 +116,8 @@ mod tests {
     use super::*;
     use nalgebra::Matrix4;
 
-    /// V̇ as a quadratic form in (e1, e2, e3, ε) at a given ω, from the error system (14) with the hidden axis 3.
+    /// Returns V̇ as a quadratic form in (e1, e2, e3, ε) at a given ω, from the error system (14) with the hidden
+    /// axis 3.
     fn form(a: &Vector3<f64>, gain: &Vector3<f64>, decay: f64, w1: f64, w2: f64) -> Matrix4<f64> {
         let mut q = Matrix4::from_diagonal(&nalgebra::Vector4::new(-gain.x, -gain.y, -gain.z, -decay));
         for (row, half) in [(0, -a.x * w2 / 2.0), (1, -a.y * w1 / 2.0), (2, -gain.z / 2.0)] {
@@ -139,9 +142,9 @@ mod tests {
         assert!(worst_eigenvalue(&a, &gain, needed * 0.999, m) > 0.0);
     }
 
-    /// The bound of the paper is above V̇ as the error system has it, at every angle of ω and for random errors.
+    /// The paper's bound is at least the V̇ of the error system, at every angle of ω and for random errors.
     #[test]
-    fn the_bound_on_the_rate_of_v_is_one() {
+    fn the_bound_on_the_rate_of_v_holds() {
         let (a, gain, m) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0), 1.5);
         let certificate = Certificate::new(&a, 3, &gain, 5.0, m, 1e-3, 1);
         for step in 0..360 {
@@ -169,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn relabelling_the_axes_moves_the_condition_with_them() {
+    fn relabelled_axes_have_relabelled_conditions() {
         let (a, gain) = (Vector3::new(-0.5, 0.75, -0.4), Vector3::new(2.0, 3.0, 4.0));
         let turned = |v: &Vector3<f64>| Vector3::new(v.z, v.x, v.y);
         let third = Certificate::new(&a, 3, &gain, 5.0, 1.5, 1e-3, 1);
@@ -178,9 +181,9 @@ mod tests {
         assert_eq!(third.paper, first.paper);
     }
 
-    /// The sampled axis e(n+1) = e(n) − g h e(n−d) really is stable up to the limit and not beyond.
+    /// The sampled axis e(n+1) = e(n) − g h e(n−d) is stable up to the limit and not beyond.
     #[test]
-    fn the_sampled_limit_is_the_real_one() {
+    fn the_sampled_axis_is_stable_up_to_the_limit() {
         for delay in [0, 1, 2, 5, 64] {
             let grows = |gain_step: f64| {
                 let mut e = vec![1.0_f64; delay + 1];

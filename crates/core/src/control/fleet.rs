@@ -1,14 +1,16 @@
-//! The synchronising law for many followers at once: structures of arrays in and out, in the widest vectors that the
-//! machine has.
+//! The synchronising law for many followers at once: structures of arrays in and out, in the machine's widest
+//! vectors.
 //!
-//! Every follower gets the bits that [`Synchronizer`] and [`limited`] give it alone: the same operations in the same order,
-//! none of them fused, and nothing is summed over followers. Must not allocate, nor keep anything of a follower.
+//! Every follower gets the bits that [`Synchronizer`] and [`limited`] compute for it alone: the same operations in
+//! the same order, none of them fused, and no sum over followers. The law must not allocate, nor store anything about
+//! a follower.
 
 use super::{Synchronizer, limited};
 use crate::model::flow_all;
 use nalgebra::Vector3;
 
-/// Followers that are computed before their commands are checked: all of it stays in the fastest cache.
+/// The number of followers computed before their commands are checked, chosen so that all data stays in the fastest
+/// cache.
 const BLOCK: usize = 256;
 
 /// The synchronising law of all followers of a fleet.
@@ -19,27 +21,29 @@ pub struct FleetLaw {
 }
 
 impl FleetLaw {
-    /// The law of one follower for all of them; no component of a command exceeds the limit, its direction kept.
+    /// Creates the law of a fleet from that of one follower. No component of a command exceeds the limit; the
+    /// direction stays.
     pub fn new(law: Synchronizer, acceleration_max_rad_s2: f64) -> Self {
         Self { law, acceleration_max_rad_s2 }
     }
 
-    /// Goes on with other coefficients a of \[D\](2): those that an observer has learned.
+    /// Replaces the coefficients a of \[D\](2) by those that an observer has learned.
     pub fn learn(&mut self, coefficients: Vector3<f64>) {
         self.law.learn(coefficients);
     }
 
-    /// Whether both motions are predicted before the law is applied.
+    /// Returns true if both motions are predicted before the law is applied.
     pub fn predicts(&self) -> bool {
         self.law.lead_s() > 0.0
     }
 
-    /// Moves all followers' rates, rad/s, on to when the command will begin to act, in place, and gives the reference then.
+    /// Predicts all followers' rates, rad/s, in place, to the time at which the command acts, and returns the
+    /// predicted reference.
     ///
-    /// `applied` are the control accelerations acting on the followers until then, rad/s².
+    /// `applied` are the control accelerations that act on the followers until then, rad/s².
     ///
     /// # Panics
-    /// If the six arrays are not of one length.
+    /// If the six arrays differ in length.
     pub fn ahead(&self, reference: &Vector3<f64>, rates: [&mut [f64]; 3], applied: [&[f64]; 3]) -> Vector3<f64> {
         if self.predicts() {
             flow_all(self.law.body(), rates, applied, self.law.lead_s());
@@ -47,13 +51,14 @@ impl FleetLaw {
         self.law.reference_ahead(*reference)
     }
 
-    /// Writes the control accelerations, rad/s², of all followers from the reference ω or ω̂ and their own rates p, rad/s.
+    /// Computes the control accelerations, rad/s², of all followers from the reference ω or ω̂ and their rates p,
+    /// rad/s.
     ///
-    /// Component i of follower n is `rates[i][n]`, and so for the commands. One call reads 24 and writes 24 bytes per
-    /// follower, and touches nothing else.
+    /// Component i of follower n is `rates[i][n]`; the commands have the same layout. One call reads 24 and writes 24
+    /// bytes per follower and no other memory.
     ///
     /// # Panics
-    /// If the six arrays are not of one length.
+    /// If the six arrays differ in length.
     #[inline]
     pub fn command(&self, reference: &Vector3<f64>, rates: [&[f64]; 3], commands: [&mut [f64]; 3]) {
         let ([p1, p2, p3], [u1, u2, u3]) = (rates, commands);
@@ -64,8 +69,8 @@ impl FleetLaw {
     }
 }
 
-/// The kernel, compiled for each kind of vectors and chosen once, when it is first called; in a build without `std`, for
-/// what the target is sure to have.
+/// The kernel, compiled for each vector instruction set and selected at its first call; without `std`, for the set
+/// that the target guarantees.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, clippy::too_many_arguments, reason = "arrays that are arguments are known not to overlap")]
 fn command(
@@ -91,7 +96,7 @@ fn command(
     }
 }
 
-/// Writes the commands as asked, and tells whether one of them may be beyond the limit.
+/// Writes the unlimited commands. Returns true if one of them may exceed the limit.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "see `command`")]
 fn exceeds(
@@ -110,14 +115,14 @@ fn exceeds(
     for (((((p1, p2), p3), u1), u2), u3) in followers {
         let asked = law.command(reference, &Vector3::new(*p1, *p2, *p3));
         (*u1, *u2, *u3) = (asked.x, asked.y, asked.z);
-        // A maximum would have to be taken in order; bits need not. What is no number is not within.
+        // A maximum would have to be computed in order; combined bits need not. NaN is not within the limit.
         let within = (asked.x.abs() <= limit) & (asked.y.abs() <= limit) & (asked.z.abs() <= limit);
         beyond |= u64::from(!within);
     }
     beyond != 0
 }
 
-/// Shortens what is beyond the limit. Rare: a follower far from its leader, or one whose rates are no numbers.
+/// Limits the commands that exceed the limit. Rare: a follower far from its leader, or one with NaN rates.
 #[cold]
 #[inline(never)]
 fn limit_all(limit: f64, u1: &mut [f64], u2: &mut [f64], u3: &mut [f64]) {
@@ -132,7 +137,7 @@ mod tests {
     use super::*;
     use crate::model::{Inertia, RigidBody, uniform};
 
-    /// Values that arithmetic treats in a way of their own.
+    /// Values that arithmetic treats specially.
     const SPECIAL: [f64; 12] = [
         0.0,
         -0.0,
@@ -153,7 +158,7 @@ mod tests {
         Synchronizer::new(body, Vector3::new(1.0, 2.0, 3.0), 0.0)
     }
 
-    /// Holds every follower of a fleet against the same one alone; all not-a-numbers are one.
+    /// Compares every follower of a fleet with the same one alone; all NaN count as equal.
     fn compare(reference: &Vector3<f64>, rates: &[Vec<f64>; 3], limit: f64) {
         let count = rates[0].len();
         let mut commands = [(); 3].map(|()| vec![9.0; count]);
@@ -170,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn every_follower_gets_the_bits_that_it_gets_alone() {
+    fn every_follower_is_bit_identical_to_one_alone() {
         for count in [0, 1, 2, 3, 7, 8, 15, 255, 256, 257, 1000, 1003] {
             for (seed, limit) in [(1, f64::INFINITY), (2, 1e3), (3, 2.0), (4, 1e-3), (5, 0.0)] {
                 let mut draw = uniform(seed, count as u64);
@@ -183,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn also_where_numbers_end() {
+    fn special_values_are_bit_identical_too() {
         let mut draw = uniform(11, 0);
         let mut pick = || SPECIAL[(draw() * SPECIAL.len() as f64) as usize];
         for limit in [f64::INFINITY, f64::MAX, 1.0] {

@@ -1,25 +1,28 @@
-//! Commands that a law has sent and that do not act yet, where a command acts more than one tick after its measurement.
+//! Commands that a law has sent and that do not act yet, for loops where a command acts more than one tick after its
+//! measurement.
 //!
-//! Must not decide what a missing command means; the plant's expiry does.
+//! This buffer must not decide what a missing command means; the plant's expiry does.
 
 use crate::state::{Persist, Words};
 
-/// The longest actuation delay, ticks.
+/// The maximum actuation delay, ticks.
 pub const ACTUATION_DELAY_MAX: u64 = 64;
 
-/// What a law has sent and what does not act yet at its next tick, for its prediction. `U` is what a command makes act.
+/// The commands that a law has sent and that do not act yet at its next tick, for its prediction. `U` is the actuator
+/// input of a command.
 #[derive(Debug)]
 pub struct InFlight<U> {
-    /// With the tick after that of the measurement, 0 if there is none; of a power of two of places, so that none is found by a
-    /// division.
+    /// The inputs, each with the tick after that of its measurement, or 0 if empty. The number of slots is a power of
+    /// two, so that none is located by a division.
     sent: [(u64, U); ACTUATION_DELAY_MAX as usize],
-    /// So many of them are in use, and so many commands are on their way at most.
+    /// The number of slots in use, and the largest number of commands in flight.
     places: usize,
     count: u64,
 }
 
 impl<U: Default> InFlight<U> {
-    /// Nothing sent yet, for a law whose commands act so many ticks after their measurement, up to [`ACTUATION_DELAY_MAX`].
+    /// Creates an empty buffer for a law whose commands act `delay_ticks` after their measurement, at most
+    /// [`ACTUATION_DELAY_MAX`].
     pub fn new(delay_ticks: u64, blank: impl Fn() -> U) -> Self {
         let count = delay_ticks.clamp(1, ACTUATION_DELAY_MAX) - 1;
         let places = if count > 0 { count.next_power_of_two() as usize } else { 0 };
@@ -29,16 +32,16 @@ impl<U: Default> InFlight<U> {
 }
 
 impl<U> InFlight<U> {
-    /// Whether no command is ever on its way when the next is made: it acts from the next tick on.
+    /// Returns true if a command acts from the next tick on, so that none is ever in flight.
     #[inline]
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
 
-    /// What acts in each tick after this one until its own command does, in turn. Where a command was not sent the one before
-    /// goes on; none as long as that is what acts at this tick.
+    /// Returns the input of each tick after `tick` until the law's own command acts, in order. A command that was not
+    /// sent is replaced by the one before; `None` stands for the input at `tick`.
     pub fn after(&self, tick: u64) -> impl Iterator<Item = Option<&U>> {
-        // The oldest is that of `tick` − count; it acts from `tick` + 1 on.
+        // The oldest command is that of `tick` − count; it acts from `tick` + 1 on.
         let mut last = None;
         (0..self.count).map(move |step| {
             last = (tick + step).checked_sub(self.count).and_then(|sent| self.at(sent)).or(last);
@@ -51,7 +54,7 @@ impl<U> InFlight<U> {
         (*filled == tick + 1).then_some(input)
     }
 
-    /// Room for what was sent at a tick.
+    /// Returns the slot for the command sent at a tick; `None` if no command is ever in flight.
     pub fn sent(&mut self, tick: u64) -> Option<&mut U> {
         if self.is_empty() {
             return None;
@@ -65,7 +68,7 @@ impl<U> InFlight<U> {
         tick as usize & self.places.wrapping_sub(1) & (ACTUATION_DELAY_MAX as usize - 1)
     }
 
-    /// Passes the state, each input by this.
+    /// Persists the buffer, each input by `each`.
     pub fn persist_by<W: Words>(&mut self, words: &mut W, mut each: impl FnMut(&mut U, &mut W)) {
         for (filled, input) in &mut self.sent[..self.places] {
             filled.persist(words);
@@ -86,16 +89,16 @@ mod tests {
     use std::vec::Vec;
 
     #[test]
-    fn a_law_knows_what_will_act_until_its_command_does() {
+    fn the_inputs_until_the_next_command_are_known() {
         let mut sent = InFlight::new(4, || 0.0);
         let inputs = |sent: &InFlight<f64>, tick| {
             sent.after(tick).map(|input| input.copied().unwrap_or(-1.0)).collect::<Vec<_>>()
         };
-        assert_eq!(inputs(&sent, 0), [-1.0; 3], "before the first, what acts goes on");
+        assert_eq!(inputs(&sent, 0), [-1.0; 3], "before the first command the acting input stays");
         for tick in (0..10).filter(|tick| *tick != 7) {
             *sent.sent(tick).unwrap() = tick as f64;
         }
-        assert_eq!(inputs(&sent, 10), [-1.0, 8.0, 9.0], "that of tick 7 was not sent");
+        assert_eq!(inputs(&sent, 10), [-1.0, 8.0, 9.0], "the command of tick 7 was not sent");
         assert_eq!(inputs(&sent, 11), [8.0, 9.0, 9.0]);
         let mut next = InFlight::new(1, || 0.0);
         assert!(next.is_empty() && next.sent(5).is_none() && inputs(&next, 5).is_empty());

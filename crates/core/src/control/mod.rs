@@ -1,4 +1,4 @@
-//! Control laws and the conditions under which they are proven. Pure: no clock, no I/O, no allocation, no logging.
+//! Control laws with their certificates. Pure: no clock, no I/O, no allocation, no logging.
 
 mod adaptation;
 mod certificate;

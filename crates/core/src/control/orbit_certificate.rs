@@ -1,31 +1,31 @@
-//! What is proven of a body held to an orbit: the exponents of the error, and the loop as it is sampled.
+//! The certificate of a body held to an orbit: the exponents of the error, in continuous time and sampled.
 //!
-//! Must only report; whether something that fails is an error is for its reader to decide.
+//! The certificate only reports; its reader decides which failed condition is an error.
 
 use super::{Condition, OrbitGains, OrbitHold};
 use crate::model::{CentralField, OrbitFault, OrbitState};
 use nalgebra::{SVector, Vector2};
 
-/// What is proven about one driven body near one circular orbit.
+/// The certificate of one driven body near one circular orbit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrbitCertificate {
-    /// The slowest exponent of the error in continuous time, 1/s: of the law and of the observer.
+    /// The slowest exponent of the error in continuous time, 1/s, of the law and the observer.
     pub rate_per_s: f64,
-    /// 1 against the modulus |z| of the slowest mode from tick to tick: of the exact motion with held thrust and its
-    /// delay, linearised about the circular orbit, and of the observer.
+    /// 1 against the modulus |z| of the slowest mode from tick to tick: of the exact motion with held, delayed
+    /// thrust, linearised about the circular orbit, and of the observer.
     pub sampled: Condition,
-    /// The exponent −ln|z|/h of that mode, 1/s: what sampling and delay leave of the rate.
+    /// The exponent −ln|z|/h of that mode, 1/s: the rate that remains after sampling and delay.
     pub sampled_rate_per_s: f64,
 }
 
 impl OrbitCertificate {
-    /// The certificate at the circular orbit of radius `r` (du) for a loop with tick `tick_s` whose commands act
-    /// `delay_ticks` after their measurement, 1 to 64.
+    /// Computes the certificate at the circular orbit of radius `r` (du) for a loop with tick `tick_s` whose commands
+    /// act `delay_ticks` after their measurement, 1 to 64.
     ///
-    /// `decay_rate_per_s` are the observer's −L, positive, or infinite where the law does not use the estimate.
+    /// `decay_rate_per_s` are the observer's −L, positive, or infinite if the law does not use the estimate.
     ///
     /// # Errors
-    /// [`OrbitFault`] if a tick on this orbit is more than the model resolves.
+    /// [`OrbitFault`] if the model does not resolve a tick on this orbit.
     pub fn new(
         field: &CentralField,
         law: &OrbitHold,
@@ -46,18 +46,18 @@ impl OrbitCertificate {
     }
 }
 
-/// A square matrix of which the first rows and columns are used: without an allocator that is the way to have any size.
+/// A square matrix whose first rows and columns are used: a matrix of variable size without an allocator.
 type Square = [[f64; SIZE]; SIZE];
-/// The state of a body, and two components of every thrust on its way.
+/// The largest number of unknowns: the state of a body, and two components of every thrust in flight.
 const SIZE: usize = STATES + 2 * DELAY_MAX as usize;
 const STATES: usize = 3;
-/// The longest delay that is told of, ticks.
+/// The longest delay that the certificate covers, ticks.
 const DELAY_MAX: u64 = 64;
 
-/// One tick of the closed loop about the circular orbit of radius `r`, as a matrix: (r, Vr, Vθ) and the thrusts on their way, the
-/// one that acts first. So many rows and columns are used.
+/// Computes the matrix of one tick of the closed loop about the circular orbit of radius `r`. Its unknowns are (r,
+/// Vr, Vθ) and the thrusts in flight, the next to act first; the returned number of rows and columns is used.
 ///
-/// The unknowns are in units of the radius, the velocity and the pull of that orbit.
+/// The unknowns are in units of the radius, the velocity and the gravity of that orbit.
 fn linearised(
     (field, law): (&CentralField, &OrbitHold),
     r: f64,
@@ -65,14 +65,15 @@ fn linearised(
     delay_ticks: u64,
     matrix: &mut Square,
 ) -> Result<usize, OrbitFault> {
-    /// Half the difference; its square and the rounding over it are both far below what is told.
+    /// Half of the difference. The error of its square and the rounding divided by it are both far below the reported
+    /// digits.
     const HALF: f64 = 1e-5;
     let thrusts = delay_ticks.clamp(1, DELAY_MAX) as usize;
     let size = STATES + 2 * thrusts;
     let circle = field.circular(r);
     let pull = field.mu() / (r * r);
     let unit = SVector::from([r, circle.vtheta, circle.vtheta, pull, pull]);
-    // What the body comes to, and the thrust that is asked for, if one unknown is off by so much.
+    // The next state and the next thrust if one unknown is off by this difference.
     let tick = |unknown: usize, off: f64| -> Result<SVector<f64, 5>, OrbitFault> {
         let at = |index: usize, unit: f64| if index == unknown { off * unit } else { 0.0 };
         let vtheta = circle.vtheta + at(2, unit[2]);
@@ -88,7 +89,7 @@ fn linearised(
             elements[unknown] = match row {
                 row if row < STATES => change[row],
                 row if row >= size - 2 => change[STATES + row + 2 - size],
-                // The next thrust moves up.
+                // The next thrust moves up by one place.
                 row => f64::from(u8::from(unknown == row + 2)),
             };
         }
@@ -96,10 +97,11 @@ fn linearised(
     Ok(size)
 }
 
-/// The largest modulus of an eigenvalue, by Gelfand's formula: the norm of the 2^n-th power, to the power 2^−n.
+/// Computes the largest modulus of an eigenvalue by Gelfand's formula: the norm of the 2^n-th power, to the power
+/// 2^−n.
 fn spectral_radius(power: &mut Square, size: usize) -> f64 {
     let (mut log, mut share) = (0.0, 1.0);
-    // 2^-40 leaves nothing of the factor between the norm and the eigenvalue.
+    // 2^-40 makes the factor between the norm and the eigenvalue negligible.
     for _ in 0..40 {
         let all = power[..size].iter().flat_map(|row| &row[..size]);
         let norm = all.fold(0.0, |norm: f64, element| norm.max(element.abs()));
@@ -117,10 +119,10 @@ fn spectral_radius(power: &mut Square, size: usize) -> f64 {
 /// Multiplies a matrix by itself.
 fn square(matrix: &mut Square, size: usize) {
     let factor = *matrix;
-    for (row, of) in matrix[..size].iter_mut().zip(&factor) {
+    for (row, factors) in matrix[..size].iter_mut().zip(&factor) {
         row[..size].fill(0.0);
-        for (scale, other) in of[..size].iter().zip(&factor).filter(|(scale, _)| **scale != 0.0) {
-            row[..size].iter_mut().zip(other).for_each(|(sum, element)| *sum += scale * element);
+        for (scale, factor_row) in factors[..size].iter().zip(&factor).filter(|(scale, _)| **scale != 0.0) {
+            row[..size].iter_mut().zip(factor_row).for_each(|(sum, element)| *sum += scale * element);
         }
     }
 }
@@ -141,9 +143,9 @@ mod tests {
 
     #[test]
     fn the_spectral_radius_is_the_largest_modulus() {
-        fn radius<const N: usize>(of: SMatrix<f64, N, N>) -> f64 {
+        fn radius<const N: usize>(values: SMatrix<f64, N, N>) -> f64 {
             let mut matrix = [[f64::NAN; SIZE]; SIZE];
-            (0..N * N).for_each(|at| matrix[at / N][at % N] = of[(at / N, at % N)]);
+            (0..N * N).for_each(|at| matrix[at / N][at % N] = values[(at / N, at % N)]);
             spectral_radius(&mut matrix, N)
         }
         let turning = Matrix2::new(0.6, -0.8, 0.8, 0.6) * 0.99;
@@ -162,29 +164,29 @@ mod tests {
         assert!((slow.sampled_rate_per_s - 0.25).abs() < 1e-9 && slow.rate_per_s == 0.25, "{slow:?}");
     }
 
-    /// The loop with the real law and the real motion grows exactly where the certificate says so.
+    /// The loop with the real law and the real motion grows exactly where the certificate predicts it.
     #[test]
-    fn the_sampled_limit_is_the_real_one() {
+    fn the_sampled_condition_predicts_the_simulated_loop() {
         let mut verdicts = [0, 0];
         for (lead_s, delay_ticks) in [0.0, 0.5].into_iter().flat_map(|lead_s| [1, 2, 5].map(|delay| (lead_s, delay))) {
             for stretch in [0.1, 0.5, 0.8, 1.2, 1.5, 2.0, 2.5] {
                 let gains = OrbitGains { radius_per_s2: stretch, radial_per_s: 1.8, transverse_per_s: 1.0 };
-                let told = certificate(gains, f64::INFINITY, 0.5, (lead_s, delay_ticks)).sampled;
+                let sampled = certificate(gains, f64::INFINITY, 0.5, (lead_s, delay_ticks)).sampled;
                 let shrinks = shrinks(gains, lead_s, delay_ticks);
-                assert_eq!(told.holds(), shrinks, "{gains:?} {lead_s} {delay_ticks}: {told:?}");
+                assert_eq!(sampled.holds(), shrinks, "{gains:?} {lead_s} {delay_ticks}: {sampled:?}");
                 verdicts[usize::from(shrinks)] += 1;
             }
         }
         assert!(verdicts.iter().all(|count| *count > 5), "{verdicts:?}");
     }
 
-    /// What prediction leaves of the rate is the same whatever the delay.
+    /// The rate with prediction does not depend on the delay.
     #[test]
-    fn prediction_takes_out_a_delay_of_any_number_of_ticks() {
+    fn prediction_compensates_a_delay_of_any_number_of_ticks() {
         let rates = [1, 2, 5, 64].map(|delay| certificate(GAINS, 4.0, 0.1, (0.1, delay)).sampled_rate_per_s);
         assert!(rates.iter().all(|rate| (rate / rates[0] - 1.0).abs() < 1e-4), "{rates:?}");
-        let [one, five] = [1, 5].map(|delay| certificate(GAINS, 4.0, 0.1, (0.0, delay)).sampled_rate_per_s);
-        assert!(five < 0.9 * one, "and without it the delay tells: {one} {five}");
+        let [short, long] = [1, 5].map(|delay| certificate(GAINS, 4.0, 0.1, (0.0, delay)).sampled_rate_per_s);
+        assert!(long < 0.9 * short, "without prediction the delay costs rate: {short} {long}");
     }
 
     fn shrinks(gains: OrbitGains, lead_s: f64, delay_ticks: u64) -> bool {

@@ -1,23 +1,24 @@
-//! The law that takes a body to a reference motion in a central field: a circular orbit, or another body's orbit.
+//! The law that steers a body to a reference motion in a central field: a circular orbit, or another body's orbit.
 //!
-//! \[S\] takes its law (2) from an earlier paper and does not reproduce it; this one is ours. With e_r = r − R, e_v = Vr − V_R
-//! and e_θ = Vθ − V_Θ against a reference (R, V_R, V_Θ) that moves freely,
+//! \[S\] takes its law (2) from an earlier paper and does not reproduce it; this law is our own. With e_r = r − R,
+//! e_v = Vr − V_R and e_θ = Vθ − V_Θ against a freely moving reference (R, V_R, V_Θ),
 //!
 //! U_r = (V_Θ²/R − μ/R²) − (Vθ²/r − μ/r²) − k_r e_r − k_v e_v,  U_θ = Vr Vθ/r − V_R V_Θ/R − k_θ e_θ
 //!
-//! puts the error under ė_r = e_v, ė_v = −k_r e_r − k_v e_v, ė_θ = −k_θ e_θ, as long as no limit acts. V = ½(k_r e_r² + e_v² +
-//! e_θ²) has V̇ = −k_v e_v² − k_θ e_θ² ≤ 0, which vanishes along a motion only at e = 0 (LaSalle), so every positive k
-//! converges. The angles keep an offset: θ̇ − Θ̇ = Vθ/r − V_Θ/R falls with the error and is integrable. With an estimate in
-//! place of a velocity, the observer's error enters as a disturbance that decays on its own.
+//! gives the error dynamics ė_r = e_v, ė_v = −k_r e_r − k_v e_v, ė_θ = −k_θ e_θ, as long as no limit acts. V = ½(k_r
+//! e_r² + e_v² + e_θ²) has V̇ = −k_v e_v² − k_θ e_θ² ≤ 0, which vanishes along a motion only at e = 0 (LaSalle), so
+//! the law converges for all positive gains. The angles keep an offset: θ̇ − Θ̇ = Vθ/r − V_Θ/R decays with the error
+//! and is integrable. With an estimate in place of a velocity, the observer's error enters as a disturbance that
+//! decays on its own.
 //!
-//! Must not ask for more than the thrusters give, nor for what is not a number.
+//! The law must not command more than the thrusters' limit, nor a value that is not finite.
 
 use super::Condition;
 use crate::model::{CentralField, OrbitState};
 use crate::vector::zeros;
 use nalgebra::Vector2;
 
-/// Gains of the law, all positive.
+/// The gains of the law, all positive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrbitGains {
     /// k_r on the radius, 1/s².
@@ -29,17 +30,17 @@ pub struct OrbitGains {
 }
 
 impl OrbitGains {
-    /// The slowest exponent of the error, 1/s: of the roots of s² + k_v s + k_r and of −k_θ.
+    /// Returns the slowest exponent of the error, 1/s: of the roots of s² + k_v s + k_r and of −k_θ.
     pub fn rate_per_s(&self) -> f64 {
         let half = 0.5 * self.radial_per_s;
         let discriminant = half * half - self.radius_per_s2;
-        // The small root from the product of both, or it would be lost beside a large k_v.
+        // The small root from the product of both, because its digits would be lost next to a large k_v.
         let radial = if discriminant > 0.0 { self.radius_per_s2 / (half + libm::sqrt(discriminant)) } else { half };
         radial.min(self.transverse_per_s)
     }
 }
 
-/// The law for one body: orbit hold and rendezvous differ in the reference alone.
+/// The law for one body. Orbit hold and rendezvous differ only in the reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrbitHold {
     field: CentralField,
@@ -49,42 +50,44 @@ pub struct OrbitHold {
 }
 
 impl OrbitHold {
-    /// A law in `field`, each component of the thrust within ±`thrust_max` (du/s², positive).
+    /// Creates a law in `field` whose thrust components are within ±`thrust_max` (du/s², positive).
     ///
-    /// `lead_s` is how far all motions are predicted before the law is applied: the delay of the loop, or 0.
+    /// `lead_s` is the time over which all motions are predicted before the law is applied: the delay of the loop, or
+    /// 0.
     pub fn new(field: CentralField, gains: OrbitGains, thrust_max: f64, lead_s: f64) -> Self {
         Self { field, gains, thrust_max, lead_s }
     }
 
-    /// The thrust, du/s², that takes `body` to the circular orbit of radius `target` (du).
+    /// Computes the thrust, du/s², that steers `body` to the circular orbit of radius `target` (du).
     ///
-    /// `applied` is the thrust acting on the body now; it matters only for the prediction.
+    /// `applied` is the thrust that acts on the body now; only the prediction uses it.
     #[inline]
     pub fn to_circle(&self, target: f64, body: &OrbitState, applied: &Vector2<f64>) -> Vector2<f64> {
         self.limited(self.law(&self.field.circular(target), &self.ahead(body, applied)))
     }
 
-    /// The thrust, du/s², that makes `body` move as the free `leader` does: same r, Vr and Vθ, at whatever angle.
+    /// Computes the thrust, du/s², that steers `body` to the motion of the free `leader`: same r, Vr and Vθ, at any
+    /// angle.
     #[inline]
     pub fn to_leader(&self, leader: &OrbitState, body: &OrbitState, applied: &Vector2<f64>) -> Vector2<f64> {
         self.limited(self.law(&self.ahead(leader, &zeros()), &self.ahead(body, applied)))
     }
 
-    /// The thrust limit against what the law asks of `body`, without thrust so far, for the free reference `to`, du/s²: the
-    /// proof covers what is within.
+    /// Returns the thrust limit against the thrust that the law computes for `body`, without thrust so far, and the
+    /// free reference `to`, du/s². The proof covers thrusts within the limit.
     pub fn margin(&self, to: &OrbitState, body: &OrbitState) -> Condition {
         let coasting = Vector2::zeros();
         let asked = self.law(&self.ahead(to, &coasting), &self.ahead(body, &coasting));
         Condition { value: self.thrust_max, required: asked.amax() }
     }
 
-    /// The state after the lead, du and du/s, under a thrust, du/s²; the present one where the model cannot tell.
+    /// Returns the state after the lead, du and du/s, under a thrust, du/s²; the current state where the model fails.
     #[inline]
     pub fn ahead(&self, state: &OrbitState, thrust: &Vector2<f64>) -> OrbitState {
         if self.lead_s > 0.0 { self.field.flow(state, thrust, self.lead_s).unwrap_or(*state) } else { *state }
     }
 
-    /// The law without the limit, du/s².
+    /// Computes the law without the limit, du/s².
     #[inline]
     fn law(&self, to: &OrbitState, body: &OrbitState) -> Vector2<f64> {
         let free = |x: &OrbitState| self.field.derivative(&(*x).into(), &zeros());
@@ -95,8 +98,8 @@ impl OrbitHold {
         )
     }
 
-    /// The law with its prediction and without the limit, for linearising the sampled loop.
-    /// What acts until the thrust does is given tick by tick.
+    /// Computes the law with its prediction and without the limit, for linearising the sampled loop. The thrusts in
+    /// flight are given tick by tick.
     pub(super) fn unlimited(
         &self,
         target: f64,
@@ -109,7 +112,7 @@ impl OrbitHold {
 
     #[inline]
     fn limited(&self, thrust: Vector2<f64>) -> Vector2<f64> {
-        // A radius of zero or an overflow gives no direction to push in.
+        // A radius of zero or an overflow leaves no valid thrust.
         let finite = thrust.x.is_finite() && thrust.y.is_finite();
         if finite { thrust.map(|value| value.clamp(-self.thrust_max, self.thrust_max)) } else { zeros() }
     }
@@ -128,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_obeys_its_own_linear_equation() {
+    fn the_error_obeys_a_linear_equation() {
         let law = law(10.0, 0.0);
         let thrust = law.to_leader(&LEADER, &BODY, &Vector2::zeros());
         let rates = |x: OrbitState, u: Vector2<f64>| law.field.derivative(&x.into(), &u);
@@ -138,12 +141,12 @@ mod tests {
     }
 
     #[test]
-    fn a_circular_orbit_is_a_leader_like_any_other() {
+    fn a_circular_orbit_equals_a_leader_on_it() {
         let law = law(10.0, 0.0);
         let circle = law.to_circle(1.3, &BODY, &Vector2::zeros());
         let leader = law.to_leader(&law.field.circular(1.3), &BODY, &Vector2::zeros());
         assert_eq!(circle, leader);
-        // Theory section 5, written out.
+        // Section 5 of the theory, written out.
         let expected = Vector2::new(-(0.9025 - 1.0) - (1.0 - 1.3) - 1.8 * 0.1, 0.095 - (0.95 - libm::sqrt(1.0 / 1.3)));
         assert!((circle - expected).amax() < 1e-15, "{circle} {expected}");
     }
@@ -158,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn each_component_keeps_to_the_limit_and_nonsense_gives_none() {
+    fn each_component_is_limited_and_invalid_states_give_no_thrust() {
         let still = OrbitState { vtheta: 0.0, ..BODY };
         assert_eq!(law(0.1, 0.0).to_circle(1.3, &still, &Vector2::zeros()), Vector2::new(0.1, 0.1));
         for r in [0.0, f64::NAN] {
@@ -167,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slowest_exponent_is_that_of_the_slowest_mode() {
+    fn the_rate_is_that_of_the_slowest_mode() {
         let rate =
             |k_r, k_v, k_t| OrbitGains { radius_per_s2: k_r, radial_per_s: k_v, transverse_per_s: k_t }.rate_per_s();
         assert_eq!(rate(1.0, 1.8, 1.0), 0.9);

@@ -1,60 +1,60 @@
-//! Physics as a watchdog: what must stay constant or small in a sound loop, held against bounds.
+//! A watchdog on physics: bounds on quantities that are constant or small in a sound loop.
 //!
-//! Must only count and say so; whoever commands decides what follows. Works on what the law itself works on, not on the
-//! truth: an estimate that breaks the physics is as bad as a body that does.
+//! The watchdog only counts and reports; the commanding role decides what follows. It checks the inputs of the law,
+//! not the truth: an estimate that violates physics is as bad as a body that does.
 
 use crate::state::persist_fields;
 
-/// Values from which a reference is taken: their median, so that one bad sample spoils nothing.
+/// The number of values whose median is the reference, so that a single bad sample does not affect it.
 const REFERENCE_SAMPLES: usize = 5;
 
-/// The most quantities that one watchdog watches.
+/// The largest number of quantities of one watchdog.
 pub const WATCHED_MAX: usize = 8;
 
 /// The bounds of a watchdog.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WatchBounds {
-    /// Nothing is judged before this tick; the references are taken from here on.
+    /// The first tick that is checked; the references are taken from here on.
     pub from_tick: u64,
-    /// The largest value of each quantity, drifts relative; +inf where it is not watched.
+    /// The largest value of each quantity, relative for drifts; +∞ disables the check.
     pub max: [f64; WATCHED_MAX],
-    /// After so many ticks in a row with a breach the safe command is latched; never if absent.
+    /// The number of consecutive ticks with a breach after which the safe command is latched; never if absent.
     pub latch_after_ticks: Option<u64>,
 }
 
 impl WatchBounds {
-    /// Nothing is watched.
+    /// No bounds.
     pub const NONE: Self = Self { from_tick: 0, max: [f64::INFINITY; WATCHED_MAX], latch_after_ticks: None };
 }
 
-/// How a quantity that is watched fared.
+/// The breaches of one watched quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Breaches {
-    /// How often it was judged.
+    /// The number of checked values.
     pub judged: u64,
-    /// How often it was beyond its bound.
+    /// The number of breaches.
     pub count: u64,
-    /// The first tick at which it was.
+    /// The first tick with a breach.
     pub first_tick: Option<u64>,
-    /// The largest value that was judged.
+    /// The largest checked value.
     pub largest: f64,
 }
 
-/// A watchdog with its counts.
+/// A watchdog with its counters.
 #[derive(Debug, Clone)]
 pub struct Watchdog {
     bounds: WatchBounds,
-    /// Whether anything is watched.
+    /// True if any quantity is watched.
     active: bool,
     references: [Reference; WATCHED_MAX],
     breaches: [Breaches; WATCHED_MAX],
-    /// The last tick with a breach, and how many there were in a row.
+    /// The last tick with a breach, and the number of consecutive ones.
     streak: (u64, u64),
     latched_at: Option<u64>,
 }
 
 impl Watchdog {
-    /// A watchdog that has seen nothing.
+    /// Creates a watchdog with zero counters.
     pub fn new(bounds: WatchBounds) -> Self {
         Self {
             active: bounds.max.iter().any(|max| *max < f64::INFINITY),
@@ -66,40 +66,40 @@ impl Watchdog {
         }
     }
 
-    /// Whether anything is watched.
+    /// Returns true if any quantity is watched.
     #[inline]
     pub fn active(&self) -> bool {
         self.active
     }
 
-    /// Whether this quantity is watched at a tick.
+    /// Returns true if this quantity is watched at a tick.
     #[inline]
     pub fn watches(&self, quantity: usize, tick: u64) -> bool {
         tick >= self.bounds.from_tick && self.bounds.max[quantity] < f64::INFINITY
     }
 
-    /// Looks at what must stay constant, in any unit.
+    /// Checks a quantity that must stay constant, in any unit.
     #[inline]
     pub fn constant(&mut self, quantity: usize, tick: u64, value: f64) {
         if self.watches(quantity, tick)
             && let Some(drift) = self.references[quantity].drift(value)
         {
-            self.judge(quantity, tick, drift);
+            self.check(quantity, tick, drift);
         }
     }
 
-    /// Looks at what must stay small.
+    /// Checks a quantity that must stay small.
     #[inline]
     pub fn magnitude(&mut self, quantity: usize, tick: u64, value: f64) {
         if self.watches(quantity, tick) {
-            self.judge(quantity, tick, value.abs());
+            self.check(quantity, tick, value.abs());
         }
     }
 
-    fn judge(&mut self, quantity: usize, tick: u64, value: f64) {
+    fn check(&mut self, quantity: usize, tick: u64, value: f64) {
         let (max, breaches) = (self.bounds.max[quantity], &mut self.breaches[quantity]);
         breaches.judged += 1;
-        // What is not a number is beyond every bound.
+        // NaN is a breach of every bound.
         let value = if value.is_nan() { f64::INFINITY } else { value };
         breaches.largest = breaches.largest.max(value);
         if value > max {
@@ -120,24 +120,24 @@ impl Watchdog {
         }
     }
 
-    /// The tick at which the safe command was latched, if it was. Nothing ends it in this run.
+    /// Returns the tick at which the safe command was latched, if it was. It stays latched for the rest of the run.
     #[inline]
     pub fn latched_at(&self) -> Option<u64> {
         self.latched_at
     }
 
-    /// How each quantity fared.
+    /// Returns the breaches of each quantity.
     pub fn breaches(&self) -> &[Breaches; WATCHED_MAX] {
         &self.breaches
     }
 
-    /// The bounds.
+    /// Returns the bounds.
     pub fn bounds(&self) -> &WatchBounds {
         &self.bounds
     }
 }
 
-/// What a constant was when it was first looked at.
+/// The initial value of a constant quantity.
 #[derive(Debug, Clone, Copy, Default)]
 struct Reference {
     first: [f64; REFERENCE_SAMPLES],
@@ -145,7 +145,7 @@ struct Reference {
 }
 
 impl Reference {
-    /// The relative difference from the reference; none while that is being taken.
+    /// Returns the relative difference from the reference; `None` while the reference is being taken.
     fn drift(&mut self, value: f64) -> Option<f64> {
         let taken = self.count as usize;
         if taken < REFERENCE_SAMPLES {
@@ -184,7 +184,7 @@ mod tests {
             .iter()
             .zip(10..)
             .for_each(|(value, tick)| invariants(&mut watchdog, tick, [*value, 4.0]));
-        assert_eq!(watchdog.breaches()[0], Breaches::default(), "nothing is judged while the reference is taken");
+        assert_eq!(watchdog.breaches()[0], Breaches::default(), "no check while the reference is taken");
         invariants(&mut watchdog, 15, [2.01, 4.1]);
         let [energy, momentum, ..] = *watchdog.breaches();
         assert_eq!((energy.judged, energy.count), (1, 0));
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_a_breach_and_what_is_not_watched_is_none() {
+    fn nan_is_a_breach_and_an_unwatched_quantity_is_not_checked() {
         let mut watchdog = watchdog(None);
         for (tick, value) in [(9, 9.0), (10, 0.5), (11, -0.6), (12, f64::NAN), (13, f64::INFINITY)] {
             watchdog.magnitude(2, tick, value);
@@ -203,16 +203,16 @@ mod tests {
         assert_eq!((innovation.judged, innovation.count, innovation.first_tick), (4, 3, Some(11)));
         assert_eq!(innovation.largest, f64::INFINITY);
         assert_eq!(lyapunov, Breaches::default());
-        assert_eq!(watchdog.latched_at(), None, "it only counts");
+        assert_eq!(watchdog.latched_at(), None, "without a latch it only counts");
     }
 
     #[test]
-    fn latches_after_breaches_in_a_row_and_for_good() {
+    fn consecutive_breaches_latch_for_good() {
         let mut watchdog = watchdog(Some(3));
         for tick in [10, 11, 13, 14, 14, 14] {
             watchdog.magnitude(2, tick, 1.0);
         }
-        assert_eq!(watchdog.latched_at(), None, "twice in a row, however many breaches a tick has");
+        assert_eq!(watchdog.latched_at(), None, "two consecutive ticks, whatever the number of breaches per tick");
         watchdog.magnitude(2, 15, 1.0);
         watchdog.magnitude(2, 16, 0.0);
         assert_eq!(watchdog.latched_at(), Some(15));

@@ -1,21 +1,21 @@
-//! The motion of many rigid bodies of one inertia at once, as structures of arrays.
+//! The motion of many rigid bodies of equal inertia at once, as structures of arrays.
 //!
-//! Every body gets the bits of [`RigidBody::flow`]: the same operations in the same order, none of them fused. Bodies of one
-//! block that need the same number of integration steps take them side by side. Must not allocate.
+//! Every body gets the bits of [`RigidBody::flow`]: the same operations in the same order, none of them fused. Bodies
+//! of one block that need the same number of integration steps take them together. Must not allocate.
 
 use super::integrate::{rk4_step, steps};
 use super::rigid_body::{RigidBody, euler, fastest_rad_s, in_one_step, max_step_s};
 use nalgebra::Vector3;
 
-/// Bodies that go on together, if they can.
+/// The number of bodies in a block.
 const BLOCK: usize = 64;
 
-/// Moves all bodies on by `dt_s` seconds under their held torques over inertia, rad/s².
+/// Advances all bodies by `dt_s` seconds under their held torques over inertia, rad/s².
 ///
-/// Component i of body n is `rates[i][n]`, rad/s, and so for the torques.
+/// Component i of body n is `rates[i][n]`, rad/s; the torques have the same layout.
 ///
 /// # Panics
-/// If the six arrays are not of one length.
+/// If the six arrays differ in length.
 pub fn flow_all(body: &RigidBody, rates: [&mut [f64]; 3], torques: [&[f64]; 3], dt_s: f64) {
     let ([r1, r2, r3], [t1, t2, t3]) = (rates, torques);
     let count = r1.len();
@@ -51,7 +51,7 @@ fn flow_block(body: &RigidBody, r1: &mut [f64], r2: &mut [f64], r3: &mut [f64], 
     }
 }
 
-/// Whether every body of a block needs one integration step only: the usual case of a fast tick.
+/// Returns true if every body of a block needs only one integration step: the usual case of a fast tick.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, clippy::too_many_arguments, reason = "arrays that are arguments are known not to overlap")]
 fn all_in_one_step(r1: &[f64], r2: &[f64], r3: &[f64], t1: &[f64], t2: &[f64], t3: &[f64], dt_s: f64) -> bool {
@@ -63,7 +63,7 @@ fn all_in_one_step(r1: &[f64], r2: &[f64], r3: &[f64], t1: &[f64], t2: &[f64], t
     more == 0
 }
 
-/// One integration step of `h` seconds for every body of a block.
+/// Takes one integration step of `h` seconds for every body of a block.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, clippy::too_many_arguments, reason = "arrays that are arguments are known not to overlap")]
 fn step_all(
@@ -89,9 +89,9 @@ mod tests {
     use super::*;
     use crate::model::{Inertia, uniform};
 
-    /// Bodies that are slow, fast, of very different speeds within one block, and no numbers at all.
+    /// Slow and fast bodies, very different speeds within one block, and NaN.
     #[test]
-    fn every_body_moves_as_it_does_alone() {
+    fn every_body_is_bit_identical_to_one_alone() {
         let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
         for count in [0, 1, 3, 7, 64, 65, 1000, 1003] {
             for (scale, dt_s) in [(1.0, 1e-3), (1.0, 1e-2), (30.0, 1e-3), (1e3, 1e-4), (0.0, 1e-3)] {

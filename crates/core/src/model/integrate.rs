@@ -1,13 +1,13 @@
 //! Fixed-step integration of an autonomous ordinary differential equation whose input is held over the step.
 //!
-//! Must not adapt its step to an error estimate: the same state and step always cost and give the same.
+//! The step must not adapt to an error estimate: equal states and steps always have the same cost and result.
 
 use nalgebra::SVector;
 
-/// The most steps one call takes. A body driven to absurd rates loses accuracy, never the tick.
+/// The maximum number of steps per call. A body at extreme rates loses accuracy, but does not miss the deadline.
 const MAX_STEPS: f64 = 10_000.0;
 
-/// One classical fourth-order Runge-Kutta step of `x' = f(x)` over `h` seconds.
+/// Takes one classical fourth-order Runge-Kutta step of `x' = f(x)` over `h` seconds.
 #[inline]
 pub fn rk4_step<const N: usize>(
     f: impl Fn(&SVector<f64, N>) -> SVector<f64, N>,
@@ -21,18 +21,18 @@ pub fn rk4_step<const N: usize>(
     x + (k1 + (k2 + k3) * 2.0 + k4) * (h / 6.0)
 }
 
-/// How many equal steps of at most `max_step_s` make up `dt_s`.
+/// Returns the number of equal steps of at most `max_step_s` in `dt_s`.
 #[inline]
 pub(super) fn steps(dt_s: f64, max_step_s: f64) -> f64 {
-    // Most ticks are one step.
+    // Most ticks need one step.
     if dt_s <= max_step_s {
         return 1.0;
     }
-    // The slack keeps a tick that equals the bound up to rounding at one step.
+    // The tolerance keeps a tick that equals the bound up to rounding at one step.
     libm::ceil(dt_s / max_step_s - 1e-6).clamp(1.0, MAX_STEPS)
 }
 
-/// Moves `x` along `x' = f(x)` by `dt_s` seconds in equal Runge-Kutta steps of at most `max_step_s`.
+/// Advances `x` along `x' = f(x)` by `dt_s` seconds in equal Runge-Kutta steps of at most `max_step_s`.
 ///
 /// `dt_s` is finite and not negative, `max_step_s` positive; a step of zero returns `x`.
 #[inline]

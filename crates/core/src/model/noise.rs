@@ -1,14 +1,14 @@
-//! What a real sensor adds to the truth: white Gaussian noise and a constant bias, from a seed.
+//! Sensor noise: white Gaussian noise and a constant bias, from a seed.
 //!
-//! Must not draw from the system's randomness, nor through a mathematical library that differs between platforms: the
-//! same seed and stream give the same bits everywhere.
+//! The noise must not use the system's randomness, nor a mathematical library that differs between platforms: equal
+//! seeds and streams give equal bits everywhere.
 
 use crate::state::{Persist, Words};
 use nalgebra::SVector;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::{Rng, SeedableRng};
 
-/// 2⁻⁵³: turns the upper 53 bits of a draw into a number in \[0, 1).
+/// 2⁻⁵³: scales the upper 53 bits of a draw to \[0, 1).
 const UNIT: f64 = 1.0 / (1_u64 << 53) as f64;
 
 /// A source of white Gaussian noise with a constant bias in each of N components.
@@ -18,17 +18,19 @@ pub struct Noise<const N: usize> {
     deviation: SVector<f64, N>,
     bias: SVector<f64, N>,
     white: bool,
-    /// Samples drawn so far.
+    /// The number of samples drawn so far.
     drawn: u64,
 }
 
 impl<const N: usize> Noise<N> {
-    /// Noise of standard deviation `deviation` (not negative) about `bias`, both finite, in the unit of what is measured.
+    /// Creates noise of standard deviation `deviation` (not negative) about `bias`, both finite, in the unit of the
+    /// measured quantity.
     ///
-    /// Sources with one seed and different `stream`s are independent, so that adding a sensor changes no other's noise.
+    /// Sources with one seed and different `stream`s are independent, so that an additional sensor does not change
+    /// the noise of others.
     pub fn new(seed: u64, stream: u64, deviation: [f64; N], bias: [f64; N]) -> Self {
         let white = deviation.iter().any(|&deviation| deviation != 0.0);
-        // Not the generator's own streams: those of one state are correlated.
+        // The generator's own streams are not used: those of one state are correlated.
         let salt = Pcg64::seed_from_u64(stream).next_u64();
         Self {
             generator: Pcg64::seed_from_u64(seed ^ salt),
@@ -39,20 +41,21 @@ impl<const N: usize> Noise<N> {
         }
     }
 
-    /// The next sample. Without deviation it is the bias, exactly, and nothing is drawn.
+    /// Returns the next sample. Without deviation it is exactly the bias, and nothing is drawn.
     #[inline]
     pub fn sample(&mut self) -> SVector<f64, N> {
         if self.white { self.draw() } else { self.bias }
     }
 
-    /// Leaves out `samples` samples.
+    /// Skips `samples` samples.
     pub fn skip(&mut self, samples: u64) {
         // Each pair of components takes one draw for its radius and one for its angle.
         self.generator.advance(u128::from(samples) * 2 * N.div_ceil(2) as u128);
         self.drawn = self.drawn.wrapping_add(samples);
     }
 
-    /// Every component draws, also one without deviation: setting one sensor's noise leaves the others' as they are.
+    /// Draws every component, even one without deviation, so that the noise of one sensor does not depend on that of
+    /// another.
     #[inline(never)]
     fn draw(&mut self) -> SVector<f64, N> {
         self.drawn = self.drawn.wrapping_add(1);
@@ -66,9 +69,9 @@ impl<const N: usize> Noise<N> {
         sample
     }
 
-    /// Two independent standard normals by Box and Muller.
+    /// Draws two independent standard normals by the Box-Muller transform.
     ///
-    /// Not the usual ziggurat: it calls the platform's mathematics wherever a dependency turns that on.
+    /// Not the usual ziggurat, which calls the platform's mathematics wherever a dependency enables it.
     fn two_normals(&mut self) -> [f64; 2] {
         // 1 − u is never zero, so the logarithm is finite.
         let radius = libm::sqrt(-2.0 * libm::log(1.0 - self.uniform()));
@@ -76,19 +79,19 @@ impl<const N: usize> Noise<N> {
         [radius * cosine, radius * sine]
     }
 
-    /// Uniform in \[0, 1).
+    /// Draws a uniform number in \[0, 1).
     fn uniform(&mut self) -> f64 {
         (self.generator.next_u64() >> 11) as f64 * UNIT
     }
 }
 
-/// Independent numbers, uniform in \[0, 1), of a seed and a stream of it.
+/// Returns an endless source of independent numbers, uniform in \[0, 1), from a seed and a stream.
 pub fn uniform(seed: u64, stream: u64) -> impl FnMut() -> f64 {
     let mut noise = Noise::<1>::new(seed, stream, [0.0], [0.0]);
     move || noise.uniform()
 }
 
-/// How many samples have been drawn tells where the source is.
+/// The state is the number of samples drawn.
 impl<const N: usize> Persist for Noise<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         let mut drawn = self.drawn;
@@ -104,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_deviation_it_is_the_bias_and_draws_nothing() {
+    fn without_deviation_a_sample_is_the_bias_and_draws_nothing() {
         let mut none = Noise::new(1, 2, [0.0; 3], [0.0; 3]);
         let before = none.clone();
         assert_eq!(none.sample(), SVector::from([0.0; 3]));
@@ -127,14 +130,14 @@ mod tests {
         }
         let moments = [mean, square, fourth, cross].map(|sum| sum / f64::from(count));
         let expected = [0.0, 1.0, 3.0, 0.0];
-        // Five standard errors of each: the seed is fixed, so this either holds for good or never.
+        // Five standard errors of each. The seed is fixed, so the result is always the same.
         for ((moment, expected), error) in moments.into_iter().zip(expected).zip([1.3e-3, 1.8e-3, 1.3e-2, 2.2e-3]) {
             assert!((moment - expected).abs() < 5.0 * error, "{moments:?}");
         }
     }
 
     #[test]
-    fn streams_and_seeds_differ_and_repeat() {
+    fn streams_and_seeds_are_distinct_and_reproducible() {
         let first = |seed, stream| Noise::new(seed, stream, [1.0], [0.0]).sample().x;
         assert_eq!(first(1, 1), first(1, 1));
         assert_ne!(first(1, 1), first(1, 2));
@@ -142,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn skipping_is_sampling_without_looking() {
+    fn skipping_equals_drawing() {
         let noise = Noise::new(5, 1, [1.0, 2.0, 3.0], [0.5; 3]);
         let (mut sampled, mut skipped) = (noise.clone(), noise);
         for _ in 0..1000 {
@@ -159,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_component_leaves_the_others_noise_alone() {
+    fn a_component_without_noise_does_not_change_the_others() {
         let both = Noise::new(3, 0, [1.0, 1.0, 1.0], [0.0; 3]).sample();
         let some = Noise::new(3, 0, [1.0, 0.0, 1.0], [0.0; 3]).sample();
         assert_eq!((some.x, some.y, some.z), (both.x, 0.0, both.z));

@@ -1,17 +1,18 @@
 //! A light body in the plane about a point mass, in polar coordinates: the restricted two-body problem, \[S\](1).
 //!
-//! Lengths are in any one unit, called du here: that of the gravitational parameter. Time is in seconds. Must not carry on
-//! where the model ends (at the central body's surface, far away, or where numbers do): the last good state comes back.
+//! Lengths are in the unit of the gravitational parameter, called du here. Time is in seconds. The model must not
+//! continue beyond its limits (the central body's surface, the outer radius, numbers that are not finite): it returns
+//! the last valid state.
 
 use super::integrate;
 use crate::vector::amax;
 use nalgebra::{Vector2, Vector4};
 
-/// How far anything may change in one integration step, rad or part of the radius. One step then errs by less than a
+/// The largest change in one integration step, rad or part of the radius. The error of one step is then below
 /// rounding.
 const MAX_STEP_RAD: f64 = 2e-3;
 
-/// The most steps one call takes: several revolutions. What needs more is not resolved by the tick.
+/// The maximum number of steps per call, enough for several revolutions. A motion that needs more is not resolved.
 const MAX_STEPS: usize = 20_000;
 
 /// Position and velocity in polar coordinates about the central body, \[S\](1).
@@ -21,7 +22,7 @@ pub struct OrbitState {
     pub r: f64,
     /// Radial velocity, du/s.
     pub vr: f64,
-    /// Angle, rad; it grows on from turn to turn.
+    /// Angle, rad, counted on over full turns.
     pub theta: f64,
     /// Transverse velocity r·θ̇, du/s.
     pub vtheta: f64,
@@ -30,19 +31,19 @@ pub struct OrbitState {
 crate::state::persist_fields!(OrbitState, r, vr, theta, vtheta);
 
 impl OrbitState {
-    /// Whether every component is finite.
+    /// Returns true if every component is finite.
     pub fn is_finite(&self) -> bool {
         [self.r, self.vr, self.theta, self.vtheta].iter().all(|value| value.is_finite())
     }
 
-    /// Angular momentum per mass r·Vθ, du²/s; constant without thrust.
+    /// Returns the angular momentum per mass r·Vθ, du²/s; constant without thrust.
     pub fn momentum(&self) -> f64 {
         self.r * self.vtheta
     }
 }
 
 impl From<OrbitState> for Vector4<f64> {
-    /// In the order of \[S\](1): r, Vr, θ, Vθ.
+    /// Returns (r, Vr, θ, Vθ), the order of \[S\](1).
     fn from(state: OrbitState) -> Self {
         Self::new(state.r, state.vr, state.theta, state.vtheta)
     }
@@ -54,13 +55,13 @@ impl From<Vector4<f64>> for OrbitState {
     }
 }
 
-/// Why there is no such field.
+/// The reason why a central field is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum CentralFieldError {
     /// The gravitational parameter is zero, negative, infinite or not a number.
     #[error("a gravitational parameter of {mu} du^3/s^2 attracts nothing; give a finite number above zero")]
     NotAttracting {
-        /// As given, du³/s².
+        /// The given value, du³/s².
         mu: f64,
     },
     /// The radii do not enclose a region: 0 < inner < outer does not hold.
@@ -77,7 +78,7 @@ pub enum CentralFieldError {
 }
 
 impl From<&CentralFieldError> for &'static str {
-    /// Returns the stable name of the mistake.
+    /// Returns the stable name of the error.
     fn from(error: &CentralFieldError) -> Self {
         match error {
             CentralFieldError::NotAttracting { .. } => "not-attracting",
@@ -86,31 +87,31 @@ impl From<&CentralFieldError> for &'static str {
     }
 }
 
-/// Where a body was when the model ended.
+/// The limit at which the model of a motion ended.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum OrbitFault {
-    /// It reached the surface of the central body.
+    /// The body reached the surface of the central body.
     #[error("it hit the central body; last good state {last:?}")]
     Collision {
         /// The last state above the surface.
         last: OrbitState,
     },
-    /// It left the region of interest.
+    /// The body left the region of interest.
     #[error("it left the region; last good state {last:?}")]
     Escape {
-        /// The last state within.
+        /// The last state within the region.
         last: OrbitState,
     },
-    /// The motion is too fast for the time asked for, or no longer a number.
+    /// The motion is too fast for the given time, or no longer finite.
     #[error("its motion cannot be resolved; last good state {last:?}")]
     Unresolved {
-        /// The last good state.
+        /// The last valid state.
         last: OrbitState,
     },
 }
 
 impl OrbitFault {
-    /// The last good state.
+    /// Returns the last valid state.
     pub fn last(&self) -> OrbitState {
         match self {
             Self::Collision { last } | Self::Escape { last } | Self::Unresolved { last } => *last,
@@ -118,7 +119,7 @@ impl OrbitFault {
     }
 }
 
-/// A point mass's attraction, between the surface of the central body and an outer radius.
+/// The attraction of a point mass, between the surface of the central body and an outer radius.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CentralField {
     mu: f64,
@@ -127,10 +128,11 @@ pub struct CentralField {
 }
 
 impl CentralField {
-    /// A field with gravitational parameter `mu` (du³/s², the paper's h²/p), ending at the radii `inner` and `outer` (du).
+    /// Creates a field with gravitational parameter `mu` (du³/s², the paper's h²/p) between the radii `inner` and
+    /// `outer` (du).
     ///
     /// # Errors
-    /// [`CentralFieldError`] names what is wrong.
+    /// [`CentralFieldError`] if a parameter is invalid.
     pub fn new(mu: f64, inner: f64, outer: f64) -> Result<Self, CentralFieldError> {
         if !(mu.is_finite() && mu > 0.0) {
             return Err(CentralFieldError::NotAttracting { mu });
@@ -141,37 +143,37 @@ impl CentralField {
         Ok(Self { mu, inner, outer })
     }
 
-    /// The gravitational parameter μ, du³/s².
+    /// Returns the gravitational parameter μ, du³/s².
     pub fn mu(&self) -> f64 {
         self.mu
     }
 
-    /// The radius of the central body, du.
+    /// Returns the radius of the central body, du.
     pub fn inner(&self) -> f64 {
         self.inner
     }
 
-    /// Whether a distance from the centre is one at which a body can be, du.
+    /// Returns true if a distance from the centre, du, lies within the field.
     pub fn holds(&self, r: f64) -> bool {
         r > self.inner && r < self.outer
     }
 
-    /// The velocity √(μ/r) of a circular orbit, du/s.
+    /// Returns the velocity √(μ/r) of a circular orbit, du/s.
     pub fn circular_velocity(&self, r: f64) -> f64 {
         libm::sqrt(self.mu / r)
     }
 
-    /// The state of a body on the circular orbit of radius `r` (du), at angle 0.
+    /// Returns the state of a body on the circular orbit of radius `r` (du), at angle 0.
     pub fn circular(&self, r: f64) -> OrbitState {
         OrbitState { r, vr: 0.0, theta: 0.0, vtheta: self.circular_velocity(r) }
     }
 
-    /// Energy per mass ½(Vr² + Vθ²) − μ/r, du²/s²; constant without thrust.
+    /// Returns the energy per mass ½(Vr² + Vθ²) − μ/r, du²/s²; constant without thrust.
     pub fn energy(&self, state: &OrbitState) -> f64 {
         0.5 * (state.vr * state.vr + state.vtheta * state.vtheta) - self.mu / state.r
     }
 
-    /// The least distance from the centre of a free orbit through `state`, past or future, du.
+    /// Returns the least distance from the centre of the free orbit through `state`, past or future, du.
     pub fn pericentre(&self, state: &OrbitState) -> f64 {
         let momentum = state.momentum();
         let parameter = momentum * momentum / self.mu;
@@ -179,25 +181,25 @@ impl CentralField {
         parameter / (1.0 + eccentricity)
     }
 
-    /// Right-hand side of \[S\](1) for (r, Vr, θ, Vθ), with `thrust` (Ur, Uθ) in du/s².
+    /// Computes the right-hand side of \[S\](1) for (r, Vr, θ, Vθ), with `thrust` (Ur, Uθ) in du/s².
     #[inline]
     pub fn derivative(&self, x: &Vector4<f64>, thrust: &Vector2<f64>) -> Vector4<f64> {
         let (r, vr, vtheta) = (x.x, x.y, x.w);
         Vector4::new(vr, (vtheta * vtheta - self.mu / r) / r + thrust.x, vtheta / r, -vr * vtheta / r + thrust.y)
     }
 
-    /// The state `dt_s` seconds after `state` under a `thrust` (du/s²) whose polar components are held.
+    /// Returns the state `dt_s` seconds after `state` under a `thrust` (du/s²) whose polar components are held.
     ///
-    /// The integration steps follow from the state alone, so equal inputs give equal bits. `dt_s` is finite and not
+    /// The integration steps depend on the inputs alone, so equal inputs give equal bits. `dt_s` is finite and not
     /// negative.
     ///
     /// # Errors
-    /// [`OrbitFault`] with the last good state if the body reaches an end of the field on the way.
+    /// [`OrbitFault`] with the last valid state if the body reaches a limit of the field.
     #[inline]
     pub fn flow(&self, state: &OrbitState, thrust: &Vector2<f64>, dt_s: f64) -> Result<OrbitState, OrbitFault> {
         let (mut x, mut left_s) = (*state, dt_s);
         for _ in 0..MAX_STEPS {
-            // The slack keeps a tick that equals the bound up to rounding at one step.
+            // The tolerance keeps a tick that equals the bound up to rounding at one step.
             let steps = libm::ceil(left_s / self.longest_step_s(&x, thrust) - 1e-6);
             if steps <= 1.0 {
                 return self.step(&x, thrust, left_s);
@@ -208,7 +210,7 @@ impl CentralField {
         Err(OrbitFault::Unresolved { last: x })
     }
 
-    /// One step, if it ends within the field.
+    /// Takes one step, if it ends within the field.
     #[inline]
     fn step(&self, last: &OrbitState, thrust: &Vector2<f64>, h: f64) -> Result<OrbitState, OrbitFault> {
         let next: OrbitState = integrate::rk4_step(|x| self.derivative(x, thrust), &(*last).into(), h).into();
@@ -224,7 +226,7 @@ impl CentralField {
         }
     }
 
-    /// The time in which nothing changes by more than [`MAX_STEP_RAD`]: by the velocity, by gravity, by thrust.
+    /// Returns the time in which nothing changes by more than [`MAX_STEP_RAD`]: by velocity, gravity or thrust.
     #[inline]
     fn longest_step_s(&self, x: &OrbitState, thrust: &Vector2<f64>) -> f64 {
         let speed = x.vr.abs().max(x.vtheta.abs()) / x.r;
@@ -244,7 +246,7 @@ mod tests {
     const START: OrbitState = OrbitState { r: 1.0, vr: 0.1, theta: 0.0, vtheta: 0.95 };
 
     #[test]
-    fn refuses_what_is_no_field() {
+    fn invalid_fields_are_refused() {
         for mu in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             assert!(matches!(CentralField::new(mu, 0.1, 1.0), Err(CentralFieldError::NotAttracting { .. })), "{mu}");
         }
@@ -255,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn free_motion_keeps_energy_and_momentum() {
+    fn free_motion_conserves_energy_and_momentum() {
         let mut x = START;
         for _ in 0..20_000 {
             x = field().flow(&x, &Vector2::zeros(), 1e-3).unwrap();
@@ -270,7 +272,7 @@ mod tests {
         let x = field().flow(&start, &Vector2::zeros(), 5.0).unwrap();
         assert!((x.r - 1.3).abs() < 1e-13 && x.vr.abs() < 1e-13, "{x:?}");
         assert!((x.theta - 5.0 * start.vtheta / 1.3).abs() < 1e-11);
-        assert!((field().pericentre(&start) - 1.3).abs() < 1e-7, "the root of a rounding");
+        assert!((field().pericentre(&start) - 1.3).abs() < 1e-7, "accurate to the square root of rounding");
     }
 
     #[test]
@@ -294,7 +296,7 @@ mod tests {
     fn a_fall_ends_above_the_surface() {
         let start = OrbitState { r: 1.0, ..OrbitState::default() };
         let Err(OrbitFault::Collision { last }) = field().flow(&start, &Vector2::zeros(), 5.0) else {
-            panic!("it fell through");
+            panic!("the body passed through the surface");
         };
         assert!(last.r > 0.05 && last.r < 0.051 && last.vr < -6.0, "{last:?}");
     }
@@ -307,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_never_becomes_a_state() {
+    fn a_state_is_always_finite() {
         for thrust in [f64::NAN, f64::INFINITY, f64::MAX] {
             let fault = field().flow(&START, &Vector2::new(thrust, 0.0), 1e-3).unwrap_err();
             assert!(fault.last().is_finite(), "{fault}");

@@ -1,21 +1,21 @@
-//! A rigid body turning about its centre of mass, in its principal axes: Euler's equations, \[D\](1)-(3), \[SZ\](1).
+//! A rigid body rotating about its centre of mass, in its principal axes: Euler's equations, \[D\](1)-(3), \[SZ\](1).
 
 use super::integrate;
 use crate::vector::{amax, product, sum};
 use nalgebra::Vector3;
 
-/// How far the body may turn in one integration step, rad. One step then errs by less than a rounding.
+/// The largest rotation in one integration step, rad. The error of one step is then below rounding.
 const MAX_STEP_RAD: f64 = 2e-3;
-/// A body that turns slowly is limited by its torque history, not by its rate.
+/// The longest integration step, s. It limits slow bodies, whose torque, not rate, determines the error.
 const LONGEST_STEP_S: f64 = 0.01;
 
-/// Principal moments of inertia that a physical body can have.
+/// The principal moments of inertia of a physically possible body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Inertia {
     moments_kg_m2: Vector3<f64>,
 }
 
-/// Why three numbers are not the principal moments of inertia of a body. Axes are counted from 1, as in the papers.
+/// The reason why three numbers are not the principal moments of a body. Axes are counted from 1, as in the papers.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum InertiaError {
     /// A moment is zero, negative, infinite or not a number.
@@ -25,7 +25,7 @@ pub enum InertiaError {
     NotPositive {
         /// The axis, 1 to 3.
         axis: usize,
-        /// The moment as given, kg m².
+        /// The given moment, kg m².
         value_kg_m2: f64,
     },
     /// One moment exceeds the sum of the other two.
@@ -44,7 +44,7 @@ pub enum InertiaError {
 }
 
 impl From<&InertiaError> for &'static str {
-    /// Returns the stable name of the mistake.
+    /// Returns the stable name of the error.
     fn from(error: &InertiaError) -> Self {
         match error {
             InertiaError::NotPositive { .. } => "no-such-inertia",
@@ -54,10 +54,11 @@ impl From<&InertiaError> for &'static str {
 }
 
 impl Inertia {
-    /// Checks three principal moments, kg m²: positive, and each at most the sum of the others (equal for a flat plate).
+    /// Checks three principal moments, kg m²: each positive and at most the sum of the others (equal for a flat
+    /// plate).
     ///
     /// # Errors
-    /// [`InertiaError`] names the axis and the reason.
+    /// [`InertiaError`] with the axis and the reason.
     pub fn new(moments_kg_m2: [f64; 3]) -> Result<Self, InertiaError> {
         for (index, &value_kg_m2) in moments_kg_m2.iter().enumerate() {
             if !(value_kg_m2.is_finite() && value_kg_m2 > 0.0) {
@@ -66,7 +67,7 @@ impl Inertia {
         }
         for (index, &value_kg_m2) in moments_kg_m2.iter().enumerate() {
             let sum_kg_m2 = moments_kg_m2[(index + 1) % 3] + moments_kg_m2[(index + 2) % 3];
-            // A plate typed in decimals may miss equality by a rounding error.
+            // Decimal input of a plate may miss equality by a rounding error.
             if value_kg_m2 > sum_kg_m2 * (1.0 + 1e-12) {
                 return Err(InertiaError::Triangle { axis: index + 1, value_kg_m2, sum_kg_m2 });
             }
@@ -74,40 +75,42 @@ impl Inertia {
         Ok(Self { moments_kg_m2: Vector3::from(moments_kg_m2) })
     }
 
-    /// The three moments, kg m².
+    /// Returns the three moments, kg m².
     pub fn moments_kg_m2(&self) -> Vector3<f64> {
         self.moments_kg_m2
     }
 
-    /// The dimensionless coefficients a of \[D\](2): a1 = (I2 − I3)/I1 and cyclic. They satisfy a1 + a2 + a3 + a1·a2·a3 = 0.
+    /// Returns the dimensionless coefficients a of \[D\](2): a1 = (I2 − I3)/I1 and cyclic. They satisfy a1 + a2 + a3
+    /// + a1·a2·a3 = 0.
     pub fn coefficients(&self) -> Vector3<f64> {
         let i = &self.moments_kg_m2;
         Vector3::new((i.y - i.z) / i.x, (i.z - i.x) / i.y, (i.x - i.y) / i.z)
     }
 
-    /// Kinetic energy ½ Σ I ω², J; constant while no torque acts. `rate` in rad/s.
+    /// Returns the kinetic energy ½ Σ I ω², J; constant without torque. `rate` in rad/s.
     pub fn kinetic_energy_j(&self, rate: &Vector3<f64>) -> f64 {
         0.5 * self.moments_kg_m2.dot(&rate.component_mul(rate))
     }
 
-    /// Magnitude of the angular momentum |I ω|, N m s; constant while no torque acts. `rate` in rad/s.
+    /// Returns the magnitude of the angular momentum |I ω|, N m s; constant without torque. `rate` in rad/s.
     pub fn momentum_n_m_s(&self, rate: &Vector3<f64>) -> f64 {
         libm::sqrt(self.moments_kg_m2.component_mul(rate).norm_squared())
     }
 
-    /// The bound M ≥ |ω(t)| for all time of a free motion through `rate`, rad/s: √(2T / I_min).
+    /// Returns the bound M ≥ |ω(t)| for all time of the free motion through `rate`, rad/s: √(2T / I_min).
     pub fn rate_bound_rad_s(&self, rate: &Vector3<f64>) -> f64 {
         libm::sqrt(2.0 * self.kinetic_energy_j(rate) / self.moments_kg_m2.min())
     }
 }
 
-/// a1 + a2 + a3 + a1·a2·a3, zero for the coefficients a of every body: what it is for others says how little they are a body's.
+/// Computes a1 + a2 + a3 + a1·a2·a3. It is zero for the coefficients a of every body and measures the inconsistency
+/// of others.
 #[inline]
 pub fn closure(a: &Vector3<f64>) -> f64 {
     sum(a) + product(a)
 }
 
-/// Right-hand side of Euler's equations, rad/s²: ω̇1 = a1 ω2 ω3 + u1 and cyclic, \[D\](2), (3).
+/// Computes the right-hand side of Euler's equations, rad/s²: ω̇1 = a1 ω2 ω3 + u1 and cyclic, \[D\](2), (3).
 ///
 /// `a` are [`Inertia::coefficients`], `rate` in rad/s, `torque` is torque over inertia, rad/s².
 #[inline]
@@ -115,31 +118,31 @@ pub fn euler(a: &Vector3<f64>, rate: &Vector3<f64>, torque: &Vector3<f64>) -> Ve
     Vector3::new(a.x * rate.y * rate.z + torque.x, a.y * rate.z * rate.x + torque.y, a.z * rate.x * rate.y + torque.z)
 }
 
-/// A rigid body's motion for a given mass distribution.
+/// The motion of a rigid body of a given inertia.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidBody {
     coefficients: Vector3<f64>,
 }
 
 impl RigidBody {
-    /// A body with the given inertia.
+    /// Creates a body with the given inertia.
     pub fn new(inertia: &Inertia) -> Self {
         Self { coefficients: inertia.coefficients() }
     }
 
-    /// A body of which only the coefficients a of \[D\](2) are known; its motion depends on nothing else.
+    /// Creates a body from the coefficients a of \[D\](2), which determine its motion.
     pub fn with_coefficients(coefficients: Vector3<f64>) -> Self {
         Self { coefficients }
     }
 
-    /// The coefficients a of \[D\](2).
+    /// Returns the coefficients a of \[D\](2).
     pub fn coefficients(&self) -> &Vector3<f64> {
         &self.coefficients
     }
 
-    /// The angular velocity `dt_s` seconds after `rate` (rad/s) under a held `torque` (rad/s²).
+    /// Returns the angular velocity `dt_s` seconds after `rate` (rad/s) under a held `torque` (rad/s²).
     ///
-    /// The number of integration steps follows from the state alone, so equal inputs give equal bits.
+    /// The number of integration steps depends on the inputs alone, so equal inputs give equal bits.
     #[inline]
     pub fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
         let fastest_rad_s = fastest_rad_s(rate, torque, dt_s);
@@ -151,19 +154,19 @@ impl RigidBody {
     }
 }
 
-/// How fast a body may turn within `dt_s` under a held torque, rad/s, more or less.
+/// Returns an approximate bound on the angular velocity within `dt_s` under a held torque, rad/s.
 #[inline]
 pub(super) fn fastest_rad_s(rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> f64 {
     amax(rate) + amax(torque) * dt_s
 }
 
-/// Whether one integration step does for `dt_s`: most ticks, and told without a division.
+/// Returns true if one integration step suffices for `dt_s`, the usual case; checked without a division.
 #[inline]
 pub(super) fn in_one_step(fastest_rad_s: f64, dt_s: f64) -> bool {
     fastest_rad_s * dt_s <= MAX_STEP_RAD && dt_s <= LONGEST_STEP_S
 }
 
-/// The longest integration step of a body that turns so fast, s.
+/// Returns the longest integration step at this angular velocity, s.
 #[inline]
 pub(super) fn max_step_s(fastest_rad_s: f64) -> f64 {
     (MAX_STEP_RAD / fastest_rad_s).min(LONGEST_STEP_S)
@@ -174,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn refuses_what_no_body_has() {
+    fn impossible_moments_are_refused() {
         assert!(matches!(Inertia::new([1.0, 0.0, 1.0]), Err(InertiaError::NotPositive { axis: 2, .. })));
         assert!(matches!(Inertia::new([1.0, 2.0, f64::NAN]), Err(InertiaError::NotPositive { axis: 3, .. })));
         assert!(matches!(Inertia::new([f64::INFINITY, 2.0, 1.0]), Err(InertiaError::NotPositive { axis: 1, .. })));
@@ -191,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn free_motion_keeps_energy_and_momentum() {
+    fn free_motion_conserves_energy_and_momentum() {
         let inertia = Inertia::new([1.0, 2.0, 2.5]).unwrap();
         let body = RigidBody::new(&inertia);
         let start = Vector3::new(0.6, -0.4, 0.8);

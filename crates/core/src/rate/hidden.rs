@@ -9,43 +9,44 @@ use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
 use nalgebra::{Vector1, Vector3};
 
-/// All components of a vector.
+/// The valid bits of all three components.
 pub const ALL: u64 = 0b111;
 
-/// 0·x is 0 unless x is not finite; without a branch for every value.
+/// Returns true if all values are finite, without a branch per value: 0·x is 0 unless x is not finite.
 #[inline]
 pub(super) fn finite(measurement: &RateMeasurement) -> bool {
     let nothing = |values: &[f64; 3]| values[0] * 0.0 + values[1] * 0.0 + values[2] * 0.0;
     nothing(&measurement.omega_rad_s) + nothing(&measurement.applied_rad_s2) == 0.0
 }
 
-/// Returns the measurement as the relations use it. Components that are not valid are 0.
+/// Returns the measurement in the form that the relations use. Components that are not valid are 0.
 #[inline]
 pub(crate) fn seen(measurement: &RateMeasurement) -> RateSample {
     RateSample { rate_rad_s: measurement.omega_rad_s.into(), torque_rad_s2: measurement.applied_rad_s2.into() }
 }
 
-/// Supplies one component from the other two.
+/// An observer that supplies one component from the other two.
 #[derive(Debug, Clone)]
 pub struct HiddenObserver {
     relation: HiddenRate,
     body: KnownBody,
     guess: Filter<1>,
     filter: Filter<1>,
-    /// The valid bits that it cannot do without.
+    /// The valid bits of the components that the observer needs.
     needed: u64,
     last: Regressor,
-    /// The angular velocity with the supplied component in its place, rad/s; while no measurement is usable, where the model
-    /// has taken it since.
+    /// The angular velocity with the supplied component, rad/s. While no measurement is usable, the model advances
+    /// it.
     rate: Vector3<f64>,
-    /// The step of the last update: most are equal.
+    /// The step of the last update; most steps are equal.
     interval: Interval,
     innovation: f64,
     status: u64,
 }
 
 impl HiddenObserver {
-    /// An observer of the component that `relation` tells of a body with the given coefficients, which starts at `guess`.
+    /// Creates an observer of the component that `relation` supplies, for a body with the given coefficients,
+    /// starting at `guess`.
     pub fn new(relation: HiddenRate, coefficients: Vector3<f64>, guess: Filter<1>) -> Self {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
@@ -62,13 +63,13 @@ impl HiddenObserver {
         }
     }
 
-    /// Begins anew from a known estimate at a known instant.
-    pub(crate) fn begin(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
+    /// Restarts from a known estimate at a known instant.
+    pub(crate) fn restart(&mut self, filter: Filter<1>, at: RateSample, status: u64) {
         (self.filter, self.innovation, self.status) = (filter, 0.0, status);
-        self.keep(&at, self.relation.regressor(&at));
+        self.store(&at, self.relation.regressor(&at));
     }
 
-    fn keep(&mut self, sample: &RateSample, regressor: Regressor) {
+    fn store(&mut self, sample: &RateSample, regressor: Regressor) {
         (self.last, self.rate) = (regressor, self.relation.complete(&sample.rate_rad_s, self.filter.estimate().x));
     }
 
@@ -77,12 +78,12 @@ impl HiddenObserver {
         self.status
     }
 
-    /// The hidden component as the last step reconstructs it, less the estimate, rad/s.
+    /// Returns the hidden component as the last step reconstructs it, less the estimate, rad/s.
     pub(crate) fn innovation(&self) -> f64 {
         self.innovation
     }
 
-    /// The angular velocity with the supplied component in its place, rad/s.
+    /// Returns the angular velocity with the supplied component, rad/s.
     pub(crate) fn rate(&self) -> Vector3<f64> {
         self.rate
     }
@@ -98,7 +99,7 @@ impl Estimator for HiddenObserver {
     }
 
     fn start(&mut self, measurement: &RateMeasurement) {
-        self.begin(self.guess, seen(measurement), status::INITIAL);
+        self.restart(self.guess, seen(measurement), status::INITIAL);
     }
 
     fn update(&mut self, measurement: &RateMeasurement, dt_s: f64) {
@@ -118,14 +119,14 @@ impl Estimator for HiddenObserver {
                 self.status |= status::UNOBSERVABLE;
             }
         }
-        self.keep(&sample, to);
+        self.store(&sample, to);
     }
 
-    /// As long as the last one, with all that is needed in the measurement.
+    /// Takes the fast path for a step as long as the last one, if all needed components are measured.
     #[inline(always)]
     fn fast_step(&mut self, measurement: &RateMeasurement, dt_s: f64, out: &mut RateEstimate) -> bool {
         let ([x, y, z], [u, v, w]) = (measurement.omega_rad_s, measurement.applied_rad_s2);
-        // 0·x is 0 unless x is not finite. A sum that is not finite, of numbers that are, goes the long way.
+        // 0·x is 0 unless x is not finite. If only the sum overflows, the step takes the general path.
         let finite = ((x + y) + (z + u) + (v + w)) * 0.0 == 0.0;
         if !finite || measurement.valid & self.needed != self.needed || self.interval.length() != dt_s {
             return false;
@@ -169,7 +170,7 @@ impl Persist for HiddenObserver {
     }
 }
 
-/// A body known by its coefficients. Where they are known, its relation is computed once.
+/// A body with its coefficients and the quantities derived from them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct KnownBody {
     pub(super) coefficients: Vector3<f64>,
@@ -178,22 +179,22 @@ pub(crate) struct KnownBody {
 }
 
 impl KnownBody {
-    /// Returns the knowledge of a body with these coefficients.
+    /// Computes the derived quantities of a body with these coefficients.
     pub fn new(coefficients: Vector3<f64>) -> Self {
         let closure = closure(&coefficients);
         let ratios = InertiaRatios::new(&coefficients).map_or([0.0; 2], |ratios| [ratios.second, ratios.third]);
         Self { coefficients, closure, inertia_ratios: ratios }
     }
 
-    /// Where a body of which this is true goes from `rate` in `dt_s` seconds, under this torque over inertia, rad/s².
+    /// Returns the angular velocity of the body `dt_s` seconds after `rate`, under this torque over inertia, rad/s².
     pub(super) fn flow(&self, rate: &Vector3<f64>, torque: &Vector3<f64>, dt_s: f64) -> Vector3<f64> {
         RigidBody::with_coefficients(self.coefficients).flow(rate, torque, dt_s)
     }
 
-    /// Writes it beside a motion.
+    /// Writes the angular velocity with the coefficients and the derived quantities.
     #[inline]
     pub fn write(&self, rate: &Vector3<f64>, out: &mut RateEstimate) {
-        // One by one: they may have been computed just now, each for itself.
+        // One by one, not as a vector: a vector load would wait for the separate stores to leave the store buffer.
         out.omega_rad_s = [rate.x, rate.y, rate.z];
         out.coefficients = self.coefficients.into();
         out.closure = self.closure;
@@ -201,7 +202,7 @@ impl KnownBody {
     }
 }
 
-/// A filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
+/// Returns a filter of the hidden component with the given decay rate, 1/s, at the given estimate, rad/s.
 pub(crate) fn filter(decay_rate_per_s: f64, estimate_rad_s: f64) -> Filter<1> {
     Filter::First(InvariantFilter::new(Vector1::new(decay_rate_per_s), Vector1::new(estimate_rad_s)))
 }

@@ -1,4 +1,5 @@
-//! What learns the coefficients a of \[D\](2) from a body's motion: all three, or the one of an axisymmetric body.
+//! The identifier of the coefficients a of \[D\](2) from a body's motion: all three, or the one of an axisymmetric
+//! body.
 
 use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
@@ -10,7 +11,7 @@ use nalgebra::{Vector1, Vector3};
 #[derive(Debug, Clone)]
 pub struct Identifier {
     kind: Kind,
-    /// The slowest decay rate of its error, per unit of excitation.
+    /// The slowest decay rate of the error, per unit of excitation.
     slowest_decay: f64,
     /// ∫ρ dt so far: rad³/s², or rad for an axisymmetric body.
     excitation: f64,
@@ -23,17 +24,17 @@ enum Kind {
 }
 
 impl Identifier {
-    /// For any body; `filter` is at the initial guess.
+    /// Creates an identifier for any body; `filter` is at the initial guess.
     pub fn asymmetric(relation: InertiaRelation, filter: Filter<3>, slowest_decay: f64) -> Self {
         Self { kind: Kind::Asymmetric { relation, filter }, slowest_decay, excitation: 0.0 }
     }
 
-    /// For a body with the symmetry axis `axis`, 1 to 3; `filter` is at the initial guess of a.
+    /// Creates an identifier for a body with the symmetry axis `axis`, 1 to 3; `filter` is at the initial guess of a.
     pub fn axisymmetric(relation: Axisymmetric, axis: usize, filter: Filter<1>, slowest_decay: f64) -> Self {
         Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay, excitation: 0.0 }
     }
 
-    /// The same identifier, begun at other coefficients.
+    /// Returns the same identifier with other initial coefficients.
     pub fn with_guess(self, a: &Vector3<f64>) -> Self {
         let kind = match self.kind {
             Kind::Asymmetric { relation, filter } => Kind::Asymmetric { relation, filter: filter.with_guess(*a) },
@@ -44,20 +45,20 @@ impl Identifier {
         Self { kind, ..self }
     }
 
-    /// Learns from one step; returns the status bits of what stood against it.
+    /// Updates the estimate with one step. Returns the status bits that explain an unused step, or 0.
     pub fn learn(&mut self, from: &RateSample, to: &RateSample, dt_s: f64) -> u64 {
         match &mut self.kind {
             Kind::Asymmetric { relation, filter } => {
                 let seen = relation.observe(from, to, dt_s, filter.estimate());
-                take(seen, filter, &mut self.excitation)
+                apply(seen, filter, &mut self.excitation)
             }
             Kind::Axisymmetric { relation, filter, .. } => {
-                take(relation.observe(from, to, dt_s), filter, &mut self.excitation)
+                apply(relation.observe(from, to, dt_s), filter, &mut self.excitation)
             }
         }
     }
 
-    /// The coefficients as learned so far.
+    /// Returns the coefficients learned so far.
     pub fn coefficients(&self) -> Vector3<f64> {
         match &self.kind {
             Kind::Asymmetric { filter, .. } => *filter.estimate(),
@@ -69,12 +70,12 @@ impl Identifier {
         }
     }
 
-    /// ∫ρ dt so far.
+    /// Returns the excitation ∫ρ dt so far.
     pub fn excitation(&self) -> f64 {
         self.excitation
     }
 
-    /// By how many decay times the initial error has decayed.
+    /// Returns the number of decay times by which the initial error has decayed.
     pub fn decay_times(&self) -> f64 {
         self.excitation * self.slowest_decay
     }
@@ -90,7 +91,7 @@ impl Persist for Identifier {
     }
 }
 
-fn take<const N: usize>(seen: Identification<N>, filter: &mut Filter<N>, excitation: &mut f64) -> u64 {
+fn apply<const N: usize>(seen: Identification<N>, filter: &mut Filter<N>, excitation: &mut f64) -> u64 {
     *excitation += seen.excitation();
     let blind = match seen {
         Identification::Excited(increment) => {
@@ -100,7 +101,7 @@ fn take<const N: usize>(seen: Identification<N>, filter: &mut Filter<N>, excitat
         Identification::Unexcited => status::NOT_EXCITED,
         Identification::Ambiguous => status::UNOBSERVABLE,
     };
-    // Nothing drifts; but a filter of second order must not take up the potential where it left it.
+    // The unknown does not drift, but a second-order filter must not continue from the potential before the gap.
     filter.predict(&zeros(), 0.0);
     blind
 }

@@ -1,4 +1,4 @@
-//! The synchronising law of one follower, with its certificate computed live.
+//! The synchronising law of one follower, which also computes its certificate at every tick.
 
 use crate::control::{Certificate, InFlight, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
@@ -7,24 +7,25 @@ use crate::state::persist_fields;
 use core::hint::black_box;
 use nalgebra::Vector3;
 
-/// What a follower's law is made of.
+/// The parameters of a follower's law.
 #[derive(Debug, Clone)]
 pub struct RateLawDesign {
     /// The law itself.
     pub law: Synchronizer,
-    /// How fast it learns that the follower has another inertia; 0: not at all.
+    /// The adaptation gain for a follower of another inertia; 0 disables the adaptation.
     pub adaptation_gain: f64,
-    /// What is proven of it; none where the observer is not the papers' filter: V is published as 0 then.
+    /// The certificate. Absent if the observer is not the papers' filter; V is then published as 0.
     pub certificate: Option<Certificate>,
-    /// The component that the observer supplies, 0 to 2.
+    /// The component supplied by the observer, 0 to 2.
     pub supplied: usize,
-    /// Whether it works with the coefficients that the observer has learned.
+    /// True if the law uses the coefficients that the observer has learned.
     pub learned: bool,
-    /// No component is asked to be larger, rad/s²: the actuators would refuse it.
+    /// The limit of each command component, rad/s²; the actuators reject more.
     pub acceleration_max_rad_s2: f64,
     /// The period h, s.
     pub tick_s: f64,
-    /// Over how many ticks a law that predicts does so: those between a measurement and the tick from which its command acts.
+    /// The number of ticks over which a predicting law predicts: from a measurement to the tick at which its command
+    /// acts.
     pub predicted_ticks: u64,
 }
 
@@ -34,17 +35,17 @@ pub struct RateLaw {
     law: Synchronizer,
     adaptation: InertiaAdaptation,
     certificate: Option<Certificate>,
-    /// 1 for the component that the observer supplies, 0 for the others.
+    /// 1 for the component supplied by the observer, 0 for the others.
     supplied: Vector3<f64>,
     learned: bool,
     acceleration_max_rad_s2: f64,
     tick_s: f64,
-    /// What a law that predicts has sent and what does not act yet, rad/s².
+    /// The commands of a predicting law that were sent and do not act yet, rad/s².
     in_flight: InFlight<[f64; 3]>,
 }
 
 impl RateLaw {
-    /// A law that has learned nothing and sent nothing yet.
+    /// Creates a law that has learned and sent nothing.
     pub fn new(design: &RateLawDesign) -> Self {
         let RateLawDesign { adaptation_gain, certificate, supplied, learned, acceleration_max_rad_s2, tick_s, .. } =
             *design;
@@ -60,9 +61,9 @@ impl RateLaw {
         }
     }
 
-    /// Reference and follower moved on, tick by tick, under what is on its way.
+    /// Predicts reference and follower, tick by tick, under the commands that do not act yet.
     #[inline(never)]
-    fn further(
+    fn predict_in_flight(
         &self,
         (mut w, mut p): (Vector3<f64>, Vector3<f64>),
         measurement: &RateMeasurement,
@@ -74,7 +75,7 @@ impl RateLaw {
     }
 }
 
-// What was learned of the coefficients comes anew with every estimate.
+// Learned coefficients are not state: every estimate carries them.
 persist_fields!(RateLaw, adaptation, in_flight);
 
 impl Law for RateLaw {
@@ -84,8 +85,8 @@ impl Law for RateLaw {
 
     #[inline(always)]
     fn command(&mut self, estimate: &RateEstimate, measurement: &RateMeasurement, out: &mut RateCommand) {
-        // Not as a pair of neighbours: this core may have written them one by one just now, and a load of two at once would
-        // wait until both have left the store buffer.
+        // Read one by one, not as pairs: this core may just have stored them one by one, and a load of two would wait
+        // until both have left the store buffer.
         let [x, y, z] = estimate.omega_rad_s;
         let (reference, follower) = (Vector3::new(x, black_box(y), z), Vector3::from(measurement.omega_rad_s));
         if self.learned {
@@ -93,7 +94,7 @@ impl Law for RateLaw {
         }
         let (mut w, mut p) = self.law.ahead(reference, follower, &measurement.applied_rad_s2);
         if !self.in_flight.is_empty() {
-            (w, p) = self.further((w, p), measurement);
+            (w, p) = self.predict_in_flight((w, p), measurement);
         }
         let mut asked = self.law.command(&w, &p);
         if self.adaptation.acts() {

@@ -1,8 +1,8 @@
-//! The observer for a gyro that fails in flight: learns the body's inertia while all components are measured, and supplies
-//! the one that is lost from the other two and from what it has learned.
+//! The observer for a gyro that fails in flight. It learns the body's inertia while all components are measured, and
+//! supplies a lost one from the other two and the learned inertia.
 //!
-//! Its modes are explicit and told in the status word. Must not jump when an axis goes or comes back, and must stay bounded
-//! when it goes too early.
+//! Its modes are explicit and published in the status word. The estimate must not jump when an axis is lost or
+//! returns, and must stay bounded when an axis is lost too early.
 
 use super::hidden::{ALL, HiddenObserver, KnownBody, filter, seen};
 use super::identifier::Identifier;
@@ -14,51 +14,51 @@ use crate::state::{Persist, Words};
 use crate::vector::amax;
 use nalgebra::Vector3;
 
-/// The identifier's error counts as gone after so many decay times: e^−25 is 1e-11.
+/// The number of decay times after which the identifier's error is negligible: e^−25 is 1e-11.
 const SETTLED_DECAYS: f64 = 25.0;
-/// Coefficients of a body close a1 + a2 + a3 + a1·a2·a3 = 0; learned ones do to within this once they are settled.
+/// The largest |a1 + a2 + a3 + a1·a2·a3| of settled coefficients; it is 0 for a body.
 const SETTLED_CLOSURE: f64 = 1e-6;
-/// A component that is supplied on poor knowledge is kept within so many times the fastest rate seen.
+/// The bound on a component that is supplied without settled coefficients, in multiples of the fastest rate measured.
 const DEGRADED_BOUND: f64 = 2.0;
 
-/// Words of the state of a stand-in's observer, whose filter is of first order.
+/// The number of state words of a supplier's observer, whose filter is of first order.
 const SUPPLIER_WORDS: usize = 11;
 
-/// What a [`Learner`] is made of.
+/// The parameters of a [`Learner`].
 #[derive(Debug, Clone)]
 pub struct LearnerDesign {
     /// The identifier at its initial guess.
     pub identifier: Identifier,
     /// Decay rate of a supplied component, 1/s.
     pub decay_rate_per_s: f64,
-    /// Below this, rad/s, measured components carry no information.
+    /// The level, rad/s, below which measured components carry no information.
     pub floor_rad_s: f64,
 }
 
-/// Learns the inertia, and supplies a component that is lost.
+/// An observer that learns the inertia and supplies a lost component.
 #[derive(Debug)]
 pub struct Learner {
     parts: LearnerDesign,
     identifier: Identifier,
     last: RateSample,
     fastest_rad_s: f64,
-    /// What supplies the lost component, while one is lost.
+    /// The supplier of the lost component, while one is lost.
     supplier: Option<Supplier>,
     status: u64,
 }
 
-/// The stand-in for a lost component.
+/// The supplier of a lost component.
 #[derive(Debug)]
 struct Supplier {
     component: usize,
     degraded: bool,
-    /// None if the coefficients learned so far do not tell the component at all: it is held.
+    /// Absent if the learned coefficients do not determine the component, which is then held.
     observer: Option<HiddenObserver>,
     held: Vector3<f64>,
 }
 
 impl Learner {
-    /// One that has learned nothing yet.
+    /// Creates a learner that has learned nothing.
     pub fn new(parts: LearnerDesign) -> Self {
         let nothing = RateSample { rate_rad_s: Vector3::zeros(), torque_rad_s2: Vector3::zeros() };
         Self {
@@ -83,19 +83,19 @@ impl Learner {
         }
     }
 
-    /// All components are measured.
+    /// Updates the identifier when all components are measured.
     fn learn(&mut self, measurement: &RateMeasurement, dt_s: f64) {
         let to = seen(measurement);
         self.status = status::LEARNING;
         self.fastest_rad_s = self.fastest_rad_s.max(amax(&to.rate_rad_s));
-        // Over the step in which an axis comes back there is no increment: only one end of it is complete.
+        // The step in which an axis returns has no increment: only one end of it is complete.
         if self.supplier.take().is_none() {
             self.status |= self.identifier.learn(&self.last, &to, dt_s);
         }
         self.last = to;
     }
 
-    /// One component is not measured.
+    /// Supplies the component that is not measured.
     fn supply(&mut self, lost: usize, measurement: &RateMeasurement, dt_s: f64) {
         let rate = self.rate();
         let (degraded, bound) = (!self.settled(), DEGRADED_BOUND * self.fastest_rad_s);
@@ -113,27 +113,27 @@ impl Learner {
                 let supplied = observer.rate()[lost];
                 if supplier.degraded && supplied.abs() > bound {
                     let within = filter(self.parts.decay_rate_per_s, bound.copysign(supplied));
-                    observer.begin(within, to, self.status);
+                    observer.restart(within, to, self.status);
                 }
             }
         }
         self.last = to;
     }
 
-    /// A stand-in that goes on from the last good value.
+    /// Creates a supplier that continues from the last valid value.
     fn supplier(&self, component: usize, rate: Vector3<f64>, degraded: bool) -> Supplier {
         let coefficients = self.identifier.coefficients();
         let relation = HiddenRate::new(&coefficients, component + 1, self.parts.floor_rad_s).ok();
         let observer = relation.map(|relation| {
             let begun = filter(self.parts.decay_rate_per_s, rate[component]);
             let mut observer = HiddenObserver::new(relation, coefficients, begun);
-            observer.begin(begun, self.last, 0);
+            observer.restart(begun, self.last, 0);
             observer
         });
         Supplier { component, degraded, observer, held: rate }
     }
 
-    /// Whether the coefficients can be relied on.
+    /// Returns true if the learned coefficients are reliable.
     fn settled(&self) -> bool {
         let a = self.identifier.coefficients();
         self.identifier.decay_times() >= SETTLED_DECAYS && closure(&a).abs() < SETTLED_CLOSURE
@@ -159,7 +159,7 @@ impl Learner {
 }
 
 impl Persist for Learner {
-    /// The stand-in is made again of the coefficients, which do not change while an axis is lost.
+    /// The supplier is rebuilt from the coefficients, which do not change while an axis is lost.
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.identifier.persist(words);
         self.last.persist(words);

@@ -1,7 +1,8 @@
-//! Angular velocities: the observers and the law of the rig `rigid-body` as roles. What that rig runs is what firmware runs.
+//! Angular velocities: the observers and the law of the rig `rigid-body` as roles, the same for the rig and for
+//! firmware.
 //!
-//! Which components are measured, which one is supplied and from what is decided here; the mathematics is in `model`, `observe`
-//! and `control`. Must not know a scenario.
+//! These roles select the measured and the supplied components; the mathematics is in `model`, `observe` and
+//! `control`. They must not depend on a scenario.
 
 mod hidden;
 mod identifier;

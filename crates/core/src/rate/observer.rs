@@ -1,4 +1,4 @@
-//! The observers of a rig of angular velocities: which components are measured, which one is supplied, and from what.
+//! The observers of angular velocities: the measured components, the supplied one, and its sources.
 
 use super::hidden::{ALL, HiddenObserver, KnownBody, finite, seen};
 use super::learner::Learner;
@@ -8,15 +8,15 @@ use crate::sample::{RateEstimate, RateMeasurement, status};
 use crate::state::{Persist, Words};
 use nalgebra::Vector3;
 
-/// An observer of this rig.
+/// An observer of an angular velocity.
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant, reason = "there is one in a process, and it is used at every tick")]
 pub enum RateObserver {
     /// One component is never measured.
     Hidden(HiddenObserver),
-    /// The same with known noise.
+    /// One component is never measured, and the sensors' noise is known.
     Kalman(KalmanObserver),
-    /// All are measured until one is lost; the inertia is learned meanwhile.
+    /// All components are measured until one is lost; the inertia is learned meanwhile.
     Learner(Learner),
 }
 
@@ -58,7 +58,7 @@ impl Estimator for RateObserver {
         }
     }
 
-    /// What is learning its model has none to go on by: it stays.
+    /// A learner has no model to advance by: its estimate stays.
     fn coast(&mut self, dt_s: f64) {
         match self {
             Self::Hidden(observer) => observer.coast(dt_s),
@@ -87,7 +87,7 @@ impl Persist for RateObserver {
     }
 }
 
-/// Supplies one component from the other two, all of them filtered: the noise of the sensors is known.
+/// An observer that supplies one component from the other two and filters all of them, for sensors of known noise.
 #[derive(Debug)]
 pub struct KalmanObserver {
     body: KnownBody,
@@ -95,16 +95,16 @@ pub struct KalmanObserver {
     hidden: usize,
     floor_rad_s: f64,
     guess_rad_s: f64,
-    /// None before the first measurement.
+    /// Absent before the first measurement.
     filter: Option<GuardedKalman>,
     last: RateSample,
-    /// Where the model has taken the body since, while no measurement was usable.
+    /// The angular velocity advanced by the model, while no measurement was usable.
     coasted: Option<Vector3<f64>>,
     status: u64,
 }
 
 impl KalmanObserver {
-    /// An observer of component `hidden` (0 to 2) of a body with the given coefficients.
+    /// Creates an observer of component `hidden` (0 to 2) of a body with the given coefficients.
     pub fn new(
         coefficients: Vector3<f64>,
         noise: RateNoise,
@@ -125,12 +125,12 @@ impl KalmanObserver {
     fn start(&mut self, measurement: &RateMeasurement) {
         (self.last, self.coasted) = (seen(measurement), None);
         self.status = status::INITIAL;
-        self.filter = self.begun();
+        self.filter = self.new_filter();
     }
 
-    /// A filter that begins with the last sample. That the component can be observed was checked when the scenario was
-    /// resolved.
-    fn begun(&self) -> Option<GuardedKalman> {
+    /// Creates a filter that begins at the last sample. The check of the scenario ensures that the component is
+    /// observable.
+    fn new_filter(&self) -> Option<GuardedKalman> {
         let (axis, first) = (self.hidden + 1, &self.last);
         GuardedKalman::new(&self.body.coefficients, axis, self.floor_rad_s, self.noise, first, self.guess_rad_s).ok()
     }
@@ -169,7 +169,7 @@ impl Persist for KalmanObserver {
         self.status.persist(words);
         let mut begun = self.filter.is_some();
         begun.persist(words);
-        if let Some(mut filter) = self.filter.or_else(|| self.begun()) {
+        if let Some(mut filter) = self.filter.or_else(|| self.new_filter()) {
             filter.persist(words);
             self.filter = begun.then_some(filter);
         }

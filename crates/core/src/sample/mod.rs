@@ -280,7 +280,7 @@ pub mod status {
     pub const UNUSABLE: u64 = 1 << 4;
     /// The observer learns the body's inertia while all components are measured.
     pub const LEARNING: u64 = 1 << 5;
-    /// The observer supplies a component that is no longer measured.
+    /// The observer supplies a component that is not measured any more.
     pub const AXIS_LOST: u64 = 1 << 6;
     /// The component was lost before the inertia had been learned: the estimate is bounded but not reliable.
     pub const DEGRADED: u64 = 1 << 7;

@@ -37,9 +37,9 @@ impl<S: Carried + ?Sized> Disturbance<S> {
     }
 
     /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
-    pub fn tamper(&mut self, tick: u64, sample: &mut S, last: &S) -> bool {
+    pub fn alter_content(&mut self, tick: u64, sample: &mut S, last: &S) -> bool {
         let acting = self.faults.iter_mut().filter_map(|course| course.acts(tick).then_some(course.fault()));
-        acting.filter(|fault| fault.tampers()).map(|fault| fault.tamper(tick, sample, last)).count() > 0
+        acting.filter(|fault| fault.alters_content()).map(|fault| fault.alter_content(tick, sample, last)).count() > 0
     }
 
     /// What happens to the sample of `tick` on its way: of several faults, what the first says.

@@ -186,7 +186,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         fill(sample);
         sample.stamp_mut().generation = self.generation;
         let stamp = *sample.stamp();
-        let tampered = disturbance.tamper(stamp.tick, sample, self.sample.borrow());
+        let tampered = disturbance.alter_content(stamp.tick, sample, self.sample.borrow());
         let way = disturbance.delivery(stamp.tick);
         if tampered || way.is_some() {
             self.counters.injected();
