@@ -118,7 +118,7 @@ pub fn report(
         ticks: ticks.report(),
         written,
         read,
-        watchdog: watchdog.and_then(|watchdog| WatchReport::of(&watchdog, &scenario.monitors)),
+        watchdog: watchdog.and_then(|watchdog| WatchReport::from_watchdog(&watchdog, &scenario.monitors)),
         stages,
         grants,
         line: None,

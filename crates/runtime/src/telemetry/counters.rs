@@ -1,6 +1,6 @@
-//! The counters of a role while it runs: its ticks, and both ends of its links. They are part of its persistent state.
+//! The counters of a running role: its ticks, and both ends of its links. They are part of its persistent state.
 //!
-//! Must not decide what counts as what; nodes and links do.
+//! Nodes and links decide which counter an event belongs to; this module only adds.
 
 use super::ledger::Ledger;
 use super::{LinkRead, LinkWritten, StateHash, Ticks, WatchReport, WatchedReport};
@@ -31,7 +31,7 @@ impl TickCounters {
         self.next
     }
 
-    /// Counts the ticks before `tick` that were not executed as missed, and tells how many.
+    /// Counts the ticks before `tick` that were not executed as missed, and returns their number.
     #[inline]
     pub fn skip_to(&mut self, tick: u64) -> u64 {
         let missed = tick.saturating_sub(self.next);
@@ -69,24 +69,24 @@ impl TickCounters {
         self.stalled += stalls;
     }
 
-    /// Counts the next tick as missed, because a scripted fault takes it or for want of inputs.
+    /// Counts the next tick as missed: an input is missing, or, if `scripted`, a scripted fault takes the tick.
     pub fn pass(&mut self, scripted: bool) {
         self.scripted += u64::from(scripted);
         self.skip_to(self.next + 1);
     }
 
-    /// Counts a life that began without the state of the one before: nothing from here on is as it would have been.
+    /// Counts a restart that lost the predecessor's state. Every tick from here on may differ from an undisturbed run's.
     pub fn restarted_without_state(&mut self) {
         self.anew += 1;
         self.disturbed(self.next);
     }
 
-    /// Notes a tick whose result may differ from an undisturbed run's.
+    /// Records a tick whose result may differ from an undisturbed run's.
     pub fn disturbed(&mut self, tick: u64) {
         self.first_disturbed.get_or_insert(tick);
     }
 
-    /// The present state.
+    /// Returns the current counts.
     pub fn report(&self) -> Ticks {
         Ticks {
             elapsed: self.next,
@@ -102,7 +102,7 @@ impl TickCounters {
     }
 }
 
-/// The counters of a signal's writing end, with its hash.
+/// The counters of a signal's writing end, with the hash of what was sent.
 #[derive(Debug)]
 pub struct WriteCounters {
     published: u64,
@@ -117,18 +117,18 @@ pub struct WriteCounters {
 persist_fields!(WriteCounters, published, skipped, void, extra, injected, last_tick, hash);
 
 impl WriteCounters {
-    /// Words of the ledger beside the record, for a run that ends with `last_tick`.
+    /// Returns the number of ledger words needed beside the record, for a run that ends with `last_tick`.
     pub fn words(last_tick: u64) -> usize {
         StateHash::words(last_tick)
     }
 
-    /// The counters of a signal of which nothing was sent.
+    /// Creates the counters of a signal of which nothing was sent.
     pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
         let hash = StateHash::open(ledger, last_tick);
         Self { published: 0, skipped: 0, void: 0, extra: 0, injected: 0, last_tick: None, hash }
     }
 
-    /// Enters the sample of a tick that was sent.
+    /// Counts the sample that was sent for a tick, and adds its content to the hash.
     #[inline]
     pub fn enter(&mut self, tick: u64, content: &[u8]) {
         self.hash.absorb(tick, content);
@@ -136,7 +136,7 @@ impl WriteCounters {
         self.cover(tick);
     }
 
-    /// Enters a tick of which there is no sample: a void was sent in its place, or nothing was.
+    /// Counts a tick without a sample. If `sent`, a no-sample marker was sent in its place.
     pub fn enter_without_sample(&mut self, tick: u64, sent: bool) {
         *(if sent { &mut self.void } else { &mut self.skipped }) += 1;
         self.cover(tick);
@@ -149,17 +149,17 @@ impl WriteCounters {
         self.last_tick = self.last_tick.max(Some(tick));
     }
 
-    /// Counts a sample that a scripted fault touched.
+    /// Counts a sample that a scripted fault changed.
     pub fn injected(&mut self) {
         self.injected += 1;
     }
 
-    /// Counts samples beyond the one that a tick has: a second, a late or a broken one.
+    /// Counts samples beyond the one of each tick: duplicated, late or corrupted ones.
     pub fn extra(&mut self, samples: u64) {
         self.extra += samples;
     }
 
-    /// The present state.
+    /// Returns the current counts.
     pub fn report(&self, service: &str) -> LinkWritten {
         LinkWritten {
             service: service.to_owned(),
@@ -177,56 +177,56 @@ impl WriteCounters {
 /// The counters of a signal's reading end.
 #[derive(Debug, Default)]
 pub struct ReadCounters {
-    /// Samples that were taken off the link, whatever they were worth.
+    /// The number of samples taken off the link, including stale and rejected ones.
     taken: u64,
     received: u64,
     gaps: u64,
     stale: u64,
-    /// The tick after the last that is counted.
+    /// The tick after the last counted one.
     covered: u64,
     void: u64,
-    /// In the order of [`Refusal::ALL`].
+    /// The counts by reason, in the order of [`Refusal::ALL`].
     rejected: [u64; Refusal::ALL.len()],
 }
 
 persist_fields!(ReadCounters, taken, received, gaps, stale, covered, void, rejected);
 
 impl ReadCounters {
-    /// Returns the number of samples received, rejected ones too.
+    /// Returns the number of samples received, including rejected ones.
     pub fn samples(&self) -> u64 {
         self.received
     }
 
-    /// How many samples were taken off the link, whatever they were worth.
+    /// Returns the number of samples taken off the link, including stale and rejected ones.
     #[inline]
     pub fn taken(&self) -> u64 {
         self.taken
     }
 
-    /// Takes one.
+    /// Counts a sample that was taken off the link.
     #[inline]
     pub fn take(&mut self) {
         self.taken += 1;
     }
 
-    /// The tick after the last that is counted.
+    /// Returns the tick after the last counted one.
     #[inline]
     pub fn covered(&self) -> u64 {
         self.covered
     }
 
-    /// Enters the sample of a tick; one that is counted already, because a predecessor received it, is not counted again.
+    /// Counts the sample of a tick. A tick that a predecessor has counted is not counted again.
     #[inline]
     pub fn received(&mut self, tick: u64) {
         self.received += self.enter(tick);
     }
 
-    /// Enters a void in the place of a tick's sample.
+    /// Counts a no-sample marker that arrived in the place of a tick's sample.
     pub fn void(&mut self, tick: u64) {
         self.void += self.enter(tick);
     }
 
-    /// Enters the sample of a tick that was received and is not believed.
+    /// Counts the sample of a tick that was received and rejected.
     pub fn rejected(&mut self, tick: u64, refusal: Refusal) {
         if tick >= self.covered {
             self.rejected[refusal as usize] += 1;
@@ -234,7 +234,7 @@ impl ReadCounters {
         self.received(tick);
     }
 
-    /// Enters a sample that is not believed and may not even be of the tick that it names.
+    /// Counts a rejected sample whose tick cannot be trusted.
     pub fn stray(&mut self) {
         self.rejected[Refusal::Stamp as usize] += 1;
     }
@@ -249,13 +249,13 @@ impl ReadCounters {
         u64::from(new)
     }
 
-    /// Enters a sample that was not newer than the one before.
+    /// Counts a sample that was not newer than the one before.
     #[inline]
     pub fn stale(&mut self) {
         self.stale += 1;
     }
 
-    /// The present state.
+    /// Returns the current counts.
     pub fn report(&self, service: &str) -> LinkRead {
         LinkRead {
             service: service.to_owned(),
@@ -276,16 +276,16 @@ impl ReadCounters {
 }
 
 impl WatchReport {
-    /// What a watchdog has seen of its quantities, by their names; nothing where nothing is watched.
-    pub fn of(watchdog: &Watchdog, names: &[&str]) -> Option<Self> {
+    /// Reports the quantities that a watchdog has judged, with their `names`. Returns `None` if it watches nothing.
+    pub fn from_watchdog(watchdog: &Watchdog, names: &[&str]) -> Option<Self> {
         let quantities = names.iter().zip(watchdog.bounds().max).zip(watchdog.breaches());
-        let one = |((name, max), breaches): ((&&str, f64), &Breaches)| {
+        let report = |((name, max), breaches): ((&&str, f64), &Breaches)| {
             let Breaches { judged, count, first_tick, largest } = *breaches;
             let largest = Some(largest).filter(|largest| largest.is_finite());
             let quantity = (*name).to_owned();
             WatchedReport { quantity, max, judged, breaches: count, first_tick, largest }
         };
-        let watched: Vec<_> = quantities.filter(|((_, max), _)| *max < f64::INFINITY).map(one).collect();
+        let watched: Vec<_> = quantities.filter(|((_, max), _)| *max < f64::INFINITY).map(report).collect();
         (!watched.is_empty()).then(|| Self { watched, latched_at_tick: watchdog.latched_at() })
     }
 }

@@ -9,10 +9,10 @@ use std::time::Duration;
 /// Ticks per half distance to 100 %: HdrHistogram's own default resolution.
 const TICKS_PER_HALF_DISTANCE: u32 = 5;
 
-/// Writes a percentile distribution, µs, in HdrHistogram's text form (its plotter reads it), with a comment at its end.
+/// Writes a percentile distribution in µs as HdrHistogram text, which its plotter reads. The comment goes to the end.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_hgrm(latency: &Latency, comment: Option<&str>, out: &mut impl Write) -> io::Result<()> {
     let histogram = latency.histogram();
     writeln!(out, "{:>12} {:>14} {:>10} {:>14}\n", "Value", "Percentile", "TotalCount", "1/(1-Percentile)")?;
@@ -33,29 +33,28 @@ pub fn write_hgrm(latency: &Latency, comment: Option<&str>, out: &mut impl Write
     comment.map_or(Ok(()), |comment| writeln!(out, "#[{comment}]"))
 }
 
-/// Writes one interval per named histogram, ns, as an HdrHistogram log, with a comment at its start: `run_s` is the
-/// length of the run.
+/// Writes an HdrHistogram log in ns, with one interval of `run_s` seconds per named histogram. The comment goes to the start.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_hlog<'a>(
     stages: impl IntoIterator<Item = (&'a str, &'a Latency)>,
     run_s: f64,
     comment: Option<&str>,
     out: &mut impl Write,
 ) -> io::Result<()> {
-    let other = |error: &dyn std::fmt::Debug| io::Error::other(format!("{error:?}"));
+    let failed = |error: &dyn std::fmt::Debug| io::Error::other(format!("{error:?}"));
     let mut serializer = V2DeflateSerializer::new();
     let mut builder = IntervalLogWriterBuilder::new();
     builder.add_comment("corotate: latencies in nanoseconds, one interval per role and stage");
     if let Some(comment) = comment {
         builder.add_comment(comment);
     }
-    let mut log = builder.begin_log_with(out, &mut serializer).map_err(|error| other(&error))?;
+    let mut log = builder.begin_log_with(out, &mut serializer).map_err(|error| failed(&error))?;
     for (name, latency) in stages {
         let tag = Tag::new(name).ok_or_else(|| io::Error::other(format!("`{name}` cannot be a tag")))?;
         log.write_histogram(latency.histogram(), Duration::ZERO, Duration::from_secs_f64(run_s), Some(tag))
-            .map_err(|error| other(&error))?;
+            .map_err(|error| failed(&error))?;
     }
     Ok(())
 }
@@ -74,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn the_percentile_table_ends_at_the_maximum_and_counts_everything() {
+    fn the_percentile_table_ends_at_the_maximum_and_counts_every_value() {
         let mut text = Vec::new();
         write_hgrm(&latency(), None, &mut text).unwrap();
         let text = String::from_utf8(text).unwrap();
@@ -92,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_log_is_read_back_by_the_library_s_own_reader() {
+    fn the_library_reads_the_log_back() {
         let latency = latency();
         let mut log = Vec::new();
         write_hlog([("leader.step", &latency)], 2.0, None, &mut log).unwrap();

@@ -1,24 +1,24 @@
-//! The state hash: one number for everything that was published, so that two runs can be compared at a glance.
+//! The state hash: one number over everything that was published, to compare two runs.
 //!
-//! It covers ticks and values, no generation and no time. Checkpoints make it comparable up to any tick.
+//! It covers ticks and values, but no generations and no times. Checkpoints make it comparable up to any tick.
 
 use super::ledger::{Ledger, Slots};
 use crate::state::{Persist, Words};
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
-/// The most checkpoints that a writer keeps; longer runs keep every second, third, … tick.
+/// The largest number of checkpoints per writer. Longer runs keep every second, third, … tick.
 const MAX_CHECKPOINTS: u64 = 16_384;
 
 /// The hash of one signal, chained over its samples (XXH3-64, each sample's hash seeded by the last).
 #[derive(Debug)]
 pub struct StateHash {
     value: u64,
-    /// How many checkpoints there are. Those beyond were written by somebody who died before they counted.
+    /// The number of valid checkpoints. A process that died before it counted may have written more.
     count: u64,
     checkpoints: Slots,
     stride: u64,
     capacity: u64,
-    /// After how many ticks the next checkpoint is, were there one more.
+    /// The number of ticks after which the next checkpoint is due, even if there is no room for it.
     due: u64,
 }
 
@@ -34,12 +34,12 @@ pub struct Checkpoints {
 }
 
 impl StateHash {
-    /// Words of the ledger for a run whose last tick is `last_tick`.
+    /// Returns the number of ledger words for a run whose last tick is `last_tick`.
     pub fn words(last_tick: u64) -> usize {
         Self::capacity(last_tick) as usize
     }
 
-    /// Ticks per checkpoint.
+    /// Returns the number of ticks per checkpoint.
     fn stride(last_tick: u64) -> u64 {
         (last_tick + 1).div_ceil(MAX_CHECKPOINTS).max(1)
     }
@@ -48,20 +48,20 @@ impl StateHash {
         (last_tick + 1) / Self::stride(last_tick)
     }
 
-    /// The hash of a run whose last tick is `last_tick`, over nothing yet.
+    /// Creates the hash of a run whose last tick is `last_tick`, over no samples.
     pub fn open(ledger: &Ledger, last_tick: u64) -> Self {
         let checkpoints = ledger.take(Self::words(last_tick));
         let (stride, capacity) = (Self::stride(last_tick), Self::capacity(last_tick));
         Self { value: 0, count: 0, checkpoints, stride, capacity, due: stride }
     }
 
-    /// The hash of a run that is only asked for at its end.
+    /// Creates a hash without checkpoints, for runs that need only the final value.
     pub fn without_checkpoints() -> Self {
         let checkpoints = Ledger::private(0).take(0);
         Self { value: 0, count: 0, checkpoints, stride: 1, capacity: 0, due: u64::MAX }
     }
 
-    /// Takes in the content of the sample of a tick. Ticks rise. In place: where the length is known, half of it is.
+    /// Adds the sample content of a tick. Ticks must rise. Inlined, because a length known at compile time halves the cost.
     #[inline(always)]
     pub fn absorb(&mut self, tick: u64, content: &[u8]) {
         if tick >= self.due {
@@ -73,7 +73,7 @@ impl StateHash {
         }
     }
 
-    /// Notes the hash for every checkpoint up to `ticks` that has passed since the last sample.
+    /// Stores the hash at every checkpoint up to `ticks` that has passed since the last sample.
     #[cold]
     fn pass(&mut self, ticks: u64) {
         while self.due <= ticks && self.count < self.capacity {
@@ -81,7 +81,7 @@ impl StateHash {
         }
     }
 
-    /// Notes the hash for the checkpoint that is due.
+    /// Stores the hash at the checkpoint that is due.
     #[inline(never)]
     fn checkpoint(&mut self) {
         if self.count < self.capacity {
@@ -93,7 +93,7 @@ impl StateHash {
         }
     }
 
-    /// What has been gathered.
+    /// Returns the checkpoints and the hash over all samples.
     pub fn checkpoints(&self) -> Checkpoints {
         let count = self.count.min(self.capacity) as usize;
         Checkpoints {
@@ -112,7 +112,7 @@ impl Persist for StateHash {
     }
 }
 
-/// One hash for several signals' hashes; the order matters.
+/// Combines the hashes of several signals into one; the order matters.
 pub fn combine(hashes: impl IntoIterator<Item = u64>) -> u64 {
     let bytes: Vec<u8> = hashes.into_iter().flat_map(u64::to_le_bytes).collect();
     xxh3_64(&bytes)
@@ -140,11 +140,11 @@ mod tests {
     }
 
     #[test]
-    fn depends_on_ticks_and_values_and_on_no_time() {
+    fn depends_on_ticks_and_values_but_not_on_time() {
         let reference = hash(&[(0, 1.0, 5), (1, 2.0, 6)]).last;
         assert_eq!(reference, hash(&[(0, 1.0, 50), (1, 2.0, 60)]).last);
-        for other in [[(0, 1.0, 5), (2, 2.0, 6)], [(0, 1.0, 5), (1, -2.0, 6)], [(0, 2.0, 5), (1, 1.0, 6)]] {
-            assert_ne!(reference, hash(&other).last);
+        for changed in [[(0, 1.0, 5), (2, 2.0, 6)], [(0, 1.0, 5), (1, -2.0, 6)], [(0, 2.0, 5), (1, 1.0, 6)]] {
+            assert_ne!(reference, hash(&changed).last);
         }
     }
 

@@ -1,11 +1,11 @@
-//! A latency histogram that never allocates after it is made and never loses a value.
+//! A latency histogram that never allocates after its creation and never loses a value.
 
 use hdrhistogram::Histogram;
 use hdrhistogram::serialization::{Deserializer, Serializer, V2Serializer};
 
-/// The largest latency that is kept apart, ns; longer ones count as this long, and are counted as clipped too.
+/// The longest latency that is resolved, ns. Longer ones count as this long, and as clipped.
 pub const MAX_LATENCY_NS: u64 = 60_000_000_000;
-/// Two significant digits cost one part in a hundred of resolution, three a thousandth and 8 times the memory.
+/// Two significant digits resolve 1 %; three resolve 0.1 % and need 8 times the memory.
 const SIGNIFICANT_DIGITS: u8 = 3;
 
 /// The distribution of one stage's latencies, ns.
@@ -15,52 +15,53 @@ pub struct Latency {
     tallies: Tallies,
 }
 
-/// Counts beside the values.
+/// Counts kept beside the histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct Tallies {
     /// Values beyond the histogram's range.
     pub clipped: u64,
-    /// Values of ticks that were missed, or lacked an input.
+    /// Values of ticks that were missed or lacked an input.
     pub missed: u64,
-    /// Negative differences, which have no value.
+    /// Negative differences, which are not recorded as values.
     pub ahead: u64,
-    /// The largest of them, ns.
+    /// The magnitude of the largest negative difference, ns.
     pub ahead_max_ns: u64,
 }
 
-/// The figures that a table shows, µs.
+/// The figures of one table row, µs.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Percentiles {
-    /// How many values.
+    /// The number of values.
     pub count: u64,
-    /// How many of them were longer than the histogram holds.
+    /// The number of values beyond the histogram's range.
     pub clipped: u64,
-    /// The values among them of ticks that were missed, or lacked an input.
+    /// The number of values of ticks that were missed or lacked an input.
     #[serde(default)]
     pub missed: u64,
-    /// Differences that were negative. If there is one, the two stamps are not of one clock: all figures below are NaN (null).
+    /// The number of negative differences. If there are any, the two stamps come from different clocks, and all figures below
+    /// are NaN (null in JSON).
     #[serde(default)]
     pub ahead: u64,
-    /// The largest of them.
+    /// The magnitude of the largest negative difference, µs.
     #[serde(default)]
     pub ahead_max_us: f64,
-    /// The least.
+    /// The minimum.
     #[serde(deserialize_with = "number_or_nan")]
     pub min_us: f64,
     /// The median.
     #[serde(deserialize_with = "number_or_nan")]
     pub p50_us: f64,
-    /// 90 % are at most this.
+    /// The 90th percentile.
     #[serde(deserialize_with = "number_or_nan")]
     pub p90_us: f64,
-    /// 99 % are at most this.
+    /// The 99th percentile.
     #[serde(deserialize_with = "number_or_nan")]
     pub p99_us: f64,
-    /// 99.9 % are at most this.
+    /// The 99.9th percentile.
     #[serde(deserialize_with = "number_or_nan")]
     pub p999_us: f64,
-    /// The largest.
+    /// The maximum.
     #[serde(deserialize_with = "number_or_nan")]
     pub max_us: f64,
     /// The mean.
@@ -68,16 +69,16 @@ pub struct Percentiles {
     pub mean_us: f64,
 }
 
-/// Reads a number; null, as JSON writes a number that is not finite, becomes NaN.
+/// Reads a number. Null, which JSON writes for a number that is not finite, becomes NaN.
 ///
 /// # Errors
-/// Those of the deserializer.
+/// Errors of the deserializer.
 pub fn number_or_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     Ok(<Option<f64> as serde::Deserialize>::deserialize(deserializer)?.unwrap_or(f64::NAN))
 }
 
 impl Percentiles {
-    /// Returns true if the figures can be relied upon: no difference was negative.
+    /// Returns true if the figures are valid: no difference was negative.
     pub fn are_shown(&self) -> bool {
         self.ahead == 0
     }
@@ -92,10 +93,10 @@ impl Default for Latency {
 }
 
 impl Latency {
-    /// Counts a latency from `from_ns` to `to_ns`.
+    /// Counts the latency from `from_ns` to `to_ns`.
     ///
-    /// A monotonic clock never goes back, so a negative difference means that the stamps are of two clocks. It is counted apart
-    /// and not recorded: zero would be a lie.
+    /// A monotonic clock never goes back, so a negative difference means that the stamps come from two clocks. It is counted
+    /// apart and not recorded.
     #[inline]
     pub fn record(&mut self, from_ns: u64, to_ns: u64) {
         let Some(ns) = to_ns.checked_sub(from_ns) else { return self.count_ahead(from_ns - to_ns) };
@@ -111,34 +112,34 @@ impl Latency {
         self.tallies.ahead_max_ns = self.tallies.ahead_max_ns.max(ns);
     }
 
-    /// Counts the same for a tick that was missed or lacked an input: what it should have made was not there so long.
+    /// Counts the latency of a tick that was missed or lacked an input. The result was absent for this time.
     #[inline]
     pub fn record_missed(&mut self, from_ns: u64, to_ns: u64) {
         self.tallies.missed += 1;
         self.record(from_ns, to_ns);
     }
 
-    /// Counts everything that another one has counted.
-    pub fn absorb(&mut self, other: &Self) {
-        // Both have the same bounds.
-        self.histogram.add(&other.histogram).expect("histograms of equal bounds add up");
-        self.tallies.clipped += other.tallies.clipped;
-        self.tallies.missed += other.tallies.missed;
-        self.tallies.ahead += other.tallies.ahead;
-        self.tallies.ahead_max_ns = self.tallies.ahead_max_ns.max(other.tallies.ahead_max_ns);
+    /// Adds all counts of another histogram.
+    pub fn absorb(&mut self, counted: &Self) {
+        // Both histograms have the same bounds.
+        self.histogram.add(&counted.histogram).expect("histograms of equal bounds add up");
+        self.tallies.clipped += counted.tallies.clipped;
+        self.tallies.missed += counted.tallies.missed;
+        self.tallies.ahead += counted.tallies.ahead;
+        self.tallies.ahead_max_ns = self.tallies.ahead_max_ns.max(counted.tallies.ahead_max_ns);
     }
 
-    /// Returns true if nothing was counted, no negative difference either.
+    /// Returns true if nothing was counted, including negative differences.
     pub fn is_empty(&self) -> bool {
         self.histogram.is_empty() && self.tallies.ahead == 0
     }
 
-    /// The histogram itself, ns.
+    /// Returns the histogram, ns.
     pub fn histogram(&self) -> &Histogram<u32> {
         &self.histogram
     }
 
-    /// The figures for a table.
+    /// Returns the figures for a table.
     pub fn percentiles(&self) -> Percentiles {
         let us = |ns: u64| ns as f64 / 1e3;
         let shown = |us: f64| if self.tallies.ahead == 0 { us } else { f64::NAN };
@@ -159,28 +160,28 @@ impl Latency {
         }
     }
 
-    /// The histogram in HdrHistogram's V2 encoding, and what is counted beside it.
+    /// Encodes the histogram as HdrHistogram V2, with the counts beside it.
     pub fn encode(&self) -> (Vec<u8>, Tallies) {
         let mut bytes = Vec::new();
         V2Serializer::new().serialize(&self.histogram, &mut bytes).expect("memory takes every byte");
         (bytes, self.tallies)
     }
 
-    /// The inverse of [`encode`](Self::encode); `None` if the bytes are no histogram.
+    /// Decodes what [`encode`](Self::encode) has encoded. Returns `None` if the bytes are not a histogram.
     pub fn decode(mut bytes: &[u8], tallies: Tallies) -> Option<Self> {
         let histogram = Deserializer::new().deserialize(&mut bytes).ok()?;
         Some(Self { histogram, tallies })
     }
 }
 
-/// Sorts values, the least first.
+/// Returns the values in rising order.
 pub fn sorted(values: impl IntoIterator<Item = f64>) -> Vec<f64> {
     let mut sorted: Vec<f64> = values.into_iter().collect();
     sorted.sort_by(f64::total_cmp);
     sorted
 }
 
-/// Returns the least of some sorted values that this part of them does not exceed: the nearest rank, as HdrHistogram counts.
+/// Returns the nearest-rank quantile of sorted values, as HdrHistogram does: the least value that the part does not exceed.
 pub fn quantile(sorted: &[f64], part: f64) -> Option<f64> {
     let rank = (part * sorted.len() as f64).ceil() as usize;
     sorted.get(rank.clamp(1, sorted.len().max(1)) - 1).copied()
@@ -191,7 +192,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keeps_every_value_and_counts_what_it_cannot_resolve() {
+    fn keeps_every_value_and_counts_clipped_ones() {
         let mut latency = Latency::default();
         for (from, to) in [(0, 1_000), (5_000, 7_000), (9, 9), (0, 2 * MAX_LATENCY_NS)] {
             latency.record(from, to);
@@ -205,12 +206,12 @@ mod tests {
         assert!(Latency::decode(&bytes[1..], tallies).is_none());
     }
 
-    /// A sender whose clock is ahead is not a fast link.
+    /// A negative difference comes from two clocks; it must not pass as a short latency.
     #[test]
-    fn a_negative_difference_is_told_and_hides_the_figures() {
+    fn a_negative_difference_is_counted_and_hides_the_figures() {
         let mut latency = Latency::default();
         latency.record(1_000_000, 0);
-        assert!(!latency.is_empty(), "nothing could be recorded, and that is to be told");
+        assert!(!latency.is_empty(), "a negative difference counts although no value was recorded");
         latency.record(0, 3_000);
         latency.record(500, 0);
         let (bytes, tallies) = latency.encode();

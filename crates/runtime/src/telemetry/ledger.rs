@@ -1,7 +1,8 @@
-//! A role's persistent state: shared memory that survives the process which writes it, so that another one continues.
+//! A role's persistent state: shared memory that survives its writer, so that a successor can continue.
 //!
-//! There is one record, kept twice. A commit writes the copy that is not current and makes it current by a single store, so
-//! whoever looks, and whenever the writer dies, there is one whole record. Must not know what is in it.
+//! The record is kept twice. A commit writes the copy that is not current and makes it current with one store. A reader
+//! therefore finds a complete record at any time, even if the writer dies during a commit. The ledger does not know what the
+//! record contains.
 
 use super::handover;
 use crate::shared::SharedWords;
@@ -15,11 +16,11 @@ use std::ptr::NonNull;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Why a ledger could not be opened.
+/// An error of opening a ledger.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum LedgerError {
-    /// The memory could not be had.
+    /// The memory cannot be opened.
     #[error("cannot keep the state in {}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "cannot-keep-state")]
     Open {
@@ -28,14 +29,14 @@ pub enum LedgerError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Another process writes in it.
+    /// Another process writes to it.
     #[error("{} is held by another process: that seat is taken; end it first", path.display())]
     #[strum(serialize = "seat-taken")]
     Taken {
         /// The file.
         path: PathBuf,
     },
-    /// The file is there and has another size.
+    /// The file exists with another size.
     #[error("{} holds {found} bytes, not {expected}: it was written by another version of this program", path.display())]
     #[strum(serialize = "state-size")]
     Size {
@@ -48,8 +49,8 @@ pub enum LedgerError {
     },
 }
 
-/// A role's persistent state: the record, some words beside it that are written on their own, and the count of the
-/// processes that have written.
+/// A role's persistent state: the record, words beside it that are written one by one, and the count of the processes that
+/// have written.
 #[derive(Debug)]
 pub struct Ledger {
     memory: Rc<Memory>,
@@ -59,7 +60,7 @@ pub struct Ledger {
 #[derive(Debug)]
 struct Memory {
     words: Storage,
-    /// Where the words are, unless they die with this process.
+    /// The file, unless the words end with this process.
     path: Option<PathBuf>,
     /// The two copies of the record.
     record: OnceCell<Storage>,
@@ -76,7 +77,7 @@ impl Storage {
         Self::Private((0..words).map(|_| AtomicU64::new(0)).collect())
     }
 
-    /// The words in a file, as many as these.
+    /// Opens or creates a file of `words` words.
     fn shared(path: &Path, words: usize) -> Result<Self, LedgerError> {
         let shared =
             SharedWords::open(path, words).map_err(|source| LedgerError::Open { path: path.to_owned(), source })?;
@@ -97,24 +98,24 @@ impl Storage {
 }
 
 impl Ledger {
-    /// How many processes have entered.
+    /// The index of the number of processes that have entered.
     const GENERATION: usize = 0;
-    /// How many commits there were; the lowest bit tells which copy is current.
+    /// The index of the number of commits; its lowest bit selects the current copy.
     const COMMITS: usize = 1;
-    /// How long the record is, words.
+    /// The index of the record's length in words.
     const LENGTH: usize = 2;
-    /// The generation that is to begin without its predecessor's state; 0 if none is.
+    /// The index of the generation that must start without its predecessor's state; 0 for no generation.
     const ANEW: usize = 3;
     const FIRST: usize = 4;
-    /// How often a reader tries to read a record that is written meanwhile.
+    /// The number of tries to read a record that is being written.
     const TRIES: usize = 1000;
 
-    /// A ledger that dies with this process: for runs in one thread.
+    /// Creates a ledger that ends with this process, for runs in one thread.
     pub fn private(words: usize) -> Self {
         Self::over(Storage::private(Self::FIRST + words), None)
     }
 
-    /// The ledger in a file of shared memory, as it was left, or new and all zero; to be read.
+    /// Opens the ledger in a shared-memory file for reading. A new one is all zero.
     ///
     /// # Errors
     /// [`LedgerError`].
@@ -122,7 +123,7 @@ impl Ledger {
         Ok(Self::over(Storage::shared(path, Self::FIRST + words)?, Some(path.to_owned())))
     }
 
-    /// The same, to be written: there is one writer at a time.
+    /// Opens the ledger in a shared-memory file for writing. There is one writer at a time.
     ///
     /// # Errors
     /// [`LedgerError`].
@@ -147,54 +148,58 @@ impl Ledger {
         &self.memory.words.words()[index]
     }
 
-    /// Enters as the next generation of writers, and tells which: 1 for the first.
+    /// Enters as the next generation of writers, and returns its number: 1 for the first.
     pub fn enter(&self) -> u64 {
         self.word(Self::GENERATION).fetch_add(1, Ordering::Relaxed) + 1
     }
 
-    /// The generation that has entered last; 0 if none has.
+    /// Returns the latest generation; 0 before the first.
     pub fn generation(&self) -> u64 {
         self.word(Self::GENERATION).load(Ordering::Relaxed)
     }
 
-    /// Lets the next generation keep the counters and nothing else: the state may be what its predecessors died of.
+    /// Makes the next generation keep only the counters, because the state may be what its predecessors failed on.
     pub fn discard_state(&self) {
         self.word(Self::ANEW).store(self.generation() + 1, Ordering::Relaxed);
     }
 
-    /// Whether the present generation is to begin without its predecessor's state.
+    /// Returns true if the current generation must start without its predecessor's state.
     pub fn discards_state(&self) -> bool {
         self.word(Self::ANEW).load(Ordering::Relaxed) == self.generation()
     }
 
-    /// The same memory, to be taken anew from its beginning.
+    /// Returns the same memory with every word free to be taken again.
     pub fn reopened(&self) -> Self {
         Self { memory: self.memory.clone(), taken: Cell::new(Self::FIRST) }
     }
 
-    /// The next `count` words beside the record. Whoever takes in the same order finds the same words again.
+    /// Takes the next `count` words beside the record. A process that takes in the same order gets the same words.
     ///
     /// # Panics
-    /// If the ledger has no more: its size is computed from the same list of what is kept in it.
+    /// If no words are left. The ledger's size is computed from the same list of parts that take from it.
     pub fn take(&self, count: usize) -> Slots {
         let begin = self.taken.replace(self.taken.get() + count);
-        let words =
-            self.memory.words.words().get(begin..begin + count).expect("the ledger is sized for all that it has");
+        let words = self
+            .memory
+            .words
+            .words()
+            .get(begin..begin + count)
+            .expect("the ledger has room for every part that takes words");
         Slots { words: words.into(), _memory: self.memory.clone() }
     }
 
-    /// Where it is, unless it dies with this process.
+    /// Returns the file, or `None` if the ledger ends with this process.
     pub fn path(&self) -> Option<&Path> {
         self.memory.path.as_deref()
     }
 
-    /// Whether another process may have to continue from here: whoever writes commits every tick.
+    /// Returns true if another process may continue from here. The writer then commits every tick.
     #[inline]
     pub fn is_shared(&self) -> bool {
         self.memory.path.is_some()
     }
 
-    /// Makes room for a record of so many words, or opens the one that is there.
+    /// Makes room for a record of `words` words, or opens the existing one.
     ///
     /// # Errors
     /// [`LedgerError`].
@@ -210,7 +215,7 @@ impl Ledger {
         Ok(())
     }
 
-    /// The record that is there, for whoever only reads: whatever its length is said to be, nothing is made.
+    /// Opens the existing record for reading. Creates nothing, whatever length the ledger claims.
     fn open_record(&self) -> Option<&Storage> {
         let words = self.word(Self::LENGTH).load(Ordering::Relaxed) as usize;
         if self.memory.record.get().is_none() && words > 0 {
@@ -225,8 +230,7 @@ impl Ledger {
         self.memory.path.as_ref().map(|path| path.with_extension("state"))
     }
 
-    /// Writes a record and makes it current. Before, room must have been [reserved](Self::reserve) for as many words as
-    /// `write` passes.
+    /// Writes a record and makes it current. Room for as many words as `write` passes must be [reserved](Self::reserve) before.
     #[inline]
     pub fn commit(&self, write: impl FnOnce(&mut Store<'_>)) {
         let Some(record) = self.memory.record.get() else { return };
@@ -234,18 +238,18 @@ impl Ledger {
         handover::commit(commits, commits.load(Ordering::Relaxed) + 1, record.words(), |words| {
             let mut store = Store { words, at: 0 };
             write(&mut store);
-            debug_assert_eq!(store.at, words.len(), "a state always takes as many words");
+            debug_assert_eq!(store.at, words.len(), "a state always has the same number of words");
         });
     }
 
-    /// The last record that was committed; none before the first, or where none can be read.
+    /// Returns the last committed record. Returns `None` before the first commit, or if no record can be read.
     pub fn record(&self) -> Option<Vec<u64>> {
         let record = self.open_record()?;
         handover::record(self.word(Self::COMMITS), record.words(), Self::TRIES)
     }
 }
 
-/// Writes a state into a record.
+/// A writer of a state into a record.
 #[derive(Debug)]
 pub struct Store<'a> {
     words: &'a [AtomicU64],
@@ -262,32 +266,32 @@ impl Words for Store<'_> {
     }
 }
 
-/// Some words of a ledger beside its record, each written whole and on its own.
+/// Words of a ledger beside its record. Each is written atomically and independently.
 #[derive(Debug)]
 pub struct Slots {
-    /// Looked up once: some are written in every tick.
+    /// The words, looked up once because some are written in every tick.
     words: NonNull<[AtomicU64]>,
-    /// What keeps them.
+    /// Keeps the words alive.
     _memory: Rc<Memory>,
 }
 
 impl Slots {
-    /// All of them.
+    /// Returns all words.
     #[inline]
     #[allow(unsafe_code)]
     pub(crate) fn words(&self) -> &[AtomicU64] {
-        // SAFETY: the words lie in `_memory`, which is neither moved nor freed nor written but through atomics as long as
-        // `self` lives.
+        // SAFETY: the words lie in `_memory`, which lives as long as `self`. It is not moved or freed, and all writes to it
+        // are atomic.
         unsafe { self.words.as_ref() }
     }
 
-    /// One word.
+    /// Returns one word.
     #[inline]
     pub fn get(&self, index: usize) -> u64 {
         self.words()[index].load(Ordering::Relaxed)
     }
 
-    /// Writes one word. A commit that follows is not seen before it.
+    /// Writes one word. A reader that sees a later commit also sees this word.
     #[inline]
     pub fn set(&self, index: usize, value: u64) {
         self.words()[index].store(value, Ordering::Relaxed);
@@ -304,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_opens_it_again_finds_what_was_committed_last() {
+    fn a_reopened_ledger_has_the_last_commit() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("x.books");
         let (first, second) = (Ledger::shared(&path, 5).unwrap(), Ledger::shared(&path, 5).unwrap());
@@ -330,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_only_reads_makes_nothing_whatever_is_in_the_file() {
+    fn a_reader_creates_no_file_whatever_length_is_claimed() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("x.books");
         let writer = Ledger::shared(&path, 0).unwrap();
@@ -346,14 +350,14 @@ mod tests {
     }
 
     #[test]
-    fn a_commit_that_was_not_finished_leaves_the_one_before() {
+    fn an_unfinished_commit_leaves_the_previous_record() {
         let ledger = Ledger::private(0);
         ledger.reserve(2).unwrap();
         commit(&ledger, &[1, 1]);
         let died = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
             ledger.commit(|store| {
                 store.word(&mut 2);
-                panic!("in the midst of it");
+                panic!("during the commit");
             });
         }));
         assert!(died.is_err());
@@ -363,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_generation_that_follows_is_distrusted() {
+    fn only_the_next_generation_discards_the_state() {
         let ledger = Ledger::private(0);
         ledger.enter();
         assert!(!ledger.discards_state());
@@ -375,7 +379,7 @@ mod tests {
         assert!(!ledger.discards_state());
     }
 
-    /// Whoever reads while somebody writes gets one record whole.
+    /// A reader that runs beside a writer gets complete records only.
     #[test]
     fn no_reader_sees_parts_of_two_records() {
         let directory = tempfile::tempdir().unwrap();

@@ -1,22 +1,22 @@
-//! The machine that a run was made on, for whoever reads its results elsewhere. Must not fail: what is not told is unknown.
+//! The machine of a run, recorded for readers of its results. Nothing here fails: unknown values stay unknown.
 
 use serde::{Deserialize, Serialize};
 
-/// A machine.
+/// A description of the machine that made a run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MachineInfo {
-    /// Its name.
+    /// Its host name.
     pub name: String,
-    /// Release and version of its kernel.
+    /// The release and version of its kernel.
     pub kernel: String,
-    /// Cores that this process may use.
+    /// The number of cores that this process may use.
     pub cores: usize,
-    /// The processor's name.
+    /// The processor's model name.
     pub cpu: String,
 }
 
 impl MachineInfo {
-    /// This machine.
+    /// Returns the description of this machine.
     pub fn local() -> Self {
         let system = rustix::system::uname();
         let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();

@@ -1,6 +1,6 @@
-//! What a role remembers of its run: latency histograms, counters, and the hash of what it published.
+//! Measurements of a role's run: latency histograms, counters, and the hash of what it published.
 //!
-//! Everything is allocated before the loop and only counted in it; export and arithmetic come after. Must not log.
+//! Everything is allocated before the loop starts and only counted in it; export and arithmetic follow. Must not log.
 
 mod counters;
 mod export;
@@ -11,7 +11,7 @@ mod ledger;
 mod machine;
 mod report;
 
-/// What [`handover`] is made of.
+/// The atomics of [`handover`], which a model checker replaces.
 mod atomic {
     pub use std::sync::atomic::{AtomicU64, Ordering, fence};
 }
