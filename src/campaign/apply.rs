@@ -44,7 +44,7 @@ pub(super) fn put(
         (there, true) => there.and_then(|there| times(there, value)).ok_or_else(|| {
             let reason =
                 "is no number in the scenario, so nothing can be a factor of it; give values, or put it into [set]";
-            ConfigError::of(place.clone(), key, "not-a-factor", reason)
+            ConfigError::invalid(place.clone(), key, "not-a-factor", reason)
         })?,
         (Some(Value::Array(list)), false) if axis::number(value).is_some() && list.iter().all(is_number) => {
             Value::Array(vec![value.clone(); list.len()])

@@ -347,12 +347,12 @@ impl Campaign {
 pub(super) fn resolved(mut document: Document, clock: ClockKind) -> Result<Scenario, ConfigError> {
     document.put("clock", clock.name().into(), &"a campaign's clock".into())?;
     document.put("record", false.into(), &"a campaign records nothing".into())?;
-    Scenario::of(document)
+    Scenario::resolve(document)
 }
 
 /// The scenario that a campaign varies.
 fn base(name: &str, file: &Document, shipped: Shipped<'_>) -> Result<Document, ConfigError> {
-    let refuse = |code, reason: String| ConfigError::of(file.place("base"), "base", code, reason);
+    let refuse = |code, reason: String| ConfigError::invalid(file.place("base"), "base", code, reason);
     if is_name(name) {
         let text = shipped(name).map_err(|error| refuse("unknown-scenario", error.to_string()))?;
         return Document::parse(&text, &format!("{name}.toml"));

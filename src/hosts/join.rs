@@ -270,7 +270,7 @@ impl Part {
             write.map_err(|source| JoinError::Write { path: path.clone(), source })?;
             document.set(&format!("{key}={}", toml::Value::String(path.display().to_string())))?;
         }
-        let scenario = Scenario::of(document)?;
+        let scenario = Scenario::resolve(document)?;
         let ours = layouts(&scenario);
         let all = ours.keys().chain(self.layouts.keys());
         let differs = |service: &&String| ours.get(*service) != self.layouts.get(*service);

@@ -44,7 +44,7 @@ impl Plan {
         let hosts: Vec<String> = scenario.hosts.hosts.iter().map(|host| host.name.clone()).collect();
         let number = |name: &str| hosts.iter().position(|host| host == name).map(|place| place as u8);
         let (own, hub) = (number(own)?, number(hub)?);
-        let host_of = |role: RoleId| number(scenario.hosts.of(role.name(scenario))?);
+        let host_of = |role: RoleId| number(scenario.hosts.host_of(role.name(scenario))?);
         let roles: Vec<(RoleId, u8)> =
             RoleId::all(scenario).into_iter().map(|role| Some((role, host_of(role)?))).collect::<Option<_>>()?;
         let mut links = Vec::new();

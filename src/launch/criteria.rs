@@ -152,7 +152,7 @@ impl Judge<'_> {
         }
         if let Some(amount) = accept.unscored_ticks_max {
             let unscored = self.unscored(0, score.unscored_ticks);
-            let limit = amount.of(self.ticks_from(0)) as f64;
+            let limit = amount.count(self.ticks_from(0)) as f64;
             criteria.push(Criterion::new("unscored_ticks_max", limit, Some(unscored as f64)));
         }
         if let Some(limit) = accept.step_latency_p99_us_max {
@@ -203,10 +203,10 @@ impl Judge<'_> {
         let ticks = self.ticks_from(from_tick);
         let blank = self.unscored(from_tick, blank);
         let allowed = match self.scenario.accept.unscored_ticks_max {
-            Some(amount) => amount.of(ticks),
+            Some(amount) => amount.count(ticks),
             // A tick that a role missed is without a sample, and counted as missed. One that was sent and not scored may have
             // been the worst.
-            None if self.lost_samples() == Some(0) => DEFAULT_SHARE.of(ticks),
+            None if self.lost_samples() == Some(0) => DEFAULT_SHARE.count(ticks),
             None => 0,
         };
         (blank > allowed).then_some(Unjudged::Unscored(blank, ticks, from_s))
@@ -244,7 +244,7 @@ impl Judge<'_> {
         // A number counts every tick; a share grants what the scenario's own faults take, besides.
         let granted = |amount: TickAmount, ticks: u64| match amount {
             TickAmount::Count(count) => count,
-            TickAmount::Share(_) => amount.of(ticks) + scripted,
+            TickAmount::Share(_) => amount.count(ticks) + scripted,
         };
         let mut criteria = Vec::new();
         for (name, limit, count, default) in [
@@ -314,7 +314,7 @@ impl Judge<'_> {
         }
         let elapsed = self.elapsed();
         let late =
-            DEFAULT_SHARE.of(elapsed).max(self.scenario.command_timeout_ticks) + self.scenario.actuation_delay_ticks;
+            DEFAULT_SHARE.count(elapsed).max(self.scenario.command_timeout_ticks) + self.scenario.actuation_delay_ticks;
         let absent = |role: &&String| {
             let covered = links_of(self.scenario, role, &self.books.links)
                 .map(|link| link.received + link.void.1 + link.gaps)

@@ -142,7 +142,7 @@ fn run_nodes(scenario: &Scenario, launch: &mut Launch<'_>) -> Result<Outcome, La
 /// A role was killed by the scenario: what is done about it, by the policy that processes have.
 fn incident(scenario: &Scenario, (role, ledger): &(RoleId, Ledger)) -> Incident {
     let (name, supervision) = (role.name(scenario), &scenario.supervision);
-    let again = supervision.of(name) == OnFailure::Restart && ledger.generation() <= supervision.restarts_max;
+    let again = supervision.reaction_to(name) == OnFailure::Restart && ledger.generation() <= supervision.restarts_max;
     let killed = Failure::new("scripted-kill", "it was killed by the scenario".to_owned(), String::new());
     Incident::without_process(name, ledger, killed, if again { Action::Restarted } else { Action::Stopped })
 }

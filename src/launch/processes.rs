@@ -135,7 +135,7 @@ fn is_external(scenario: &Scenario, launch: &Launch<'_>, role: &str) -> bool {
 /// The other host that has a role, if one takes part and has.
 fn elsewhere<'s>(scenario: &'s Scenario, launch: &Launch<'_>, role: &str) -> Option<&'s str> {
     let seat = launch.host.as_ref()?;
-    scenario.hosts.of(role).filter(|host| *host != seat.host)
+    scenario.hosts.host_of(role).filter(|host| *host != seat.host)
 }
 
 /// Leaves the seat of every external role in the domain, for the program that is to take it.

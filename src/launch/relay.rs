@@ -80,7 +80,7 @@ impl RelayWatch {
             *known = true;
             let stopped = end.incidents.iter().find(|incident| incident.action == Action::Stopped);
             let roles = RoleId::all(scenario).into_iter().map(|role| role.name(scenario).to_owned());
-            let mut roles = roles.filter(|role| scenario.hosts.of(role) == Some(host));
+            let mut roles = roles.filter(|role| scenario.hosts.host_of(role) == Some(host));
             incidents.push(stopped.cloned().unwrap_or_else(|| {
                 let cause = end.failed.unwrap_or_else(|| "it ended before the run did".to_owned());
                 let cause = format!("the host {host} left: {cause}");

@@ -486,7 +486,7 @@ impl Member {
     /// Decides what is done about a failure, and prepares it.
     pub fn fail(&mut self, failure: Failure, scenario: &Scenario, now_ns: u64) -> Incident {
         let supervision = &scenario.supervision;
-        let restart = |(role, _): (RoleId, &Ledger)| supervision.of(role.name(scenario)) == OnFailure::Restart;
+        let restart = |(role, _): (RoleId, &Ledger)| supervision.reaction_to(role.name(scenario)) == OnFailure::Restart;
         let repeated = self.panics_again(&failure, scenario.clock);
         let again =
             !self.external && self.books().all(restart) && self.restarts < supervision.restarts_max && !repeated;

@@ -96,7 +96,7 @@ fn attempt(arguments: &Arguments, rows: &[Row]) -> Result<Results, (Exit, Failur
     spinner.finish_and_clear();
     let (board, privileges) = measured.map_err(|error| match error {
         BenchError::Interrupted(signal) => (Exit::Signal(signal), error.into()),
-        error => (Exit::Failure, Failure::of(last.borrow(), error)),
+        error => (Exit::Failure, Failure::prefixed(last.borrow(), error)),
     })?;
     let results = Results::new(&bench, board, privileges, started);
     write_results(&directory, &results)

@@ -61,7 +61,7 @@ fn checked(arguments: &Arguments, path: &Path) -> Result<String, Failure> {
         return Ok(if arguments.resolved { resolved(&told, campaign.to_toml()) } else { told });
     }
     let scenario = load(Some(path), arguments.set.iter().map(|argument| Change::Set(argument)))?;
-    check_cores(&scenario).map_err(|error| Failure::of(path.display(), error))?;
+    check_cores(&scenario).map_err(|error| Failure::prefixed(path.display(), error))?;
     if arguments.json {
         return Ok(json(path, &scenario));
     }

@@ -113,7 +113,7 @@ struct Body {
 pub fn estimate(arguments: &Arguments) -> Ended {
     let body = body(arguments).map_err(|failure| fail(Exit::Usage, failure))?;
     let inertia = Inertia::new(body.moments.into());
-    let inertia = inertia.map_err(|error| fail(Exit::Usage, Failure::of("the inertia", error)))?;
+    let inertia = inertia.map_err(|error| fail(Exit::Usage, Failure::prefixed("the inertia", error)))?;
     let request = Request {
         axis: arguments.hidden,
         coefficients: inertia.coefficients(),

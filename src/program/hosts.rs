@@ -213,6 +213,6 @@ mod with_hosts {
 
     fn refused(error: JoinError) -> Exit {
         let exit = if matches!(error, JoinError::Write { .. }) { Exit::Failure } else { Exit::Usage };
-        fail(exit, Failure::of("cannot join", error))
+        fail(exit, Failure::prefixed("cannot join", error))
     }
 }

@@ -97,7 +97,7 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
         Method::Axisymmetric => matches!(finding, Finding::Short { .. } | Finding::Still { .. }),
     };
     if let Some(finding) = identified.findings.iter().find(forbids) {
-        return Err(Failure::of("the log tells of no body", *finding));
+        return Err(Failure::prefixed("the log tells of no body", *finding));
     }
     let nothing =
         || Failure::new("no-motion", "the log tells of no body: it has no motion that can be fitted; see the notes");
@@ -126,8 +126,8 @@ fn body(arguments: &Arguments, identified: &Identified) -> Result<Body, Failure>
             known(moments)
         }
     };
-    let (inertia, flattened) =
-        nearest_body(&found.moments).map_err(|error| Failure::of("the moments that fit best are no body's", error))?;
+    let (inertia, flattened) = nearest_body(&found.moments)
+        .map_err(|error| Failure::prefixed("the moments that fit best are no body's", error))?;
     let moments = if flattened { inertia.moments_kg_m2() } else { found.moments };
     Ok(Body { moments, ..found })
 }

@@ -168,7 +168,7 @@ impl Program {
     /// Adds a rig: scenarios may name it.
     #[must_use]
     pub fn rig<R: Rig>(mut self) -> Self {
-        self.rigs.push(RigKind::of::<R>());
+        self.rigs.push(RigKind::new::<R>());
         self
     }
 

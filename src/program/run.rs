@@ -185,7 +185,7 @@ impl Arguments {
             let reason = "somebody else's role has no part in a run over several hosts; leave it out, or --external";
             return refuse("external-with-hosts", reason.to_owned());
         }
-        if let Some(role) = scenario.debug.iter().find(|role| scenario.hosts.of(role) != Some(&host)) {
+        if let Some(role) = scenario.debug.iter().find(|role| scenario.hosts.host_of(role) != Some(&host)) {
             let reason = format!("the {role} of launch.debug is on another host; debug the roles of this one");
             return refuse("debugged-elsewhere", reason);
         }
@@ -201,7 +201,7 @@ impl Arguments {
     fn check_external(&self, scenario: &Scenario) -> Result<(), Failure> {
         let check = |role: &String| {
             let checked = scenario.check_external(role);
-            checked.map_err(|error| Failure::of(format_args!("--external {role}"), error))
+            checked.map_err(|error| Failure::prefixed(format_args!("--external {role}"), error))
         };
         self.external.iter().try_for_each(check)
     }

@@ -52,7 +52,7 @@ pub fn load<'a>(given: Option<&Path>, changes: impl IntoIterator<Item = Change<'
     let resolved = Document::parse(&text, &origin).and_then(|document| {
         if is_campaign(&document) {
             let reason = "makes it a campaign; run it with `corotate sweep`, or one case of it with --case N";
-            return Err(ConfigError::of(document.place("base"), "base", "is-campaign", reason));
+            return Err(ConfigError::invalid(document.place("base"), "base", "is-campaign", reason));
         }
         changed(document, changes)
     });
@@ -65,7 +65,7 @@ pub fn changed<'a>(
     changes: impl IntoIterator<Item = Change<'a>>,
 ) -> Result<Scenario, ConfigError> {
     changes.into_iter().try_for_each(|change| change.apply(&mut document))?;
-    Scenario::of(document)
+    Scenario::resolve(document)
 }
 
 /// The text that is meant, by the name under which it is shipped, by its path or from standard input; and what errors call it.
@@ -145,7 +145,8 @@ mod tests {
     #[test]
     fn the_line_that_an_error_is_about_is_quoted() {
         let text = "a = 1\nb = 2   \n";
-        let quote = |place: Place| quoting(ConfigError::of(place, "b", "code", "wrong"), "x.toml", text).to_string();
+        let quote =
+            |place: Place| quoting(ConfigError::invalid(place, "b", "code", "wrong"), "x.toml", text).to_string();
         let line = |number| Place { line: Some(number), ..Place::from("x.toml") };
         assert_eq!(quote(line(2)), "x.toml:2: b: wrong [code]\n   2 | b = 2");
         assert_eq!(quote(line(99)), "x.toml:99: b: wrong [code]");

@@ -160,7 +160,7 @@ fn books(domain: &Domain, scenario: &Scenario) -> Vec<RoleReport> {
     let counters = |role: RoleId| {
         let name = role.name(scenario);
         let ledger = open_ledger(domain, scenario, role).ok().filter(|ledger| ledger.generation() > 0);
-        if ledger.is_none() && scenario.hosts.of(name).is_some() {
+        if ledger.is_none() && scenario.hosts.host_of(name).is_some() {
             return None;
         }
         let file = std::fs::read(report_path(domain.root(), name)).ok();

@@ -13,9 +13,9 @@ impl Failure {
     }
 
     /// Puts the name of an option or a file before the text of each mistake.
-    pub fn of(what: impl fmt::Display, error: impl Into<Self>) -> Self {
+    pub fn prefixed(prefix: impl fmt::Display, error: impl Into<Self>) -> Self {
         let Self(mistakes) = error.into();
-        Self(mistakes.into_iter().map(|(text, code)| (format!("{what}: {text}"), code)).collect())
+        Self(mistakes.into_iter().map(|(text, code)| (format!("{prefix}: {text}"), code)).collect())
     }
 }
 

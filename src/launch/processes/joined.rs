@@ -17,7 +17,7 @@ impl<'a> Supervisor<'a> {
         let recorder = RecorderWatch::start(None, scenario, domain, bus)?;
         let foxglove = foxglove::start(None, domain)?;
         let own = |role: &RoleId| {
-            role.process_role(scenario) == *role && scenario.hosts.of(role.name(scenario)) == Some(host)
+            role.process_role(scenario) == *role && scenario.hosts.host_of(role.name(scenario)) == Some(host)
         };
         let roles = RoleId::all(scenario).into_iter().filter(own);
         let started = roles.map(|role| Ok((role, RoleProcess::start(scenario, role, domain)?)));

@@ -52,7 +52,7 @@ pub enum TickAmount {
 
 impl TickAmount {
     /// The amount of `ticks`, in whole ticks.
-    pub fn of(self, ticks: u64) -> u64 {
+    pub fn count(self, ticks: u64) -> u64 {
         match self {
             Self::Count(count) => count,
             // A part in a million more: 1 % of 300 ticks is 3, whatever the rounding.

@@ -66,7 +66,7 @@ impl Document {
                 }
                 message => ("syntax", message.replace('\n', ", ")),
             };
-            ConfigError::of(place, "", code, format!("{reason}; correct the line"))
+            ConfigError::invalid(place, "", code, format!("{reason}; correct the line"))
         };
         let spanned = DeTable::parse(text).map_err(syntax)?;
         let table = toml::from_str::<Table>(text).map_err(syntax)?;
@@ -105,7 +105,7 @@ impl Document {
     pub fn set_by_option(&mut self, option: &str, key: &str, text: &str) -> Result<(), ConfigError> {
         let place = Place::from(format!("{option} {text}"));
         self.assign(key, text, place.clone()).map_err(|error| {
-            ConfigError::of(place, key, (&error).into(), format!("{error}; give it as a scenario does"))
+            ConfigError::invalid(place, key, (&error).into(), format!("{error}; give it as a scenario does"))
         })?;
         self.refuse_absurd()
     }
@@ -181,9 +181,12 @@ impl Document {
     /// [`ConfigError::Invalid`].
     pub fn refuse_lists(&self, keys: &[&str]) -> Result<(), ConfigError> {
         match keys.iter().find(|key| self.table.get(**key).is_some_and(Value::is_array)) {
-            Some(key) => {
-                Err(ConfigError::of(self.place(key), *key, "wrong-type", format!("is a list; write [{key}], once")))
-            }
+            Some(key) => Err(ConfigError::invalid(
+                self.place(key),
+                *key,
+                "wrong-type",
+                format!("is a list; write [{key}], once"),
+            )),
             None => Ok(()),
         }
     }
@@ -199,7 +202,7 @@ impl Document {
     /// [`ConfigError::Invalid`] with all mistakes, each with the place of the key.
     pub fn read_into<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         if let Some(asked) = &self.asked {
-            let _ = asked.set(Shape::of::<T>());
+            let _ = asked.set(Shape::read_by::<T>());
         }
         self.read_once().map_err(|problem| ConfigError::Invalid { problems: self.with_others::<T>(*problem) })
     }
@@ -210,7 +213,7 @@ impl Document {
 
     /// Returns a mistake with those that are found once it is mended, and so on.
     fn with_others<T: DeserializeOwned>(&self, first: Problem) -> Vec<Problem> {
-        let (shape, mut mended, mut found) = (Shape::of::<T>(), self.clone(), Vec::<Problem>::new());
+        let (shape, mut mended, mut found) = (Shape::read_by::<T>(), self.clone(), Vec::<Problem>::new());
         let mut next = Some(first);
         for _ in 0..MAX_MISTAKES {
             // What could not be mended is met again.
@@ -301,7 +304,7 @@ impl Document {
                 } else {
                     ("not-finite", format!("{value} is not a finite number; give one"))
                 };
-                Err(ConfigError::of(self.place(&key), key, code, reason))
+                Err(ConfigError::invalid(self.place(&key), key, code, reason))
             }
             None => Ok(()),
         }
@@ -321,7 +324,7 @@ pub fn read_text(reader: impl Read, origin: &Path) -> Result<String, ConfigError
     }
     String::from_utf8(bytes).map_err(|error| {
         let place = position(&origin.display().to_string(), error.as_bytes(), error.utf8_error().valid_up_to());
-        ConfigError::of(place, "", "not-utf8", "this is not UTF-8 text; correct the line")
+        ConfigError::invalid(place, "", "not-utf8", "this is not UTF-8 text; correct the line")
     })
 }
 

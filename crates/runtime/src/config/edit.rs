@@ -35,7 +35,7 @@ impl Document {
         let judged = value.clone();
         self.put_value(path, value, place.clone()).map_err(|error| {
             let reason = format!("{error}; name a key of the scenario, as --set does");
-            ConfigError::of(place.clone(), path, (&error).into(), reason)
+            ConfigError::invalid(place.clone(), path, (&error).into(), reason)
         })?;
         self.refuse_absurd_value(&judged, path.to_owned())
     }

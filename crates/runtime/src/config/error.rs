@@ -87,7 +87,7 @@ pub enum PathError {
 
 impl ConfigError {
     /// A single mistake.
-    pub fn of(place: Place, key: impl Into<String>, code: &'static str, reason: impl Into<String>) -> Self {
+    pub fn invalid(place: Place, key: impl Into<String>, code: &'static str, reason: impl Into<String>) -> Self {
         Problem::new(place, key, code, reason).into()
     }
 

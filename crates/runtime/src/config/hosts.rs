@@ -78,14 +78,14 @@ pub struct Hosts {
 
 impl Hosts {
     /// The name of the host that has a role; none where there is one computer.
-    pub fn of(&self, role: &str) -> Option<&str> {
+    pub fn host_of(&self, role: &str) -> Option<&str> {
         let has = |host: &&Host| host.roles.iter().any(|other| other == role);
         self.hosts.iter().find(has).map(|host| &*host.name)
     }
 
     /// Ticks that a sample may take from one role to another.
     fn way(&self, from: &str, to: &str) -> u64 {
-        match (self.of(from), self.of(to)) {
+        match (self.host_of(from), self.host_of(to)) {
             (Some(from), Some(to)) if from != to => self.budget(from, to),
             _ => 0,
         }
@@ -176,7 +176,7 @@ pub(crate) fn check_alone(hosts: &Hosts, processes: &[Vec<String>], external: &[
         format!("{} hosts are more than a run can have; give 16 at the most", hosts.hosts.len())
     });
     for (index, roles) in processes.iter().enumerate() {
-        let apart = roles.iter().any(|role| hosts.of(role) != hosts.of(&roles[0]));
+        let apart = roles.iter().any(|role| hosts.host_of(role) != hosts.host_of(&roles[0]));
         checks.require(!apart, &format!("launch.processes[{index}]"), "roles-apart", || {
             format!("{} are on different hosts and cannot share a process; take them apart", roles.join(", "))
         });
@@ -288,6 +288,6 @@ mod tests {
         let scenario = Scenario::parse(&text, "x.toml", &[]).unwrap();
         let again = Scenario::parse(&scenario.to_toml(), "y.toml", &[]).unwrap();
         assert_eq!(again.hosts, scenario.hosts);
-        assert_eq!((again.hosts.of("observer"), again.hosts.hosts.len()), (Some("b"), 2));
+        assert_eq!((again.hosts.host_of("observer"), again.hosts.hosts.len()), (Some("b"), 2));
     }
 }

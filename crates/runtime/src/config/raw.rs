@@ -293,7 +293,7 @@ impl Default for Supervision {
 
 impl Supervision {
     /// What is done about a role that failed.
-    pub fn of(&self, role: &str) -> OnFailure {
+    pub fn reaction_to(&self, role: &str) -> OnFailure {
         match &self.on_failure {
             Policy::All(policy) => *policy,
             Policy::ByRole(roles) => roles.get(role).copied().unwrap_or(OnFailure::Restart),

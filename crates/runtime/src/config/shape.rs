@@ -43,7 +43,7 @@ pub(crate) struct Key {
 
 impl Shape {
     /// What a type reads.
-    pub fn of<T: DeserializeOwned>() -> Self {
+    pub fn read_by<T: DeserializeOwned>() -> Self {
         at::<T>(&mut Vec::new())
     }
 
@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn a_type_tells_its_keys() {
-        let Shape::Table { keys, closed } = Shape::of::<Outer>() else { panic!("it is a table") };
+        let Shape::Table { keys, closed } = Shape::read_by::<Outer>() else { panic!("it is a table") };
         assert!(!closed);
         let required: Vec<&str> = keys.iter().filter(|key| key.required).map(|key| key.name).collect();
         assert_eq!(required, ["name", "axes", "cores", "limits", "inner"]);

@@ -209,7 +209,7 @@ impl<R: SimpleRig> Rig for R {
         rig.check(context, checks);
         let table = toml::Table::try_from(&rig).map_err(|error| {
             let reason = format!("its parameters cannot be written as TOML: {error}");
-            ConfigError::of(sections.place(""), R::NAME, "not-toml", reason)
+            ConfigError::invalid(sections.place(""), R::NAME, "not-toml", reason)
         })?;
         Ok((Some(rig), table))
     }

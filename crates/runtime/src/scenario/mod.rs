@@ -100,14 +100,14 @@ impl Scenario {
 
     fn changed(mut document: Document, overrides: &[String]) -> Result<Self, ConfigError> {
         overrides.iter().try_for_each(|argument| document.set(argument))?;
-        Self::of(document)
+        Self::resolve(document)
     }
 
     /// The same from a document, with whatever was changed in it.
     ///
     /// # Errors
     /// [`ConfigError`].
-    pub fn of(mut document: Document) -> Result<Self, ConfigError> {
+    pub fn resolve(mut document: Document) -> Result<Self, ConfigError> {
         document.refuse_lists(&[&registry::tables()[..], &TABLES].concat())?;
         let sections = document.split_off(&registry::sections());
         let maxima: Maxima = document.split_off_within("watchdog", |key| key.ends_with("_max")).read_into()?;
@@ -274,7 +274,7 @@ fn nested_keys(name: Option<&str>, rig: Option<&dyn AnyRig>) -> Vec<String> {
     let mut nested = Vec::new();
     let shapes = registry::shapes();
     let own = shapes.iter().filter(|(rig, _)| name == Some(*rig)).flat_map(|(_, keys)| keys);
-    let Shape::Table { keys: common, .. } = Shape::of::<Raw>() else { unreachable!("a scenario is a table") };
+    let Shape::Table { keys: common, .. } = Shape::read_by::<Raw>() else { unreachable!("a scenario is a table") };
     for key in own.chain(&common) {
         if let Shape::Table { keys, .. } = &key.shape {
             nested.extend(keys.iter().map(|inner| format!("{}.{}", key.name, inner.name)));

@@ -22,7 +22,7 @@ type Resolved = Result<(Option<Arc<dyn AnyRig>>, toml::Table), ConfigError>;
 
 impl RigKind {
     /// That of a rig.
-    pub fn of<R: Rig>() -> Self {
+    pub fn new<R: Rig>() -> Self {
         let resolve = |name: &str, sections: &Document, context: Context, checks: &mut Checks<'_>| {
             let (rig, table) = R::resolve(name, sections, context, checks)?;
             Ok((rig.map(|rig| Arc::new(rig) as Arc<dyn AnyRig>), table))
@@ -40,7 +40,7 @@ pub fn register(kinds: Vec<RigKind>) -> bool {
 
 /// The rigs of this crate, compiled with it: a program that names them so does not compile them once more.
 pub fn shipped() -> Vec<RigKind> {
-    vec![RigKind::of::<RigidBodyRig>(), RigKind::of::<OrbitRig>()]
+    vec![RigKind::new::<RigidBodyRig>(), RigKind::new::<OrbitRig>()]
 }
 
 /// The rigs of this program: those of this crate where none were registered.

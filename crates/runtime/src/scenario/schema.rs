@@ -19,7 +19,7 @@ pub fn schema(program: &str, shipped: &[(&str, &str)]) -> Value {
     let notes = notes(shipped);
     let rigs = registry::shapes();
     let names: Vec<&str> = rigs.iter().map(|(name, _)| *name).collect();
-    let Shape::Table { keys: common, .. } = Shape::of::<Raw>() else { unreachable!("a scenario is a table") };
+    let Shape::Table { keys: common, .. } = Shape::read_by::<Raw>() else { unreachable!("a scenario is a table") };
     let mut properties = Map::new();
     for key in &common {
         properties.insert(key.name.to_owned(), of_key(key, "", &notes, None));
