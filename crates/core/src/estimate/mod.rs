@@ -1,12 +1,13 @@
-//! The component of an angular velocity that a log lacks, from the other two, \[D\] section 3, along the log.
+//! The component that is missing in a log of angular velocity, from the other two, \[D\] section 3.
 //!
 //! | file | duty |
 //! |---|---|
 //! | `reconstruction` | the hidden component, sample by sample |
-//! | `rate` | which decay rate is sensible for a log |
-//! | `score` | the estimate beside a measured component, where there is one |
+//! | `rate` | the choice of a decay rate for a log |
+//! | `score` | the comparison of the estimate with a measured component |
 //!
-//! Pure: no clock, no I/O, no allocation but for `score`, which needs `std`. Must not read the hidden component but to score.
+//! Pure: no clock, no I/O, no allocation except in `score`, which needs `std`. The hidden component must be read for
+//! scoring only.
 
 mod rate;
 mod reconstruction;

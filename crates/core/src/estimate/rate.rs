@@ -1,25 +1,25 @@
-//! Which decay rate is sensible for a log, from what is measured alone.
+//! The choice of a decay rate for a log from the measured components alone.
 //!
-//! A filter of rate λ passes an error δφ of the potential on at λ δφ, and forgets an error δg of the drift as δg/λ. Both model
-//! errors are taken for the same part ε of what they are errors of, so that without noise the two balance at λ² = g, the
-//! motion's own time scale; noise lowers that. Where segments are short, the first estimate of each must be forgotten in
-//! time. Must not see the hidden component, nor a score.
+//! A filter of rate λ amplifies an error δφ of the potential to λ δφ, and reduces an error δg of the drift to δg/λ.
+//! Both model errors are assumed to be the same part ε of their quantities, so that without noise the two balance at
+//! λ² = g, the motion's own time scale; noise lowers that rate. In short segments the initial estimate of each must
+//! decay in time. The choice must not use the hidden component, nor a score.
 
 use crate::identify::Sample;
 use nalgebra::Vector3;
 
-/// ε: so well are a sensor's scale, a sensor's alignment and a body's inertia known.
+/// ε: the relative accuracy of a sensor's scale, of its alignment and of a body's inertia.
 const MODEL_ERROR: f64 = 0.01;
-/// What may be left of the first estimate when half of a segment has passed.
+/// The part of the initial estimate that may be left after half a segment.
 const LEFT: f64 = 0.01;
-/// Differences of so high an order leave little of a motion, and of white noise this part.
+/// The order of differences, which remove most of a motion, and the part of white noise in them.
 const ORDER: usize = 6;
 const ORDER_POWER: f64 = 924.0;
 
-/// What there is to be known of a log before a rate is chosen: takes in samples, keeps sums.
+/// The statistics of a log for the choice of a rate, as sums over its samples.
 #[derive(Debug, Clone)]
 pub struct RateSurvey {
-    /// i, j and k.
+    /// The indices i, j and k.
     axes: [usize; 3],
     coefficients: Vector3<f64>,
     last: Option<Sample>,
@@ -28,7 +28,7 @@ pub struct RateSurvey {
     in_row: usize,
     noise: (f64, u64),
     drift: (f64, u64),
-    /// Σ ln of what a measured rate's error does to φ, s.
+    /// Σ ln of the derivative of φ with respect to the measured rates, s.
     gradient: (f64, u64),
     duration_s: f64,
     segments: u64,
@@ -36,18 +36,18 @@ pub struct RateSurvey {
     fastest_rad_s: f64,
 }
 
-/// The rate that was chosen, and why.
+/// The chosen rate, with the quantities that determine it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RateChoice {
     /// The rate, 1/s.
     pub decay_per_s: f64,
     /// The rate at which errors of noise and model balance, 1/s.
     pub balance_per_s: f64,
-    /// The rate by which the first estimate is forgotten in half a segment, 1/s.
+    /// The rate at which the initial estimate decays in half a segment, 1/s.
     pub forgetting_per_s: f64,
-    /// Noise of one measured rate, rad/s: what is left of the log in differences of sixth order.
+    /// The noise of one measured rate, rad/s: the remainder of the log in differences of sixth order.
     pub noise_rad_s: f64,
-    /// Root mean square of the hidden rate's known drift, rad/s².
+    /// The root mean square of the hidden rate's known drift, rad/s².
     pub drift_rad_s2: f64,
     /// The mean length of a segment, s.
     pub segment_s: f64,
@@ -55,13 +55,13 @@ pub struct RateChoice {
     pub interval_s: f64,
     /// The fastest measured rate, rad/s.
     pub fastest_rad_s: f64,
-    /// What an error of a measured rate does to the potential φ, geometric mean, s.
+    /// The effect of an error of a measured rate on the potential φ, geometric mean, s.
     pub potential_per_rate_s: f64,
 }
 
 impl RateChoice {
-    /// Density of what the model does not know for a Kalman filter of the given rate and noise, (rad/s)²/s: its bandwidth is
-    /// (q/(σ²h))^(1/4), with the noise σ of the potential and the interval h.
+    /// Returns the density of the unknown drift for a Kalman filter of the given rate and noise, (rad/s)²/s. Its
+    /// bandwidth is (q/(σ²h))^(1/4), with the noise σ of the potential and the interval h.
     pub fn density(&self, decay_per_s: f64, noise_rad_s: f64) -> f64 {
         let square = decay_per_s * decay_per_s * self.potential_per_rate_s * noise_rad_s;
         square * square * self.interval_s
@@ -69,7 +69,7 @@ impl RateChoice {
 }
 
 impl RateSurvey {
-    /// A survey for hidden axis `axis`, 1 to 3, of a body with the coefficients a of \[D\](2).
+    /// Creates the statistics for the hidden axis `axis`, 1 to 3, of a body with the coefficients a of \[D\](2).
     pub fn new(coefficients: &Vector3<f64>, axis: usize) -> Self {
         Self {
             axes: [axis % 3, (axis + 1) % 3, (axis + 2) % 3],
@@ -87,7 +87,7 @@ impl RateSurvey {
         }
     }
 
-    /// Takes in the next sample of a segment.
+    /// Adds the next sample of a segment.
     pub fn push(&mut self, sample: &Sample) {
         let [i, j, k] = self.axes;
         let (x, y) = (sample.rate_rad_s[i], sample.rate_rad_s[j]);
@@ -107,7 +107,7 @@ impl RateSurvey {
             }
         }
         self.in_row += 1;
-        // Those of the segment before are gone then.
+        // By then those of the previous segment are gone.
         if self.in_row > ORDER {
             let square = |differences: &[f64; ORDER + 1]| differences[ORDER] * differences[ORDER];
             add(&mut self.noise, 0.5 * (square(&self.differences[0]) + square(&self.differences[1])));
@@ -129,7 +129,7 @@ impl RateSurvey {
         self.last = None;
     }
 
-    /// The rate for such a log; none if it has no interval, or nothing moves.
+    /// Chooses the rate for the log; `None` if it has no interval, or nothing moves.
     pub fn choose(&self) -> Option<RateChoice> {
         let mean = |(sum, count): (f64, u64)| if count == 0 { 0.0 } else { sum / count as f64 };
         if self.intervals == 0 || self.duration_s <= 0.0 {
@@ -145,7 +145,7 @@ impl RateSurvey {
         let segment_s = self.duration_s / self.segments as f64;
         let forgetting_per_s = -libm::log(LEFT) / (0.5 * segment_s);
         let interval_s = self.duration_s / self.intervals as f64;
-        // Faster than that a filter only repeats what the last step says.
+        // A faster filter would only repeat the reconstruction of the last step.
         let decay_per_s = balance_per_s.max(forgetting_per_s).min(1.0 / interval_s);
         (decay_per_s > 0.0 && decay_per_s.is_finite()).then_some(RateChoice {
             decay_per_s,
@@ -171,7 +171,7 @@ mod tests {
     use super::*;
     use crate::model::{Inertia, Noise, RigidBody};
 
-    /// The choice for segments of so many samples at 100 Hz.
+    /// Returns the choice for segments of `samples` samples at 100 Hz.
     fn choice(noise_rad_s: f64, samples: u32) -> RateChoice {
         let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
         let mut noise = Noise::new(9, 0, [noise_rad_s; 3], [0.0; 3]);
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_told_from_motion_and_lowers_the_rate() {
+    fn noise_is_separated_from_motion_and_lowers_the_rate() {
         for noise_rad_s in [1e-3, 1e-2, 0.1] {
             let found = choice(noise_rad_s, 4000).noise_rad_s;
             assert!((found / noise_rad_s - 1.0).abs() < 0.1, "{noise_rad_s}: {found}");
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn short_segments_ask_for_more_and_a_step_is_the_limit() {
+    fn short_segments_need_a_faster_rate_up_to_that_of_a_step() {
         let short = choice(1e-3, 80);
         assert!((short.segment_s - 0.79).abs() < 1e-9, "{short:?}");
         assert!((short.decay_per_s - 100.0_f64.ln() / 0.395).abs() < 1e-9, "{short:?}");

@@ -1,82 +1,82 @@
-//! The hidden component, sample by sample: segments, first guesses and damping around the relation and its filters.
+//! The hidden component, sample by sample: segments, initial guesses and damping around the relation and its filters.
 
-use crate::identify::{Sample, freed};
+use crate::identify::{Sample, undamped};
 use crate::observe::{
     Filter, HiddenRate, HiddenRateError, Increment, Interval, InvariantFilter, KalmanFilter, Observation, RateSample,
     Regressor, SecondOrderFilter,
 };
 use nalgebra::{Vector1, Vector3};
 
-/// The damping ratio of the filter of second order.
+/// The damping ratio of the second-order filter.
 const DAMPING_RATIO: f64 = core::f64::consts::FRAC_1_SQRT_2;
 
-/// Which filter weighs the steps.
+/// The filter and its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FilterKind {
-    /// The paper's: the error falls as e^{−decay·t}.
+    /// The papers' filter: the error decays as e^{−decay·t}.
     First {
-        /// Positive, 1/s.
+        /// The decay rate, positive, 1/s.
         decay_per_s: f64,
     },
-    /// Two poles of the given bandwidth, damped by 1/√2.
+    /// Two poles of the given bandwidth with the damping ratio 1/√2.
     Second {
-        /// Positive, rad/s.
+        /// The bandwidth, positive, rad/s.
         bandwidth_rad_s: f64,
     },
-    /// The gains of the Kalman filter.
+    /// The Kalman filter's gains.
     Kalman {
-        /// Standard deviation of one measured rate, rad/s.
+        /// The standard deviation of one measured rate, rad/s.
         noise_rad_s: f64,
-        /// Density of what the model does not know, (rad/s)²/s.
+        /// The density of the unknown drift, (rad/s)²/s.
         density: f64,
-        /// Standard deviation of the guess, rad/s.
+        /// The standard deviation of the guess, rad/s.
         guess_deviation_rad_s: f64,
     },
 }
 
-/// What is known of the body, and what is asked for.
+/// The known properties of the body, and the parameters of the reconstruction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Setup {
     /// The coefficients a of \[D\](2).
     pub coefficients: Vector3<f64>,
     /// The hidden axis, 1 to 3.
     pub axis: usize,
-    /// Damping by a torque −c I ω, 1/s; not negative for air.
+    /// The damping by a torque −c I ω, 1/s; not negative for air.
     pub damping_per_s: f64,
     /// The filter.
     pub filter: FilterKind,
-    /// The first estimate of every segment, rad/s; without one it is what the first step that tells says.
+    /// The initial estimate of every segment, rad/s; if absent, the reconstruction of the first observable step.
     pub guess_rad_s: Option<f64>,
-    /// Below this the measured rates carry no information, rad/s.
+    /// The level below which the measured rates carry no information, rad/s.
     pub floor_rad_s: f64,
 }
 
-/// Why there can be no reconstruction.
+/// The reason why a reconstruction is impossible.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum ReconstructionError {
     /// The axis cannot be observed.
     #[error(transparent)]
     Relation(#[from] HiddenRateError),
-    /// A number is impossible.
+    /// A number is invalid.
     #[error("{name} = {value}: give a finite number{}", if *.positive { " above 0" } else { "" })]
     Number {
-        /// What it is.
+        /// The name of the parameter.
         name: &'static str,
-        /// What was given.
+        /// The given value.
         value: f64,
-        /// Whether it must be above zero.
+        /// True if the value must be above zero.
         positive: bool,
     },
 }
 
-/// What one sample gave.
+/// The estimate at one sample.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reconstructed {
-    /// The hidden rate, rad/s; not a number as long as nothing has told of it.
+    /// The hidden rate, rad/s; NaN before the first observable step.
     pub rate_rad_s: f64,
-    /// Whether the step to this sample told something of it. If not, the model went on alone.
+    /// True if the step to this sample was observable. Otherwise the model advanced the estimate.
     pub observed: bool,
-    /// Its standard deviation by the filter, where it knows one, rad/s.
+    /// The filter's standard deviation, rad/s, if it computes one.
     pub deviation_rad_s: Option<f64>,
 }
 
@@ -101,7 +101,7 @@ pub struct Reconstructed {
 /// .unwrap();
 /// let (body, mut rate) = (RigidBody::new(&inertia), Vector3::new(0.6, -0.4, 0.8));
 /// for tick in 0..1000 {
-///     // What is in the place of the hidden component is not read.
+///     // The hidden component is not used.
 ///     let measured = Vector3::new(rate.x, rate.y, f64::NAN);
 ///     let estimate = reconstruction.push(&Sample { time_s: f64::from(tick) * 1e-2, rate_rad_s: measured });
 ///     assert!(tick < 1 || (estimate.rate_rad_s - rate.z).abs() < 1e-6);
@@ -115,21 +115,21 @@ pub struct Reconstruction {
     guess_rad_s: Option<f64>,
     damping_per_s: f64,
     filter: Filter<1>,
-    /// The last sample's time and what the relation sees in it.
+    /// The time of the last sample, and its terms in the relation.
     last: Option<(f64, Regressor)>,
-    /// Whether the filter has an estimate.
+    /// True if the filter has an estimate.
     begun: bool,
-    /// The last step's length with what follows from it: most are equal.
+    /// The last step's length with the quantities derived from it; most steps are equal.
     interval: Interval,
     interval_s: f64,
     growth: f64,
 }
 
 impl Reconstruction {
-    /// A reconstruction that has seen nothing yet.
+    /// Creates a reconstruction without samples.
     ///
     /// # Errors
-    /// [`ReconstructionError`].
+    /// [`ReconstructionError`] if a parameter is invalid or the axis is not observable.
     pub fn new(setup: &Setup) -> Result<Self, ReconstructionError> {
         let positive = |name, value: f64| number(name, value, value > 0.0, true);
         for coefficient in &setup.coefficients {
@@ -173,26 +173,26 @@ impl Reconstruction {
         })
     }
 
-    /// Ends a segment: the next sample begins another motion, with a first guess of its own.
+    /// Ends a segment: the next sample begins another motion, with its own initial guess.
     pub fn end_segment(&mut self) {
         self.last = None;
     }
 
-    /// Takes in the next sample of a segment, its time after the last one's and its measured components finite; gives the
-    /// hidden component at it.
+    /// Adds the next sample of a segment, whose time is after that of the last one and whose measured components are
+    /// finite. Returns the hidden component at it.
     #[inline]
     pub fn push(&mut self, sample: &Sample) -> Reconstructed {
         let Some((last_s, from)) = self.last else { return self.begin(sample) };
         let interval_s = sample.time_s - last_s;
         if interval_s != self.interval_s {
-            let (freed_s, growth) = freed(interval_s, self.damping_per_s);
-            (self.interval, self.interval_s, self.growth) = (freed_s.into(), interval_s, growth);
+            let (undamped_s, growth) = undamped(interval_s, self.damping_per_s);
+            (self.interval, self.interval_s, self.growth) = (undamped_s.into(), interval_s, growth);
         }
-        // By the clock and the rates of a motion without damping, see `freed`.
+        // On the clock and with the rates of a motion without damping, see `undamped`.
         let to = self.regressor(&(sample.rate_rad_s * self.growth));
         let observed = match self.relation.observe(&from, &to, self.interval, self.filter.estimate().x) {
             Observation::Seen(increment) => {
-                self.take(&increment);
+                self.apply(&increment);
                 true
             }
             Observation::Unobservable { drift } => {
@@ -206,19 +206,19 @@ impl Reconstruction {
             self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
             self.filter = self.filter.with_guess(self.filter.estimate() / self.growth);
         }
-        self.told(observed)
+        self.result(observed)
     }
 
-    /// The first sample of a segment tells nothing of the hidden component.
+    /// Begins a segment. Its first sample carries no information about the hidden component.
     #[cold]
     fn begin(&mut self, sample: &Sample) -> Reconstructed {
         self.last = Some((sample.time_s, self.regressor(&sample.rate_rad_s)));
         (self.filter, self.begun) = (self.guess, self.guess_rad_s.is_some());
-        self.told(false)
+        self.result(false)
     }
 
     #[inline]
-    fn take(&mut self, increment: &Increment<1>) {
+    fn apply(&mut self, increment: &Increment<1>) {
         // The Kalman filter weighs its guess itself.
         if !self.begun && !matches!(self.filter, Filter::Kalman(_)) {
             self.filter = self.filter.with_guess(increment.reconstruction() - increment.drift);
@@ -233,13 +233,13 @@ impl Reconstruction {
     }
 
     #[inline]
-    fn told(&self, observed: bool) -> Reconstructed {
+    fn result(&self, observed: bool) -> Reconstructed {
         let rate_rad_s = if self.begun { self.filter.estimate().x } else { f64::NAN };
         Reconstructed { rate_rad_s, observed, deviation_rad_s: self.filter.deviation().map(|deviation| deviation.x) }
     }
 }
 
-/// Checks a number.
+/// Checks a parameter.
 fn number(name: &'static str, value: f64, possible: bool, positive: bool) -> Result<(), ReconstructionError> {
     if value.is_finite() && possible { Ok(()) } else { Err(ReconstructionError::Number { name, value, positive }) }
 }
@@ -254,7 +254,8 @@ mod tests {
         Setup { coefficients, axis, damping_per_s: 0.0, filter, guess_rad_s: None, floor_rad_s: 1e-6 }
     }
 
-    /// The worst error over the last half of 4 s of tumbling at 100 Hz, and how many samples were not observed.
+    /// Returns the largest error over the last half of 4 s of tumbling at 100 Hz, and the number of samples not
+    /// observed.
     fn worst(setup: &Setup, noise_rad_s: f64) -> (f64, u32) {
         let body = RigidBody::with_coefficients(setup.coefficients);
         let mut noise = Noise::new(5, 0, [noise_rad_s; 3], [0.0; 3]);
@@ -263,12 +264,12 @@ mod tests {
         for tick in 0..400 {
             let mut measured = rate + noise.sample();
             measured[setup.axis - 1] = f64::NAN;
-            let told = reconstruction.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: measured });
-            blind += u32::from(!told.observed);
+            let estimate = reconstruction.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: measured });
+            blind += u32::from(!estimate.observed);
             if tick >= 200 {
-                worst = worst.max((told.rate_rad_s - rate[setup.axis - 1]).abs());
+                worst = worst.max((estimate.rate_rad_s - rate[setup.axis - 1]).abs());
             }
-            let (interval_s, growth) = freed(0.01, setup.damping_per_s);
+            let (interval_s, growth) = undamped(0.01, setup.damping_per_s);
             rate = body.flow(&rate, &Vector3::zeros(), interval_s) / growth;
         }
         (worst, blind)
@@ -296,24 +297,24 @@ mod tests {
     }
 
     #[test]
-    fn a_damping_that_is_not_known_is_an_error_of_its_size() {
+    fn an_unknown_damping_causes_an_error_of_its_size() {
         let known = Setup { damping_per_s: 0.3, ..setup([1.0, 2.5, 2.0], 3, FILTERS[0]) };
         let body = RigidBody::with_coefficients(known.coefficients);
         let mut unaware = Reconstruction::new(&Setup { damping_per_s: 0.0, ..known }).unwrap();
         let (mut rate, mut worst) = (Vector3::new(2.0, -3.0, 2.5), 0.0_f64);
         for tick in 0..400 {
-            let told = unaware.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: rate });
+            let estimate = unaware.push(&Sample { time_s: f64::from(tick) * 0.01, rate_rad_s: rate });
             if tick >= 200 {
-                worst = worst.max((told.rate_rad_s - rate.z).abs());
+                worst = worst.max((estimate.rate_rad_s - rate.z).abs());
             }
-            let (interval_s, growth) = freed(0.01, 0.3);
+            let (interval_s, growth) = undamped(0.01, 0.3);
             rate = body.flow(&rate, &Vector3::zeros(), interval_s) / growth;
         }
         assert!(worst > 0.05, "{worst:e}");
     }
 
     #[test]
-    fn segments_begin_anew_and_say_so() {
+    fn each_segment_begins_without_an_observed_sample() {
         let mut reconstruction = Reconstruction::new(&setup([1.0, 2.0, 2.5], 3, FILTERS[0])).unwrap();
         let sample = |time_s| Sample { time_s, rate_rad_s: Vector3::new(1.0, 1.0, f64::NAN) };
         assert!(reconstruction.push(&sample(0.0)).rate_rad_s.is_nan());
@@ -327,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_refused() {
+    fn invalid_parameters_are_refused() {
         let good = setup([1.0, 2.0, 2.5], 3, FILTERS[0]);
         let refused = |setup: Setup| Reconstruction::new(&setup).unwrap_err().to_string();
         assert!(refused(Setup { axis: 4, ..good }).contains("axis 4 does not exist"));

@@ -1,21 +1,22 @@
-//! The estimate beside a measured component: root mean square over the part of each segment in which the first guess is
-//! forgotten. Memory does not grow with a segment. Must not be asked before a segment has ended.
+//! The comparison of the estimate with a measured component: root mean squares over the part of each segment in which
+//! the initial guess has decayed. Memory is bounded. A segment's score must not be read before it has ended.
 
-/// Segments of at most so many samples are scored over their second half; longer ones over all but the first half of this.
+/// The longest segment, in samples, that is scored over its second half. Longer ones are scored over all but the
+/// first half of this number.
 const HALVED_SAMPLES: usize = 1 << 16;
 
-/// How well the estimate did in one segment.
+/// The score of one segment.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct SegmentScore {
-    /// Root mean square of estimate − measured over the second half of the segment, rad/s.
+    /// The root mean square of estimate − measured over the second half of the segment, rad/s.
     pub error_rad_s: f64,
-    /// Root mean square of the measured component over the same samples, rad/s.
+    /// The root mean square of the measured component over the same samples, rad/s.
     pub measured_rad_s: f64,
-    /// How many samples these are.
+    /// The number of scored samples.
     pub scored: u64,
-    /// All samples of the segment.
+    /// The number of samples in the segment.
     pub samples: u64,
-    /// Those to which no step told anything of the hidden component, but for the first.
+    /// The number of samples, apart from the first, whose step was not observable.
     pub unobserved: u64,
 }
 
@@ -29,7 +30,7 @@ struct Sums {
 
 impl Sums {
     fn add(&mut self, (error, measured): (f64, f64)) {
-        // Where either is not known there is nothing to compare.
+        // Samples without a known value are not compared.
         if error.is_finite() {
             self.error += error * error;
             self.measured += measured * measured;
@@ -38,10 +39,10 @@ impl Sums {
     }
 }
 
-/// A score in the making: one segment at a time.
+/// A score being computed, one segment at a time.
 #[derive(Debug, Clone, Default)]
 pub struct Score {
-    /// Error and measured component of each sample so far, as long as it is open which half they are in.
+    /// The error and the measured component of each sample, until it is known in which half they are.
     open: Vec<(f64, f64)>,
     sums: Sums,
     samples: u64,
@@ -49,7 +50,7 @@ pub struct Score {
 }
 
 impl Score {
-    /// Takes in a sample: the estimate, what was measured (not a number where it was not), and whether the step told anything.
+    /// Adds a sample: the estimate, the measured value (NaN if missing), and whether the step was observable.
     pub fn push(&mut self, estimate_rad_s: f64, measured_rad_s: f64, observed: bool) {
         let pair = (estimate_rad_s - measured_rad_s, measured_rad_s);
         self.samples += 1;
@@ -62,13 +63,13 @@ impl Score {
         }
     }
 
-    /// Sums up what is open from a place on.
+    /// Adds the pending samples from an index on to the sums.
     fn close(&mut self, from: usize) {
         self.open.iter().skip(from).for_each(|pair| self.sums.add(*pair));
         self.open.clear();
     }
 
-    /// Ends a segment; none if it had no sample.
+    /// Ends a segment and returns its score; `None` if it had no sample.
     pub fn end_segment(&mut self) -> Option<SegmentScore> {
         self.close(self.open.len() / 2);
         let (sums, samples, unobserved) = (self.sums, self.samples, self.unobserved);
@@ -89,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_second_half_is_scored_and_what_is_not_known_is_not() {
+    fn the_second_half_is_scored_without_unknown_values() {
         let mut score = Score::default();
         for (estimate, measured) in [(9.0, 1.0), (9.0, 1.0), (5.0, 2.0), (f64::NAN, 2.0), (2.0, f64::NAN), (0.0, 3.0)] {
             score.push(estimate, measured, measured > 1.0);
@@ -101,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_segment_is_scored_behind_its_start() {
+    fn a_long_segment_is_scored_after_its_start() {
         let mut score = Score::default();
         for sample in 0..200_000 {
             score.push(if sample < HALVED_SAMPLES / 2 { 100.0 } else { 1.5 }, 1.0, true);

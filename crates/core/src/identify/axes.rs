@@ -1,56 +1,56 @@
 //! Least squares of Euler's equations in their weak form, \[SZ\](1), for a body whose principal axes are those of the sensor.
 //!
-//! ω_i(t) − ω̄_i = a_i (∫ω_j ω_k − mean) − c_i (∫ω_i − mean): each axis by itself is linear in its coefficient a_i and in the
-//! damping c_i of a torque −c_i I_i ω_i, as air exerts it. The three a_i are found apart, so that their identity
-//! a1 + a2 + a3 + a1 a2 a3 = 0 is a check. Must not use that identity.
+//! ω_i(t) − ω̄_i = a_i (∫ω_j ω_k − mean) − c_i (∫ω_i − mean): each axis is linear in its coefficient a_i and in the
+//! damping c_i of a torque −c_i I_i ω_i, such as that of the air. The three a_i are fitted separately, so that their
+//! identity a1 + a2 + a3 + a1 a2 a3 = 0 is a check. The fit must not use that identity.
 
 use super::motion::{FEATURES, Motion, PRODUCTS, Sums, TURNS};
 use super::spread;
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2, Vector3};
 
-/// Two regressors whose directions differ by less than this cannot be told apart.
+/// The least difference in direction at which two regressors can be separated.
 const COLLINEAR: f64 = 1e-9;
 
-/// What least squares say of a body about known principal axes.
+/// The result of least squares for a body with known principal axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AxesFit {
     /// The coefficients a of \[SZ\](1).
     pub coefficients: Vector3<f64>,
-    /// Standard deviations of these, by resampling; none if there are too few pieces.
+    /// The standard deviations of the coefficients, by resampling; absent if there are too few pieces.
     pub deviation: Option<Vector3<f64>>,
-    /// Damping by a torque −c I ω, 1/s; zero unless asked for.
+    /// The damping by a torque −c I ω, 1/s; zero unless it is fitted.
     pub damping_per_s: Vector3<f64>,
-    /// Standard deviations of this, by resampling.
+    /// The standard deviation of the damping, by resampling.
     pub damping_deviation_per_s: Option<Vector3<f64>>,
     /// The part of each rate's variance about its mean that the motion explains, at most 1.
     pub r_squared: Vector3<f64>,
-    /// What is left of each rate, root mean square, rad/s.
+    /// The residual of each rate, root mean square, rad/s.
     pub residual_rad_s: Vector3<f64>,
-    /// How strongly the motion speaks of each coefficient: root mean square of what a unit of it does to the rate, rad/s.
+    /// The excitation of each coefficient: root mean square of the rate per unit of the coefficient, rad/s.
     pub excitation_rad_s: Vector3<f64>,
 }
 
 impl AxesFit {
-    /// a1 + a2 + a3 + a1·a2·a3: zero for every body.
+    /// Computes a1 + a2 + a3 + a1·a2·a3: zero for every body.
     pub fn closure(&self) -> f64 {
         crate::model::closure(&self.coefficients)
     }
 }
 
-/// One axis, fitted.
+/// The fit of one axis.
 #[derive(Debug, Clone, Copy)]
 struct Axis {
     coefficient: f64,
     damping: f64,
     unexplained: f64,
-    /// What is left of the coefficient's regressor once the damping's is taken out.
+    /// The part of the coefficient's regressor that is orthogonal to the damping's.
     excitation: f64,
 }
 
 impl Motion {
-    /// What the motion says of a body whose principal axes are the sensor's; with `damping`, of the air's torque too.
+    /// Fits a body whose principal axes are the sensor's; with `damping`, the air's torque too.
     ///
-    /// None if there is no piece of a motion, or an axis of which it says nothing at all.
+    /// Returns `None` if the motion has no piece, or carries no information about an axis.
     pub fn about_known_axes(&self, damping: bool) -> Option<AxesFit> {
         let total = self.total();
         let axes = fit(&total, damping)?;
@@ -80,7 +80,7 @@ impl Motion {
     }
 }
 
-/// Fits the three axes; none if one of them has nothing to be fitted by.
+/// Fits the three axes; `None` if the motion carries no information about one of them.
 fn fit(sums: &Sums, damping: bool) -> Option<[Axis; 3]> {
     let fitted = [0, 1, 2].map(|index| fit_axis(&sums.scatter, index, damping));
     match fitted {
@@ -89,9 +89,9 @@ fn fit(sums: &Sums, damping: bool) -> Option<[Axis; 3]> {
     }
 }
 
-/// Normal equations of one axis. Of the scatter only the upper triangle is filled.
+/// Solves the normal equations of one axis. Only the upper triangle of the scatter is filled.
 fn fit_axis(scatter: &SMatrix<f64, FEATURES, FEATURES>, index: usize, damping: bool) -> Option<Axis> {
-    // The products are in the order yz, zx, xy behind the three squares.
+    // The products are in the order yz, zx, xy after the three squares.
     let (rate, product, turn) = (index, PRODUCTS + 3 + index, TURNS + index);
     let [xx, xy, yy] = [(product, product), (rate, product), (rate, rate)].map(|at| scatter[at]);
     if !(xx > 0.0 && xx.is_finite() && yy.is_finite()) {

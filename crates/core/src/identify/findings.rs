@@ -1,53 +1,53 @@
-//! What a log tells of the body, and what it cannot tell, in sentences.
+//! The conclusions from a log about the body, and their limits, as sentences.
 
 use super::motion::{GROUPS, Motion};
 use super::{AxesFit, TensorFit};
 use nalgebra::Vector3;
 
-/// So many standard deviations count as certain.
+/// The number of standard deviations that counts as certain.
 const CERTAIN: f64 = 3.0;
-/// A rate of which less than this part is explained was not moved as Euler's equations say.
+/// The part of a rate below which the motion does not obey Euler's equations.
 const EXPLAINED: f64 = 0.9;
-/// A coefficient, which no body has beyond 1, is not known by this log if its standard deviation is so large, or where that is
-/// not known if it moves its rate by less than so many times what is left of it.
+/// The standard deviation from which a coefficient counts as unknown (no body's exceeds 1), and, where that is
+/// unknown, the least ratio of its effect on the rate to the residual.
 const UNKNOWN: f64 = 0.3;
 const EXCITED: f64 = 0.5;
-/// A tensor that fits no better than this, compared with the next one, is not known by this log.
+/// The least ratio of the next tensor's fit to the best one's at which the tensor counts as known.
 const DISTINCT: f64 = 2.0;
-/// Fewer samples are too few.
+/// The least number of samples.
 const FEW_SAMPLES: u64 = 20;
-/// A sensor's axis so far from a principal one counts as turned, rad.
+/// The angle between a sensor's axis and a principal one from which the sensor counts as turned, rad.
 const TILTED_RAD: f64 = 0.05;
 /// The letters of the axes.
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// What is to be known of a result. [`Display`](std::fmt::Display) says it in a sentence.
+/// A conclusion about a result; [`Display`](std::fmt::Display) prints it as a sentence.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Finding {
-    /// Scale cannot be known.
+    /// The scale is unknown.
     #[error("only ratios of moments can be known from a free motion; for kg m2 multiply by one moment that you know")]
     Scale,
-    /// There is next to nothing.
-    #[error("the log is too short: {samples} samples; {FEW_SAMPLES} are the least of which a fit means anything")]
+    /// The log is too short.
+    #[error("the log is too short: {samples} samples; a fit needs at least {FEW_SAMPLES}")]
     Short {
-        /// How many there are.
+        /// The number of samples.
         samples: u64,
     },
-    /// Nothing to resample.
+    /// There are too few pieces for resampling.
     #[error(
-        "no uncertainty is told: the log has {pieces} pieces of motion, and 4 are needed; log more segments, or longer ones"
+        "no uncertainty: the log has {pieces} pieces of motion, but 4 are required; log more segments, or longer ones"
     )]
     FewPieces {
-        /// How many there are.
+        /// The number of pieces.
         pieces: u64,
     },
     /// The body hardly turned.
-    #[error("the body turned by {turn_rad:.2} rad in all: hardly a motion; log a faster or longer one")]
+    #[error("the body turned by only {turn_rad:.2} rad in all; log a faster or longer motion")]
     Still {
-        /// By how much.
+        /// The total angle.
         turn_rad: f64,
     },
-    /// One coefficient has no say in this motion.
+    /// The motion does not depend on one coefficient.
     #[error(
         "a{} is not known by this log: what it does to the rate about {} ({excitation_rad_s:.2e} rad/s) is too little beside \
          what the fit leaves ({residual_rad_s:.2e} rad/s); log a motion about all axes", axis + 1, AXES[*axis]
@@ -55,9 +55,9 @@ pub enum Finding {
     Unexcited {
         /// The index of the axis.
         axis: usize,
-        /// Root mean square of what a unit of the coefficient does.
+        /// The root mean square effect of a unit of the coefficient.
         excitation_rad_s: f64,
-        /// Root mean square of what is left.
+        /// The root mean square residual.
         residual_rad_s: f64,
     },
     /// All coefficients may be zero.
@@ -75,26 +75,26 @@ pub enum Finding {
         /// The index of the axis of symmetry.
         axis: usize,
     },
-    /// The air is felt.
+    /// The air damps the motion.
     #[error(
         "a torque acts: the motion is damped at {damping_per_s:.3} 1/s (standard deviation {deviation_per_s:.3}); it is part of \
          the fit, and an estimate needs it"
     )]
     Damped {
-        /// The rate.
+        /// The damping.
         damping_per_s: f64,
-        /// How sure it is.
+        /// Its standard deviation.
         deviation_per_s: f64,
     },
-    /// Something drives the body.
+    /// A torque drives the body.
     #[error(
         "energy comes in: the rates grow at {growth_per_s:.3} 1/s (standard deviation {deviation_per_s:.3}); a torque drives the \
          body, so it is no free motion"
     )]
     Driven {
-        /// The rate.
+        /// The growth of the rates.
         growth_per_s: f64,
-        /// How sure it is.
+        /// Its standard deviation.
         deviation_per_s: f64,
     },
     /// Euler's equations about these axes do not explain a rate.
@@ -108,7 +108,7 @@ pub enum Finding {
         /// The part that is explained.
         r_squared: f64,
     },
-    /// The three coefficients are not those of one body.
+    /// The three coefficients do not belong to one body.
     #[error(
         "a1 + a2 + a3 + a1 a2 a3 = {closure:.3} is not zero within 3 standard deviations ({deviation:.3}): a torque acts, or the \
          axes are not principal ones, or not at right angles"
@@ -116,7 +116,7 @@ pub enum Finding {
     Open {
         /// The sum.
         closure: f64,
-        /// How sure it is.
+        /// Its standard deviation.
         deviation: f64,
     },
     /// The sensor is turned against the body.
@@ -125,10 +125,10 @@ pub enum Finding {
         tilt_rad.to_degrees()
     )]
     Tilted {
-        /// By how much, at most.
+        /// The largest angle.
         tilt_rad: f64,
     },
-    /// Another tensor would do.
+    /// Another tensor fits nearly as well.
     #[error(
         "the whole tensor is not known by this log: another one fits nearly as well (ratio {distinction:.2}); log a motion \
          about all axes"
@@ -161,26 +161,26 @@ impl From<&Finding> for &'static str {
 }
 
 impl Finding {
-    /// Whether it leaves no body about the sensor's axes.
+    /// Returns true if the finding rules out a body about the sensor's axes.
     pub fn forbids_axes(&self) -> bool {
         matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Unexcited { .. })
     }
 
-    /// Whether it leaves no whole tensor.
+    /// Returns true if the finding rules out a whole tensor.
     pub fn forbids_tensor(&self) -> bool {
         matches!(self, Self::Short { .. } | Self::Still { .. } | Self::Indistinct { .. })
     }
 }
 
-/// What is to be known of these fits, the most serious first; scale is always among them.
+/// Returns the findings about these fits, the most serious first; always includes the unknown scale.
 pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorFit>) -> Vec<Finding> {
-    let account = motion.summary();
+    let summary = motion.summary();
     let mut found = Vec::new();
-    if account.samples < FEW_SAMPLES {
-        found.push(Finding::Short { samples: account.samples });
+    if summary.samples < FEW_SAMPLES {
+        found.push(Finding::Short { samples: summary.samples });
     }
-    if account.turn_rad < 1.0 {
-        found.push(Finding::Still { turn_rad: account.turn_rad });
+    if summary.turn_rad < 1.0 {
+        found.push(Finding::Still { turn_rad: summary.turn_rad });
     }
     if let Some(fit) = axes {
         about_axes(fit, &mut found);
@@ -188,8 +188,8 @@ pub fn findings(motion: &Motion, axes: Option<&AxesFit>, tensor: Option<&TensorF
     if let Some(fit) = tensor {
         about_tensor(fit, &mut found);
     }
-    if account.pieces < 4 {
-        found.push(Finding::FewPieces { pieces: account.pieces });
+    if summary.pieces < 4 {
+        found.push(Finding::FewPieces { pieces: summary.pieces });
     }
     found.push(Finding::Scale);
     found
@@ -215,14 +215,14 @@ fn about_axes(fit: &AxesFit, found: &mut Vec<Finding>) {
         return;
     }
     for axis in (0..3).filter(|axis| excited[*axis]) {
-        // A coefficient of zero says that the other two moments are equal.
+        // A coefficient of zero means that the other two moments are equal.
         if zero(axis) {
             found.push(Finding::Symmetric { axis });
         } else if fit.r_squared[axis] < EXPLAINED {
             found.push(Finding::Unexplained { axis, r_squared: fit.r_squared[axis] });
         }
     }
-    // How the sum moves with each coefficient.
+    // The derivative of the sum with respect to each coefficient.
     let a = &fit.coefficients;
     let slopes = Vector3::new(1.0 + a.y * a.z, 1.0 + a.z * a.x, 1.0 + a.x * a.y);
     let (closure, deviation) = (fit.closure(), slopes.component_mul(&deviation).norm());

@@ -6,11 +6,11 @@
 //! | `axes` | least squares of the weak form, principal axes known |
 //! | `tensor` | the whole tensor and its principal axes |
 //! | `recursive` | the papers' identifiers along the log |
-//! | `spread` | how sure a result is, by resampling |
-//! | `findings` | what the log tells of the body, and what it cannot tell |
+//! | `spread` | the uncertainty of a result, by resampling |
+//! | `findings` | the conclusions from a log, and its limits |
 //!
-//! All of it takes one pass, and memory that does not grow. Pure: no clock, no I/O, no allocation but for `findings`, which
-//! needs `std`. Must not be told more than the angular velocity: a torque is at best the air's, −c I ω.
+//! All of it takes one pass and bounded memory. Pure: no clock, no I/O, no allocation except in `findings`, which
+//! needs `std`. Its only input is the angular velocity; the only torque it models is that of the air, −c I ω.
 
 mod axes;
 #[cfg(feature = "std")]
@@ -24,18 +24,18 @@ pub use axes::AxesFit;
 #[cfg(feature = "std")]
 pub use findings::{Finding, findings};
 pub use motion::{Motion, MotionSummary, Sample};
-pub(crate) use recursive::freed;
+pub(crate) use recursive::undamped;
 pub use recursive::{Recursive, RecursiveAxisymmetric, RecursiveFit};
 pub use tensor::TensorFit;
 
 use crate::model::{Inertia, InertiaError};
 use nalgebra::Vector3;
 
-/// How far beyond what a body can have the largest moment may be found, as a part of it, for the body to count as flat.
+/// The largest excess of a moment over the sum of the other two, as a part of it, at which the body counts as flat.
 const FLAT: f64 = 0.05;
 
-/// Moments of inertia that a body can have, from fitted ones. A largest moment that exceeds the sum of the others by less
-/// than a twentieth, as it may be found of a flat body, is lowered to that sum; whether it was is told.
+/// Returns the physically possible moments of inertia nearest to fitted ones. A largest moment that exceeds the sum
+/// of the others by less than a twentieth, as for a flat body, is lowered to that sum; the second value is then true.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
@@ -44,15 +44,15 @@ const FLAT: f64 = 0.05;
 /// ```
 ///
 /// # Errors
-/// [`InertiaError`] if they are too far from any body's.
+/// [`InertiaError`] if the moments are too far from those of any body.
 pub fn nearest_body(moments: &Vector3<f64>) -> Result<(Inertia, bool), InertiaError> {
     let largest = moments.imax();
-    let others = moments.sum() - moments[largest];
-    let excess = moments[largest] - others;
+    let sum_of_others = moments.sum() - moments[largest];
+    let excess = moments[largest] - sum_of_others;
     let mut flat = *moments;
     let flatten = excess > 0.0 && excess < FLAT * moments[largest];
     if flatten {
-        flat[largest] = others;
+        flat[largest] = sum_of_others;
     }
     Inertia::new(flat.into()).map(|inertia| (inertia, flatten))
 }

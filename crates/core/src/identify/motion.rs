@@ -1,32 +1,34 @@
-//! What a log says of a body, as sums: all that the least squares need, whatever their model, and whatever the log's length.
+//! A log as sums: all data for least squares with any model, independent of the log's length.
 //!
-//! Integrated over time, Euler's equations need no derivative of a measured rate (the *weak form*): of every sample only the
-//! angular velocity ω, the integrals of its products ω_i ω_j, and its own integral enter. Within a *piece*, a stretch of one
-//! free motion, their covariance about the mean says everything, for the constants of integration are unknown. Must not keep a
-//! sample longer than its two neighbours, nor join what a gap parts.
+//! Integrated over time, Euler's equations need no derivative of a measured rate (the *weak form*). Each sample
+//! contributes only its angular velocity ω, the integrals of its products ω_i ω_j, and the integral of ω. Within a
+//! *piece*, a stretch of one free motion, their covariance about the mean contains all information, because the
+//! constants of integration are unknown. This module must not store a sample longer than its two neighbours, nor join
+//! a motion across a gap.
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
-/// ω, the integrals of ω_x², ω_y², ω_z², ω_y ω_z, ω_z ω_x, ω_x ω_y, and the integral of ω.
+/// The number of features: ω, the integrals of ω_x², ω_y², ω_z², ω_y ω_z, ω_z ω_x, ω_x ω_y, and the integral of ω.
 pub(super) const FEATURES: usize = 12;
-/// Where the products and the turns begin among the features.
+/// The indices of the first product and the first angle among the features.
 pub(super) const PRODUCTS: usize = 3;
 pub(super) const TURNS: usize = 9;
-/// What is integrated.
+/// The number of integrals.
 const INTEGRALS: usize = 9;
 
-/// Pieces are dealt out to so many groups, of which each is left out once to learn how sure the result is.
+/// The number of groups of pieces; each is left out once to estimate the uncertainty of a result.
 pub(super) const GROUPS: usize = 20;
 
-/// A piece ends when the body has turned so far, rad: what no model knows of has then had time to add up.
+/// The angle by which the body rotates in a piece, rad; a longer piece would accumulate errors that no model
+/// describes.
 const PIECE_TURN_RAD: f64 = 8.0 * core::f64::consts::PI;
-/// Fewer samples say nothing of a motion whose constants of integration are unknown.
+/// The least number of samples in a piece, because its constants of integration are unknown.
 const PIECE_SAMPLES: u64 = 4;
 
 /// A sample of a log.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// When, s.
+    /// The time, s.
     pub time_s: f64,
     /// The angular velocity, rad/s; finite.
     pub rate_rad_s: Vector3<f64>,
@@ -47,7 +49,7 @@ impl Default for Sums {
     }
 }
 
-/// The motion that a log shows, as sums that do not grow with it.
+/// The motion in a log, as sums of constant size.
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
@@ -71,21 +73,21 @@ pub struct Motion {
     pub(super) groups: [Sums; GROUPS],
     integral: Integral,
     piece: Piece,
-    account: MotionSummary,
+    summary: MotionSummary,
 }
 
-/// What a log amounts to.
+/// A summary of a log.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct MotionSummary {
-    /// The samples that were used.
+    /// The number of samples used.
     pub samples: u64,
-    /// The pieces that they were cut into, for resampling.
+    /// The number of pieces, for resampling.
     pub pieces: u64,
-    /// The segments.
+    /// The number of segments.
     pub segments: u64,
-    /// How long all segments are together, s.
+    /// The total duration of all segments, s.
     pub duration_s: f64,
-    /// By which angle the body turned in all of them, rad.
+    /// The total angle by which the body rotated, rad.
     pub turn_rad: f64,
     /// The fastest rate, rad/s.
     pub fastest_rad_s: f64,
@@ -97,13 +99,13 @@ impl Default for Motion {
             groups: [Sums::default(); GROUPS],
             integral: Integral::default(),
             piece: Piece::default(),
-            account: MotionSummary::default(),
+            summary: MotionSummary::default(),
         }
     }
 }
 
 impl Motion {
-    /// The motion of some segments, each of samples whose times increase.
+    /// Creates the motion of these segments, each of samples with increasing times.
     pub fn from_segments<'a>(segments: impl IntoIterator<Item = &'a [Sample]>) -> Self {
         let mut motion = Self::default();
         for segment in segments {
@@ -113,39 +115,39 @@ impl Motion {
         motion
     }
 
-    /// Takes in the next sample of a segment; its time is after the last one's.
+    /// Adds the next sample of a segment; its time is after that of the last one.
     #[inline]
     pub fn push(&mut self, sample: &Sample) {
         if let Some(last) = self.integral.newest() {
             let interval_s = sample.time_s - last.sample.time_s;
             let turn = 0.5 * (last.sample.rate_rad_s.norm() + sample.rate_rad_s.norm()) * interval_s;
-            self.account.duration_s += interval_s;
-            self.account.turn_rad += turn;
+            self.summary.duration_s += interval_s;
+            self.summary.turn_rad += turn;
             self.piece.turn_rad += turn;
         }
-        self.account.fastest_rad_s = self.account.fastest_rad_s.max(sample.rate_rad_s.norm());
-        self.account.samples += 1;
+        self.summary.fastest_rad_s = self.summary.fastest_rad_s.max(sample.rate_rad_s.norm());
+        self.summary.samples += 1;
         if let Some(features) = self.integral.push(sample) {
-            self.take(&features);
+            self.add(&features);
         }
     }
 
     /// Ends a segment: the next sample begins another motion.
     pub fn end_segment(&mut self) {
         let ended = self.integral.end();
-        self.account.segments += u64::from(ended.is_some());
+        self.summary.segments += u64::from(ended.is_some());
         if let Some(features) = ended {
-            self.take(&features);
+            self.add(&features);
         }
         self.end_piece();
     }
 
-    /// What it amounts to.
+    /// Returns the summary.
     pub fn summary(&self) -> &MotionSummary {
-        &self.account
+        &self.summary
     }
 
-    /// All pieces together.
+    /// Returns the sums over all pieces.
     pub(super) fn total(&self) -> Sums {
         let mut total = Sums::default();
         for group in &self.groups {
@@ -157,28 +159,28 @@ impl Motion {
     }
 
     #[inline]
-    fn take(&mut self, features: &SVector<f64, FEATURES>) {
-        self.piece.take(features);
+    fn add(&mut self, features: &SVector<f64, FEATURES>) {
+        self.piece.add(features);
         if self.piece.turn_rad > PIECE_TURN_RAD {
             self.end_piece();
-            // What was the last sample of one piece is the first of the next.
-            self.piece.take(features);
+            // The last sample of a piece is also the first of the next.
+            self.piece.add(features);
         }
     }
 
     fn end_piece(&mut self) {
         let piece = core::mem::take(&mut self.piece);
         if piece.samples >= PIECE_SAMPLES {
-            let group = &mut self.groups[(self.account.pieces % GROUPS as u64) as usize];
+            let group = &mut self.groups[(self.summary.pieces % GROUPS as u64) as usize];
             group.scatter += piece.scatter;
             group.samples += piece.samples;
             group.pieces += 1;
-            self.account.pieces += 1;
+            self.summary.pieces += 1;
         }
     }
 }
 
-/// A stretch of one motion, by Welford's sums: no digits are lost to a mean that is large.
+/// A stretch of one motion, by Welford's sums: a large mean costs no digits.
 #[derive(Debug, Clone)]
 struct Piece {
     samples: u64,
@@ -195,14 +197,14 @@ impl Default for Piece {
 
 impl Piece {
     #[inline]
-    fn take(&mut self, features: &SVector<f64, FEATURES>) {
+    fn add(&mut self, features: &SVector<f64, FEATURES>) {
         self.samples += 1;
         let share = 1.0 / self.samples as f64;
         let apart = features - self.mean;
         self.mean += apart * share;
         let weighted = apart * (1.0 - share);
         for column in 0..FEATURES {
-            // The upper triangle; the other is its mirror.
+            // The upper triangle only; the scatter is symmetric.
             for row in 0..=column {
                 self.scatter[(row, column)] += weighted[row] * apart[column];
             }
@@ -224,7 +226,7 @@ impl Point {
         Self { sample: *sample, value: SVector::from([x * x, y * y, z * z, y * z, z * x, x * y, x, y, z]) }
     }
 
-    /// The features of the sample, its integrals being `integral`.
+    /// Returns the features of the sample with the integrals `integral`.
     #[inline]
     fn features(&self, integral: &SVector<f64, INTEGRALS>) -> SVector<f64, FEATURES> {
         let mut features = SVector::<f64, FEATURES>::zeros();
@@ -234,8 +236,8 @@ impl Point {
     }
 }
 
-/// Integrals over a segment by Hermite's rule, the slopes those of parabolas through three samples: of fourth order in the
-/// interval, and for intervals of any length. A sample comes out when the next one is known.
+/// Integrals over a segment by Hermite's rule, with the slopes of parabolas through three samples: of fourth order in
+/// the interval, for intervals of any length. A sample is integrated when the next one is known.
 #[derive(Debug, Clone, Copy, Default)]
 struct Integral {
     /// The last two samples.
@@ -244,24 +246,24 @@ struct Integral {
     value: SVector<f64, INTEGRALS>,
 }
 
-/// The newest sample, and the way to it.
+/// The newest sample, and the step to it.
 #[derive(Debug, Clone, Copy)]
 struct Step {
     point: Point,
     interval_s: f64,
-    /// The mean slope from the sample before, and the slope there if it is known.
+    /// The mean slope from the previous sample, and the slope there if it is known.
     mean: SVector<f64, INTEGRALS>,
     start: Option<SVector<f64, INTEGRALS>>,
 }
 
 impl Integral {
-    /// The sample that came last.
+    /// Returns the last sample.
     #[inline]
     fn newest(&self) -> Option<&Point> {
         self.next.as_ref().map(|step| &step.point).or(self.last.as_ref())
     }
 
-    /// Takes in a sample; gives the features of the one before, or those of the segment's first.
+    /// Adds a sample. Returns the features of the previous one; for the first sample of a segment its own.
     #[inline]
     fn push(&mut self, sample: &Sample) -> Option<SVector<f64, FEATURES>> {
         let point = Point::new(sample);
@@ -284,10 +286,10 @@ impl Integral {
         Some(features)
     }
 
-    /// Gives the features of the segment's last sample, if it has more than one, and forgets it.
+    /// Returns the features of the segment's last sample, if it has more than one, and resets the integrals.
     fn end(&mut self) -> Option<SVector<f64, FEATURES>> {
         let (last, step) = (self.last.take()?, self.next.take()?);
-        // A parabola, or of two samples a line.
+        // A parabola, or a line for two samples.
         let slope = step.start.map_or(step.mean, |start| step.mean * 2.0 - start);
         Some(self.move_to(&step, &last, slope))
     }
@@ -318,7 +320,7 @@ mod tests {
         })
     }
 
-    /// The last integrals of a segment.
+    /// Returns the last integrals of a segment.
     fn integrals(samples: impl Iterator<Item = Sample>) -> SVector<f64, FEATURES> {
         let mut integral = Integral::default();
         samples.for_each(|sample| _ = integral.push(&sample));
@@ -341,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn two_samples_are_joined_by_a_line_and_one_is_nothing() {
+    fn two_samples_are_joined_by_a_line_and_one_is_ignored() {
         let path = samples(2, |_| 0.5, |t| [t, 0.0, 1.0]);
         let features = integrals(path);
         assert!((features[TURNS] - 0.375).abs() < 1e-15 && (features[TURNS + 2] - 0.5).abs() < 1e-15, "{features}");
@@ -352,14 +354,14 @@ mod tests {
     }
 
     #[test]
-    fn sums_are_those_about_the_mean_of_each_piece() {
+    fn sums_are_about_the_mean_of_each_piece() {
         let path: Vec<Sample> = samples(400, |_| 0.01, |t| [6.0 + libm::sin(t), 1e-3 * t, 5.0]).collect();
         let motion = Motion::from_segments([&path[..], &path[..]]);
         let account = motion.summary();
         assert_eq!((account.samples, account.segments, account.pieces), (800, 2, 4));
         assert!((account.duration_s - 2.0 * 3.99).abs() < 1e-12);
         let total = motion.total();
-        // The samples at which a piece ends are in the next one too.
+        // The sample at which a piece ends is also in the next one.
         assert_eq!(total.samples, 802);
         let (first, second) = (motion.groups[0].scatter, motion.groups[2].scatter);
         assert!((first - second).amax() < 1e-9 * first.amax(), "the same motion twice");

@@ -1,8 +1,9 @@
-//! The papers' recursive identifiers, \[SZ\](4)-(17), along a log: they forget what they were told and need no sums.
+//! The papers' recursive identifiers, \[SZ\](4)-(17), along a log: they need no sums and can forget old samples.
 //!
-//! Whatever the body's motion, errors fall with the *excitation* W, not with time. With a given rate they fall as e^{−rate·W},
-//! as in the paper. Without, every piece of excitation counts alike and nothing is forgotten: the gains of the Kalman filter
-//! for a constant, in which only the ratio of noise to first guess would matter, and the guess is worth nothing.
+//! Whatever the body's motion, errors decay with the *excitation* W, not with time. With a given rate they decay as
+//! e^{−rate·W}, as in the paper. Without a rate all excitation has equal weight and nothing is forgotten. The gains
+//! are then those of the Kalman filter for a constant; only the ratio of noise to initial deviation would matter, and
+//! the initial guess has no weight.
 
 use super::Sample;
 use crate::observe::{
@@ -10,21 +11,22 @@ use crate::observe::{
 };
 use nalgebra::{SVector, Vector3};
 
-/// Standard deviation of the first guess of a coefficient, which no body has beyond 1, in units of a sensor's noise.
+/// The standard deviation of the initial guess of a coefficient, in units of a sensor's noise; no body's coefficient
+/// exceeds 1.
 const GUESS_DEVIATION: f64 = 1e6;
-/// A step whose |ω1 ω2 ω3|, or whose spin, is below this part of what the fastest rate so far allows is not used.
+/// The part of the largest possible |ω1 ω2 ω3|, or spin, at the fastest rate so far, below which a step is not used.
 const FLOOR: f64 = 1e-3;
 
-/// What a recursive identifier has made of a log.
+/// The result of a recursive identifier.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RecursiveFit<const N: usize> {
     /// The coefficients.
     pub coefficients: SVector<f64, N>,
-    /// Their standard deviations for a noise of 1 rad/s on every rate, by the filter; none for one with a given rate.
+    /// The filter's standard deviations for a noise of 1 rad/s on every rate; absent with a given rate.
     pub deviation_per_rad_s: Option<SVector<f64, N>>,
-    /// W, what the log told: (rad/s)³ s, or rad of spin for an axisymmetric body.
+    /// The excitation W: (rad/s)³ s, or rad of spin for an axisymmetric body.
     pub excitation: f64,
-    /// How many steps told something, how many did not, and how many were too long for the motion.
+    /// The number of steps that were used, that did not excite, and that were too long for the motion.
     pub steps: [u64; 3],
 }
 
@@ -58,7 +60,7 @@ pub struct RecursiveAxisymmetric {
     path: Path,
 }
 
-/// Where a log is, and what became of its steps.
+/// The last sample of a log, and the counters of its steps.
 #[derive(Debug, Clone, Default)]
 struct Path {
     last: Option<Sample>,
@@ -68,7 +70,7 @@ struct Path {
     steps: [u64; 3],
 }
 
-/// A filter of N constants.
+/// Returns a filter of N constants.
 fn filter<const N: usize>(rate: Option<f64>) -> Filter<N> {
     let all = SVector::repeat;
     match rate {
@@ -82,30 +84,30 @@ impl Path {
         Self { damping_per_s, ..Self::default() }
     }
 
-    /// The step to the next sample, freed of the damping: its ends and its length.
+    /// Returns the ends and the length of the step to the next sample, with the damping removed.
     ///
-    /// Where a torque −c I ω acts, ν = ω e^{c(t − t0)} over τ with dτ = e^{−c(t − t0)} dt moves as ω does without one.
+    /// Under a torque −c I ω, ν = ω e^{c(t − t0)} over τ with dτ = e^{−c(t − t0)} dt moves like ω without torque.
     #[inline]
     fn step(&mut self, sample: &Sample) -> Option<([RateSample; 2], f64)> {
         self.fastest_rad_s = self.fastest_rad_s.max(sample.rate_rad_s.norm());
         let last = self.last.replace(*sample)?;
-        let (interval_s, growth) = freed(sample.time_s - last.time_s, self.damping_per_s);
+        let (interval_s, growth) = undamped(sample.time_s - last.time_s, self.damping_per_s);
         let free = |rate_rad_s| RateSample { rate_rad_s, torque_rad_s2: Vector3::zeros() };
         let ends = [free(last.rate_rad_s), free(sample.rate_rad_s * growth)];
-        // Over a pause in which nothing is left of the motion there is nothing to be learned.
+        // A pause after which no motion is left carries no information.
         let usable = interval_s > 0.0 && ends[1].rate_rad_s.iter().all(|rate| rate.is_finite());
         usable.then_some((ends, interval_s))
     }
 
-    /// Counts a step, and moves the filter over it.
-    fn take<const N: usize>(&mut self, filter: &mut Filter<N>, told: &Identification<N>) {
-        let kind = match told {
+    /// Counts a step and advances the filter over it.
+    fn apply<const N: usize>(&mut self, filter: &mut Filter<N>, observed: &Identification<N>) {
+        let kind = match observed {
             Identification::Excited(increment) => {
                 filter.step(increment);
                 self.excitation += increment.weight;
                 0
             }
-            // What comes after is not tied to what was before.
+            // A later step does not continue from this one.
             Identification::Unexcited => {
                 filter.predict(&SVector::zeros(), 0.0);
                 1
@@ -128,9 +130,10 @@ impl Path {
     }
 }
 
-/// The length of a step by the clock τ of a motion without damping, s, and the factor of the rates at its end.
+/// Returns the length of a step on the clock τ of a motion without damping, s, and the factor of the rates at its
+/// end.
 #[inline]
-pub(crate) fn freed(interval_s: f64, damping_per_s: f64) -> (f64, f64) {
+pub(crate) fn undamped(interval_s: f64, damping_per_s: f64) -> (f64, f64) {
     if damping_per_s == 0.0 {
         return (interval_s, 1.0);
     }
@@ -139,18 +142,19 @@ pub(crate) fn freed(interval_s: f64, damping_per_s: f64) -> (f64, f64) {
 }
 
 impl Recursive {
-    /// An identifier whose error falls as e^{−rate·W}, or one that forgets nothing; `damping_per_s` as found by least squares.
+    /// Creates an identifier whose error decays as e^{−rate·W}, or one that forgets nothing; `damping_per_s` is the
+    /// result of least squares.
     pub fn new(rate: Option<f64>, damping_per_s: f64) -> Self {
         Self { filter: filter(rate), path: Path::new(damping_per_s) }
     }
 
-    /// Takes in the next sample of a segment; its time is after the last one's.
+    /// Adds the next sample of a segment; its time is after that of the last one.
     pub fn push(&mut self, sample: &Sample) {
         let Some(([from, to], interval_s)) = self.path.step(sample) else { return };
         let fastest = self.path.fastest_rad_s;
         let relation = InertiaRelation::new(FLOOR * fastest * fastest * fastest).with_variance(Vector3::repeat(1.0));
-        let told = relation.observe(&from, &to, interval_s, self.filter.estimate());
-        self.path.take(&mut self.filter, &told);
+        let observed = relation.observe(&from, &to, interval_s, self.filter.estimate());
+        self.path.apply(&mut self.filter, &observed);
     }
 
     /// Ends a segment: the next sample begins another motion.
@@ -159,14 +163,14 @@ impl Recursive {
         self.filter.predict(&SVector::zeros(), 0.0);
     }
 
-    /// What it knows.
+    /// Returns the current fit.
     pub fn fit(&self) -> RecursiveFit<3> {
         self.path.fit(&self.filter)
     }
 }
 
 impl RecursiveAxisymmetric {
-    /// The same for a body that is symmetric about `axis`, 1 to 3; W is the angle of its spin, rad.
+    /// Creates the identifier for a body that is symmetric about `axis`, 1 to 3; W is the angle of its spin, rad.
     ///
     /// # Errors
     /// [`AxisymmetricError`] if there is no such axis.
@@ -175,12 +179,12 @@ impl RecursiveAxisymmetric {
         Ok(Self { axis, filter: filter(rate), path: Path::new(damping_per_s) })
     }
 
-    /// Takes in the next sample of a segment; its time is after the last one's.
+    /// Adds the next sample of a segment; its time is after that of the last one.
     pub fn push(&mut self, sample: &Sample) {
         let Some(([from, to], interval_s)) = self.path.step(sample) else { return };
         let Ok(relation) = Axisymmetric::new(self.axis, FLOOR * self.path.fastest_rad_s) else { return };
-        let told = relation.with_variance(Vector3::repeat(1.0)).observe(&from, &to, interval_s);
-        self.path.take(&mut self.filter, &told);
+        let observed = relation.with_variance(Vector3::repeat(1.0)).observe(&from, &to, interval_s);
+        self.path.apply(&mut self.filter, &observed);
     }
 
     /// Ends a segment: the next sample begins another motion.
@@ -189,7 +193,7 @@ impl RecursiveAxisymmetric {
         self.filter.predict(&SVector::zeros(), 0.0);
     }
 
-    /// What it knows: a = (I_j − I_k)/I_i, so that I_k/I_i = 1 − a.
+    /// Returns the current fit: a = (I_j − I_k)/I_i, so that I_k/I_i = 1 − a.
     pub fn fit(&self) -> RecursiveFit<1> {
         self.path.fit(&self.filter)
     }
@@ -206,14 +210,14 @@ mod tests {
         for tick in 0..20_000 {
             let time_s = f64::from(tick) * 1e-3;
             each(&Sample { time_s, rate_rad_s: rate });
-            // A damped motion is a free one, slower and slower.
-            let (interval_s, growth) = freed(1e-3, damping_per_s);
+            // A damped motion is a free one that slows down.
+            let (interval_s, growth) = undamped(1e-3, damping_per_s);
             rate = body.flow(&rate, &Vector3::zeros(), interval_s) / growth;
         }
     }
 
     #[test]
-    fn a_damped_body_is_identified_as_the_free_one_is() {
+    fn a_damped_body_is_identified_like_a_free_one() {
         let expected = Inertia::new([1.0, 2.0, 2.5]).unwrap().coefficients();
         for (damping, rate) in [(0.0, None), (0.1, None), (0.1, Some(20.0))] {
             let mut identifier = Recursive::new(rate, damping);
@@ -225,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn an_axisymmetric_body_is_known_by_one_coefficient() {
+    fn an_axisymmetric_body_is_identified_by_one_coefficient() {
         let mut identifier = RecursiveAxisymmetric::new(3, None, 0.05).unwrap();
         tumble([2.0, 2.0, 1.5], 0.05, |sample| identifier.push(sample));
         let fit = identifier.fit();
@@ -234,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_segment_is_not_joined_to_the_last() {
+    fn a_new_segment_does_not_continue_the_last() {
         let mut identifier = Recursive::new(None, 0.0);
         for start in [[1.2, 0.8, 1.6], [-0.5, 1.9, 0.4]] {
             let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());

@@ -1,14 +1,16 @@
-//! How sure a result is: each group of pieces is left out once, and the results are compared (the delete-a-group jackknife).
+//! The uncertainty of a result by the delete-a-group jackknife: each group of pieces is left out once, and the
+//! results are compared.
 //!
-//! It needs no model of the noise, and tells of errors of the model too, as far as they differ between pieces.
+//! It needs no model of the noise, and includes errors of the model as far as they differ between pieces.
 
 use super::motion::{Motion, Sums};
 use nalgebra::SVector;
 
-/// With fewer groups nothing is said.
+/// The least number of groups.
 const FEWEST: usize = 4;
 
-/// Standard deviations of what `result` makes of the motion; none with too few pieces, or where a part alone has no result.
+/// Computes the standard deviations of `result` over the motion; `None` with too few pieces, or if a part alone has
+/// no result.
 pub(super) fn over_groups<const N: usize>(
     motion: &Motion,
     result: impl Fn(&Sums) -> Option<SVector<f64, N>>,
@@ -26,7 +28,7 @@ pub(super) fn over_groups<const N: usize>(
             pieces: total.pieces - group.pieces,
         })
     };
-    // Twice, instead of a place for every result.
+    // Computed twice, to avoid storing every result.
     let mut mean = SVector::zeros();
     for group in filled() {
         mean += without(group)? / count as f64;

@@ -1,77 +1,79 @@
-//! The whole tensor of inertia, up to its scale, for a sensor that is turned in any way against the body.
+//! The whole inertia tensor, up to its scale, for a sensor at any orientation to the body.
 //!
-//! In the sensor's own axes J ω(t) + ∫ω × Jω dt is constant while no torque acts, and J ω + ∫(ω × Jω + c Jω) dt under a damping
-//! torque −c Jω: linear in the six entries of J. In rad/s its deviation from that constant is J⁻¹ times what is left, so the
-//! squares are weighed by J⁻² of the last round; and noise of equal size on all rates enters them by tr(J J⁻² J), to which the
-//! sum is compared. So the smallest of six generalised eigenvalues is sought, again and again: total least squares, which noise
-//! does not pull towards a sphere. Must not be given the noise, nor an alignment.
+//! In the sensor's axes J ω(t) + ∫ω × Jω dt is constant without torque, and J ω + ∫(ω × Jω + c Jω) dt under a damping
+//! torque −c Jω: both are linear in the six entries of J. The deviation from that constant is J times a residual in
+//! rad/s, so the squares are weighted by J⁻² of the last round. Noise of equal size on all rates contributes tr(J J⁻²
+//! J), the reference of the sum. So the smallest of six generalised eigenvalues is computed repeatedly: total least
+//! squares, which noise does not bias towards a sphere. The fit must not depend on a given noise or alignment.
 
 use super::motion::{FEATURES, Motion, PRODUCTS, Sums, TURNS};
 use super::spread;
 use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, SymmetricEigen, Vector3, Vector6};
 
-/// Rounds of weighing, at most, and the change of J at which they end.
+/// The maximum number of rounds of weighting, and the change of J at which they end.
 const ROUNDS: usize = 40;
 const SETTLED: f64 = 1e-9;
-/// A weight is not greater than for a moment of this part of the largest.
+/// The smallest moment used in a weight, as a part of the largest.
 const LEAST_MOMENT: f64 = 1e-3;
-/// Sweeps of the eigenvalue solver, at most.
+/// The maximum number of sweeps of the eigenvalue solver.
 const SWEEPS: usize = 200;
 
-/// A linear map from the features to what shall be constant.
+/// A linear map from the features to the conserved vector.
 type Row = SMatrix<f64, 3, FEATURES>;
 
-/// The maps of all six elements of a tensor, one below the other.
+/// The maps of all six elements of a tensor, stacked.
 type Stack = SMatrix<f64, 18, FEATURES>;
 
-/// What least squares say of a body's tensor of inertia.
+/// The result of least squares for a body's inertia tensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TensorFit {
-    /// The principal moments, the largest being 1, each of the axis that stands closest to the sensor's x, y and z. Of a
-    /// wrong model they may be negative.
+    /// The principal moments, the largest being 1, each of the axis closest to the sensor's x, y or z. They may be
+    /// negative if the model is wrong.
     pub moments: Vector3<f64>,
-    /// Standard deviations of these, by resampling; none if there are too few pieces.
+    /// The standard deviations of the moments, by resampling; absent if there are too few pieces.
     pub deviation: Option<Vector3<f64>>,
-    /// The principal axes as columns, in the sensor's axes: a rotation. A rate in them is its transpose times the measured one.
+    /// The principal axes as columns, in the sensor's axes: a rotation. Its transpose converts a measured rate to
+    /// these axes.
     pub axes: Matrix3<f64>,
-    /// Standard deviation of the direction of each axis, by resampling, rad.
+    /// The standard deviation of the direction of each axis, by resampling, rad.
     pub axes_deviation_rad: Option<Vector3<f64>>,
-    /// Damping by a torque −c Jω, 1/s; zero unless asked for.
+    /// The damping by a torque −c Jω, 1/s; zero unless it is fitted.
     pub damping_per_s: f64,
-    /// Standard deviation of this, by resampling.
+    /// The standard deviation of the damping, by resampling.
     pub damping_deviation_per_s: Option<f64>,
     /// The part of each measured rate's variance about its mean that the motion explains, at most 1.
     pub r_squared: Vector3<f64>,
-    /// How much worse the next tensor fits: the ratio of the two smallest eigenvalues. Near 1, the motion does not tell.
+    /// The ratio of the two smallest eigenvalues: how much worse the next tensor fits. Near 1 the motion does not
+    /// determine the tensor.
     pub distinction: f64,
 }
 
 impl TensorFit {
-    /// How far each principal axis is from the sensor's, rad.
+    /// Returns the angle of each principal axis from the sensor's, rad.
     pub fn tilt_rad(&self) -> Vector3<f64> {
         self.axes.diagonal().map(|cosine| libm::acos(cosine.abs().min(1.0)))
     }
 }
 
-/// A tensor in the making.
+/// A tensor during the iteration.
 #[derive(Debug, Clone, Copy)]
 struct Solution {
-    /// Of trace 1.
+    /// The tensor, of trace 1.
     tensor: Matrix3<f64>,
     damping: f64,
     distinction: f64,
 }
 
 impl Motion {
-    /// What the motion says of the whole tensor; with `damping`, of the air's torque too.
+    /// Fits the whole tensor; with `damping`, the air's torque too.
     ///
-    /// None if there is no piece of a motion, or nothing that a tensor could be found by.
+    /// Returns `None` if the motion has no piece, or does not determine a tensor.
     pub fn about_unknown_axes(&self, damping: bool) -> Option<TensorFit> {
         self.tensor(true, damping)
     }
 
-    /// The moments about the sensor's own axes that fit best together, the largest being 1: those of
-    /// [`about_unknown_axes`](Self::about_unknown_axes) with the tensor diagonal.
+    /// Fits the moments about the sensor's own axes, the largest being 1: the fit of
+    /// [`about_unknown_axes`](Self::about_unknown_axes) with a diagonal tensor.
     pub fn moments_about_known_axes(&self, damping: bool) -> Option<TensorFit> {
         self.tensor(false, damping)
     }
@@ -80,7 +82,7 @@ impl Motion {
         let total = self.total();
         let best = solve(&total, whole, damping)?;
         let (moments, axes) = principal(&best.tensor)?;
-        // Moments, then directions by their part across the axis, then damping.
+        // The moments, then the directions by their part across the axis, then the damping.
         let spread = spread::over_groups(self, |sums| {
             let solution = solve(sums, whole, damping)?;
             let (moments, own) = principal(&solution.tensor)?;
@@ -113,7 +115,7 @@ impl Motion {
     }
 }
 
-/// A basis of symmetric tensors, of unit length: xx, yy, zz, yz, zx, xy.
+/// Returns an element of the basis of symmetric tensors, of unit length: xx, yy, zz, yz, zx, xy.
 fn basis(index: usize) -> Matrix3<f64> {
     let mut tensor = Matrix3::zeros();
     if index < 3 {
@@ -126,12 +128,12 @@ fn basis(index: usize) -> Matrix3<f64> {
     tensor
 }
 
-/// Where the product of two rates stands among the features.
+/// Returns the index of the product of two rates among the features.
 fn product(first: usize, second: usize) -> usize {
     if first == second { PRODUCTS + first } else { PRODUCTS + 3 + (3 - first - second) }
 }
 
-/// J ω + ∫ω × Jω, and ∫Jω, as maps of the features.
+/// Returns J ω + ∫ω × Jω, and ∫Jω, as maps of the features.
 fn maps(tensor: &Matrix3<f64>) -> [Row; 2] {
     let (mut free, mut damped) = (Row::zeros(), Row::zeros());
     for row in 0..3 {
@@ -160,11 +162,11 @@ fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
     let elements = [0, 1, 2, 3, 4, 5].map(basis);
     let (mut free, mut damped) = (Stack::zeros(), Stack::zeros());
     for (index, element) in elements.iter().enumerate() {
-        let [one, other] = maps(element);
-        free.fixed_rows_mut::<3>(3 * index).copy_from(&one);
-        damped.fixed_rows_mut::<3>(3 * index).copy_from(&other);
+        let [free_map, damped_map] = maps(element);
+        free.fixed_rows_mut::<3>(3 * index).copy_from(&free_map);
+        damped.fixed_rows_mut::<3>(3 * index).copy_from(&damped_map);
     }
-    // All that a round needs of the scatter.
+    // All products of the scatter that a round needs.
     let products =
         [free * scatter * free.transpose(), free * scatter * damped.transpose(), damped * scatter * damped.transpose()];
     // The sum of weight · block over the block of two elements.
@@ -183,7 +185,7 @@ fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
                 right[(p, q)] = (elements[p] * weight).dot(&elements[q]);
             }
         }
-        // What is not asked for stands apart, at an eigenvalue among the others'.
+        // Unused unknowns are decoupled, with an eigenvalue among those of the others.
         let apart = (left.trace(), right.trace());
         for p in unknowns..6 {
             (left[(p, p)], right[(p, p)]) = apart;
@@ -213,7 +215,7 @@ fn solve(sums: &Sums, whole: bool, with_damping: bool) -> Option<Solution> {
     Some(solution)
 }
 
-/// J⁻² with moments that are not too small, by which what is left is weighed.
+/// Returns J⁻², with a lower limit on the moments: the weight of the residuals.
 fn weight(tensor: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(*tensor, f64::EPSILON, SWEEPS)?;
     let least = LEAST_MOMENT * eigenvalues.amax();
@@ -223,8 +225,8 @@ fn weight(tensor: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     weight.iter().all(|entry| entry.is_finite()).then_some(weight)
 }
 
-/// The x with the smallest x·left·x over x·right·x, and how many times that the next one is; among those that have only the
-/// first `unknowns` entries.
+/// Returns the x with the smallest ratio of x·left·x to x·right·x, and the ratio of the next smallest to it, over
+/// vectors whose entries after the first `unknowns` are zero.
 fn smallest(left: &Matrix6<f64>, right: &Matrix6<f64>, unknowns: usize) -> Option<(Vector6<f64>, f64)> {
     let lower = Cholesky::new(*right)?.unpack();
     let inverse = lower.solve_lower_triangular(&Matrix6::identity())?;
@@ -240,13 +242,13 @@ fn smallest(left: &Matrix6<f64>, right: &Matrix6<f64>, unknowns: usize) -> Optio
     };
     let (best, least) = (0..6).filter(|index| wanted(*index)).fold((0, f64::INFINITY), smaller);
     let (_, next) = (0..6).filter(|index| wanted(*index) && *index != best).fold((0, f64::INFINITY), smaller);
-    // Rounding may take an eigenvalue of zero below zero.
+    // Rounding may make a zero eigenvalue negative.
     let floor = f64::EPSILON * eigenvalues.amax();
     let distinction = next.max(floor) / least.max(floor);
     Some((inverse.transpose() * eigenvectors.column(best), distinction))
 }
 
-/// Principal moments, the largest 1, and axes, each the one closest to a sensor's axis.
+/// Returns the principal moments, the largest 1, and the axes, each the one closest to a sensor's axis.
 fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
     let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::try_new(*tensor, f64::EPSILON, SWEEPS)?;
     const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
@@ -259,7 +261,7 @@ fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         }
     }
     if axes.determinant() < 0.0 {
-        // A rotation it must be: the axis that is least aligned is turned round.
+        // The axes must form a rotation: the least aligned axis is reversed if necessary.
         let column = axes.diagonal().map(f64::abs).imin();
         axes.column_mut(column).neg_mut();
     }
@@ -268,7 +270,7 @@ fn principal(tensor: &Matrix3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
     (largest > 0.0).then(|| (moments / largest, axes))
 }
 
-/// The part of each rate's variance that is explained.
+/// Returns the explained part of each rate's variance.
 fn r_squared(sums: &Sums, solution: &Solution) -> Option<Vector3<f64>> {
     let mut scatter = sums.scatter;
     scatter.fill_lower_triangle_with_upper_triangle();

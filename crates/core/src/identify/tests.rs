@@ -2,7 +2,7 @@ use super::*;
 use crate::model::{Noise, RigidBody};
 use nalgebra::{Matrix3, Rotation3};
 
-/// A body's tumbling as a turned sensor sees it: segments of so many samples at an interval, with damping and noise.
+/// A tumbling body measured by a turned sensor: segments of `samples` samples at an interval, with damping and noise.
 struct Tumble {
     moments: [f64; 3],
     damping_per_s: f64,
@@ -40,7 +40,7 @@ impl Tumble {
             for tick in 0..self.samples {
                 let time_s = f64::from(tick) * self.interval_s;
                 motion.push(&Sample { time_s, rate_rad_s: self.turn * rate + noise.sample() });
-                let (interval_s, growth) = freed(self.interval_s, self.damping_per_s);
+                let (interval_s, growth) = undamped(self.interval_s, self.damping_per_s);
                 rate = body.flow(&rate, &Vector3::zeros(), interval_s) / growth;
             }
             motion.end_segment();
@@ -69,9 +69,9 @@ fn known_axes_are_fitted_within_their_own_deviations() {
 }
 
 #[test]
-fn the_whole_tensor_is_found_behind_any_turn() {
+fn the_whole_tensor_is_found_at_any_orientation() {
     for angles in [[0.0, 0.0, 0.0], [0.02, -0.01, 0.015], [0.7, -0.4, 2.5], [3.0, 1.2, -2.0]] {
-        // The last in every direction, the others in one.
+        // The last orientation is turned about all axes, the others about one.
         let all = [(0.0, 0.0), (0.2, 0.0), (0.2, 0.05)];
         for (damping_per_s, noise_rad_s) in all.into_iter().skip(if angles[0] == 0.7 { 0 } else { 2 }) {
             let turn = Rotation3::from_euler_angles(angles[0], angles[1], angles[2]);
@@ -84,7 +84,7 @@ fn the_whole_tensor_is_found_behind_any_turn() {
             }
             assert!((fit.damping_per_s - damping_per_s).abs() < 5e-3, "{fit:?}");
             assert!((fit.axes.determinant() - 1.0).abs() < 1e-9 && fit.distinction > 10.0, "{fit:?}");
-            // The tensor itself, whatever the order and the signs of its axes.
+            // Compares the tensor itself, which does not depend on the order and the signs of its axes.
             let rebuilt = fit.axes * Matrix3::from_diagonal(&fit.moments) * fit.axes.transpose();
             let truth = turn * Matrix3::from_diagonal(&Vector3::from(tumble.moments)) * turn.transpose();
             assert!((rebuilt - truth).amax() < 1e-2, "{angles:?}: {rebuilt} {truth}");
@@ -93,7 +93,7 @@ fn the_whole_tensor_is_found_behind_any_turn() {
 }
 
 #[test]
-fn moments_about_known_axes_are_those_of_one_body() {
+fn moments_about_known_axes_belong_to_one_body() {
     let tumble = Tumble { damping_per_s: 0.1, noise_rad_s: 0.02, ..Tumble::default() };
     let fit = tumble.motion().moments_about_known_axes(true).unwrap();
     assert!((fit.moments - Vector3::from(tumble.moments)).amax() < 3e-3, "{fit:?}");
@@ -102,14 +102,14 @@ fn moments_about_known_axes_are_those_of_one_body() {
 }
 
 #[test]
-fn noise_does_not_pull_the_tensor_towards_a_sphere() {
+fn noise_does_not_bias_the_tensor_towards_a_sphere() {
     let tumble = Tumble { moments: [0.6, 0.8, 1.0], noise_rad_s: 0.5, segments: 400, ..Tumble::default() };
     let fit = tumble.motion().about_unknown_axes(false).unwrap();
     assert!((fit.moments - Vector3::from(tumble.moments)).amax() < 0.02, "{fit:?}");
 }
 
 #[test]
-fn what_a_log_cannot_tell_is_said() {
+fn the_limits_of_a_log_are_reported() {
     let found = |tumble: &Tumble| {
         let motion = tumble.motion();
         findings(&motion, motion.about_known_axes(true).as_ref(), motion.about_unknown_axes(true).as_ref())
@@ -140,7 +140,7 @@ fn what_a_log_cannot_tell_is_said() {
 }
 
 #[test]
-fn a_spin_about_one_axis_says_nothing_of_the_others() {
+fn a_spin_about_one_axis_does_not_excite_the_others() {
     let mut motion = Motion::default();
     let mut noise = Noise::new(7, 0, [1e-3; 3], [0.0; 3]);
     for segment in 0..10 {
@@ -156,7 +156,7 @@ fn a_spin_about_one_axis_says_nothing_of_the_others() {
 }
 
 #[test]
-fn nothing_gives_nothing() {
+fn an_empty_log_has_no_result() {
     let empty = Motion::default();
     assert!(empty.about_known_axes(true).is_none() && empty.about_unknown_axes(true).is_none());
     let rest =
@@ -166,7 +166,7 @@ fn nothing_gives_nothing() {
 }
 
 #[test]
-fn a_body_too_flat_is_flattened_and_one_far_beyond_refused() {
+fn slightly_impossible_moments_are_corrected_and_others_refused() {
     let (inertia, flattened) = nearest_body(&Vector3::new(0.93, 0.08, 1.0)).unwrap();
     assert_eq!((inertia.moments_kg_m2(), flattened), (Vector3::new(0.93, 0.08, 1.0), false));
     assert!(nearest_body(&Vector3::new(0.9, 0.08, 1.0)).unwrap().1);

@@ -40,7 +40,7 @@ pub enum HiddenRateError {
     /// The measured components do not depend on the hidden one.
     #[error(
         "axis {axis} cannot be observed: the body turns like a sphere (a1 = a2 = a3 = 0), so the measured components do \
-         not feel the hidden one; give moments of inertia that differ"
+         not depend on the hidden one; give moments of inertia that differ"
     )]
     Sphere {
         /// The hidden axis, 1 to 3.

@@ -1,4 +1,4 @@
-//! The frames that `docs/serial-protocol.md` shows are those of this module.
+//! The frames in `docs/serial-protocol.md` are compared with those of this module.
 
 use super::*;
 use crate::role::CommandEvent;
@@ -18,7 +18,7 @@ fn dump(bytes: &[u8]) -> String {
     bytes.chunks(32).map(line).collect::<Vec<_>>().join("\n         ")
 }
 
-/// Every frame of the document: its title, payload and frame.
+/// Returns every frame of the document: its title, payload and frame.
 fn shown() -> Vec<(String, Vec<u8>, Vec<u8>)> {
     let blocks = DOCUMENT.split("```").skip(1).step_by(2);
     let frame = |block: &str| {
@@ -29,7 +29,7 @@ fn shown() -> Vec<(String, Vec<u8>, Vec<u8>)> {
     blocks.map(frame).collect()
 }
 
-/// Every message, as the document has it.
+/// Returns every message of the document.
 fn messages() -> Vec<(&'static str, Vec<u8>)> {
     let (omega_rad_s, applied_rad_s2) = ([1.0, -0.5, 0.0], [0.5, -1.0, 0.25]);
     let command = RateCommand { acceleration_rad_s2: applied_rad_s2, ..RateCommand::default() };
@@ -53,25 +53,25 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
     };
     let welcome = Message::Welcome(Welcome { run: 300, next_tick: 0, device: "board 1" });
     let refuse = Message::Refuse(Refuse { reason: Reason::NotGreeted, detail: "greet me first" });
-    let said = |sequence, message| write(sequence, message, &mut [0; MAX_PAYLOAD]).unwrap().to_vec();
+    let payload = |sequence, message| write(sequence, message, &mut [0; MAX_PAYLOAD]).unwrap().to_vec();
     let applied = CommandEvent::Applied;
     vec![
-        ("Hello to a body, sequence 0", said(0, Message::Hello(hello))),
-        ("Welcome, sequence 0: it begins", said(0, welcome)),
-        ("Refuse, sequence 0: it was not greeted", said(0, refuse)),
-        ("Tick 200 with a command of 0.5, -1, 0.25 rad/s^2, sequence 129", said(129, tick(1, command.content()))),
-        ("Tick 200 without a command, sequence 129", said(129, tick(0, &[]))),
-        ("Answer to it, sequence 1: applied, measurement and truth", said(1, answer(3, applied, &whole))),
+        ("Hello to a body, sequence 0", payload(0, Message::Hello(hello))),
+        ("Welcome, sequence 0: it begins", payload(0, welcome)),
+        ("Refuse, sequence 0: it was not greeted", payload(0, refuse)),
+        ("Tick 200 with a command of 0.5, -1, 0.25 rad/s^2, sequence 129", payload(129, tick(1, command.content()))),
+        ("Tick 200 without a command, sequence 129", payload(129, tick(0, &[]))),
+        ("Answer to it, sequence 1: applied, measurement and truth", payload(1, answer(3, applied, &whole))),
         (
             "Answer to it, sequence 1: held, without a truth",
-            said(1, answer(1, CommandEvent::Held, measurement.content())),
+            payload(1, answer(1, CommandEvent::Held, measurement.content())),
         ),
-        ("Stop, sequence 130", said(130, Message::Stop)),
+        ("Stop, sequence 130", payload(130, Message::Stop)),
     ]
 }
 
 #[test]
-fn the_frames_of_the_document_are_those_on_the_line() {
+fn the_documented_frames_are_those_on_the_line() {
     let mut expected = String::new();
     let mut all = Vec::new();
     for (title, payload) in messages() {

@@ -1,16 +1,17 @@
-//! Frames: a payload with its CRC, COBS-encoded between two zero bytes; and the decoder that finds them among any bytes.
+//! Frames: a payload with its CRC, COBS-encoded between two zero bytes, and the decoder that finds them in a byte
+//! stream.
 //!
-//! Pure and of bounded memory. Must not know what a payload means, and must not fail on any input: what is no frame is
-//! counted and dropped.
+//! Pure and of bounded memory. This module must not depend on a payload's meaning, and must not panic on any input:
+//! it counts and drops everything that is not a frame.
 
 use crc::{CRC_32_ISO_HDLC, Crc};
 use serde::{Deserialize, Serialize};
 
-/// The longest payload, bytes.
+/// The maximum length of a payload, bytes.
 pub const MAX_PAYLOAD: usize = 1020;
-/// The longest frame on the line, delimiters included, bytes.
+/// The maximum length of a frame with its delimiters, bytes.
 pub const MAX_FRAME: usize = MAX_BLOCK + 2;
-/// CRC-32 as in zlib, Ethernet and PNG: reflected polynomial 0x04C11DB7, begun with and inverted by 0xFFFFFFFF.
+/// CRC-32 as in zlib, Ethernet and PNG: reflected polynomial 0x04C11DB7, initial value and final XOR 0xFFFFFFFF.
 pub const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 const CRC_BYTES: usize = 4;
@@ -26,11 +27,11 @@ const _: () = assert!(MAX_CHECKED == 1024 && MAX_FRAME == 1031);
 #[error("a message is longer than the {MAX_PAYLOAD} bytes that a frame holds; shorten the names in it")]
 pub struct TooLong;
 
-/// Writes the frame of a payload and returns it. It begins with a delimiter too, so that whatever came before it on the
-/// line ends there and takes nothing of the frame with it.
+/// Writes the frame of a payload and returns it. It begins with a delimiter too, so that preceding garbage on the
+/// line does not become part of it.
 ///
 /// # Errors
-/// [`TooLong`].
+/// [`TooLong`] if the payload is too long.
 pub fn encode<'a>(payload: &[u8], frame: &'a mut [u8; MAX_FRAME]) -> Result<&'a [u8], TooLong> {
     let length = payload.len();
     if length > MAX_PAYLOAD {
@@ -45,31 +46,31 @@ pub fn encode<'a>(payload: &[u8], frame: &'a mut [u8; MAX_FRAME]) -> Result<&'a 
     Ok(&frame[..block + 2])
 }
 
-/// What a decoder has met.
+/// The counters of a decoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct FrameCounters {
-    /// Bytes taken in.
+    /// Bytes received.
     pub bytes: u64,
     /// Frames found.
     pub frames: u64,
-    /// Blocks between delimiters that were COBS, but of another CRC.
+    /// Blocks between delimiters that were valid COBS with a wrong CRC.
     pub crc_errors: u64,
-    /// Blocks between delimiters that were too short, too long, or no COBS.
+    /// Blocks between delimiters that were too short, too long, or invalid COBS.
     pub malformed: u64,
     /// Bytes of those blocks.
     pub dropped_bytes: u64,
-    /// How often a good frame followed a dropped block.
+    /// Valid frames after a dropped block.
     pub resyncs: u64,
 }
 
-/// Finds frames in a stream of bytes.
+/// A decoder that finds frames in a byte stream.
 #[derive(Debug, Clone)]
 pub struct Decoder {
     block: [u8; MAX_BLOCK],
     length: usize,
-    /// Bytes of the block at hand beyond what any frame has.
+    /// The bytes of the current block beyond the maximum length of a frame.
     excess: u64,
-    /// Whether a block was dropped since the last good frame.
+    /// True if a block was dropped since the last valid frame.
     lost: bool,
     counters: FrameCounters,
 }
@@ -86,11 +87,11 @@ impl Default for Decoder {
 }
 
 impl Decoder {
-    /// Takes one byte; returns the payload of the frame that it completes, if it does.
+    /// Processes one byte. Returns the payload of the frame that it completes, if any.
     pub fn push(&mut self, byte: u8) -> Option<&[u8]> {
         self.counters.bytes += 1;
         if byte != DELIMITER {
-            self.keep(byte);
+            self.store(byte);
             return None;
         }
         let (length, excess) = (core::mem::take(&mut self.length), core::mem::take(&mut self.excess));
@@ -115,7 +116,7 @@ impl Decoder {
         }
     }
 
-    /// Takes bytes, and hands every payload found in them to `each`.
+    /// Processes bytes and passes every payload found in them to `each`.
     pub fn feed(&mut self, bytes: &[u8], mut each: impl FnMut(&[u8])) {
         for &byte in bytes {
             if let Some(payload) = self.push(byte) {
@@ -124,19 +125,19 @@ impl Decoder {
         }
     }
 
-    /// Forgets the block at hand: the line was cut there.
+    /// Drops the current block after an interruption of the line.
     pub fn cut(&mut self) {
         self.lost |= self.length > 0;
         self.counters.dropped_bytes += self.length as u64 + self.excess;
         (self.length, self.excess) = (0, 0);
     }
 
-    /// What has been met so far.
+    /// Returns the counters.
     pub fn counters(&self) -> FrameCounters {
         self.counters
     }
 
-    fn keep(&mut self, byte: u8) {
+    fn store(&mut self, byte: u8) {
         match self.block.get_mut(self.length) {
             Some(place) => {
                 *place = byte;
@@ -147,7 +148,7 @@ impl Decoder {
     }
 }
 
-/// Decodes a block in place; returns the length of its payload.
+/// Decodes a block in place and returns the length of its payload.
 fn open(block: &mut [u8]) -> Result<usize, Fault> {
     let length = cobs::decode_in_place(block).map_err(|_| Fault::Form)?;
     let (payload, crc) = block[..length].split_last_chunk::<CRC_BYTES>().ok_or(Fault::Form)?;
@@ -169,15 +170,15 @@ mod tests {
         (found, decoder.counters())
     }
 
-    /// The check value of the catalogue of CRCs, and a frame that firmware may be compared with.
+    /// The check value of the catalogue of CRCs, and a frame for comparison with firmware.
     #[test]
-    fn the_bytes_on_the_line_are_these() {
+    fn a_frame_has_these_bytes() {
         assert_eq!(CRC.checksum(b"123456789"), 0xCBF4_3926);
         assert_eq!(frame(&[1, 0, 2]), [0, 2, 1, 6, 2, 0x09, 0xd2, 0x8d, 0x10, 0]);
     }
 
     #[test]
-    fn a_payload_beyond_the_longest_is_refused_and_the_longest_fits() {
+    fn the_longest_payload_fits_and_a_longer_one_is_refused() {
         let longest = [7; MAX_PAYLOAD];
         assert_eq!(frame(&longest).len(), MAX_FRAME);
         assert_eq!(decode(&frame(&longest)).0, [longest.to_vec()]);
@@ -185,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_frame_is_counted() {
+    fn invalid_blocks_are_counted() {
         let bytes = [&[0, 1, 2, 3, 0, 2, 5, 0][..], &frame(b"payload"), &vec![9; 2000], &frame(b"again")].concat();
         let (found, counters) = decode(&bytes);
         assert_eq!(found, [b"payload".to_vec(), b"again".to_vec()]);
@@ -194,10 +195,10 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_line_takes_one_frame_and_no_more() {
+    fn an_interrupted_line_loses_only_one_frame() {
         let whole = frame(b"payload");
         let mut decoder = Decoder::default();
-        decoder.feed(&whole[..5], |_| panic!("half a frame is none"));
+        decoder.feed(&whole[..5], |_| panic!("half a frame is not delivered"));
         decoder.cut();
         let mut found = 0;
         decoder.feed(&whole, |_| found += 1);
@@ -210,31 +211,31 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_make_it_fail_and_all_of_them_are_accounted_for(bytes in prop::collection::vec(any::<u8>(), 0..3000)) {
+        fn no_bytes_panic_and_all_are_counted(bytes in prop::collection::vec(any::<u8>(), 0..3000)) {
             let (found, counters) = decode(&bytes);
             prop_assert_eq!(found.len() as u64, counters.frames);
             prop_assert_eq!(counters.bytes, bytes.len() as u64);
             prop_assert!(counters.dropped_bytes <= counters.bytes);
         }
 
-        /// Garbage takes no frame with it, wherever it ends: every frame brings its own delimiters.
+        /// Garbage never hides a frame: every frame brings its own delimiters.
         #[test]
         fn every_frame_between_garbage_is_found(parts in prop::collection::vec((prop::collection::vec(any::<u8>(), 0..1200), payload()), 1..8)) {
             let bytes: Vec<u8> = parts.iter().flat_map(|(garbage, payload)| [garbage.clone(), frame(payload)].concat()).collect();
             let (found, _) = decode(&bytes);
             let sent: Vec<&Vec<u8>> = parts.iter().map(|(_, payload)| payload).collect();
-            // Random bytes may be a frame by chance, one block in 2^32.
+            // Random bytes are a valid frame with a probability of 2⁻³² per block.
             prop_assert_eq!(found.iter().filter(|found| sent.contains(found)).count(), sent.len());
         }
 
-        /// No other payload than the sent one comes out, whichever byte is damaged, a delimiter too.
+        /// A damaged byte, even a delimiter, never yields another payload than the sent one.
         #[test]
         fn a_corrupted_frame_is_never_delivered(payload in payload(), at in any::<prop::sample::Index>(), flip in 1..=255_u8) {
             let mut bytes = frame(&payload);
             let at = at.index(bytes.len());
             bytes[at] ^= flip;
             let (found, counters) = decode(&bytes);
-            // A delimiter that is damaged joins the frame with what is around it, here nothing.
+            // A damaged delimiter joins the frame with its surroundings, here nothing.
             prop_assert!(found.iter().all(|found| *found == payload), "{:?}", counters);
             if at > 0 && at < bytes.len() - 1 {
                 prop_assert!(found.is_empty());
@@ -242,7 +243,7 @@ mod tests {
         }
 
         #[test]
-        fn how_the_bytes_are_cut_into_pieces_does_not_matter(payloads in prop::collection::vec(payload(), 1..5), size in 1..600_usize) {
+        fn the_pieces_of_the_stream_do_not_matter(payloads in prop::collection::vec(payload(), 1..5), size in 1..600_usize) {
             let bytes: Vec<u8> = payloads.iter().flat_map(|payload| frame(payload)).collect();
             let (mut decoder, mut found) = (Decoder::default(), Vec::new());
             for piece in bytes.chunks(size) {

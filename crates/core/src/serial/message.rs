@@ -1,6 +1,7 @@
-//! The messages: what they say and how they lie in a payload. The table in the module's documentation is this file's.
+//! The messages and their encoding in a payload, as in the tables of `docs/serial-protocol.md`.
 //!
-//! A sample travels as the bytes after its stamp, so that no message knows any rig. Must not know how messages are sent.
+//! A sample is sent as the bytes after its stamp, so that no message depends on a rig. Messages must not depend on
+//! the medium.
 
 use super::frame::{MAX_PAYLOAD, TooLong};
 use crate::role::CommandEvent;
@@ -8,106 +9,106 @@ use serde::{Deserialize, Serialize};
 
 /// The version of this protocol: the first byte of every payload, in all versions.
 pub const VERSION: u8 = 2;
-/// The most bytes of samples in a [`Tick`] or an [`Answer`]: 120 fields.
+/// The maximum size of the samples in a [`Tick`] or an [`Answer`], bytes: 120 fields.
 pub const MAX_CONTENT: usize = 960;
-/// The most samples in either.
+/// The maximum number of samples in a [`Tick`] or an [`Answer`].
 pub const MAX_SAMPLES: usize = 32;
-/// The longest name or reason in a message, bytes.
+/// The maximum length of a name or reason in a message, bytes.
 pub const MAX_TEXT: usize = 64;
-/// The longest list of layouts in a message, bytes.
+/// The maximum length of a list of layouts in a message, bytes.
 pub const MAX_NAMES: usize = 448;
 
-/// What is said on the line.
+/// A message of the protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Message<'a> {
-    /// Host: who is there, and how the run will be.
+    /// From the host: the greeting with the parameters of the run.
     #[serde(borrow)]
     Hello(Hello<'a>),
-    /// Device: it takes part.
+    /// From the device: it takes part.
     Welcome(Welcome<'a>),
-    /// Device: it does not, or not yet.
+    /// From the device: it does not take part, or not yet.
     Refuse(Refuse<'a>),
-    /// Host: a tick is due.
+    /// From the host: the request for a tick.
     Tick(Tick<'a>),
-    /// Device: what it makes of that tick.
+    /// From the device: the answer to a tick.
     Answer(Answer<'a>),
-    /// Host: go to the safe command now.
+    /// From the host: apply the safe command now.
     Stop,
 }
 
 /// The host's greeting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hello<'a> {
-    /// Which run. A device that knows it goes on where it was; another one begins at its initial state.
+    /// The identifier of the run. A device that knows it continues; another device begins at its initial state.
     pub run: u64,
-    /// Whether ticks follow the clock; if not, they come as fast as they are answered, and silence means nothing.
+    /// True if ticks follow the clock. Otherwise each comes as soon as the last is answered, and there is no timeout.
     pub realtime: bool,
     /// The period h, ns.
     pub period_ns: u64,
     /// The last tick of the run; the first is 0.
     pub last_tick: u64,
-    /// After so many ticks in a row without a command a body goes to its safe command. At least 1.
+    /// The number of consecutive ticks without a command after which a body applies its safe command. At least 1.
     pub timeout_ticks: u64,
-    /// Whether the safe command is for good (until another run), or ends with the next command.
+    /// True if the safe command holds until the next run; otherwise the next command ends it.
     pub manual_rearm: bool,
-    /// The seat that the device takes: a body's name, `observer`, `controller`, or `observer controller` for both.
+    /// The role of the device: a body's name, `observer`, `controller`, or `observer controller` for both.
     pub role: &'a str,
-    /// The names of the layouts of the samples in [`Tick::inputs`], in order, with a blank between two: versioned type names with
-    /// hashes, or without them to a device that knows none.
+    /// The layout names of the samples in [`Tick::inputs`], in order, separated by blanks: versioned type names with
+    /// hashes, or without hashes for a device that has none.
     pub reads: &'a str,
-    /// Those of [`Answer::outputs`].
+    /// The layout names of the samples in [`Answer::outputs`].
     pub writes: &'a str,
 }
 
-/// A device that takes part.
+/// The acceptance of a run by a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Welcome<'a> {
-    /// [`Hello::run`], told back.
+    /// The value of [`Hello::run`].
     pub run: u64,
-    /// The first tick that the device would still answer; 0 if it has just begun.
+    /// The first tick that the device can still answer; 0 if it has just started.
     pub next_tick: u64,
-    /// What the device calls itself: kind and version, for people.
+    /// The name of the device: kind and version, for display.
     pub device: &'a str,
 }
 
-/// Why a device does not take part.
+/// The reason why a device does not take part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Reason {
-    /// The payload's first byte is another version than the device's.
+    /// The payload's first byte is not the device's version.
     Version,
-    /// The samples are of other types.
+    /// The layouts of the samples differ.
     Samples,
-    /// The device has another role, or is not fit for it.
+    /// The device has another role, or does not support the parameters.
     Role,
-    /// It was not greeted since it began: greet it.
+    /// The device has not been greeted since its start.
     NotGreeted,
 }
 
-/// A device that does not take part. This message is the same in all versions.
+/// The refusal of a device. This message is the same in all versions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refuse<'a> {
     /// The kind of reason.
     pub reason: Reason,
-    /// What a person should know.
+    /// Details for the user.
     pub detail: &'a str,
 }
 
-/// Some of the samples that were agreed upon, each as the bytes after its stamp.
+/// Samples of the agreed layouts, each as the bytes after its stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Samples<'a> {
-    /// Bit i: sample i is there.
+    /// Bit i is set if sample i is present.
     pub present: u32,
-    /// Those that are there, one after another.
+    /// The bytes of the present samples, in order.
     pub bytes: &'a [u8],
 }
 
-/// A tick that is due.
+/// The request for a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tick<'a> {
     /// The tick k.
     pub tick: u64,
-    /// What is known in time and believed: for a body the command computed from measurement k − 1, which acts from k on; for
-    /// the others the samples of tick k.
+    /// The inputs that arrived in time and were accepted. For a body the command computed from measurement k − 1,
+    /// which acts from k on; for other roles the samples of tick k.
     #[serde(borrow)]
     pub inputs: Samples<'a>,
 }
@@ -117,11 +118,11 @@ pub struct Tick<'a> {
 pub struct Answer<'a> {
     /// The sequence number of the frame that is answered.
     pub echo: u32,
-    /// Its tick.
+    /// The tick.
     pub tick: u64,
-    /// What became of a body's command; of all others that none was due.
+    /// The outcome of a body's command; `NotDue` for other roles.
     pub event: CommandEvent,
-    /// What the device says of this tick: of a body the state at k under the command that now acts.
+    /// The outputs of the tick; for a body the state at k under the command that now acts.
     #[serde(borrow)]
     pub outputs: Samples<'a>,
 }
@@ -129,34 +130,34 @@ pub struct Answer<'a> {
 #[derive(Serialize, Deserialize)]
 struct Envelope<'a> {
     version: u8,
-    /// Counts the sender's frames, from 0, repeated ones too.
+    /// The number of the sender's frame, from 0, including repeated ones.
     sequence: u32,
     #[serde(borrow)]
     message: Message<'a>,
 }
 
-/// Why a payload is no message.
+/// The reason why a payload is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ParseError {
-    /// It is of this version of the protocol.
+    /// The payload is of this other version of the protocol.
     Version(u8),
-    /// It is of this version, and nonsense.
+    /// The payload is of this version, but malformed.
     Malformed,
 }
 
-/// Writes a message into a payload and returns it.
+/// Writes a message into a payload and returns the bytes written.
 ///
 /// # Errors
-/// [`TooLong`], only if names in it are.
+/// [`TooLong`] if the names in the message are too long.
 pub fn write<'a>(sequence: u32, message: Message<'_>, payload: &'a mut [u8; MAX_PAYLOAD]) -> Result<&'a [u8], TooLong> {
     let envelope = Envelope { version: VERSION, sequence, message };
     postcard::to_slice(&envelope, payload).map(|payload| &*payload).map_err(|_| TooLong)
 }
 
-/// Reads a message and its sequence number from a payload.
+/// Parses a message and its sequence number from a payload.
 ///
 /// # Errors
-/// [`ParseError`].
+/// [`ParseError`] if the payload is of another version or malformed.
 pub fn parse(payload: &[u8]) -> Result<(u32, Message<'_>), ParseError> {
     match payload.first() {
         Some(&VERSION) => {}
@@ -169,7 +170,7 @@ pub fn parse(payload: &[u8]) -> Result<(u32, Message<'_>), ParseError> {
     }
 }
 
-/// As much of a text as a message takes.
+/// Returns the part of a text that fits into a message.
 pub(super) fn shorten(text: &str) -> &str {
     let mut end = text.len().min(MAX_TEXT);
     while !text.is_char_boundary(end) {
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tick_lies_in_its_payload_as_documented() {
+    fn a_tick_is_encoded_as_documented() {
         let tick = Tick { tick: 300, inputs: Samples { present: 0b10, bytes: &[9, 8, 7] } };
         let sequence = [0x81, 0x84, 0x8c, 0x20];
         let expected = [&[VERSION][..], &sequence, &[3], &[0xac, 0x02], &[2, 3, 9, 8, 7]].concat();
@@ -207,7 +208,7 @@ mod tests {
 
     /// The longest of every message fits into a frame.
     #[test]
-    fn what_is_written_is_read_back() {
+    fn a_written_message_is_parsed_back() {
         let most = u64::MAX;
         let samples = Samples { present: u32::MAX, bytes: &[255; MAX_CONTENT] };
         let names = &LONG.repeat(MAX_NAMES / MAX_TEXT);
@@ -240,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn another_version_is_told_from_nonsense() {
+    fn another_version_and_malformed_payloads_are_distinct_errors() {
         let mut stop = written(Message::Stop);
         stop[0] = 9;
         assert_eq!(parse(&stop), Err(ParseError::Version(9)));
@@ -251,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_cut_between_characters() {
+    fn a_text_is_shortened_between_characters() {
         assert_eq!(shorten("short"), "short");
         let text = "é".repeat(MAX_TEXT);
         assert_eq!(shorten(&text[..]).len(), MAX_TEXT);
@@ -260,7 +261,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_payload_makes_it_fail(payload in prop::collection::vec(any::<u8>(), 0..MAX_PAYLOAD)) {
+        fn no_payload_panics(payload in prop::collection::vec(any::<u8>(), 0..MAX_PAYLOAD)) {
             let _ = parse(&payload);
             let _ = parse(&[&[VERSION][..], &payload].concat());
         }

@@ -1,64 +1,66 @@
-//! What a device is in a run: a body, an observer, a controller, or observer and controller together.
+//! The role of a device: a body, an observer, a controller, or observer and controller together.
 //!
-//! Each is the role of this library with its samples taken from a message and put into one. Must not know how messages come.
+//! Each is a role of this library whose samples are read from one message and written to another. This module must
+//! not depend on the transport of messages.
 
 use super::message::{Hello, MAX_CONTENT, MAX_SAMPLES, Samples};
 use crate::role::{Actuation, CommandEvent, Controller, Estimator, Law, Observer, Plant, Rearm, SingleBody};
 use crate::sample::{Sample, Stamp, content_length};
 
-/// A body lives through at most so many ticks that it missed; after a longer absence its clock jumps.
+/// The largest number of missed ticks that a body catches up; after a longer absence its clock jumps.
 const CATCH_UP_TICKS: u64 = 100_000;
 
-/// A sample as both ends must agree on it.
+/// A sample's layout as both ends must agree on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
-    /// [`Sample::LAYOUT`].
+    /// The value of [`Sample::LAYOUT`].
     pub name: &'static str,
-    /// Bytes after its stamp.
+    /// The number of bytes after the stamp.
     pub length: usize,
 }
 
 impl Layout {
-    /// That of a sample.
+    /// Returns the layout of a sample.
     pub const fn for_sample<S: Sample>() -> Self {
         Self { name: S::LAYOUT, length: content_length::<S>() }
     }
 }
 
-/// What a device is in one run: a state machine, tick by tick.
+/// The role of a device in one run: a state machine, executed tick by tick.
 pub trait DeviceRole {
-    /// The samples that it reads, in order.
+    /// Returns the layouts of the samples that the role reads, in order.
     fn reads() -> impl Iterator<Item = Layout>;
-    /// The samples that it writes, in order.
+    /// Returns the layouts of the samples that the role writes, in order.
     fn writes() -> impl Iterator<Item = Layout>;
-    /// Executes a tick: each once, in order, but for those that are missed.
+    /// Executes a tick. Each tick is executed at most once, in order.
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent;
-    /// Does what the tick just executed left to be done. The answer does not wait for it.
-    fn settle(&mut self) {}
-    /// So many ticks from this one on never came.
+    /// Completes the executed tick with work that the answer does not wait for.
+    fn finish_tick(&mut self) {}
+    /// Handles `ticks` missed ticks from `from` on.
     fn miss(&mut self, _from: u64, _ticks: u64) {}
-    /// After how many more ticks without any word it goes to its safe command by itself; 0 if that acts, or there is none.
+    /// Returns the number of further missed ticks after which the role applies its safe command; 0 if it acts or does
+    /// not exist.
     fn ticks_until_safe(&self) -> u64 {
         0
     }
-    /// Goes to the safe command now.
+    /// Applies the safe command now.
     fn expire(&mut self) {}
 }
 
-/// The samples of a request, taken one after another.
+/// The samples of a request, read in order.
 pub struct Inputs<'a> {
     present: u32,
     bytes: &'a [u8],
 }
 
 impl<'a> Inputs<'a> {
-    /// Those of a message, if it has what was agreed upon.
+    /// Returns the samples of a message, if they have the agreed layouts.
     pub(super) fn new(samples: Samples<'a>, layouts: impl Iterator<Item = Layout>) -> Option<Self> {
         let fits = length(layouts, samples.present) == Some(samples.bytes.len());
         fits.then_some(Self { present: samples.present, bytes: samples.bytes })
     }
 
-    /// The next sample with its tick in its stamp, if it is there.
+    /// Returns the next sample with this tick in its stamp, if the sample is present.
     pub fn take<S: Sample>(&mut self, tick: u64) -> Option<S> {
         let there = self.present & 1 == 1;
         self.present >>= 1;
@@ -71,7 +73,7 @@ impl<'a> Inputs<'a> {
     }
 }
 
-/// The samples of an answer, put one after another.
+/// The samples of an answer, written in order.
 pub struct Outputs {
     present: u32,
     count: usize,
@@ -86,7 +88,7 @@ impl Default for Outputs {
 }
 
 impl Outputs {
-    /// The next sample; none if there is none at this tick.
+    /// Writes the next sample; `None` if it is missing at this tick.
     pub fn put<S: Sample>(&mut self, sample: Option<&S>) {
         let index = self.count;
         self.count += 1;
@@ -107,7 +109,7 @@ impl Outputs {
     }
 }
 
-/// How many bytes the samples take that are present; none if there are others than these.
+/// Returns the size of the present samples, bytes; `None` if there are more samples than layouts.
 pub(super) fn length(layouts: impl Iterator<Item = Layout>, present: u32) -> Option<usize> {
     let mut left = present;
     let mut bytes = 0;
@@ -118,24 +120,24 @@ pub(super) fn length(layouts: impl Iterator<Item = Layout>, present: u32) -> Opt
     (left == 0).then_some(bytes)
 }
 
-/// A body with its sensors and actuators, which protect themselves: a [`Plant`].
+/// The role of a body with its sensors and actuators, which protect themselves: a [`Plant`].
 pub struct DevicePlant<B: SingleBody> {
     plant: Plant<B>,
-    tells_truth: bool,
+    with_truth: bool,
 }
 
 impl<B: SingleBody> DevicePlant<B> {
-    /// A body at its initial state, in the run of this greeting.
+    /// Creates a body at its initial state, with the parameters of the greeting.
     pub fn new(body: B, hello: &Hello<'_>) -> Self {
         let rearm = if hello.manual_rearm { Rearm::Manual } else { Rearm::Auto };
         let actuation = Actuation { driven: true, delay_ticks: 1, timeout_ticks: hello.timeout_ticks, rearm };
-        Self { plant: Plant::new(body, actuation, hello.period_ns as f64 / 1e9), tells_truth: true }
+        Self { plant: Plant::new(body, actuation, hello.period_ns as f64 / 1e9), with_truth: true }
     }
 
-    /// One that tells its measurements only: a real one, which knows no more than its sensors do.
+    /// Omits the truth from the answers, for a real body, which knows only its measurements.
     #[must_use]
     pub fn without_truth(mut self) -> Self {
-        self.tells_truth = false;
+        self.with_truth = false;
         self
     }
 }
@@ -150,7 +152,7 @@ impl<B: SingleBody> DeviceRole for DevicePlant<B> {
     }
 
     fn execute(&mut self, tick: u64, inputs: &mut Inputs<'_>, outputs: &mut Outputs) -> CommandEvent {
-        // It was computed from the measurement of the tick before.
+        // The command was computed from the measurement of the previous tick.
         let command = inputs.take::<B::Command>(tick.saturating_sub(1));
         let event = self.plant.command(tick, command.as_ref());
         let stamp = Stamp { tick, ..Stamp::default() };
@@ -158,16 +160,16 @@ impl<B: SingleBody> DeviceRole for DevicePlant<B> {
         self.plant.measure(&stamp, &mut measurement);
         self.plant.truth(&stamp, &mut truth);
         outputs.put(Some(&measurement));
-        outputs.put(Some(&truth).filter(|_| self.tells_truth));
+        outputs.put(Some(&truth).filter(|_| self.with_truth));
         event
     }
 
     /// Moves the body.
-    fn settle(&mut self) {
+    fn finish_tick(&mut self) {
         self.plant.advance(1);
     }
 
-    /// Lives through them as the actuators do: they hold, and then go safe.
+    /// Advances the body over missed ticks: the actuators hold the last input, then apply the safe command.
     fn miss(&mut self, from: u64, ticks: u64) {
         for tick in from..from.saturating_add(ticks.min(CATCH_UP_TICKS)) {
             self.plant.command(tick, None);
@@ -184,18 +186,19 @@ impl<B: SingleBody> DeviceRole for DevicePlant<B> {
     }
 }
 
-/// An observer of the first body.
+/// The role of an observer of the first body.
 pub struct DeviceObserver<E: Estimator> {
     observer: Observer<E>,
 }
 
 impl<E: Estimator> DeviceObserver<E> {
-    /// An observer at its initial guess, in the run of this greeting.
+    /// Creates an observer at its initial guess, with the period of the greeting.
     pub fn new(estimator: E, hello: &Hello<'_>) -> Self {
         Self { observer: Observer::new(estimator, hello.period_ns as f64 / 1e9) }
     }
 
-    /// The estimate of a tick. A measurement that is not there was not believed: nobody is asked where there was none.
+    /// Computes the estimate of a tick. A missing measurement was not accepted by the host's guard; without a
+    /// measurement the host does not ask.
     fn estimate(&mut self, tick: u64, inputs: &mut Inputs<'_>) -> E::Estimate {
         let mut estimate = E::Estimate::default();
         match inputs.take::<E::Measurement>(tick) {
@@ -221,18 +224,18 @@ impl<E: Estimator> DeviceRole for DeviceObserver<E> {
     }
 }
 
-/// A controller of N driven bodies.
+/// The role of a controller of N driven bodies.
 pub struct DeviceController<L: Law, const N: usize> {
     controllers: [Controller<L>; N],
 }
 
 impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceController<L, N> {
-    /// A controller with the law of each body.
+    /// Creates a controller with the law of each body.
     pub fn new(laws: [L; N]) -> Self {
         Self { controllers: laws.map(Controller::new) }
     }
 
-    /// One command for each body whose measurement is there.
+    /// Computes one command for each body whose measurement is present.
     fn command(&mut self, tick: u64, estimate: Option<&L::Estimate>, inputs: &mut Inputs<'_>, outputs: &mut Outputs) {
         for controller in &mut self.controllers {
             let measurement = inputs.take::<L::Measurement>(tick);
@@ -262,7 +265,8 @@ impl<L: Law<Measurement: Sample, Command: Sample>, const N: usize> DeviceRole fo
     }
 }
 
-/// Observer and controller in one device, a flight computer: measurements in, the estimate and the commands out.
+/// The role of a flight computer: observer and controller in one device. It reads measurements and writes the
+/// estimate and the commands.
 pub struct DeviceFlightComputer<E: Estimator, L: Law, const N: usize> {
     observer: DeviceObserver<E>,
     controller: DeviceController<L, N>,
@@ -273,7 +277,7 @@ where
     E: Estimator,
     L: Law<Estimate = E::Estimate, Measurement: Sample, Command: Sample>,
 {
-    /// Both at their beginnings, in the run of this greeting.
+    /// Creates both roles at their initial states, with the period of the greeting.
     pub fn new(estimator: E, laws: [L; N], hello: &Hello<'_>) -> Self {
         Self { observer: DeviceObserver::new(estimator, hello), controller: DeviceController::new(laws) }
     }

@@ -1,4 +1,5 @@
-//! Both ends together over a line in memory, in virtual time: clean, faulty, cut, and misunderstood.
+//! Both ends together over a line in memory, in virtual time: without faults, with faults, interrupted, and with
+//! mismatches.
 
 use super::*;
 use crate::role::{Actuation, Body, CommandEvent, Plant, Rearm};
@@ -11,7 +12,7 @@ const PERIOD_NS: u64 = 10_000_000;
 const TIMEOUT_TICKS: u64 = 4;
 const STEP_NS: u64 = 100_000;
 
-/// A body that integrates what it is told, about the first axis.
+/// A body that integrates its commands about the first axis.
 #[derive(Debug, Clone, PartialEq)]
 struct Spinner {
     rate: f64,
@@ -74,7 +75,7 @@ fn device() -> Spinning {
     Device::new("spinner 1", |hello| Some(DevicePlant::new(spinner(), hello)))
 }
 
-/// What befalls the bytes of a line, per byte.
+/// The fault probabilities of a line, per byte.
 #[derive(Debug, Clone, Copy)]
 struct Faults {
     drop: f64,
@@ -84,7 +85,7 @@ struct Faults {
 
 const CLEAN: Faults = Faults { drop: 0.0, corrupt: 0.0, garbage: 0.0 };
 
-/// Both ends, the line between them, and a clock that somebody else moves.
+/// Both ends, the line between them, and a clock moved by the test.
 struct Rig {
     host: HostSession,
     device: Spinning,
@@ -95,7 +96,7 @@ struct Rig {
     cut: bool,
 }
 
-/// What the host heard, with the contents copied out.
+/// The host's events, with their contents copied out.
 #[derive(Debug, Clone, PartialEq)]
 enum Event {
     Welcome(u64),
@@ -134,7 +135,7 @@ impl Rig {
         out
     }
 
-    /// One step of time: what is due goes out, is answered, and comes back.
+    /// Advances time by one step: due frames are sent, answered, and received.
     fn step(&mut self) -> Vec<Event> {
         self.now_ns += STEP_NS;
         let mut up = Vec::new();
@@ -145,21 +146,21 @@ impl Rig {
         self.device.receive(&up, self.now_ns, |frame| down.extend_from_slice(frame));
         self.device.elapse(self.now_ns);
         let down = self.damage(&down);
-        self.hear(&down)
+        self.receive(&down)
     }
 
-    fn hear(&mut self, bytes: &[u8]) -> Vec<Event> {
+    fn receive(&mut self, bytes: &[u8]) -> Vec<Event> {
         let mut events = Vec::new();
         for &byte in bytes {
-            let Some(heard) = self.host.push(byte, self.now_ns) else { continue };
-            events.push(match heard {
+            let Some(event) = self.host.push(byte, self.now_ns) else { continue };
+            events.push(match event {
                 DeviceEvent::Welcome(welcome) => Event::Welcome(welcome.next_tick),
                 DeviceEvent::Refused(refuse) => Event::Refused(refuse.reason, refuse.detail.to_owned()),
                 DeviceEvent::OtherVersion(version) => Event::OtherVersion(version),
                 DeviceEvent::Answer(answer) => {
                     let (mut measurement, mut truth) = (RateMeasurement::default(), RateTruth::default());
-                    let (measured, true_one) = answer.outputs.bytes.split_at(MEASUREMENT);
-                    assert!(measurement.set_content(measured) && truth.set_content(true_one));
+                    let (measured, true_bytes) = answer.outputs.bytes.split_at(MEASUREMENT);
+                    assert!(measurement.set_content(measured) && truth.set_content(true_bytes));
                     Event::Answer(answer.tick, answer.event, measurement, truth)
                 }
             });
@@ -167,7 +168,7 @@ impl Rig {
         events
     }
 
-    /// Steps until the host has heard something, or for `ns`.
+    /// Steps until the host has an event, or for `ns`.
     fn until(&mut self, ns: u64) -> Option<Event> {
         let end_ns = self.now_ns + ns;
         while self.now_ns < end_ns {
@@ -182,7 +183,7 @@ impl Rig {
         assert!(matches!(self.until(PERIOD_NS), Some(Event::Welcome(_))));
     }
 
-    /// Asks for a tick and gives the answer.
+    /// Requests a tick and returns the answer.
     fn ask(&mut self, tick: u64, value: Option<f64>, ns: u64) -> Option<Event> {
         let command = value.map(command);
         let bytes = command.as_ref().map_or(&[][..], crate::sample::Message::content);
@@ -203,7 +204,7 @@ fn value(tick: u64) -> f64 {
     (tick as f64 * 0.7).sin()
 }
 
-/// The answers of a plant that sits in the host's own process.
+/// Returns the answers of a plant in the host's own process.
 fn built_in(ticks: u64) -> Vec<Event> {
     let actuation = Actuation { driven: true, delay_ticks: 1, timeout_ticks: TIMEOUT_TICKS, rearm: Rearm::Auto };
     let mut plant = Plant::new(spinner(), actuation, PERIOD_NS as f64 / 1e9);
@@ -221,7 +222,7 @@ fn built_in(ticks: u64) -> Vec<Event> {
 }
 
 #[test]
-fn a_device_answers_as_the_built_in_plant_does() {
+fn a_device_answers_like_the_built_in_plant() {
     let mut rig = Rig::new(hello(1, false), CLEAN, 1);
     for (tick, expected) in (0..).zip(built_in(50)) {
         assert_eq!(rig.ask(tick, (tick > 0).then(|| value(tick)), 1_000_000_000), Some(expected));
@@ -239,7 +240,7 @@ fn a_device_answers_as_the_built_in_plant_does() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
-    /// Without a clock every request is repeated until it is answered: no fault of the line is seen in the answers.
+    /// Without a clock every request is repeated until it is answered, so that faults of the line do not change the answers.
     #[test]
     fn no_fault_of_the_line_changes_an_answer(seed: u64, drop in 0.0..0.004, corrupt in 0.0..0.004, garbage in 0.0..0.004) {
         let mut rig = Rig::new(hello(1, false), Faults { drop, corrupt, garbage }, seed);
@@ -251,9 +252,9 @@ proptest! {
     }
 }
 
-/// The faults above are not so rare that the test tests nothing.
+/// Faults of this rate occur often enough to be tested.
 #[test]
-fn a_faulty_line_is_seen_in_the_books() {
+fn a_faulty_line_is_counted() {
     let mut rig = Rig::new(hello(1, false), Faults { drop: 0.002, corrupt: 0.002, garbage: 0.002 }, 5);
     for tick in 0..300 {
         assert!(rig.ask(tick, Some(0.0), 3_600_000_000_000).is_some());
@@ -266,9 +267,9 @@ fn a_faulty_line_is_seen_in_the_books() {
     assert!(counters.sequence_gaps > 10 && counters.frames_sent > 330 && counters.late == 0, "{counters:?}");
 }
 
-/// A device that takes 20 ms is not asked twice for ever, where 5 ms are the least patience.
+/// A device that takes 20 ms is asked twice at first only, although 5 ms is the shortest repetition interval.
 #[test]
-fn a_slow_device_is_asked_once_per_tick_after_a_while() {
+fn a_slow_device_is_eventually_asked_once_per_tick() {
     const SLOW_STEPS: usize = 200;
     let mut rig = Rig::new(hello(1, false), CLEAN, 1);
     let mut line = std::collections::VecDeque::from(vec![Vec::new(); SLOW_STEPS]);
@@ -284,7 +285,7 @@ fn a_slow_device_is_asked_once_per_tick_after_a_while() {
         rig.device.receive(&up, rig.now_ns, |frame| down.extend_from_slice(frame));
         line.push_back(down);
         let down = line.pop_front().unwrap();
-        if rig.hear(&down).iter().any(|event| matches!(event, Event::Answer(..))) {
+        if rig.receive(&down).iter().any(|event| matches!(event, Event::Answer(..))) {
             asked.push(rig.host.counters().repeats);
             tick += 1;
             rig.host.request(tick, Samples::default(), rig.now_ns);
@@ -293,22 +294,22 @@ fn a_slow_device_is_asked_once_per_tick_after_a_while() {
     assert!(asked[0] > 0 && asked[39] == asked[9], "{asked:?}");
 }
 
-/// A device that takes more than half of a period for each frame follows again once it was held up: what it has not answered in
-/// time it is not asked again while it is at it.
+/// A device that takes more than half of a period per frame catches up after a delay, because it is not asked again while it
+/// works on a late request.
 #[test]
-fn a_device_that_was_held_up_catches_up() {
-    // How long it takes for a frame, ns: quick at first, so that a request is repeated early.
+fn a_delayed_device_catches_up() {
+    // The time per frame, ns: short at first, so that a request is repeated early.
     let slow = |tick: u64| if tick < 50 { 3_000_000 } else { 5_600_000 };
-    const HELD_UP: u64 = 50;
-    const HELD_UP_NS: u64 = 25_000_000;
+    const DELAYED: u64 = 50;
+    const DELAYED_NS: u64 = 25_000_000;
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     let (mut line, mut busy_ns, mut missed) = (std::collections::VecDeque::new(), 0, Vec::new());
     for tick in 0..200 {
         let end_ns = rig.now_ns + PERIOD_NS;
         rig.host.request(tick, Samples::default(), rig.now_ns);
-        if tick == HELD_UP {
-            busy_ns = rig.now_ns + HELD_UP_NS;
+        if tick == DELAYED {
+            busy_ns = rig.now_ns + DELAYED_NS;
         }
         let mut answered = false;
         while rig.now_ns < end_ns {
@@ -320,7 +321,7 @@ fn a_device_that_was_held_up_catches_up() {
             while let Some((_, up)) = line.pop_front_if(|(done_ns, _)| *done_ns <= rig.now_ns) {
                 let mut down = Vec::new();
                 rig.device.receive(&up, rig.now_ns, |frame| down.extend_from_slice(frame));
-                answered |= rig.hear(&down).iter().any(|event| matches!(event, Event::Answer(..)));
+                answered |= rig.receive(&down).iter().any(|event| matches!(event, Event::Answer(..)));
             }
         }
         if !answered {
@@ -328,50 +329,50 @@ fn a_device_that_was_held_up_catches_up() {
             missed.push(tick);
         }
     }
-    assert!(missed.contains(&HELD_UP) && missed.len() < 10, "{missed:?}");
+    assert!(missed.contains(&DELAYED) && missed.len() < 10, "{missed:?}");
 }
 
 #[test]
-fn a_tick_asked_twice_is_executed_once() {
+fn a_tick_requested_twice_is_executed_once() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     let first = rig.ask(0, None, PERIOD_NS);
     let moved = rig.ask(1, Some(2.0), PERIOD_NS);
     assert!(first.is_some() && moved.is_some());
-    assert_eq!(rig.ask(1, Some(77.0), PERIOD_NS), moved, "the same answer, the other command unheard");
-    assert_eq!(rig.ask(0, None, PERIOD_NS), None, "older than that it says nothing");
+    assert_eq!(rig.ask(1, Some(77.0), PERIOD_NS), moved, "the same answer, without the other command");
+    assert_eq!(rig.ask(0, None, PERIOD_NS), None, "no answer to an older tick");
     let Some(Event::Answer(2, CommandEvent::Applied, measurement, _)) = rig.ask(2, Some(2.0), PERIOD_NS) else {
         panic!()
     };
     assert_eq!(measurement.omega_rad_s[0], 1.0 + 2.0 * 0.01);
 }
 
-/// Ticks that never came are missing commands: held, then safe.
+/// Missing ticks are missing commands: the input is held, then the safe command acts.
 #[test]
-fn ticks_that_were_lost_expire_like_commands() {
+fn missing_ticks_expire_like_missing_commands() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
     rig.ask(1, Some(1.0), PERIOD_NS);
-    // Ticks 2 to 4 are lost, 5 comes without a command: the fourth in a row.
+    // Ticks 2 to 4 are lost and 5 has no command: the fourth missing command in a row.
     let Some(Event::Answer(5, CommandEvent::Expired, measurement, _)) = rig.ask(5, None, PERIOD_NS) else { panic!() };
     assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15 && measurement.applied_rad_s2[0] == 0.0);
     let Some(Event::Answer(6, CommandEvent::Applied, ..)) = rig.ask(6, Some(1.0), PERIOD_NS) else { panic!() };
 }
 
 #[test]
-fn a_device_that_hears_nothing_goes_safe_by_its_own_clock_and_comes_back() {
+fn a_device_without_ticks_applies_the_safe_command_by_its_own_clock_and_recovers() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
     rig.ask(1, Some(1.0), PERIOD_NS);
     assert!(!rig.device.is_safe());
-    let heard_ns = rig.now_ns;
-    rig.device.elapse(heard_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2 - STEP_NS);
+    let executed_ns = rig.now_ns;
+    rig.device.elapse(executed_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2 - STEP_NS);
     assert!(!rig.device.is_safe());
-    rig.device.elapse(heard_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2);
+    rig.device.elapse(executed_ns + TIMEOUT_TICKS * PERIOD_NS + PERIOD_NS / 2);
     assert!(rig.device.is_safe());
-    assert_eq!(rig.ask(5, Some(1.0), PERIOD_NS), None, "it has lived through that tick");
+    assert_eq!(rig.ask(5, Some(1.0), PERIOD_NS), None, "the device has passed that tick");
     let Some(Event::Answer(6, CommandEvent::Applied, measurement, _)) = rig.ask(6, Some(1.0), PERIOD_NS) else {
         panic!()
     };
@@ -379,7 +380,7 @@ fn a_device_that_hears_nothing_goes_safe_by_its_own_clock_and_comes_back() {
 }
 
 #[test]
-fn without_a_clock_silence_means_nothing() {
+fn without_a_clock_there_is_no_timeout() {
     let mut rig = Rig::new(hello(1, false), CLEAN, 1);
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
@@ -389,22 +390,22 @@ fn without_a_clock_silence_means_nothing() {
 }
 
 #[test]
-fn stop_is_safe_at_once_and_the_run_can_go_on() {
+fn stop_applies_the_safe_command_at_once_and_the_run_can_continue() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     assert!(rig.device.is_safe());
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
     rig.ask(1, Some(1.0), PERIOD_NS);
     let stop = rig.host.stop().to_vec();
-    rig.device.receive(&stop, rig.now_ns, |_| panic!("nothing to say to that"));
+    rig.device.receive(&stop, rig.now_ns, |_| panic!("no answer to Stop"));
     assert!(rig.device.is_safe());
     let Some(Event::Answer(2, CommandEvent::Applied, ..)) = rig.ask(2, Some(1.0), PERIOD_NS) else { panic!() };
     assert!(!rig.device.is_safe());
 }
 
-/// A device that was replaced in the middle of a run is asked in vain, then greeted, and begins at its initial state.
+/// A device replaced during a run does not answer, is greeted, and begins at its initial state.
 #[test]
-fn a_device_that_began_anew_is_greeted_at_once() {
+fn a_restarted_device_is_greeted_at_once() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
@@ -418,7 +419,7 @@ fn a_device_that_began_anew_is_greeted_at_once() {
 }
 
 #[test]
-fn a_silent_device_is_greeted_anew_and_goes_on_where_it_was() {
+fn a_silent_device_is_greeted_again_and_continues() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.ask(0, None, PERIOD_NS);
@@ -434,7 +435,10 @@ fn a_silent_device_is_greeted_anew_and_goes_on_where_it_was() {
     let Some(Event::Answer(20, CommandEvent::Applied, measurement, _)) = rig.ask(20, Some(1.0), 20 * PERIOD_NS) else {
         panic!()
     };
-    assert!((measurement.omega_rad_s[0] - 1.04).abs() < 1e-15, "it was safe meanwhile, not reset: {measurement:?}");
+    assert!(
+        (measurement.omega_rad_s[0] - 1.04).abs() < 1e-15,
+        "the safe command acted, and the body was not reset: {measurement:?}"
+    );
     let counters = rig.host.counters();
     assert_eq!((counters.handshakes, counters.restarts, rig.host.silent_ns(rig.now_ns)), (2, 0, 0));
 }
@@ -451,11 +455,11 @@ fn another_run_begins_at_the_initial_state() {
 }
 
 #[test]
-fn who_does_not_fit_is_refused_by_name() {
+fn mismatched_samples_and_roles_are_refused() {
     let (command, measurement) = (RateCommand::LAYOUT, RateMeasurement::LAYOUT);
     for (reads, writes, own) in [
         ("corotate/rigid-body/command/v0", WRITES, command),
-        // Other fields under the same type name, and a host that states none.
+        // Other fields under the same type name, and a host without hashes.
         ("corotate/rigid-body/command/v2#00000000", WRITES, command),
         (RateCommand::TYPE_NAME, WRITES, command),
         ("corotate/rigid-body/command/v2#ff8ce508 more", WRITES, "fewer samples"),
@@ -472,7 +476,7 @@ fn who_does_not_fit_is_refused_by_name() {
     assert!(matches!(rig.until(PERIOD_NS), Some(Event::Refused(Reason::Role, _))));
 }
 
-/// The bytes of a Stop in the words of another version.
+/// Returns the bytes of a Stop of another version.
 fn foreign(version: u8) -> Vec<u8> {
     encode(&[version, 0, 5], &mut [0; MAX_FRAME]).unwrap().to_vec()
 }
@@ -481,15 +485,15 @@ fn foreign(version: u8) -> Vec<u8> {
 fn another_version_is_refused_by_both_ends() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     for version in [1, 9] {
-        assert_eq!(rig.hear(&foreign(version)), [Event::OtherVersion(version)]);
+        assert_eq!(rig.receive(&foreign(version)), [Event::OtherVersion(version)]);
         let mut reply = Vec::new();
         rig.device.receive(&foreign(version), 1, |frame| reply.extend_from_slice(frame));
-        assert!(matches!(&rig.hear(&reply)[..], [Event::Refused(Reason::Version, _)]));
+        assert!(matches!(&rig.receive(&reply)[..], [Event::Refused(Reason::Version, _)]));
     }
 }
 
 #[test]
-fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
+fn late_and_repeated_answers_and_echoes_are_counted_and_dropped() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.host.request(0, Samples::default(), rig.now_ns);
@@ -497,19 +501,19 @@ fn what_comes_late_twice_or_from_the_host_itself_is_counted_and_dropped() {
     let mut answer = Vec::new();
     rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
     rig.host.give_up();
-    assert!(rig.hear(&answer).is_empty());
+    assert!(rig.receive(&answer).is_empty());
     rig.ask(1, Some(1.0), PERIOD_NS).unwrap();
     rig.host.request(2, Samples::default(), rig.now_ns);
     let asked = rig.host.due(rig.now_ns, &rig.hello).unwrap().to_vec();
     let mut answer = Vec::new();
     rig.device.receive(&asked, rig.now_ns, |frame| answer.extend_from_slice(frame));
-    assert_eq!(rig.hear(&answer).len(), 1);
-    assert!(rig.hear(&answer).is_empty() && rig.hear(&asked).is_empty());
+    assert_eq!(rig.receive(&answer).len(), 1);
+    assert!(rig.receive(&answer).is_empty() && rig.receive(&asked).is_empty());
     let counters = rig.host.counters();
     assert_eq!((counters.late, counters.duplicates, counters.echoes, counters.unanswered), (1, 1, 1, 1));
 }
 
-/// A frame of the device with this sequence number, which is no answer to anything that is asked.
+/// Returns a frame of the device with this sequence number that answers no request.
 fn frame_of(sequence: u32) -> Vec<u8> {
     let outputs = Samples { present: 1, bytes: &[0; MEASUREMENT] };
     let answer = Answer { echo: 0, tick: 1000, event: CommandEvent::Held, outputs };
@@ -519,32 +523,32 @@ fn frame_of(sequence: u32) -> Vec<u8> {
 }
 
 proptest! {
-    /// What is lost is counted once, wherever the numbers wrap, and however often frames that were heard come again.
+    /// Lost frames are counted once, across the wrap of the sequence number and with repeated frames.
     #[test]
-    fn frames_that_come_again_are_no_loss(first: u32, fates in prop::collection::vec((any::<bool>(), any::<prop::sample::Index>(), any::<bool>()), 1..200)) {
+    fn repeated_frames_are_not_lost_frames(first: u32, fates in prop::collection::vec((any::<bool>(), any::<prop::sample::Index>(), any::<bool>()), 1..200)) {
         let mut rig = Rig::new(hello(1, true), CLEAN, 1);
-        let (mut heard, mut lost) = (vec![first], 0);
-        rig.hear(&frame_of(first));
+        let (mut received, mut lost) = (vec![first], 0);
+        rig.receive(&frame_of(first));
         let (mut sequence, mut pending) = (first, 0);
         for (arrives, old, again) in fates {
             sequence = sequence.wrapping_add(1);
             if arrives {
-                rig.hear(&frame_of(sequence));
-                heard.push(sequence);
+                rig.receive(&frame_of(sequence));
+                received.push(sequence);
                 lost += std::mem::take(&mut pending);
             } else {
                 pending += 1;
             }
             if again {
-                rig.hear(&frame_of(heard[old.index(heard.len())]));
+                rig.receive(&frame_of(received[old.index(received.len())]));
             }
             prop_assert_eq!(rig.host.counters().sequence_gaps, lost);
         }
     }
 
-    /// Every loss of the device's memory is told once, wherever it happens after an answer, and no other handshake is one.
+    /// Every restart of the device after an answer is counted once, and no other handshake counts as one.
     #[test]
-    fn a_device_that_lost_the_run_is_told_from_one_that_was_away(fates in prop::collection::vec(0..4_u8, 1..30)) {
+    fn a_restarted_device_is_distinguished_from_an_unreachable_one(fates in prop::collection::vec(0..4_u8, 1..30)) {
         let mut rig = Rig::new(hello(1, true), CLEAN, 1);
         rig.greet();
         let (mut restarts, mut tick) = (0, 0);
@@ -556,7 +560,7 @@ proptest! {
                     rig.device = device();
                     restarts += 1;
                 }
-                // It was merely unreachable.
+                // The device was only unreachable.
                 1 => rig.host.cut(rig.now_ns),
                 // Both at once.
                 2 => {
@@ -573,9 +577,9 @@ proptest! {
     }
 }
 
-/// Samples of another length than agreed are no answer.
+/// Answers with samples of another length than agreed are malformed.
 #[test]
-fn an_answer_of_another_length_is_none() {
+fn an_answer_of_another_length_is_malformed() {
     let mut rig = Rig::new(hello(1, true), CLEAN, 1);
     rig.greet();
     rig.host.request(0, Samples::default(), rig.now_ns);
@@ -594,15 +598,15 @@ fn an_answer_of_another_length_is_none() {
         let answer = Answer { echo: 0, tick: 0, event: CommandEvent::NotDue, outputs };
         let payload = write(0, Message::Answer(answer), &mut payload).unwrap();
         let frame = encode(payload, &mut [0; MAX_FRAME]).unwrap().to_vec();
-        let mut heard = 0;
-        frame.iter().for_each(|byte| heard += usize::from(rig.host.push(*byte, rig.now_ns).is_some()));
-        assert_eq!(heard, expected);
+        let mut events = 0;
+        frame.iter().for_each(|byte| events += usize::from(rig.host.push(*byte, rig.now_ns).is_some()));
+        assert_eq!(events, expected);
     }
     assert_eq!(rig.host.counters().malformed, 5);
 }
 
 #[test]
-fn a_real_device_tells_no_truth() {
+fn a_real_device_sends_no_truth() {
     let seat = |hello: &Hello<'_>| Some(DevicePlant::new(spinner(), hello).without_truth());
     let mut device = Device::new("real", seat);
     let mut payload = [0; MAX_PAYLOAD];
@@ -623,14 +627,14 @@ fn a_real_device_tells_no_truth() {
 }
 
 proptest! {
-    /// Neither end fails on any bytes, in whatever state it is; no tick is executed that nobody asked for.
+    /// Neither end panics on any bytes, in any state.
     #[test]
-    fn no_bytes_make_an_end_fail(bytes in prop::collection::vec(any::<u8>(), 0..2000), payloads in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..60), 0..20)) {
+    fn no_bytes_panic(bytes in prop::collection::vec(any::<u8>(), 0..2000), payloads in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..60), 0..20)) {
         let mut rig = Rig::new(hello(1, true), CLEAN, 1);
         rig.greet();
         let frames = payloads.iter().flat_map(|payload| encode(&[&[VERSION][..], payload].concat(), &mut [0; MAX_FRAME]).unwrap().to_vec());
         let bytes = [bytes, frames.collect()].concat();
-        rig.hear(&bytes);
+        rig.receive(&bytes);
         rig.device.receive(&bytes, 0, |_| {});
         rig.device.elapse(u64::MAX);
     }
