@@ -1,6 +1,6 @@
 //! Pure arithmetic of the time grid. Must not read a clock.
 
-/// Ticks at epoch, epoch + h, epoch + 2h, …
+/// The ticks T_k = epoch + k·h.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Grid {
     /// T_0, ns.
@@ -10,19 +10,19 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// T_k, ns.
+    /// Returns T_k, ns.
     #[inline]
     pub fn due_ns(&self, tick: u64) -> u64 {
         self.epoch_ns + tick * self.period_ns
     }
 
-    /// The latest tick that is due at `now_ns`; 0 before the epoch.
+    /// Returns the latest tick due at `now_ns`; 0 before the epoch.
     #[inline]
     pub fn tick_at(&self, now_ns: u64) -> u64 {
         now_ns.saturating_sub(self.epoch_ns) / self.period_ns
     }
 
-    /// The first tick that is not due before `now_ns`.
+    /// Returns the first tick that is due at or after `now_ns`.
     pub fn next_at(&self, now_ns: u64) -> u64 {
         now_ns.saturating_sub(self.epoch_ns).div_ceil(self.period_ns)
     }

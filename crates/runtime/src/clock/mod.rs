@@ -1,4 +1,4 @@
-//! The time grid T_k = epoch + k·h and how to wait on it. Never a relative sleep: deadlines are absolute, so nothing drifts.
+//! The time grid T_k = epoch + k·h and waiting on it. Deadlines are absolute: a relative sleep would drift.
 
 mod grid;
 mod run_clock;
@@ -9,17 +9,17 @@ pub use run_clock::{Correction, RunClock, STEEPEST, adopt};
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, DynamicClockId, Timespec, clock_gettime, clock_gettime_dynamic};
 
-/// Where time comes from.
+/// Source of time stamps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Clock {
     /// CLOCK_MONOTONIC.
     Monotonic,
-    /// None: lockstep and in-process runs look at no time, so they have no latencies either.
+    /// No time: lockstep and in-process runs read no clock and have no latencies.
     None,
 }
 
 impl Clock {
-    /// Nanoseconds on the monotonic clock, or 0 where there is no time.
+    /// Returns the time on the monotonic clock, or 0 without a clock, ns.
     #[inline]
     pub fn now_ns(self) -> u64 {
         match self {
@@ -29,21 +29,21 @@ impl Clock {
     }
 }
 
-/// Nanoseconds on the clock of the run: CLOCK_MONOTONIC, and where the run has several hosts, that of the one which launched it,
-/// [as this one knows it](adopt).
+/// Returns the time on the clock of the run, ns: CLOCK_MONOTONIC or, in a run on several hosts, that of the launching
+/// host [as this one knows it](adopt).
 #[inline]
 pub fn monotonic_ns() -> u64 {
     let raw_ns = raw_ns();
     run_clock::correction().map_or(raw_ns, |correction| correction.apply(raw_ns))
 }
 
-/// Nanoseconds on this host's own CLOCK_MONOTONIC.
+/// Returns the time on this host's own CLOCK_MONOTONIC, ns.
 #[inline]
 pub fn raw_ns() -> u64 {
     nanoseconds(clock_gettime(ClockId::Monotonic))
 }
 
-/// Nanoseconds from CLOCK_MONOTONIC to CLOCK_TAI on this host; 0 on a system without it.
+/// Returns the offset from CLOCK_MONOTONIC to CLOCK_TAI on this host, ns; 0 on a system without CLOCK_TAI.
 pub fn tai_offset_ns() -> i64 {
     let between = || {
         let before_ns = raw_ns();
@@ -51,7 +51,7 @@ pub fn tai_offset_ns() -> i64 {
         let after_ns = raw_ns();
         Some((after_ns - before_ns, tai_ns as i64 - (before_ns / 2 + after_ns / 2) as i64))
     };
-    // Of several readings the one that nothing came between.
+    // The fastest of several readings was not interrupted.
     let fastest = (0..5).filter_map(|_| between()).min();
     fastest.map_or(0, |(_, offset_ns)| offset_ns)
 }
@@ -60,7 +60,7 @@ fn nanoseconds(time: Timespec) -> u64 {
     time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
 }
 
-/// Sleeps until `due_ns` on the clock of the run; returns at once if that is past. A signal may end it early.
+/// Sleeps until `due_ns` on the clock of the run; returns at once if that is past. A signal may end the sleep early.
 #[inline]
 pub fn sleep_until(due_ns: u64) {
     let due_ns = match run_clock::correction() {
@@ -68,13 +68,13 @@ pub fn sleep_until(due_ns: u64) {
         None => due_ns,
     };
     let due = Timespec { tv_sec: (due_ns / 1_000_000_000) as i64, tv_nsec: (due_ns % 1_000_000_000) as _ };
-    // Interrupted or not, the caller looks at the clock again.
+    // The caller reads the clock again, interrupted or not.
     let _ = clock_nanosleep_absolute(ClockId::Monotonic, &due);
 }
 
-/// Waits until `due_ns`: sleeps until `lead_ns` before, then spins. Returns the time at which it ended.
+/// Sleeps until `lead_ns` before `due_ns`, then spins until `due_ns`. Returns the time at the end.
 ///
-/// The spin is bounded by the lead: a wake that comes early is followed by at most that much of it.
+/// The spin lasts at most `lead_ns`.
 #[inline]
 pub fn wait_until(due_ns: u64, lead_ns: u64) -> u64 {
     loop {

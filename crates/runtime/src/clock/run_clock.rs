@@ -1,8 +1,8 @@
-//! The time of a run whose hosts have clocks of their own: each host's monotonic clock with a correction, so that all ticks and
-//! stamps of the run are on one time base, that of the host which launched it.
+//! The clock of a run on several hosts: each host's monotonic clock plus a correction, so that all ticks and stamps
+//! have the time base of the launching host.
 //!
-//! The correction is a line that one process of the host writes and all others of the run there read from shared memory. It has no
-//! step: a new line begins where the old one is. Must not know how the correction is found.
+//! The correction is a linear function of time without steps: a new line begins where the old one is. One process of
+//! each host writes it to shared memory, the others read it. Must not know how the correction is found.
 
 use crate::shared::SharedWords;
 use std::io;
@@ -10,15 +10,15 @@ use std::path::Path;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
-/// Counts the lines; the one that holds is in the place of its parity, and the next is written into the other.
+/// Number of lines written. Its parity selects the current of two slots; the next line goes into the other slot.
 const SEQUENCE: usize = 0;
 /// Words of a line: reference, offset, slope.
 const LINE: usize = 3;
 const WORDS: usize = 1 + 2 * LINE;
 
-/// The fraction of a slope: 2⁻⁴⁰.
+/// Fraction bits of a slope, in units of 2⁻⁴⁰.
 const FRACTION: u32 = 40;
-/// The steepest line, ns per ns: what a clock is moved by at the most while it catches up.
+/// The steepest slope, ns per ns: bounds the rate at which a clock catches up.
 pub const STEEPEST: f64 = 500e-6;
 
 /// A line: the correction of the monotonic clock as a function of that clock.
@@ -26,25 +26,26 @@ pub const STEEPEST: f64 = 500e-6;
 pub struct Correction {
     reference_ns: u64,
     offset_ns: i64,
-    /// Ns per ns, as a multiple of 2⁻⁴⁰.
+    /// Slope in ns per ns, as a multiple of 2⁻⁴⁰.
     slope: i64,
 }
 
 impl Correction {
-    /// `offset_ns` at `reference_ns` on the monotonic clock, and from there on `slope` ns more per ns, at most [`STEEPEST`].
+    /// Creates a line through `offset_ns` at `reference_ns`, with a slope in ns per ns that is limited to
+    /// ±[`STEEPEST`].
     pub fn new(reference_ns: u64, offset_ns: i64, slope: f64) -> Self {
         let slope = (slope.clamp(-STEEPEST, STEEPEST) * (1_u64 << FRACTION) as f64) as i64;
         Self { reference_ns, offset_ns, slope }
     }
 
-    /// The correction at a time on the monotonic clock, ns.
+    /// Returns the correction at a time on the monotonic clock, ns.
     #[inline]
     pub fn at(&self, raw_ns: u64) -> i64 {
         let elapsed_ns = i128::from(raw_ns) - i128::from(self.reference_ns);
         self.offset_ns + ((elapsed_ns * i128::from(self.slope)) >> FRACTION) as i64
     }
 
-    /// The time of the run at a time on the monotonic clock, ns.
+    /// Returns the time of the run at a time on the monotonic clock, ns.
     #[inline]
     pub fn apply(&self, raw_ns: u64) -> u64 {
         raw_ns.saturating_add_signed(self.at(raw_ns))
@@ -56,7 +57,7 @@ impl Correction {
 pub struct RunClock(SharedWords);
 
 impl RunClock {
-    /// The one in a file, made if it is not there: then it corrects nothing.
+    /// Opens the correction in a file; creates one without effect if the file is missing.
     ///
     /// # Errors
     /// The system's reason.
@@ -69,7 +70,11 @@ impl RunClock {
     }
 
     fn whole(words: SharedWords) -> io::Result<Self> {
-        if words.words().len() == WORDS { Ok(Self(words)) } else { Err(io::Error::other("it is another version's")) }
+        if words.words().len() == WORDS {
+            Ok(Self(words))
+        } else {
+            Err(io::Error::other("it is a file of another version"))
+        }
     }
 
     fn line(&self, sequence: u64) -> &[AtomicU64] {
@@ -77,17 +82,17 @@ impl RunClock {
         &self.0.words()[place..place + LINE]
     }
 
-    /// Replaces the correction. There is one writer; where it dies the one before still holds.
+    /// Replaces the correction. One writer only; if it dies while writing, the previous correction stays valid.
     pub fn set(&self, correction: Correction) {
         let next = self.0.words()[SEQUENCE].load(Ordering::Relaxed) + 1;
-        // Whoever sees anything of this line sees too that the one which was in its place holds no more.
+        // A reader that sees a word of the new line also sees the sequence number that made its old line invalid.
         fence(Ordering::Release);
         let words = [correction.reference_ns, correction.offset_ns as u64, correction.slope as u64];
         self.line(next).iter().zip(words).for_each(|(place, word)| place.store(word, Ordering::Relaxed));
         self.0.words()[SEQUENCE].store(next, Ordering::Release);
     }
 
-    /// The correction. Nobody is waited for: it is read again only if there was a new one meanwhile.
+    /// Returns the correction without blocking: reads again only if a new one was written meanwhile.
     #[inline]
     pub fn get(&self) -> Correction {
         let sequence = &self.0.words()[SEQUENCE];
@@ -105,10 +110,10 @@ impl RunClock {
 
 static OF_THIS_PROCESS: OnceLock<RunClock> = OnceLock::new();
 
-/// Takes the time of this process from the correction in a file, from now on and for good, if there is such a file.
+/// Makes this process use the correction in a file permanently, if the file exists.
 ///
 /// # Errors
-/// The system's reason, but for a file that is not there.
+/// The system's reason, except for a missing file.
 pub fn adopt(path: &Path) -> io::Result<()> {
     match RunClock::existing(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
@@ -118,7 +123,7 @@ pub fn adopt(path: &Path) -> io::Result<()> {
     }
 }
 
-/// The correction of this process's clock; none where there is one host, and on the one that launched the run.
+/// Returns the correction of this process's clock; `None` in a run on one host, and on the launching host.
 #[inline]
 pub(super) fn correction() -> Option<Correction> {
     OF_THIS_PROCESS.get().map(RunClock::get)
@@ -135,8 +140,8 @@ mod tests {
         let ten_hours_ns = 36_000_000_000_000;
         let drifted_ns = line.at(1_000 + ten_hours_ns) - line.at(1_000);
         assert!((drifted_ns - 1_800_000_000).abs() <= 100, "{drifted_ns}");
-        assert_eq!(Correction::new(0, 5, -1.0).at(1_000_000) - 5, -500, "no clock stands still");
-        assert_eq!(Correction::new(0, -10, 0.0).apply(3), 0, "there is no time before zero");
+        assert_eq!(Correction::new(0, 5, -1.0).at(1_000_000) - 5, -500, "the slope is limited");
+        assert_eq!(Correction::new(0, -10, 0.0).apply(3), 0, "time does not become negative");
     }
 
     #[test]

@@ -1,29 +1,31 @@
-//! Notes when a device stopped answering and when it answered again, by the host's requests and its answers.
+//! Records outages of a device from the host's requests and the device's answers.
 //!
-//! Must not do I/O, look at a clock, or end anything.
+//! Must not do I/O, read a clock, or end anything.
 
 use crate::telemetry::Outage;
 
-/// A device that has not answered for less than this is late, not absent, ns.
+/// Silence up to this duration counts as late, not as an outage, ns.
 const SILENT_NS: u64 = 250_000_000;
-/// The most that one look adds to a silence, ns, and in real time, in periods: the host may have been stopped itself.
+/// Upper bound on the silence that one poll adds, in ns and, in real time, in periods: the host itself may have been
+/// stopped.
 const LOOK_MAX_NS: u64 = 100_000_000;
 const LOOK_PERIODS: u64 = 4;
-/// Outages that find room without allocation.
+/// Number of outages that are recorded without allocation.
 const OUTAGES: usize = 64;
 
-/// The absences of one device.
+/// The outages of one device.
 pub(super) struct Absences {
-    /// A longer silence is an outage, ns; in real time only: where ticks wait, a slow device costs nothing.
+    /// A longer silence is an outage, ns. Unlimited without real time: there ticks wait, and a slow device costs
+    /// nothing.
     limit_ns: u64,
     look_max_ns: u64,
     wait: Option<Wait>,
-    /// The last tick that was answered.
+    /// The last answered tick.
     answered: Option<u64>,
     ended: Vec<Wait>,
 }
 
-/// Requests without an answer since some tick.
+/// Requests without an answer, from `tick` on.
 #[derive(Debug, Default)]
 struct Wait {
     tick: u64,
@@ -43,7 +45,7 @@ impl Wait {
             false => format!("its device did not answer for {seconds:.2} s"),
         };
         if self.restarted {
-            cause.push_str("; the device that answered had lost the run and began anew");
+            cause.push_str("; the device that answered had lost the run and started again");
         }
         if let Some(name) = &self.renamed {
             cause.push_str(&format!("; another device answered: {name}"));
@@ -59,19 +61,19 @@ impl Wait {
 }
 
 impl Absences {
-    /// Absences of a device in a run; with a `period_ns` where ticks follow the clock.
+    /// Creates an empty record; `period_ns` is given only in real time.
     pub fn new(period_ns: Option<u64>, timeout_ticks: u64) -> Self {
         let limit_ns = period_ns.map_or(u64::MAX, |period_ns| SILENT_NS.max(timeout_ticks.saturating_mul(period_ns)));
         let look_max_ns = period_ns.map_or(LOOK_MAX_NS, |period_ns| LOOK_PERIODS.saturating_mul(period_ns));
         Self { limit_ns, look_max_ns, wait: None, answered: None, ended: Vec::with_capacity(OUTAGES) }
     }
 
-    /// Notes that a tick is asked for.
+    /// Records a request for a tick.
     pub fn asked(&mut self, tick: u64, now_ns: u64) {
         self.wait.get_or_insert_with(|| Wait { tick, looked_ns: now_ns, ..Wait::default() });
     }
 
-    /// Looks at the line once more.
+    /// Adds the time since the last poll to the silence; `open` is the state of the line.
     pub fn look(&mut self, now_ns: u64, open: bool) {
         if let Some(wait) = &mut self.wait {
             wait.waited_ns += now_ns.saturating_sub(wait.looked_ns).min(self.look_max_ns);
@@ -80,7 +82,7 @@ impl Absences {
         }
     }
 
-    /// Notes that the device was greeted again, with the tick that it would answer next, and its name if that is another one.
+    /// Records a new greeting: the tick that the device would answer next, and its name if the name changed.
     pub fn greeted(&mut self, next_tick: u64, renamed: Option<&str>) {
         if let Some(wait) = &mut self.wait {
             wait.restarted |= self.answered.is_some_and(|answered| next_tick <= answered);
@@ -88,7 +90,7 @@ impl Absences {
         }
     }
 
-    /// Notes that a tick was answered.
+    /// Records an answered tick.
     pub fn answered(&mut self, tick: u64) {
         self.answered = Some(tick);
         if let Some(wait) = self.wait.take().filter(|wait| self.is_outage(wait)) {
@@ -100,7 +102,7 @@ impl Absences {
         wait.cut || wait.restarted || wait.renamed.is_some() || wait.waited_ns > self.limit_ns
     }
 
-    /// Returns what happened so far.
+    /// Returns all outages so far, including one that still lasts.
     pub fn outages(&self) -> Vec<Outage> {
         let lasting = self.wait.iter().filter(|wait| self.is_outage(wait));
         self.ended.iter().chain(lasting).map(Wait::outage).collect()
@@ -113,7 +115,7 @@ mod tests {
 
     const PERIOD_NS: u64 = 5_000_000;
 
-    /// Asks for ticks, one a period; those in `silent` are not answered, those in `cut` find the line closed.
+    /// Requests one tick per period. Ticks in `silent` stay unanswered; in `cut` the line is closed.
     fn outages(
         mut absences: Absences,
         silent: std::ops::Range<u64>,
@@ -141,7 +143,7 @@ mod tests {
         let found = outages(realtime(), 100..151, 0..0, 200);
         assert_eq!((found.len(), found[0].tick, found[0].back_at_tick), (1, 100, Some(151)));
         assert!((found[0].seconds - 0.255).abs() < 1e-9, "{found:?}");
-        assert!(outages(Absences::new(None, 5), 100..199, 0..0, 200).is_empty(), "where ticks wait it costs nothing");
+        assert!(outages(Absences::new(None, 5), 100..199, 0..0, 200).is_empty(), "without real time ticks wait");
     }
 
     #[test]
@@ -154,9 +156,9 @@ mod tests {
         assert_eq!((found.len(), found[0].tick, found[0].back_at_tick), (1, 100, None));
     }
 
-    /// A host that was stopped itself did not listen.
+    /// A host that was stopped did not poll the line.
     #[test]
-    fn time_without_a_look_is_no_silence() {
+    fn time_without_a_poll_does_not_count_as_silence() {
         let mut absences = realtime();
         absences.asked(7, 0);
         absences.look(60_000_000_000, true);
@@ -165,10 +167,10 @@ mod tests {
     }
 
     #[test]
-    fn another_device_and_one_that_lost_the_run_are_told() {
+    fn a_replaced_device_and_a_restarted_device_are_outages() {
         for (next_tick, renamed) in [(0, None), (8, Some("other 2"))] {
             let mut absences = realtime();
-            // A device that has answered nothing yet has nothing to lose.
+            // A device without any answer has no run to lose.
             absences.asked(7, 0);
             absences.greeted(0, None);
             absences.answered(7);

@@ -5,11 +5,11 @@
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
-/// The budget in the commands that grant one, us of each second.
+/// The budget in the suggested commands, µs per second.
 const GRANTED_US: u32 = 900_000;
 
-/// Returns the budget files of this process's cgroup and of its parents that hold zero, the outermost first. Empty where
-/// the kernel keeps no such budgets. `root` is the directory of the machine's files.
+/// Returns the budget files with value zero of this process's cgroup and its parents, outermost first. Empty where the
+/// kernel keeps no such budgets. `root` is the root of the machine's files.
 pub fn empty_budgets(root: &Path) -> Vec<PathBuf> {
     let read = |path: &str| fs::read_to_string(root.join(path)).unwrap_or_default();
     find(&read("proc/self/cgroup"), &read("proc/self/mountinfo"))
@@ -21,13 +21,13 @@ pub fn empty_budgets(root: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Returns the commands that grant a budget to each of these files.
+/// Returns the shell commands that grant a budget in each file.
 pub fn grant_budgets(files: &[PathBuf]) -> String {
     let commands = files.iter().map(|file| format!("echo {GRANTED_US} > {}", file.display()));
     commands.collect::<Vec<_>>().join("; ")
 }
 
-/// Returns the budget files of the cgroups of the controller `cpu`, version 1, the outermost first. Version 2 has none.
+/// Returns the budget files of the cgroups of controller `cpu` (version 1), outermost first. Version 2 has no budgets.
 fn find(cgroups: &str, mounts: &str) -> Vec<PathBuf> {
     let has_cpu = |list: &str| list.split(',').any(|name| name == "cpu");
     // "1:cpu,cpuacct:/path"
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn no_text_makes_it_fail() {
+    fn arbitrary_text_does_not_panic() {
         for (cgroups, mounts) in [("1:cpu:/", " - "), ("1:cpu:/", "a b c d e f - cgroup x"), ("::", "- - - -")] {
             let _ = find(cgroups, mounts);
         }

@@ -1,7 +1,7 @@
-//! The link to a device in a role's seat.
+//! The link to a device that takes the place of a role.
 //!
-//! A silent device is waited for, asked again, greeted anew, and its line opened again, for a bounded time. Must not know
-//! what its samples mean.
+//! While the device is silent, the link repeats its request, greets the device again and reopens the line, for a
+//! bounded time. Must not know the meaning of samples.
 
 use super::absence::Absences;
 use super::error::DeviceError;
@@ -21,38 +21,38 @@ use crate::telemetry::Outage;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Between two tries to open a line again, ns.
+/// Pause between two attempts to reopen a line, ns.
 const REOPEN_NS: u64 = 100_000_000;
-/// Between two looks at the line while the device is greeted for the first time, ns.
+/// Pause between two polls of the line during the first greeting, ns.
 const LOOK_NS: u64 = 1_000_000;
-/// For so long refusals of earlier greetings are ignored once a device is greeted by type names alone, ns.
+/// Period in which refusals of earlier greetings are ignored, after the greeting dropped the layout hashes, ns.
 const BARE_NS: u64 = 1_000_000_000;
-/// How many bytes are taken from the line at once, and how often in one turn: garbage must not hold up a tick.
+/// Bytes per read, and reads per turn: garbage must not delay a tick.
 const CHUNK: usize = 512;
 const CHUNKS: usize = 4;
-/// Bits on the line per byte: start, eight, stop.
+/// Bits on the line per byte: start, eight data bits, stop.
 const BITS_PER_BYTE: u64 = 10;
-/// Bytes of a frame beside the samples in it: delimiters, COBS, CRC, numbers; the least.
+/// Lower bound on the bytes of a frame besides its samples: delimiters, COBS, CRC, numbers.
 const FRAME_OVERHEAD: u64 = 14;
 
-/// Which seat a device takes, and where it is.
+/// The roles of a device, and its line.
 #[derive(Debug, Clone)]
 pub struct DeviceConfig {
     /// The domain's directory.
     pub domain: PathBuf,
-    /// The role's name: a driven body's, `observer` or `controller`; or both of these.
+    /// Role names: a driven body, `observer` or `controller`; or both of the latter.
     pub roles: Vec<String>,
     /// The device's serial line.
     pub path: PathBuf,
-    /// Its speed, bit/s; as it is, if none.
+    /// Line speed, bit/s; `None` keeps the current one.
     pub baud: Option<u32>,
-    /// How long a silent device, or one that is gone, is waited for, s.
+    /// Patience with a silent or absent device, s.
     pub patience_s: f64,
-    /// Go on with a device of another name that answers in the midst of a run.
+    /// True to accept a device with another name during the run.
     pub other_device: bool,
 }
 
-/// What a device is greeted with.
+/// The content of the greeting.
 #[derive(Debug, Clone)]
 struct Greeting {
     run: u64,
@@ -64,7 +64,7 @@ struct Greeting {
     role: String,
     reads: String,
     writes: String,
-    /// Since when the samples are named without the hashes of their layouts, ns.
+    /// Time since which samples are named without layout hashes, ns.
     bare_since_ns: Option<u64>,
 }
 
@@ -83,8 +83,8 @@ impl Greeting {
         }
     }
 
-    /// Names the samples without the hashes of their layouts from now on if the device refuses because it knows none: then it
-    /// names one of them so itself. Returns false if that is not why it refuses.
+    /// Drops the layout hashes from the greeting if the device refuses because it knows none: it then names a sample
+    /// without a hash. Returns false if the refusal has another reason.
     fn drop_hashes(&mut self, refuse: &Refuse<'_>, now_ns: u64) -> bool {
         let mut names = self.reads.split(' ').chain(self.writes.split(' '));
         if refuse.reason != Reason::Samples || !names.any(|name| type_name_of(name) == refuse.detail) {
@@ -93,26 +93,27 @@ impl Greeting {
         let bare = |names: &str| names.split(' ').map(type_name_of).collect::<Vec<_>>().join(" ");
         let since_ns = *self.bare_since_ns.get_or_insert(now_ns);
         (self.reads, self.writes) = (bare(&self.reads), bare(&self.writes));
-        // Refusals of earlier greetings may still be on their way.
+        // Refusals of earlier greetings may still arrive.
         now_ns.saturating_sub(since_ns) < BARE_NS
     }
 }
 
-/// The samples that pass over the line: names of their layouts, and bytes after the stamp.
+/// The samples on the line: layout names, and lengths without the stamp in bytes.
 struct Layouts {
     reads: Vec<(&'static str, usize)>,
     writes: Vec<(&'static str, usize)>,
 }
 
 impl Layouts {
-    /// Those of a role, or of observer and controller together, which keep the estimate to themselves.
+    /// Returns the layouts of one role, or of observer and controller together; the latter two exchange the estimate
+    /// inside the device.
     fn for_roles(scenario: &Settings, roles: &[RoleId]) -> Self {
         let mut layouts = Self { reads: Vec::new(), writes: Vec::new() };
         for role in roles {
             let ports = ports(scenario, *role);
-            let kept = usize::from(roles.len() > 1 && *role == RoleId::Controller);
+            let internal = usize::from(roles.len() > 1 && *role == RoleId::Controller);
             let layout = |port: &Port| (port.layout, port.size - size_of::<Stamp>());
-            layouts.reads.extend(ports.reads.iter().skip(kept).map(layout));
+            layouts.reads.extend(ports.reads.iter().skip(internal).map(layout));
             layouts.writes.extend(ports.writes.iter().map(layout));
         }
         layouts
@@ -126,7 +127,7 @@ impl Layouts {
         layouts.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(" ")
     }
 
-    /// Refuses what no message could hold.
+    /// Checks that a message can hold the samples.
     fn check(&self, role: &str) -> Result<(), DeviceError> {
         let [read, written]: [usize; 2] =
             [&self.reads, &self.writes].map(|layouts| Self::lengths(layouts).iter().sum());
@@ -144,22 +145,22 @@ pub struct DeviceLink {
     line: Line,
     host: HostSession,
     greeting: Greeting,
-    /// Bytes of each sample that the device reads, in order.
+    /// Length of each sample that the device reads, bytes.
     inputs: Vec<usize>,
     patience_ns: u64,
     reopen_ns: u64,
-    /// The name of the device that has the seat, once it has said it.
+    /// The device's name, once known.
     device: Option<String>,
     other_device: bool,
     absences: Absences,
 }
 
 impl DeviceLink {
-    /// Opens the line to a device that is to have these roles of a scenario; `run` tells this run from others.
+    /// Opens the line to a device that takes these roles of a scenario; `run` identifies the run.
     ///
     /// # Errors
     /// [`DeviceError::Line`], [`DeviceError::Delayed`], [`DeviceError::TooLong`] and [`DeviceError::TooSlow`].
-    pub fn open(seat: &DeviceConfig, scenario: &Settings, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
+    pub fn open(config: &DeviceConfig, scenario: &Settings, roles: &[RoleId], run: u64) -> Result<Self, DeviceError> {
         let body = matches!(roles, [RoleId::Plant(_)]);
         if body && scenario.actuation_delay_ticks > 1 {
             return Err(DeviceError::Delayed { ticks: scenario.actuation_delay_ticks });
@@ -168,7 +169,7 @@ impl DeviceLink {
         let role = roles.iter().map(|role| role.name(scenario)).collect::<Vec<_>>().join(" ");
         layouts.check(&role)?;
         let (inputs, written) = (Layouts::lengths(&layouts.reads), Layouts::lengths(&layouts.writes));
-        check_speed(seat.baud, scenario, inputs.iter().chain(&written).sum())?;
+        check_speed(config.baud, scenario, inputs.iter().chain(&written).sum())?;
         let realtime = scenario.clock == ClockKind::Realtime;
         let mut outputs = [0; MAX_SAMPLES];
         outputs.iter_mut().zip(&written).for_each(|(output, length)| *output = *length as u16);
@@ -176,7 +177,7 @@ impl DeviceLink {
             run,
             period_ns: realtime.then_some(scenario.period_ns),
             outputs,
-            // A measurement, or an estimate. A controller may withhold any command.
+            // A measurement or an estimate is required. A controller may omit any command.
             required: u32::from(roles != [RoleId::Controller]),
         };
         let greeting = Greeting {
@@ -191,8 +192,8 @@ impl DeviceLink {
             writes: Layouts::names(&layouts.writes),
             bare_since_ns: None,
         };
-        let patience_ns = (seat.patience_s * 1e9) as u64;
-        let line = Line::open(&seat.path, seat.baud)?;
+        let patience_ns = (config.patience_s * 1e9) as u64;
+        let line = Line::open(&config.path, config.baud)?;
         Ok(Self {
             line,
             host: HostSession::new(terms),
@@ -201,27 +202,27 @@ impl DeviceLink {
             patience_ns,
             reopen_ns: 0,
             device: None,
-            other_device: seat.other_device,
+            other_device: config.other_device,
             absences: Absences::new(terms.period_ns, scenario.command_timeout_ticks),
         })
     }
 
-    /// The names of its roles, with spaces between them.
+    /// Returns the names of the roles, separated by spaces.
     pub(crate) fn role(&self) -> &str {
         &self.greeting.role
     }
 
-    /// Bytes of each sample that the device reads, in order.
+    /// Returns the length of each sample that the device reads, bytes.
     pub(super) fn inputs(&self) -> &[usize] {
         &self.inputs
     }
 
-    /// Bytes of each sample that the device writes, in order.
+    /// Returns the length of each sample that the device writes, bytes.
     pub(super) fn outputs(&self) -> Vec<usize> {
         self.host.terms().outputs.iter().map(|length| usize::from(*length)).take_while(|length| *length > 0).collect()
     }
 
-    /// Returns what a reader must know of the device's samples, to stand behind its name.
+    /// Returns a remark on the device's samples, to follow its name.
     pub(crate) fn remark(&self) -> &'static str {
         match self.greeting.bare_since_ns.is_some() {
             true => " (states no layouts: its samples are trusted by their type names)",
@@ -229,11 +230,11 @@ impl DeviceLink {
         }
     }
 
-    /// Greets the device until it says welcome; gives its name, or `None` if `terminated` came first. The device `before` is the one
-    /// that an earlier bridge had in this run.
+    /// Greets the device until it answers; returns its name, or `None` if `terminated` is set first. `before` is the
+    /// name of the device that an earlier bridge had in this run.
     ///
     /// # Errors
-    /// [`DeviceError`] if it refuses, or stays silent for too long.
+    /// [`DeviceError`] if the device refuses or stays silent for too long.
     pub fn greet(&mut self, before: Option<String>, terminated: &AtomicBool) -> Result<Option<String>, DeviceError> {
         self.device = before;
         while !terminated.load(Ordering::Relaxed) {
@@ -247,22 +248,22 @@ impl DeviceLink {
         Ok(None)
     }
 
-    /// Asks for a tick from now on.
+    /// Requests a tick, and repeats the request until it is answered.
     #[inline]
     pub fn request(&mut self, tick: u64, samples: Samples<'_>, now_ns: u64) {
         self.host.request(tick, samples, now_ns);
         self.absences.asked(tick, now_ns);
     }
 
-    /// Asks no more for the tick at hand.
+    /// Stops requesting the current tick.
     pub fn give_up(&mut self) {
         self.host.give_up();
     }
 
-    /// One turn: takes what has arrived, sends what is due. `answer` gets the answer to the tick at hand.
+    /// Processes received bytes and sends due frames. `answer` receives the answer to the current tick.
     ///
     /// # Errors
-    /// [`DeviceError`] if the device has been away for too long, or will not take part any more.
+    /// [`DeviceError`] if the device was silent for too long or refuses to continue.
     #[inline]
     pub fn turn(&mut self, now_ns: u64, answer: impl FnMut(&Answer<'_>)) -> Result<(), DeviceError> {
         self.exchange(now_ns, answer)
@@ -304,9 +305,9 @@ impl DeviceLink {
                     Some(DeviceEvent::OtherVersion(theirs)) => {
                         return Err(DeviceError::Version { path: line.path().to_owned(), theirs });
                     }
-                    Some(DeviceEvent::Answer(heard)) => {
-                        absences.answered(heard.tick);
-                        answer(&heard);
+                    Some(DeviceEvent::Answer(received)) => {
+                        absences.answered(received.tick);
+                        answer(&received);
                     }
                     Some(DeviceEvent::Welcome(welcome)) => {
                         let renamed = welcomed(line, &welcome, device, *other_device)?;
@@ -321,7 +322,7 @@ impl DeviceLink {
         Ok(())
     }
 
-    /// Tries now and then; true if the line is open again.
+    /// Tries at intervals to open the line; returns true if it is open.
     fn open_again(&mut self, now_ns: u64) -> bool {
         if now_ns < self.reopen_ns {
             return false;
@@ -352,25 +353,25 @@ impl DeviceLink {
         DeviceError::Silent { path: self.line.path().to_owned(), waited_s, hint }
     }
 
-    /// The line's counters.
+    /// Returns the counters of the line.
     pub fn counters(&self) -> LineCounters {
         self.host.counters()
     }
 
-    /// When the device was absent.
+    /// Returns the device's outages.
     pub fn outages(&self) -> Vec<Outage> {
         self.absences.outages()
     }
 }
 
-/// Keeps the name that a device says; returns true if it is another than before, and that is allowed.
+/// Stores the device's name; returns true if another name replaced an earlier one and that is allowed.
 fn welcomed(
     line: &Line,
     welcome: &Welcome<'_>,
     device: &mut Option<String>,
     other_device: bool,
 ) -> Result<bool, DeviceError> {
-    // A device is greeted again while ticks run, and nothing is allocated for one that is still the same.
+    // The device is greeted again while ticks run: nothing is allocated for an unchanged name.
     if device.as_ref().is_some_and(|expected| welcome.device.escape_debug().eq(expected.chars())) {
         return Ok(false);
     }
@@ -385,13 +386,13 @@ fn welcomed(
 }
 
 impl Drop for DeviceLink {
-    /// However this ends, the device is told to go to its safe command; if that is lost, it does so by itself.
+    /// Tells the device to apply its safe command. If that frame is lost, the device does so by its own timeout.
     fn drop(&mut self) {
         self.line.write(self.host.stop());
     }
 }
 
-/// What a device says may be anything; a terminal must survive it.
+/// Escapes text from the device, which may contain control characters.
 fn printable(text: &str) -> String {
     text.escape_debug().to_string()
 }
@@ -411,7 +412,7 @@ fn refused(line: &Line, greeting: &Greeting, refuse: &Refuse<'_>) -> DeviceError
     DeviceError::Refused { path: line.path().to_owned(), role: greeting.role.clone(), reason }
 }
 
-/// Whether a tick and its answer have room in the period.
+/// Checks that a request and its answer fit into the period.
 fn check_speed(baud: Option<u32>, scenario: &Settings, content: usize) -> Result<(), DeviceError> {
     let (Some(baud), ClockKind::Realtime) = (baud, scenario.clock) else { return Ok(()) };
     let bits = BITS_PER_BYTE * (2 * FRAME_OVERHEAD + content as u64);

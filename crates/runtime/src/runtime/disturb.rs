@@ -1,6 +1,6 @@
-//! Scripted faults at the places where they act: a writing end's samples, and a role before its tick.
+//! Scripted faults where they act: on the samples of a writing end, and on a role before its tick.
 //!
-//! Must cost an undisturbed role nothing but one look whether there is anything to do.
+//! Must cost an undisturbed role no more than one check.
 
 use crate::bus::{Carried, Signal};
 use crate::clock::{monotonic_ns, sleep_until};
@@ -10,49 +10,50 @@ use crate::state::{Persist, Words};
 use crate::telemetry::TickCounters;
 use std::borrow::{Borrow, BorrowMut};
 
-/// What happens to the samples of one signal.
+/// The scripted faults on the samples of one signal.
 #[derive(Debug)]
 pub struct Disturbance<S: Carried + ?Sized> {
     faults: Vec<FaultSequence>,
-    /// Samples that are held back, each with the tick at which it is sent, in the order in which they are sent. As much room
-    /// as can ever be needed is taken at the start.
+    /// Delayed samples, each with the tick at which it is sent, in sending order. The capacity for the worst case is
+    /// allocated at the start.
     late: Vec<(u64, S::Owned)>,
     room: usize,
-    /// How many bodies the signal tells of.
+    /// Number of bodies in a sample.
     bodies: usize,
 }
 
 impl<S: Carried + ?Sized> Disturbance<S> {
-    /// What a scenario does to a role's signal about a body, or a fleet of so many, from a tick on; nothing if there is
-    /// nothing.
+    /// Returns a scenario's faults on a role's signal about a body, or a fleet of `bodies`, from `next_tick` on; `None`
+    /// without faults.
     pub fn for_signal(scenario: &Settings, role: &str, body: &str, bodies: usize, next_tick: u64) -> Option<Box<Self>> {
-        Self::new(courses(scenario, role, Some(body), next_tick), bodies)
+        Self::new(fault_sequences(scenario, role, Some(body), next_tick), bodies)
     }
 
     fn new(faults: Vec<FaultSequence>, bodies: usize) -> Option<Box<Self>> {
-        let kept = |course: &FaultSequence| delay_bound(course.fault()).min(course.fault().ticks) as usize;
-        // One is added before those that are due are let go.
+        let kept = |sequence: &FaultSequence| delay_bound(sequence.fault()).min(sequence.fault().ticks) as usize;
+        // A sample is added before the due ones are removed.
         let room = faults.iter().map(kept).sum::<usize>() + 1;
         (!faults.is_empty()).then(|| Box::new(Self { faults, late: Vec::with_capacity(room), room, bodies }))
     }
 
-    /// Changes the content of the sample of `tick` and tells whether anything was changed. `last` was sent before.
+    /// Changes the content of the sample of `tick`; returns true if a content fault acted. `last` is the sample sent
+    /// before.
     pub fn alter_content(&mut self, tick: u64, sample: &mut S, last: &S) -> bool {
-        let acting = self.faults.iter_mut().filter_map(|course| course.acts(tick).then_some(course.fault()));
+        let acting = self.faults.iter_mut().filter_map(|sequence| sequence.acts(tick).then_some(sequence.fault()));
         acting.filter(|fault| fault.alters_content()).map(|fault| fault.alter_content(tick, sample, last)).count() > 0
     }
 
-    /// What happens to the sample of `tick` on its way: of several faults, what the first says.
+    /// Returns the delivery fault of the sample of `tick`: of several faults, the first one's.
     pub fn delivery(&mut self, tick: u64) -> Option<Delivery> {
         delivery(&mut self.faults, tick)
     }
 
-    /// A sample to be disturbed.
+    /// Returns a zero sample.
     pub fn blank(&self) -> S::Owned {
         S::blank(self.bodies)
     }
 
-    /// Keeps a sample until `tick`.
+    /// Holds a sample back until `tick`.
     pub fn keep(&mut self, tick: u64, sample: &S) {
         let mut kept = self.blank();
         kept.borrow_mut().assign(sample);
@@ -60,17 +61,17 @@ impl<S: Carried + ?Sized> Disturbance<S> {
         self.late.insert(at, (tick, kept));
     }
 
-    /// How many of the samples that are kept are to be sent before that of `tick`.
+    /// Returns the number of delayed samples that are due before the sample of `tick`.
     pub fn due(&self, tick: u64) -> u64 {
         self.late.partition_point(|(due, _)| *due <= tick) as u64
     }
 
-    /// One of the samples that are kept, in the order in which they are sent.
+    /// Returns a delayed sample by its position in sending order.
     pub fn late(&self, index: u64) -> Option<&S> {
         self.late.get(index as usize).map(|(_, sample)| sample.borrow())
     }
 
-    /// Lets the first samples that are kept go.
+    /// Removes the first delayed samples.
     pub fn forget(&mut self, samples: u64) {
         self.late.drain(..self.late.len().min(samples as usize));
     }
@@ -89,31 +90,31 @@ impl<S: Carried + ?Sized> Persist for Disturbance<S> {
     }
 }
 
-/// What a scenario does to a role (`body` none) or to its signal about a body. What a predecessor has passed is decided here,
-/// and not at its successor's first tick.
-fn courses(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) -> Vec<FaultSequence> {
+/// Returns a scenario's faults on a role (`body` is `None`) or on its signal about a body. Ticks of a predecessor are
+/// replayed here, not at the successor's first tick.
+fn fault_sequences(scenario: &Settings, role: &str, body: Option<&str>, next_tick: u64) -> Vec<FaultSequence> {
     let here = |fault: &&ScriptedFault| fault.role == role && fault.body.as_deref() == body;
-    let course = |scripted: &ScriptedFault| {
-        let mut course = FaultSequence::new(scripted.fault.clone());
+    let sequence = |scripted: &ScriptedFault| {
+        let mut sequence = FaultSequence::new(scripted.fault.clone());
         if let Some(last) = next_tick.checked_sub(1) {
-            course.acts(last);
+            sequence.acts(last);
         }
-        course
+        sequence
     };
-    scenario.faults.iter().filter(here).map(course).collect()
+    scenario.faults.iter().filter(here).map(sequence).collect()
 }
 
 fn delivery(faults: &mut [FaultSequence], tick: u64) -> Option<Delivery> {
-    faults.iter_mut().find_map(|course| course.fault().delivery(tick).filter(|_| course.acts(tick)))
+    faults.iter_mut().find_map(|sequence| sequence.fault().delivery(tick).filter(|_| sequence.acts(tick)))
 }
 
-/// Which samples of a signal are late because a scripted fault says so. Where there are no voids, a reader knows by it that
-/// they are, however soon after their tick it looks: what is late is so by the script, not by who was faster.
+/// The samples of a signal that a scripted fault delays. Without no-sample markers a reader uses this to reject a late
+/// sample, however early it reads: lateness follows from the script, not from timing.
 #[derive(Debug)]
 pub struct LateSamples(Vec<FaultSequence>);
 
 impl LateSamples {
-    /// Those of a signal about a body; nothing if there are none that a reader could take for samples in time.
+    /// Returns the delays of a signal about a body; `None` if no reader could mistake a late sample for one in time.
     pub fn for_signal(scenario: &Settings, signal: Signal, body: &str) -> Option<Box<Self>> {
         let role = match signal {
             Signal::Measurement => body,
@@ -121,67 +122,68 @@ impl LateSamples {
             Signal::Command => "controller",
             _ => return None,
         };
-        let faults = courses(scenario, role, Some(body), 0);
-        let late = scenario.clock == ClockKind::Realtime && faults.iter().any(|course| delay_bound(course.fault()) > 0);
+        let faults = fault_sequences(scenario, role, Some(body), 0);
+        let late =
+            scenario.clock == ClockKind::Realtime && faults.iter().any(|sequence| delay_bound(sequence.fault()) > 0);
         late.then(|| Box::new(Self(faults)))
     }
 
-    /// Whether that of a tick is.
+    /// Returns true if the sample of this tick is delayed.
     pub fn contains(&mut self, tick: u64) -> bool {
         matches!(delivery(&mut self.0, tick), Some(Delivery::Late(_)))
     }
 }
 
-/// By how many ticks a fault sends a sample late, at the most.
+/// Returns the largest delay of a fault, ticks.
 fn delay_bound(fault: &Fault) -> u64 {
     if let Action::Transport(Transport::Delay(delay)) = fault.action { delay.bound() } else { 0 }
 }
 
-/// How many late samples may come at once on a signal of a scenario, at the most.
+/// Returns the largest number of delayed samples that a signal may carry at once.
 pub fn late_samples(scenario: &Settings) -> usize {
     scenario.faults.iter().map(|scripted| delay_bound(&scripted.fault) as usize).sum()
 }
 
-/// How many samples per tick a signal of a scenario may carry beyond the one that is its own.
+/// Returns the largest number of samples per tick that faults add to a signal.
 pub fn extra_samples(scenario: &Settings) -> usize {
     let extra = |scripted: &&ScriptedFault| match scripted.fault.action {
         Action::Transport(transport) => transport != Transport::Drop,
-        // A flip of a bit may make a sample that belongs to no tick, beside the void in its place.
+        // A flipped bit may create a sample of an invalid tick beside the no-sample marker that replaces it.
         Action::Content(tamper) => matches!(tamper.change, Change::Flip(_)),
         Action::Role(_) => false,
     };
     scenario.faults.iter().filter(extra).count()
 }
 
-/// The scripted faults that a role has met before a tick.
+/// The faults that acted before a tick.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 struct InjectedFaults {
-    /// So many stalls.
+    /// Number of stalls.
     stalls: u64,
-    /// Its life is over, where it has no process that could be killed: whoever drives it builds it anew.
+    /// True if a role without a process of its own was killed: its driver rebuilds it.
     killed: bool,
 }
 
-/// What happens to a role before its ticks.
+/// The scripted faults on a role before its ticks.
 #[derive(Debug)]
 pub struct Interruptions {
     faults: Vec<FaultSequence>,
     first_life: bool,
-    /// Whether the role is a process, which can be killed.
+    /// True if the role is a process, which can be killed.
     process: bool,
-    /// Ticks before this one have been looked at.
+    /// The first tick that has not been checked.
     next: u64,
 }
 
 impl Interruptions {
-    /// What a scenario does to a role in this generation of it, from a tick on.
+    /// Returns a scenario's faults on a role of this generation, from `next_tick` on.
     pub fn for_role(scenario: &Settings, role: &str, generation: u64, next_tick: u64) -> Self {
         let process = scenario.clock != ClockKind::InProcess;
-        let faults = courses(scenario, role, None, next_tick);
+        let faults = fault_sequences(scenario, role, None, next_tick);
         Self { faults, first_life: generation == 1, process, next: 0 }
     }
 
-    /// Whether the role is not to execute this tick, whatever is there for it.
+    /// Returns true if a scripted fault skips this tick.
     #[inline]
     pub fn misses(&mut self, tick: u64) -> bool {
         !self.faults.is_empty() && self.scripts_miss(tick)
@@ -190,10 +192,10 @@ impl Interruptions {
     #[cold]
     fn scripts_miss(&mut self, tick: u64) -> bool {
         let miss = Action::Role(Interruption::Miss);
-        self.faults.iter_mut().any(|course| course.fault().action == miss && course.acts(tick))
+        self.faults.iter_mut().any(|sequence| sequence.fault().action == miss && sequence.acts(tick))
     }
 
-    /// Acts before the next tick of a role, once, and enters it into the role's counters; true if the role's life is over.
+    /// Applies the faults before the role's next tick, once, and counts them; returns true if the role was killed.
     #[inline]
     pub fn before_next(&mut self, counters: &mut TickCounters) -> bool {
         let injected = self.before(counters.next());
@@ -210,9 +212,9 @@ impl Interruptions {
     fn act(&mut self, tick: u64) -> InjectedFaults {
         self.next = tick + 1;
         let mut injected = InjectedFaults::default();
-        for course in &mut self.faults {
-            let acts = course.acts(tick);
-            match course.fault().action {
+        for sequence in &mut self.faults {
+            let acts = sequence.acts(tick);
+            match sequence.fault().action {
                 _ if !acts => {}
                 Action::Role(Interruption::Stall { ns }) => {
                     stall(ns);
@@ -231,7 +233,7 @@ impl Interruptions {
     }
 }
 
-/// Does nothing for so long, deaf to everything.
+/// Sleeps for this time and ignores everything else.
 fn stall(ns: u64) {
     let end_ns = monotonic_ns() + ns;
     while monotonic_ns() < end_ns {
@@ -239,9 +241,9 @@ fn stall(ns: u64) {
     }
 }
 
-/// Ends this process as the kernel or an operator would: without a word, without cleaning up.
+/// Kills this process with SIGKILL, without any cleanup.
 fn kill() {
-    // Nothing is left to do if the kernel should refuse; then the role lives on, and the fault was none.
+    // If the kernel refuses, the role continues and the fault has no effect.
     let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::KILL);
 }
 
@@ -256,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_comes_in_order_when_it_is_due_and_takes_no_memory_on_the_way() {
+    fn delayed_samples_arrive_in_order_without_allocation() {
         let delay = Action::Transport(Transport::Delay(Delay::constant(3)));
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 100, delay)], 1).unwrap();
         let room = disturbance.late.capacity();
@@ -274,9 +276,9 @@ mod tests {
         assert_eq!((disturbance.delivery(105), disturbance.late.capacity()), (None, room));
     }
 
-    /// Whatever is drawn, what is late finds room, and comes when it is due.
+    /// Random delays never exceed the allocated capacity.
     #[test]
-    fn samples_that_overtake_one_another_take_no_memory_on_the_way() {
+    fn randomly_delayed_samples_arrive_once_without_allocation() {
         let delay = Delay { jitter_ticks: 7, ..Delay::constant(0) };
         let delay = Action::Transport(Transport::Delay(delay));
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 500, delay)], 1).unwrap();
@@ -309,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_faults_the_first_decides_the_way() {
+    fn the_first_of_several_faults_decides_the_delivery() {
         let [drop, twice] = [Transport::Drop, Transport::Duplicate].map(Action::Transport);
         let mut disturbance = Disturbance::<RateCommand>::new(vec![fault(5, 2, twice), fault(6, 2, drop)], 1).unwrap();
         let ways = [4, 5, 6, 7, 8].map(|tick| disturbance.delivery(tick));
@@ -319,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_holds_the_role_up_once_per_tick() {
+    fn a_stall_delays_the_role_once_per_tick() {
         let faults = vec![fault(3, 2, Action::Role(Interruption::Stall { ns: 2_000_000 }))];
         let mut interruptions = Interruptions { faults, first_life: false, process: true, next: 0 };
         let begun = monotonic_ns();
@@ -329,11 +331,11 @@ mod tests {
     }
 
     #[test]
-    fn whoever_has_no_process_is_told_of_its_end_and_its_successor_is_spared() {
+    fn a_kill_without_a_process_is_returned_once_and_spares_the_successor() {
         let kill = || vec![fault(3, 1, Action::Role(Interruption::Kill))];
         let mut first = Interruptions { faults: kill(), first_life: true, process: false, next: 0 };
         assert_eq!([2, 3].map(|tick| first.before(tick).killed), [false, true]);
         let mut second = Interruptions { faults: kill(), first_life: false, process: true, next: 0 };
-        assert!(!second.before(3).killed, "and lives to say so");
+        assert!(!second.before(3).killed, "the successor is not killed");
     }
 }

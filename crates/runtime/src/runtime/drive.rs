@@ -1,7 +1,7 @@
-//! Decides when a node runs: by the time grid, or by its inputs. One driver per clock.
+//! Decides when a node runs: on the time grid, or when its inputs arrive. One driver per clock.
 //!
-//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a notifier; what is
-//! late is skipped and counted, never made up for in a burst. Lockstep: inputs and credit, no time at all.
+//! Must not know what a node computes. Real time: absolute deadlines, a bounded spin, then sleep on a notifier; late
+//! ticks are skipped and counted, never executed in a burst. Lockstep: inputs and credit only, no time.
 
 use super::error::NodeError;
 use super::hooks::{self, Failpoint};
@@ -13,54 +13,54 @@ use crate::sample::{Health, Phase, RoleState, Schedule, Stamp};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// How often a role looks at the schedule and says how it is, ns.
+/// Interval at which a role reads the schedule and publishes its heartbeat, ns.
 const TURN_NS: u64 = 20_000_000;
-/// Between two looks whether the run is still there, ns.
+/// Interval between checks that the run still exists, ns.
 const GONE_NS: u64 = 1_000_000_000;
-/// How long a role naps between two looks where there is no input that it could sleep on, ns.
+/// Sleep between two polls if no input can wake the role, ns.
 const NAP_NS: u64 = 50_000;
-/// How long a role sleeps on the notifier of the input that it lacks before it looks around, ns.
+/// Longest sleep on the notifier of a missing input, ns.
 const SLEEP_NS: u64 = 20_000_000;
-/// How long after its last tick a role still waits for inputs, ns and periods.
+/// Time that a role still waits for inputs after its last tick, ns and periods.
 const GRACE_NS: u64 = 1_000_000_000;
 const GRACE_PERIODS: u64 = 5;
-/// Lockstep ticks between two looks at the schedule and the time.
+/// Lockstep ticks between two reads of the schedule and the time.
 const TURN_TICKS: u64 = 256;
 
-/// How a drive ended.
+/// The end of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
     /// The last tick is done.
     Finished,
-    /// The launcher or a signal said stop.
+    /// The launcher or a signal ended the run.
     Stopped,
 }
 
-/// What one role says of itself.
+/// Status of one role, published to the launcher.
 pub struct Heartbeat<B: Bus> {
-    /// Whose it is.
+    /// The role.
     pub role: RoleId,
-    /// Where it is said.
+    /// The writing end of its health signal.
     pub health: B::Writer<Health>,
-    /// Which of the role's lives this is, from 1.
+    /// The role's generation, from 1.
     pub generation: u64,
 }
 
-/// A process's line to the launcher, with the heartbeat of each of its roles.
+/// A process's link to the launcher, with the heartbeat of each of its roles.
 pub struct LauncherLink<'a, B: Bus> {
     bus: &'a B,
     schedule: B::Reader<Schedule>,
     heartbeats: Vec<Heartbeat<B>>,
     denied: u64,
     terminated: &'a AtomicBool,
-    /// Whether the run was gone when that was looked at last, and when it will be again, ns.
+    /// Result of the last check that the run still exists, and time of the next check, ns.
     gone: bool,
     next_look_ns: u64,
 }
 
 impl<'a, B: Bus> LauncherLink<'a, B> {
-    /// A line over opened links. `denied` counts the privileges that were not granted; `terminated` is set by a signal
-    /// that asks the process to end.
+    /// Creates the link over open signals. `denied` is the number of refused privileges; `terminated` is set by a
+    /// signal that asks the process to end.
     pub fn new(
         bus: &'a B,
         schedule: B::Reader<Schedule>,
@@ -71,12 +71,12 @@ impl<'a, B: Bus> LauncherLink<'a, B> {
         Self { bus, schedule, heartbeats, denied, terminated, gone: false, next_look_ns: 0 }
     }
 
-    /// Whether nobody has had these seats before.
+    /// Returns true if no role of this process had a predecessor.
     pub fn first(&self) -> bool {
         self.heartbeats.iter().all(|heartbeat| heartbeat.generation == 1)
     }
 
-    /// Tells the launcher how the roles are.
+    /// Publishes the state and tick counters of each role.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -97,7 +97,7 @@ impl<'a, B: Bus> LauncherLink<'a, B> {
         Ok(())
     }
 
-    /// The launcher's last word.
+    /// Returns the newest schedule.
     ///
     /// # Errors
     /// [`BusError::Receive`].
@@ -106,16 +106,17 @@ impl<'a, B: Bus> LauncherLink<'a, B> {
         Ok(self.schedule.current().copied().unwrap_or_default())
     }
 
-    /// Whether the run is over for this role.
+    /// Returns true if the run is over for this process.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     pub fn stopped(&mut self) -> Result<bool, BusError> {
-        let told = self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop;
-        Ok(told || self.gone())
+        let stop_requested =
+            self.terminated.load(Ordering::Relaxed) || Phase::from_number(self.schedule()?.phase) == Phase::Stop;
+        Ok(stop_requested || self.gone())
     }
 
-    /// Whether nobody is left who could give a word: a launcher that was killed gives none.
+    /// Returns true if the run no longer exists: a killed launcher sends no stop.
     fn gone(&mut self) -> bool {
         let now_ns = monotonic_ns();
         if now_ns >= self.next_look_ns {
@@ -126,20 +127,20 @@ impl<'a, B: Bus> LauncherLink<'a, B> {
     }
 }
 
-/// How a role waits in real time.
+/// Waiting behaviour of a role in real time.
 #[derive(Debug, Clone, Copy)]
 pub struct WaitPolicy<'a> {
-    /// It wakes so long before the tick and spins the rest, ns.
+    /// The role wakes this long before the tick and spins the rest, ns.
     pub lead_ns: u64,
-    /// It spins at most so long for a sample that is due, ns. At 0 it sleeps at once, and no timer wakes it before.
+    /// Longest spin for a due sample, ns. At 0 the role sleeps at once and no timer wakes it.
     pub spin_ns: u64,
-    /// For samples of these roles it does not spin but gives way: they need its core.
+    /// For samples of these roles it yields instead of spinning: they need its core.
     pub yields_to: &'a [RoleId],
-    /// The part of the period after which it goes on without what is missing.
+    /// Instant in the period, as a fraction, after which the role continues without missing samples.
     pub cutoff: f64,
 }
 
-/// What a driver needs besides its node.
+/// Drives the nodes of one process.
 pub struct Driver<'a, 'b, B: Bus> {
     launcher: &'a mut LauncherLink<'b, B>,
     last_tick: u64,
@@ -148,7 +149,7 @@ pub struct Driver<'a, 'b, B: Bus> {
 }
 
 impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
-    /// A drive up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
+    /// Creates a driver up to `last_tick`; in lockstep at most `window_ticks` ahead of the slowest consumer.
     pub fn new(launcher: &'a mut LauncherLink<'b, B>, last_tick: u64, window_ticks: u64) -> Self {
         Self { launcher, last_tick, window_ticks, next_turn_ns: 0 }
     }
@@ -171,7 +172,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
             match executed {
                 Some(Poll::Executed) => {
                     if begun == Poll::Executed && !policy.yields_to.is_empty() {
-                        // What it sent is what the others wait for, and they wait for its core too.
+                        // Other roles wait for the sent sample, and for this core.
                         std::thread::yield_now();
                     }
                     node.finish_tick()?;
@@ -186,14 +187,14 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         Ok(Ended::Finished)
     }
 
-    /// A plant's tick: exactly when it is due, or the latest one due if this process was held up.
+    /// Executes a plant's tick when it is due, or the latest due one if this process was delayed.
     fn on_time(&mut self, node: &mut dyn Node, grid: Grid, lead_ns: u64) -> Result<Poll, NodeError> {
         let now_ns = wait_until(grid.due_ns(node.next_tick()), lead_ns);
         node.poll(RunCondition::Now { tick: grid.tick_at(now_ns), now_ns })
     }
 
-    /// Another role's tick, or what a tick has set off: when its inputs are there. Spins for a while, then sleeps on the notifier of
-    /// the input that it lacks.
+    /// Waits for the inputs of a tick and executes it. Spins for a while, then sleeps on the notifier of the missing
+    /// input. `None` if the run was stopped.
     fn on_arrival(
         &mut self,
         node: &mut dyn Node,
@@ -228,7 +229,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         }
     }
 
-    /// Sleeps until `until_ns`, but not deaf: true if the run was stopped meanwhile.
+    /// Sleeps until `until_ns` while serving the launcher; returns true if the run was stopped.
     fn idle_until(&mut self, until_ns: u64, node: &mut dyn Node) -> Result<bool, NodeError> {
         while monotonic_ns() < until_ns {
             hooks::at(Failpoint::Waiting);
@@ -240,7 +241,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         Ok(false)
     }
 
-    /// Now and then: how this role is, and whether the run is over.
+    /// Publishes the heartbeat if it is due; returns true if the run is over.
     fn turn(&mut self, node: &mut dyn Node) -> Result<bool, NodeError> {
         if !self.turn_is_due() {
             return Ok(false);
@@ -259,9 +260,9 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         due
     }
 
-    /// Waits for the input that a node lacks, or for credit.
+    /// Waits for the missing input, or for credit.
     fn rest(&mut self, node: &mut dyn Node, up_to: u64, backoff: &mut Backoff) -> Result<(), NodeError> {
-        // Nobody waits for who is so far ahead, and somebody may need its core.
+        // No role waits for one that is this far ahead, and another may need its core.
         let ahead = node.next_tick() > up_to;
         if !ahead && backoff.brief() {
             return Ok(());
@@ -273,7 +274,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
         Ok(())
     }
 
-    /// Drives a node by its inputs alone, at most its window ahead of the slowest consumer.
+    /// Drives a node by its inputs alone, at most the window ahead of the slowest consumer.
     ///
     /// # Errors
     /// [`NodeError`] if a link failed.
@@ -308,7 +309,7 @@ impl<'a, 'b, B: Bus> Driver<'a, 'b, B> {
     }
 }
 
-/// One round of waiting for a sample that is due: whoever is to send it may need this core.
+/// Spins once for a due sample, or yields if its sender needs this core.
 fn spin(node: &dyn Node, yields_to: &[RoleId]) {
     if node.awaits().is_some_and(|role| yields_to.contains(&role)) {
         std::thread::yield_now();
@@ -317,20 +318,21 @@ fn spin(node: &dyn Node, yields_to: &[RoleId]) {
     }
 }
 
-/// Looks that are worth a spin.
+/// Number of polls before the first sleep.
 const SPIN_ROUNDS: u32 = 50;
 
-/// Waits longer the longer there is nothing to do: spins, then sleeps.
+/// Spins a limited number of rounds, then asks for a sleep.
 ///
-/// It does not yield: Linux takes a whole time slice off who does (6.18), and thousands of yields per second drive the queue's
-/// clock so far ahead that whoever wakes up beside other busy processes waits for seconds, the kernel's own threads too.
+/// It does not yield: Linux 6.18 takes a whole time slice from a process that yields, and thousands of yields per
+/// second advance the queue's clock so far that a process that wakes beside busy ones, even a kernel thread, waits for
+/// seconds.
 #[derive(Default)]
 pub struct Backoff {
     rounds: u32,
 }
 
 impl Backoff {
-    /// One round of waiting that is no sleep; false if it is time for one.
+    /// Spins one round; returns false once the caller should sleep.
     pub fn brief(&mut self) -> bool {
         let brief = self.rounds < SPIN_ROUNDS;
         if brief {
@@ -341,11 +343,11 @@ impl Backoff {
     }
 }
 
-/// Drives all nodes in one thread, each tick through all of them in the order given. `revive` gives a role whose life is over
-/// (its index) its successor, or ends the run.
+/// Drives all nodes in one thread, each tick through all of them in the given order. `revive` returns the successor of
+/// a killed role (by index), or `None` to end the run.
 ///
 /// # Errors
-/// [`NodeError`] if a link failed, or if the roles wait for one another in a circle.
+/// [`NodeError`] if a link failed, or if the roles wait for each other in a cycle.
 pub fn drive_in_turn(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
@@ -355,7 +357,7 @@ pub fn drive_in_turn(
     drive_in_turn_tracked(nodes, last_tick, &Cell::new(None), revive, after_tick)
 }
 
-/// Runs the nodes in turn; `turn` is the index of the node whose turn it is, none between ticks.
+/// Drives all nodes in one thread; `turn` holds the index of the running node, `None` between ticks.
 pub fn drive_in_turn_tracked(
     nodes: &mut Vec<ReadyNode>,
     last_tick: u64,
@@ -367,7 +369,7 @@ pub fn drive_in_turn_tracked(
         for index in 0..nodes.len() {
             turn.set(Some(index));
             if nodes[index].before_tick() {
-                // The seat is left before it is taken again, as between processes.
+                // The old node is dropped before its successor opens the links, as between processes.
                 let mut left = nodes.remove(index);
                 left.finish()?;
                 drop(left);

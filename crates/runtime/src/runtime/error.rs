@@ -1,19 +1,19 @@
-//! Why a node cannot go on, and why there is no device, or none any more.
+//! Errors of nodes and devices.
 
 use super::line::LineError;
 use crate::bus::BusError;
 use crate::serial::{MAX_CONTENT, MAX_NAMES, MAX_SAMPLES, VERSION};
 use std::path::PathBuf;
 
-/// Why there is no device, or none any more.
+/// A device failed or cannot take part.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum DeviceError {
-    /// Its line could not be opened.
+    /// The serial line could not be opened.
     #[error(transparent)]
     #[strum(transparent)]
     Line(#[from] LineError),
-    /// It takes too long to say what must be said.
+    /// One tick takes longer on the line than the run allows.
     #[error(
         "at {baud} baud one tick takes {line_us} us on the line, and the run has {tick_us} us for it; give --baud {least} \
          or more, or run with a lower tick_hz"
@@ -22,14 +22,14 @@ pub enum DeviceError {
     TooSlow {
         /// The speed, bit/s.
         baud: u32,
-        /// One request and its answer, µs.
+        /// Duration of one request and its answer, µs.
         line_us: u64,
         /// The period up to its cutoff, µs.
         tick_us: u64,
-        /// The least speed that would do, bit/s.
+        /// The lowest sufficient speed, bit/s.
         least: u64,
     },
-    /// The run asks for what a device does not do.
+    /// The run uses an actuation delay that devices do not support.
     #[error(
         "a device applies a command at the tick after it, and the run has actuation_delay_ticks = {ticks}; give 1, or let \
          a simulated plant take part"
@@ -39,18 +39,18 @@ pub enum DeviceError {
         /// The run's delay, ticks.
         ticks: u64,
     },
-    /// It does not answer.
+    /// The device does not answer.
     #[error("the device on {} has not answered for {waited_s:.1} s: {hint}", path.display())]
     #[strum(serialize = "device-silent")]
     Silent {
         /// The line.
         path: PathBuf,
-        /// How long it was waited for, s.
+        /// Waiting time, s.
         waited_s: f64,
-        /// What to look at.
+        /// A hint on what to check.
         hint: String,
     },
-    /// It speaks another protocol version.
+    /// The device uses another protocol version.
     #[error(
         "the device on {} speaks protocol version {theirs} and this program version {VERSION}; update the older of the two",
         path.display()
@@ -62,7 +62,7 @@ pub enum DeviceError {
         /// The device's version.
         theirs: u8,
     },
-    /// Another device answers in its place.
+    /// Another device answers instead of the expected one.
     #[error(
         "on {} the device `{found}` answers in the place of `{expected}`; connect that one again, or give \
          --allow-other-device",
@@ -72,28 +72,28 @@ pub enum DeviceError {
     Other {
         /// The line.
         path: PathBuf,
-        /// The name of the device that the run began with.
+        /// The name of the device at the start of the run.
         expected: String,
-        /// The name of the other one.
+        /// The name of the device that answered.
         found: String,
     },
-    /// What it would have to say is too much for a message.
+    /// The samples of the role do not fit into a message.
     #[error(
         "`{role}` reads {read} and writes {written} bytes in {samples} samples per tick, and a message holds {MAX_CONTENT} \
-         bytes in {MAX_SAMPLES} samples, whose names take {MAX_NAMES} bytes; no device can have this seat: drive fewer bodies"
+         bytes in {MAX_SAMPLES} samples, whose names take {MAX_NAMES} bytes; no device can take this role: drive fewer bodies"
     )]
     #[strum(serialize = "seat-too-large")]
     TooLong {
         /// The role.
         role: String,
-        /// Bytes of the samples that it reads.
+        /// Bytes of the samples that the role reads.
         read: usize,
-        /// The same of those that it writes.
+        /// Bytes of the samples that the role writes.
         written: usize,
-        /// The number of samples in the longer message.
+        /// Number of samples in the longer message.
         samples: usize,
     },
-    /// It refuses to take part.
+    /// The device refuses the role.
     #[error("the device on {} refuses to be `{role}`: {reason}", path.display())]
     #[strum(serialize = "device-refused")]
     Refused {
@@ -101,12 +101,12 @@ pub enum DeviceError {
         path: PathBuf,
         /// The role.
         role: String,
-        /// Its reason, and what to do.
+        /// The device's reason, with a remedy.
         reason: String,
     },
 }
 
-/// Why a node cannot go on.
+/// A node cannot continue.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum NodeError {
@@ -118,11 +118,11 @@ pub enum NodeError {
     #[error(transparent)]
     #[strum(transparent)]
     Device(#[from] DeviceError),
-    /// The function that computes a role failed.
+    /// The function that computes the role failed.
     #[error("{reason}")]
     #[strum(serialize = "computed-role-failed")]
     Computed {
-        /// As it says.
+        /// The reason that the function returned.
         reason: String,
     },
 }

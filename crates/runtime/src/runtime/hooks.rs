@@ -1,27 +1,27 @@
-//! Named places in a role's life at which a test makes it die or stand still. Empty unless the feature `hooks` is on, which
-//! is for tests alone.
+//! Failpoints: named places where a test kills or stops a role. Empty unless the feature `hooks` is on, which is for
+//! tests only.
 //!
-//! `COROTATE_HOOK="observer sent 1500 KILL"`: the observer, the 1500th time that it has just sent a sample, gets SIGKILL
-//! from itself, once in a run. `STOP` is SIGSTOP, `HANG` an endless sleep. Must not do anything else to a role.
+//! `COROTATE_HOOK="observer sent 1500 KILL"`: the observer sends itself SIGKILL after its 1500th sent sample, once per
+//! run. `STOP` is SIGSTOP, `HANG` sleeps forever. Must not affect a role in any other way.
 
-/// A place in a role's life.
+/// A place in the life of a role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Failpoint {
-    /// Before it opens its links.
+    /// Before the links are opened.
     Opening,
-    /// All is open and warm; it waits for the word to run.
+    /// Links are open and warm; the role waits for the run phase.
     Ready,
-    /// It has made a sample that it has not committed itself to.
+    /// A sample is staged and not committed.
     Staged,
-    /// It is about to commit its state, has written part of it, or has just committed it.
+    /// Directly before the state is committed.
     Committing,
-    /// See there.
+    /// While the state is written.
     InCommit,
-    /// See there.
+    /// Directly after the commit.
     Committed,
-    /// It has just sent a sample.
+    /// Directly after a sample is sent.
     Sent,
-    /// It has nothing to do but to wait.
+    /// The role waits for input.
     Waiting,
 }
 
@@ -32,11 +32,11 @@ pub use off::{at, enter};
 mod off {
     use super::Failpoint;
 
-    /// Nothing.
+    /// Does nothing.
     #[inline(always)]
     pub fn enter(_roles: &[&str], _generation: u64) {}
 
-    /// Nothing.
+    /// Does nothing.
     #[inline(always)]
     pub fn at(_place: Failpoint) {}
 }
@@ -54,13 +54,13 @@ mod on {
     struct Hook {
         place: Failpoint,
         left: AtomicU64,
-        /// None for a hang.
+        /// The signal to send; `None` hangs.
         signal: Option<Signal>,
     }
 
     static HOOK: OnceLock<Option<Hook>> = OnceLock::new();
 
-    /// Arms the hook if it is meant for one of these roles, which are this process, and for nobody before it.
+    /// Arms the hook if it names one of this process's roles and the generation is 1.
     pub fn enter(roles: &[&str], generation: u64) {
         HOOK.get_or_init(|| parse(&std::env::var("COROTATE_HOOK").ok()?, roles).filter(|_| generation == 1));
     }
@@ -91,7 +91,7 @@ mod on {
         Some(Hook { place, left, signal })
     }
 
-    /// Passes a place.
+    /// Triggers the hook if it is armed for this place.
     #[inline]
     pub fn at(place: Failpoint) {
         if let Some(Some(hook)) = HOOK.get()

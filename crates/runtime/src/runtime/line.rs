@@ -1,6 +1,6 @@
-//! A serial line: a terminal device, raw, read and written without ever waiting, and opened again after it was cut.
+//! A serial line: a terminal device in raw mode that is read and written without waiting, and reopened after a cut.
 //!
-//! Must not know what its bytes mean, nor end anything because it is gone; whoever uses it decides how long to wait.
+//! Must not know the meaning of its bytes, nor decide how long to wait for a line that is gone.
 
 use crate::serial::MAX_FRAME;
 use rustix::fd::OwnedFd;
@@ -14,7 +14,7 @@ use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
-/// Why a line could not be opened.
+/// A line could not be opened.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum LineError {
@@ -26,29 +26,29 @@ pub enum LineError {
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
-    /// It is something else.
-    #[error("{} is no serial line: not a terminal device; give one as /dev/ttyUSB0, /dev/ttyACM0, or a pty", path.display())]
+    /// The path is not a terminal device.
+    #[error("{} is not a serial line (not a terminal device); give one as /dev/ttyUSB0, /dev/ttyACM0, or a pty", path.display())]
     NotATerminal {
         /// The path as given.
         path: PathBuf,
     },
-    /// Somebody else has it.
+    /// Another program uses the line.
     #[error("{} is in use by another program; end that first", path.display())]
     #[strum(serialize = "line-in-use")]
     InUse {
         /// The device.
         path: PathBuf,
     },
-    /// It cannot be set up.
+    /// The line cannot be configured.
     #[error("cannot set {} to raw mode{}: {source}; does it know that speed?", path.display(), baud.map_or(String::new(), |baud| format!(" at {baud} baud")))]
     #[strum(serialize = "line-setup")]
     Setup {
         /// The device.
         path: PathBuf,
-        /// The speed asked for.
+        /// The requested speed.
         baud: Option<u32>,
         /// The system's reason.
         source: io::Error,
@@ -58,7 +58,7 @@ pub enum LineError {
 /// A serial line, open or cut.
 pub struct Line {
     path: PathBuf,
-    /// The same, as the system wants it, so that opening it again allocates nothing.
+    /// The same path as a C string: reopening allocates nothing.
     name: CString,
     baud: Option<u32>,
     port: Option<OwnedFd>,
@@ -68,7 +68,7 @@ pub struct Line {
 }
 
 impl Line {
-    /// Opens a terminal device for this process alone. Without `baud` (bit/s) its speed stays as it is.
+    /// Opens a terminal device exclusively. Without `baud` (bit/s) its speed stays unchanged.
     ///
     /// # Errors
     /// [`LineError`].
@@ -83,12 +83,12 @@ impl Line {
         &self.path
     }
 
-    /// The speed that was asked for, bit/s.
+    /// The requested speed, bit/s.
     pub fn baud(&self) -> Option<u32> {
         self.baud
     }
 
-    /// Whether the line is open, as far as is known.
+    /// Returns true unless the line is known to be cut.
     pub fn is_open(&self) -> bool {
         self.port.is_some()
     }
@@ -96,21 +96,21 @@ impl Line {
     /// Tries to open the line again.
     ///
     /// # Errors
-    /// [`LineError`], and the line is as it was.
+    /// [`LineError`]; the line then stays cut.
     pub fn reopen(&mut self) -> Result<(), LineError> {
-        // First of all let go of the old one: two of one name cannot be had.
+        // The old descriptor is closed first: the device may allow one only.
         self.cut();
         self.port = Some(open_port(&self.path, &self.name, self.baud)?);
         Ok(())
     }
 
-    /// Reads what has arrived into `bytes`; returns how many. A line that turns out to be cut is closed.
+    /// Reads available bytes and returns their number. Closes a line that is found to be cut.
     pub fn read(&mut self, bytes: &mut [u8]) -> usize {
         let Some(port) = &self.port else { return 0 };
         match rustix::io::read(port, bytes) {
             Ok(count) if count > 0 => count,
             Err(Errno::AGAIN | Errno::INTR) => 0,
-            // The end of the stream, or the error of a device that was pulled out.
+            // End of the stream, or the error of an unplugged device.
             Ok(_) | Err(_) => {
                 self.cut();
                 0
@@ -118,7 +118,8 @@ impl Line {
         }
     }
 
-    /// Sends a frame, and what is left of the one before only if it can go at once; false if that was lost.
+    /// Sends a frame after what is left of the previous one. Returns false if the rest of the previous frame was
+    /// dropped.
     pub fn write(&mut self, frame: &[u8]) -> bool {
         self.flush();
         let whole = self.from == self.to;
@@ -128,7 +129,7 @@ impl Line {
         whole
     }
 
-    /// Sends what is left of the last frame, as much as the line takes.
+    /// Sends as much of the last frame as the line takes.
     pub fn flush(&mut self) {
         while self.from < self.to {
             let Some(port) = &self.port else { return };
@@ -164,20 +165,20 @@ fn open_port(path: &Path, name: &CString, baud: Option<u32>) -> Result<OwnedFd, 
         Err(Errno::BUSY) => return Err(LineError::InUse { path: path.to_owned() }),
         Err(error) => return Err(refused(path, error)),
     };
-    // What other programs on serial lines do too.
+    // Other programs for serial lines take this lock too.
     flock(&port, FlockOperation::NonBlockingLockExclusive).map_err(|_| LineError::InUse { path: path.to_owned() })?;
     set_up(&port, baud).map_err(|error| LineError::Setup { path: path.to_owned(), baud, source: error.into() })?;
     Ok(port)
 }
 
-/// Eight bits, no parity, one stop bit, no flow control, no modem lines, nothing translated.
+/// Configures eight data bits, no parity, one stop bit, no flow control, no modem lines, no translation.
 fn set_up(port: &OwnedFd, baud: Option<u32>) -> rustix::io::Result<()> {
     let mut settings = tcgetattr(port)?;
     settings.make_raw();
-    // A board that resets when the line is hung up must not do so because a bridge ends.
+    // A board that resets on hang-up must not reset when the bridge ends.
     settings.control_modes -= ControlModes::CSTOPB | ControlModes::CRTSCTS | ControlModes::HUPCL;
     settings.control_modes |= ControlModes::CLOCAL | ControlModes::CREAD;
-    // Without a byte a read says so, and does not look like the end of the stream.
+    // A read without data returns an error instead of an end of stream.
     settings.special_codes[SpecialCodeIndex::VMIN] = 1;
     settings.special_codes[SpecialCodeIndex::VTIME] = 0;
     if let Some(baud) = baud {
@@ -192,7 +193,7 @@ mod tests {
     use super::*;
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
-    /// The far end of a line, and the path of the near one.
+    /// Returns the far end of a line, and the path of the near end.
     fn pty() -> (OwnedFd, PathBuf) {
         let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
         grantpt(&far).unwrap();
@@ -202,11 +203,11 @@ mod tests {
     }
 
     #[test]
-    fn bytes_go_through_untranslated_and_nobody_waits() {
+    fn bytes_pass_unchanged_and_reads_do_not_block() {
         let (far, path) = pty();
         let mut line = Line::open(&path, Some(115_200)).unwrap();
         let (every, mut bytes) = ((0..=255).collect::<Vec<u8>>(), [0; 512]);
-        assert_eq!(line.read(&mut bytes), 0, "nothing has come, and the line is not taken for cut");
+        assert_eq!(line.read(&mut bytes), 0, "no data is not an end of stream");
         assert!(line.is_open() && line.write(&every));
         let mut seen = 0;
         while seen < 256 {
@@ -222,9 +223,9 @@ mod tests {
         assert_eq!(back, every);
     }
 
-    /// Nobody reads at the far end: what does not fit is dropped, and said so, and nothing blocks.
+    /// The far end does not read: frames that do not fit are dropped and reported, and no call blocks.
     #[test]
-    fn a_full_line_does_not_hold_up_its_writer() {
+    fn a_full_line_does_not_block_its_writer() {
         let (_far, path) = pty();
         let mut line = Line::open(&path, None).unwrap();
         let lost = (0..2000).filter(|_| !line.write(&[1; MAX_FRAME])).count();
@@ -232,18 +233,18 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_line_is_noticed_and_can_be_opened_again() {
+    fn a_cut_line_is_detected_and_can_be_reopened() {
         let (far, path) = pty();
         let link = tempfile::tempdir().unwrap();
         let link = link.path().join("tty");
         std::os::unix::fs::symlink(&path, &link).unwrap();
         let mut line = Line::open(&link, None).unwrap();
-        // The name first: the number of a pty is used again at once, by another test perhaps.
+        // The name goes first: another test may reuse the number of the pty at once.
         std::fs::remove_file(&link).unwrap();
         drop(far);
         assert_eq!(line.read(&mut [0; 8]), 0);
         assert!(!line.is_open() && line.reopen().is_err());
-        assert!(line.write(b"lost") && line.read(&mut [0; 8]) == 0, "a cut line is no error");
+        assert!(line.write(b"lost") && line.read(&mut [0; 8]) == 0, "a cut line is not an error");
         let (_far, path) = pty();
         std::os::unix::fs::symlink(&path, &link).unwrap();
         line.reopen().unwrap();
@@ -251,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_line_is_refused_with_a_remedy() {
+    fn a_path_that_is_not_a_line_is_refused_with_a_remedy() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("file");
         std::fs::write(&file, "text").unwrap();

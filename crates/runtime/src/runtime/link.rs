@@ -1,4 +1,4 @@
-//! The two ends of a link: what was sent, received, lost, not believed, and its hash.
+//! The two ends of a link with their counters: sent, received, lost and rejected samples, and a hash.
 
 #[cfg(test)]
 mod balance;
@@ -30,7 +30,7 @@ mod tests {
         input: Input<MemoryBus, RateCommand>,
     }
 
-    /// Keeps a state.
+    /// Collects the words of a state.
     #[derive(Clone, Default)]
     pub(super) struct Store(pub(super) Vec<u64>);
 
@@ -73,7 +73,7 @@ mod tests {
             (self.output.counters().report(""), self.input.counters().report(""))
         }
 
-        /// The writing end of a successor of which this was committed.
+        /// Opens the writing end of a successor and restores the committed state.
         fn successor(&self, committed: &Store) -> Output<MemoryBus, RateCommand> {
             let mut output = output(&self.bus, &self.ledger, 2);
             output.persist(&mut Restore(&committed.0));
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shallow_reader_counts_what_it_was_too_late_for() {
+    fn a_shallow_reader_counts_overwritten_samples_as_gaps() {
         let mut ends = ends(1);
         ends.send(&[0, 1, 2, 3]);
         assert_eq!(ends.input.seek(3).unwrap(), Seek::Found);
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn an_older_sample_is_counted_and_never_seen() {
+    fn an_older_sample_is_counted_as_stale_and_not_returned() {
         let mut ends = ends(8);
         ends.send(&[3, 2, 3, 4]);
         assert!(ends.input.advance().unwrap());
@@ -113,14 +113,14 @@ mod tests {
         ends.send(&[4]);
         assert!(
             !ends.input.advance().unwrap() && ends.input.sample().is_none(),
-            "displaced, not mistaken for the good one"
+            "the older sample is not returned as the newest one"
         );
         assert_eq!(ends.counters().1.stale, 3);
     }
 
-    /// A writer that dies anywhere on its way leaves a successor what it needs: everything is sent and counted once.
+    /// Wherever the writer dies, its successor sends and counts every sample once.
     #[test]
-    fn whatever_a_writer_was_committed_to_is_sent_and_counted_once() {
+    fn every_committed_sample_is_sent_and_counted_once() {
         let directory = tempfile::tempdir().unwrap();
         for (case, sent) in [("staged", false), ("sent", true)] {
             let path = directory.path().join(format!("{case}.books"));
@@ -149,7 +149,7 @@ mod tests {
             assert_eq!(
                 (as_told.published, as_told.last_tick),
                 (3, Some(2)),
-                "{case}: what is committed counts as sent"
+                "{case}: a committed sample counts as sent"
             );
             let mut straight = self::ends(8);
             straight.send(&[0, 1]);
@@ -160,9 +160,9 @@ mod tests {
         }
     }
 
-    /// A reader that continues another's counts neither what that one counted nor anything less.
+    /// A reader that continues another one counts every sample exactly once.
     #[test]
-    fn what_a_link_repeats_to_a_successor_is_not_counted_again() {
+    fn samples_repeated_to_a_successor_are_counted_once() {
         let mut ends = ends(8);
         ends.send(&[0, 1, 0, 2]);
         assert_eq!(ends.input.seek(2).unwrap(), Seek::Found);
@@ -174,7 +174,7 @@ mod tests {
         input.counters().persist(&mut Restore(&counters.0));
         input.persist(&mut Restore(&state.0));
         input.repeated = true;
-        // All again, as a link with history does, then what is new: a stale one and tick 5.
+        // All samples again, as on a link with history; then a stale one and tick 5.
         for tick in [0, 1, 0, 2, 1, 5] {
             output.send(|sample| sample.stamp.tick = tick).unwrap();
         }
@@ -183,22 +183,24 @@ mod tests {
         assert_eq!((read.received, read.gaps, read.stale, read.last_tick), (4, 2, 2, Some(5)));
     }
 
-    /// Twenty ticks on a link that sends samples late, twice and not at all, with deaths at one of them.
+    /// Twenty ticks on a link with delays, duplicates and drops. Reader or writer dies at one tick.
     #[derive(Debug, Default)]
     struct Course {
         tick: u64,
         reader_dies: bool,
-        /// The writer dies when it has sent so many samples of the tick, the last so many of them without a mark.
+        /// The writer dies after this number of samples of the tick, of which this number at the end is not recorded as
+        /// sent.
         writer_dies: Option<(usize, u64)>,
-        /// So many of the last samples the link brings to the reader's successor.
+        /// The number of past samples that the link repeats to the reader's successor.
         history: usize,
     }
 
-    /// The ticks of deaths, each with the number of samples that go out then: one, two late ones before it, two, a void.
+    /// The ticks of deaths with the number of samples sent then: one; two delayed ones and one; two; a no-sample
+    /// marker.
     const DEATHS: [(u64, usize); 4] = [(11, 1), (12, 3), (13, 2), (14, 1)];
 
     impl Course {
-        /// The reader's counters at the end, and what it had for every tick.
+        /// Returns the reader's counters at the end, and its value for every tick.
         fn run(&self) -> (LinkRead, Vec<Option<f64>>) {
             let faults = "fault=[{kind='delay', role='controller', delay_ticks=3, from_tick=9}, \
                 {kind='delay', role='controller', delay_ticks=2, from_tick=10}, \
@@ -208,7 +210,7 @@ mod tests {
             let scenario = Scenario::parse(SHIPPED[0].1, "pair", &[faults.to_owned()]).unwrap();
             let directory = tempfile::tempdir().unwrap();
             let ledger = Ledger::shared(&directory.path().join("x.books"), EXTENT.words(WORDS)).unwrap();
-            // What is sent on the one is brought on the other.
+            // Samples sent on one bus are copied to the other.
             let depths = Depths { role: 100, scorer: 100, history: 0 };
             let (sends, mut brings) = (MemoryBus::new(depths), MemoryBus::new(depths));
             let mut from = sends.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
@@ -229,9 +231,9 @@ mod tests {
             let reader = |bus: &MemoryBus, generation| {
                 let shared = ledger.reopened();
                 shared.take(EXTENT.words(WORDS) - RetainedSamples::words(EXTENT.retained_samples, WORDS));
-                let kept = RetainedSamples::open(&shared, EXTENT.retained_samples, WORDS);
+                let retained = RetainedSamples::open(&shared, EXTENT.retained_samples, WORDS);
                 let input = Input::<_, RateCommand>::open(bus, &topic(), Reader::Role).unwrap();
-                let mut input = input.with_recovery(kept, 1, generation > 1);
+                let mut input = input.with_recovery(retained, 1, generation > 1);
                 input.expect(AcceptedTicks::Next);
                 input
             };
@@ -279,7 +281,7 @@ mod tests {
                     bring(&brings, &sent[before..]);
                 }
                 output.finish().unwrap();
-                // The reader is three ticks behind, and at last none.
+                // The reader lags by three ticks and catches up at the end.
                 let due = (tick + 1).saturating_sub(if tick < 16 { 3 } else { 0 });
                 for due in seen.len() as u64..due {
                     assert_ne!(input.seek(due).unwrap(), Seek::NotYet, "{due} {self:?}");
@@ -295,9 +297,10 @@ mod tests {
         }
     }
 
-    /// Whoever dies, and whatever the link lacks or repeats: the successors go on as if nothing had happened.
+    /// Wherever a process dies and whatever the link loses or repeats, the successors continue as if nothing had
+    /// happened.
     #[test]
-    fn whoever_dies_what_was_sent_is_taken_once() {
+    fn every_sent_sample_is_received_once_after_a_death() {
         let undisturbed = Course::default().run();
         let (read, seen) = &undisturbed;
         assert_eq!((read.received, read.void, read.gaps, read.stale, read.rejected), (17, 3, 0, 9, 0));

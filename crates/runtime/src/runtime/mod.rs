@@ -1,7 +1,7 @@
-//! Drives roles: a node is one role on a bus with its counters; a driver decides when it runs.
+//! Runs roles: a node is one role on a bus with its counters; a driver decides when the node runs.
 //!
-//! Between ready and drain a node allocates nothing of its own, logs nothing, locks nothing and panics on nothing that can
-//! arrive from outside. Must not decide what a run is for, nor start processes.
+//! Between the phases ready and drain a node does not allocate, log or lock, and no input from outside makes it panic.
+//! Must not decide what a run is for, nor start processes.
 
 mod absence;
 mod budget;
@@ -50,40 +50,40 @@ use crate::bus::Depths;
 use crate::config::{ClockKind, Settings};
 use crate::sample::FleetTruth;
 
-/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks: at most, and with large samples.
+/// Range of the lockstep window, ticks. The smallest value applies to the largest samples.
 const WINDOW_TICKS: std::ops::RangeInclusive<u64> = 2..=64;
-/// Samples of a fleet that may wait for one reader come to so many bytes at the most, where that is enough to go on.
+/// Upper bound on the fleet samples that wait for one reader, bytes, unless the window's minimum needs more.
 const WAITING_BYTES: usize = 1 << 20;
-/// The same for the scorer of a run in real time, which looks seldom.
+/// The same bound for the scorer of a real-time run, bytes: the scorer reads rarely.
 const SCORED_BYTES: usize = 1 << 22;
 
-/// How long the longest sample of a fleet is, bytes; none without a fleet.
+/// Returns the length of the longest fleet sample, bytes; `None` without a fleet.
 fn longest_sample(scenario: &Settings) -> Option<usize> {
     let fleets = scenario.bodies.iter().filter_map(|body| body.fleet);
     fleets.max().map(|bodies| FleetTruth::length(bodies) * size_of::<u64>())
 }
 
-/// How far the fastest plant may run ahead of the slowest consumer in lockstep, ticks.
+/// Returns the number of ticks that the fastest plant may run ahead of the slowest consumer in lockstep.
 pub fn window_ticks(scenario: &Settings) -> u64 {
     let fits = longest_sample(scenario).map_or(u64::MAX, |bytes| (WAITING_BYTES / 2 / bytes) as u64);
     fits.clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
 }
 
-/// How deep the links of a scenario are.
+/// Returns the queue depths of a scenario's links.
 pub fn depths(scenario: &Settings) -> Depths {
-    // The scorer looks about every 20 ms, the recorder every 5. Neither has priority: beside 18 ready tasks on two cores the
-    // recorder was not run for 0.4 s.
+    // The scorer reads about every 20 ms, the recorder every 5 ms. Neither has priority: beside 18 ready tasks on two
+    // cores the recorder did not run for 0.4 s.
     let second = (1_000_000_000 / scenario.period_ns).next_power_of_two() as usize;
     match scenario.clock {
         ClockKind::Realtime => {
             let fits = longest_sample(scenario).map_or(usize::MAX, |bytes| (SCORED_BYTES / bytes).max(8));
             let late = disturb::late_samples(scenario);
-            // Of commands on their way all are to be had.
+            // All commands in flight must fit.
             let fits = fits.max(scenario.actuation_delay_ticks as usize);
             Depths { role: 1, scorer: second.clamp(64, 8192).min(fits) + late, history: 0 }
         }
-        // Nobody is more than the window ahead of anybody: twice that never overflows, nor as much again for whatever
-        // scripted faults add.
+        // No role runs further ahead of another than the window: twice the window never overflows, plus the same for
+        // each sample that scripted faults add.
         ClockKind::Lockstep | ClockKind::InProcess => {
             let extra = disturb::extra_samples(scenario);
             let deep = (2 + extra) * window_ticks(scenario) as usize + disturb::late_samples(scenario);

@@ -1,6 +1,6 @@
-//! One role on a bus: takes its samples, lets the pure role compute, sends, keeps the counters.
+//! A role with its links and counters: reads samples, calls the role, sends its output.
 //!
-//! Must not wait, and must not decide when it runs; a driver does.
+//! Must not wait or decide when it runs; a driver does.
 
 mod bridge;
 mod context;
@@ -37,14 +37,14 @@ use context::{extent, words};
 use plant::PlantNode;
 use std::path::Path;
 
-/// An upper bound on the state of a role, bytes, but for samples and what is remembered of them.
+/// Upper bound on a role's state without samples, bytes.
 const RECORD_BYTES: usize = 8 << 10;
-/// So many times the size of what a role reads and writes is remembered at the most: samples made, bodies, guards.
+/// Upper bound on the state that depends on samples (samples, bodies, guards), in multiples of the size of the role's
+/// samples.
 const SAMPLES_KEPT: usize = 4;
 
-/// An upper bound on the shared memory that a role's record takes, bytes: two copies of what it writes, and of what bodies,
-/// filters, laws and guards remember, which is at most so many times what is said of them; and of commands, as many as are on
-/// their way.
+/// Returns an upper bound on the shared memory of a role's record, bytes: two copies of the role's state, which is
+/// bounded by a multiple of the size of its samples, and of the commands in flight.
 fn record_bytes(scenario: &Settings, ports: &Ports) -> usize {
     let all = || ports.writes.iter().chain(&ports.reads);
     let samples: usize = all().map(|port| port.size).sum();
@@ -57,12 +57,12 @@ fn record_bytes(scenario: &Settings, ports: &Ports) -> usize {
     2 * (RECORD_BYTES + SAMPLES_KEPT * samples + in_flight * commands)
 }
 
-/// A ledger for a role that no successor will need.
+/// Creates a ledger in private memory, for a role without successor.
 pub fn private_ledger(scenario: &Settings, role: RoleId) -> Ledger {
     Ledger::private(ledger_words(scenario, role))
 }
 
-/// A ledger in a file, for a role that a successor may continue.
+/// Creates a ledger in a file, for a role that a successor may continue.
 ///
 /// # Errors
 /// [`LedgerError`].
@@ -70,7 +70,7 @@ pub fn shared_ledger(scenario: &Settings, role: RoleId, path: &Path) -> Result<L
     Ledger::shared(path, ledger_words(scenario, role))
 }
 
-/// An upper bound on the shared memory that a run takes, bytes.
+/// Returns an upper bound on the shared memory of a run, bytes.
 pub fn shared_memory_bytes(scenario: &Settings) -> usize {
     let depths = super::depths(scenario);
     let port = |port: &Port| footprint(&port.qos(depths), port.size);
@@ -80,11 +80,11 @@ pub fn shared_memory_bytes(scenario: &Settings) -> usize {
         signals + ledger_words(scenario, role) * size_of::<u64>() + record_bytes(scenario, &ports)
     };
     let Ports { schedule, health, .. } = ports(scenario, RoleId::Observer);
-    // The recorder says how it is, as the roles do.
+    // The recorder publishes health too.
     COMMON_BYTES + port(&schedule) + port(&health) + RoleId::all(scenario).into_iter().map(role).sum::<usize>()
 }
 
-/// What a role's ledger says, with what the role itself has to add.
+/// Returns the report of a role: the counters in its ledger, with the stages and grants that the role adds.
 pub fn report(
     scenario: &Settings,
     role: RoleId,
@@ -93,13 +93,13 @@ pub fn report(
     grants: Vec<Grant>,
 ) -> RoleReport {
     let (ports, ledger) = (ports(scenario, role), &ledger.reopened());
-    // Of a role that has committed nothing there are zeros.
+    // All counters are zero if the role has committed nothing.
     let record = ledger.record().unwrap_or_default();
     let record_words = &mut Restore(&record);
-    let (mut ticks, voids) = (TickCounters::default(), scenario.clock != ClockKind::Realtime);
+    let (mut ticks, markers) = (TickCounters::default(), scenario.clock != ClockKind::Realtime);
     ticks.persist(record_words);
     let written = |port: &Port| {
-        link::written(record_words, &port.topic.to_string(), words(port), voids, (ledger, extent(scenario)))
+        link::written(record_words, &port.topic.to_string(), words(port), markers, (ledger, extent(scenario)))
     };
     let written = ports.writes.iter().map(written).collect();
     let read = |port: &Port| {
@@ -126,7 +126,7 @@ pub fn report(
     }
 }
 
-/// The same for a rig whose type is known, on a bus of any type.
+/// Builds the node of a rig of known type on a bus of any type.
 ///
 /// # Errors
 /// [`BusError::Open`].
@@ -149,25 +149,25 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
             let context = context(&(RoleId::Plant(index), ledger.reopened()));
             return Ok(Box::new(bridge::BridgeNode::<R, B>::open(rig, index, link, &context)?));
         }
-        RoleImpl::Device(role, others, link) if others.is_empty() => {
-            let computer = SampleSource::Device(DeviceHandle::all(link));
-            return role_node(rig, &context(&(role, ledger.reopened())), Some(computer));
+        RoleImpl::Device(role, companions, link) if companions.is_empty() => {
+            let source = SampleSource::Device(DeviceHandle::all(link));
+            return role_node(rig, &context(&(role, ledger.reopened())), Some(source));
         }
         RoleImpl::Device(_, _, link) => {
-            let shares = roles.iter().zip(DeviceHandle::both(link));
-            let open = |(of, share): (&(RoleId, Ledger), _)| {
-                Ok((of.0, role_node(rig, &context(of), Some(SampleSource::Device(share)))?))
+            let handles = roles.iter().zip(DeviceHandle::both(link));
+            let open = |(entry, handle): (&(RoleId, Ledger), _)| {
+                Ok((entry.0, role_node(rig, &context(entry), Some(SampleSource::Device(handle)))?))
             };
-            let nodes = shares.map(open).collect::<Result<_, BusError>>()?;
+            let nodes = handles.map(open).collect::<Result<_, BusError>>()?;
             return Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)));
         }
         RoleImpl::Function(role, compute) => {
-            let computing = FunctionRole::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
-            return role_node(rig, &context(&(role, ledger.reopened())), Some(SampleSource::Function(computing)));
+            let function = FunctionRole::new(compute, &ports(scenario, role), (1 << R::AXES) - 1);
+            return role_node(rig, &context(&(role, ledger.reopened())), Some(SampleSource::Function(function)));
         }
         RoleImpl::Role(..) => {}
     }
-    let open = |of: &(RoleId, Ledger)| Ok((of.0, role_node(rig, &context(of), None)?));
+    let open = |entry: &(RoleId, Ledger)| Ok((entry.0, role_node(rig, &context(entry), None)?));
     if let [only] = &mut roles[..] {
         return open(only).map(|(_, node)| node);
     }
@@ -175,19 +175,19 @@ pub fn build_rig<R: Rig, B: Bus + 'static>(
     Ok(Box::new(group::GroupNode::new(nodes, clock == Clock::Monotonic, scenario.last_tick)))
 }
 
-/// The node of one role of this program, whose samples somebody else may compute.
+/// Opens the node of one role, with another source of its samples if given.
 fn role_node<R: Rig, B: Bus + 'static>(
     rig: &R,
     context: &NodeContext<'_, B>,
-    computer: Option<SampleSource>,
+    source: Option<SampleSource>,
 ) -> Result<ReadyNode, BusError> {
     Ok(match context.role {
         RoleId::Plant(index) => {
             let info = &rig.bodies()[index];
             match rig.fleet(index) {
                 None => {
-                    // A device in its place has a node of its own.
-                    let function = match computer {
+                    // A device that is a plant has a node of its own.
+                    let function = match source {
                         Some(SampleSource::Function(function)) => Some(function),
                         Some(SampleSource::Device(_)) | None => None,
                     };
@@ -196,8 +196,8 @@ fn role_node<R: Rig, B: Bus + 'static>(
                 Some(fleet) => Box::new(PlantNode::open(fleet.body(), fleet.command_guard(), info, context, None)?),
             }
         }
-        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, context, computer)?),
-        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, context, computer)?),
+        RoleId::Observer => Box::new(observer::ObserverNode::<R, B>::open(rig, context, source)?),
+        RoleId::Controller => Box::new(controller::ControllerNode::<R, B>::open(rig, context, source)?),
     })
 }
 
@@ -218,9 +218,9 @@ mod tests {
         }
     }
 
-    /// What is asked for before a run is more than it takes, and not much more, whatever the size of a fleet.
+    /// The requested memory is larger than the used memory, but not by more than a factor of two for fleets.
     #[test]
-    fn the_room_that_a_fleet_needs_is_known_beforehand() {
+    fn the_requested_shared_memory_bounds_the_used_one() {
         for (clock, count) in [("lockstep", 1), ("lockstep", 1000), ("realtime", 1000), ("realtime", 20_000)] {
             let overrides = [format!("clock={clock}"), format!("follower.0.count={count}")];
             let text = SHIPPED.iter().find(|(name, _)| *name == "rigid-fleet").unwrap().1;
@@ -244,7 +244,7 @@ mod tests {
             println!("{clock} {count}: {taken} bytes of {asked}");
             assert!(taken <= asked, "{clock} {count}: {taken} bytes of {asked}");
             assert!(count == 1 || asked < 2 * taken, "{clock} {count}: {taken} bytes of {asked}");
-            assert!(signals > 100 * count, "{clock} {count}: the samples are among them, {signals} bytes");
+            assert!(signals > 100 * count, "{clock} {count}: {signals} bytes must include the samples");
         }
     }
 }

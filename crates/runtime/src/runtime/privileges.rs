@@ -1,6 +1,6 @@
-//! Real-time privileges: asked for, taken where granted, and reported either way.
+//! Real-time privileges: requested, taken where granted, and reported in both cases.
 //!
-//! Must not fail a run: whether a missing privilege matters is decided by `--require-rt`.
+//! Must not end a run: `--require-rt` decides whether a missing privilege matters.
 
 use super::budget::{empty_budgets, grant_budgets};
 use super::role_id::RoleId;
@@ -18,12 +18,12 @@ use std::num::NonZero;
 use std::path::Path;
 
 const FIFO: &str = "SCHED_FIFO";
-/// What a limit on locked memory must allow a role, bytes. Its own need is far below.
+/// Lower bound on the memlock limit, bytes. A role needs far less.
 const ENOUGH_LOCKED: u64 = 256 << 20;
 
-/// Locks this process's memory, present and future. To be done before links are opened.
+/// Locks the present and future memory of this process. Must precede the opening of links.
 ///
-/// Not under a limit that the process could reach: there the next allocation, or the stack's growth, would kill it.
+/// Refuses under a limit that the process could reach: the next allocation or stack growth would kill it.
 fn lock_memory() -> io::Result<()> {
     let unlimited = capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::IPC_LOCK));
     match getrlimit(Resource::Memlock).current {
@@ -31,27 +31,28 @@ fn lock_memory() -> io::Result<()> {
             let (limit, enough) = (limit >> 10, ENOUGH_LOCKED >> 10);
             Err(io::Error::other(format!("the memlock limit is {limit} KiB, and less than {enough} is not safe")))
         }
-        // What is touched stays; what is never touched, as most of the program, takes no memory. The warm-up touches the rest.
+        // Touched pages stay; untouched ones, as most of the program, take no memory. The warm-up touches what is
+        // needed.
         _ => Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT)?),
     }
 }
 
-/// What a role has got.
+/// The privileges of a role.
 #[derive(Debug, Default)]
 pub struct Privileges {
-    /// Everything that was asked for, granted or not.
+    /// All requested privileges, granted or not.
     pub grants: Vec<Grant>,
-    /// Whether the role runs before all ordinary processes.
+    /// True if the role runs before all ordinary processes.
     pub has_realtime: bool,
-    /// The other roles on the role's core, all of one priority. Among these whoever waits for another's sample gives way to
-    /// it: a switch between equals costs a fraction of what falling asleep does.
+    /// The other roles on the role's core, all of equal priority. A role that waits for a sample of one of these yields
+    /// to it: a switch between equals costs a fraction of a sleep and a wake.
     pub co_located: Vec<RoleId>,
 }
 
-/// Takes what a role of a scenario asks for, for the calling thread.
+/// Takes the privileges that a scenario requests for a role, for the calling thread.
 pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
     let settings = &scenario.realtime;
-    // No privilege: without SCHED_FIFO the kernel would let timers run late by 50 us to save power.
+    // Not a privilege. Without SCHED_FIFO the kernel would delay timers by 50 us to save power.
     let _ = set_current_timer_slack(NonZero::new(1));
     let mut grants = Vec::new();
     if settings.lock_memory {
@@ -63,7 +64,8 @@ pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
         grants.push(grant(FIFO, settings.priority.to_string(), set_fifo(settings.priority), &remedy));
     }
     let has_realtime = grants.iter().any(|grant| grant.privilege == FIFO && grant.granted);
-    // Among equals, being bound to a busy core is worse than being free: "auto" binds with a real-time priority only.
+    // Without priority, a pinned role on a busy core is worse off than a free one: "auto" pins with a real-time
+    // priority only.
     let cores = cores(settings, has_realtime);
     let mut co_located = Vec::new();
     if let Some(core) = core_of(&cores, role, scenario) {
@@ -72,16 +74,15 @@ pub fn take_privileges(scenario: &Settings, role: RoleId) -> Privileges {
         let pinned = sched_setaffinity(None, &set).map_err(io::Error::from);
         if pinned.is_ok() && has_realtime {
             co_located = RoleId::all(scenario);
-            co_located.retain(|other| {
-                other.process_role(scenario) != role && core_of(&cores, *other, scenario) == Some(core)
-            });
+            co_located
+                .retain(|peer| peer.process_role(scenario) != role && core_of(&cores, *peer, scenario) == Some(core));
         }
         grants.push(grant("core", core.to_string(), pinned, "name cores of this machine in realtime.cores"));
     }
     Privileges { grants, has_realtime, co_located }
 }
 
-/// Returns what grants a real-time priority that is refused, on the machine whose files lie below `root`.
+/// Returns the remedy for a refused real-time priority; `root` is the root of the machine's files.
 pub fn priority_remedy(root: &Path) -> String {
     let empty = empty_budgets(root);
     if let Some(file) = empty.last() {
@@ -93,16 +94,16 @@ pub fn priority_remedy(root: &Path) -> String {
     "raise the rtprio limit (ulimit -r) or grant CAP_SYS_NICE".to_owned()
 }
 
-/// Asks for a real-time priority in a thread that ends at once, and returns the refusal; none if it is granted.
+/// Requests a real-time priority in a short-lived thread; returns the error if it is refused.
 pub fn refused_priority(priority: i32) -> Option<io::Error> {
     std::thread::spawn(move || set_fifo(priority).err()).join().ok().flatten()
 }
 
-/// Returns the cores that the scenario names and this process cannot be bound to: they are not online, or not in its cpuset.
+/// Returns the cores that the scenario names and this process cannot use: offline, or not in its cpuset.
 pub fn unavailable_cores(settings: &Realtime) -> Vec<usize> {
     let Cores::List(cores) = &settings.cores else { return Vec::new() };
     let mut cores = cores.clone();
-    // In a thread that ends at once, and its binding with it. Any other refusal is told by the roles.
+    // A short-lived thread takes its affinity with it. The roles report other errors.
     let bind = move || {
         cores.retain(|core| {
             let mut set = CpuSet::new();
@@ -114,7 +115,7 @@ pub fn unavailable_cores(settings: &Realtime) -> Vec<usize> {
     std::thread::spawn(bind).join().unwrap_or_default()
 }
 
-/// Opens `/dev/cpu_dma_latency` and asks for 0 µs. The request lasts as long as the file is open.
+/// Opens `/dev/cpu_dma_latency` and requests 0 µs. The request lasts as long as the file is open.
 pub fn hold_low_latency_idle(settings: &Realtime) -> (Option<File>, Vec<Grant>) {
     if !settings.low_latency_idle {
         return (None, Vec::new());
@@ -136,7 +137,7 @@ fn grant(privilege: &str, asked: String, result: io::Result<()>, remedy: &str) -
     Grant { privilege: privilege.to_owned(), asked, granted: result.is_ok(), reason }
 }
 
-/// The cores that roles are to be bound to; none if they are not.
+/// Returns the cores for roles; empty if roles are not pinned.
 fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
     match &settings.cores {
         Cores::List(cores) => cores.clone(),
@@ -146,9 +147,9 @@ fn cores(settings: &Realtime, has_realtime: bool) -> Vec<usize> {
     }
 }
 
-/// The core of a role's process: plants in turn, for all of them act when the tick is due; observer and controller on cores
-/// of their own if there are any, else beside the leader and beside the first follower, whose measurements they wait for. A
-/// process of several roles is where the first of them would be.
+/// Returns the core of a role's process. Plants take turns over the cores, because all of them act at the due instant.
+/// Observer and controller get cores of their own if possible, else those of the leader and of the first follower,
+/// whose measurements they wait for. The first role decides for a process of several roles.
 fn core_of(cores: &[usize], role: RoleId, scenario: &Settings) -> Option<usize> {
     let bodies = scenario.bodies.len();
     let own_or = |own: usize, beside: usize| if own < cores.len() { own } else { beside };
@@ -164,18 +165,18 @@ fn set_fifo(priority: i32) -> io::Result<()> {
     set_scheduler(libc::SCHED_FIFO, priority)
 }
 
-/// Opens links to a loop that may be running, for a process that no role waits for, and yields to all roles from then on: at this
-/// niceness, off their cores.
+/// Opens links to a running loop for a process that no role waits for. From then on the process runs at this niceness
+/// and off the cores of the roles.
 pub fn join_at_low_priority<T>(scenario: &Settings, niceness: i32, open: impl FnOnce() -> T) -> T {
     let opened = with_realtime_priority(open);
     yield_cores(scenario, niceness);
     opened
 }
 
-/// Opens or closes links at the least real-time priority, if it is granted.
+/// Opens or closes links at the lowest real-time priority, if granted.
 ///
-/// A role that finds a link half made waits until it is whole, and must not wait for a process that others keep from going
-/// on.
+/// A role that finds a half-made link waits for its completion, so the process that makes it must not be preempted by
+/// ordinary ones.
 pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
     take_lowest_realtime_priority();
     let done = act();
@@ -183,13 +184,14 @@ pub fn with_realtime_priority<T>(act: impl FnOnce() -> T) -> T {
     done
 }
 
-/// Goes before all ordinary processes from now on, behind roles of a higher priority. Not granted, it takes its chance.
+/// Takes the lowest real-time priority: before all ordinary processes, after the roles. Without permission nothing
+/// changes.
 pub fn take_lowest_realtime_priority() {
     let _ = set_fifo(1);
 }
 
-/// Goes before all roles of a scenario, for the calling thread and those that it starts from now on: what carries samples between hosts
-/// does little, and whoever spins for a sample that it has would hold it up. What is not granted is done without.
+/// Takes a priority above all roles, for the calling thread and threads started from now on: the process that carries
+/// samples between hosts does little, and a spinning role would delay it. Without permission nothing changes.
 #[cfg(feature = "hosts")]
 pub fn take_priority_above_roles(scenario: &Settings) {
     let _ = set_current_timer_slack(NonZero::new(1));
@@ -198,7 +200,7 @@ pub fn take_priority_above_roles(scenario: &Settings) {
     }
 }
 
-/// Takes a niceness, and leaves the cores that the scenario names for roles. What is not granted is no harm.
+/// Sets the niceness and leaves the cores that the scenario names for roles. Failures are ignored.
 fn yield_cores(scenario: &Settings, niceness: i32) {
     let _ = nice(niceness);
     if let (Cores::List(critical), Ok(mut allowed)) = (&scenario.realtime.cores, sched_getaffinity(None)) {
@@ -209,18 +211,18 @@ fn yield_cores(scenario: &Settings, niceness: i32) {
     }
 }
 
-/// Gives the real-time priority of the calling thread back: what follows the last tick must not delay another role's.
+/// Returns the calling thread to ordinary priority: work after the last tick must not delay another role.
 pub fn release_priority() {
-    // Failing to give up what one has harms nobody but the last tick.
+    // A failure affects only the time after the last tick.
     let _ = set_scheduler(libc::SCHED_OTHER, 0);
 }
 
-/// For how long a process without priority is asked to be let run at a time, ns: the least that the kernel grants.
+/// Requested time slice of a process without priority, ns: the shortest that the kernel grants.
 const TURN_NS: u64 = 100_000;
 
-/// Asks for short turns, for the calling thread and what it starts from now on. Whoever sleeps until a sample comes is then woken at
-/// once, and not when the turns of busy processes are over; its share of the processor stays the same. It needs no privilege. Linux
-/// heeds it from 6.12 on; on others nothing changes.
+/// Requests short time slices for the calling thread and threads started from now on. A sleeping process then wakes at
+/// once instead of after the slices of busy processes; its share of the processor stays the same. Needs no privilege.
+/// Effective from Linux 6.12 on, ignored by older kernels.
 pub fn request_short_slices() {
     let mut attributes = libc::sched_attr {
         size: size_of::<libc::sched_attr>() as u32,
@@ -234,12 +236,12 @@ pub fn request_short_slices() {
     };
     let size = attributes.size;
     #[allow(unsafe_code)]
-    // SAFETY: thread 0 is the calling one, and the pointer is to a live structure of the size that is told.
-    let told = unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attributes, size, 0) };
-    if told == 0 && attributes.sched_policy == libc::SCHED_OTHER as u32 {
+    // SAFETY: thread 0 is the calling one, and the pointer is to a live structure of the given size.
+    let result = unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attributes, size, 0) };
+    if result == 0 && attributes.sched_policy == libc::SCHED_OTHER as u32 {
         attributes.sched_runtime = TURN_NS;
         #[allow(unsafe_code)]
-        // SAFETY: as above; the kernel only reads it. A kernel that does not know it leaves all as it is.
+        // SAFETY: as above; the kernel only reads it. An older kernel changes nothing.
         let _ = unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0) };
     }
 }
@@ -262,12 +264,12 @@ mod tests {
 
     fn shipped(name: &str, overrides: &[&str]) -> Scenario {
         let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).unwrap();
-        let overrides: Vec<String> = overrides.iter().map(|one| (*one).to_owned()).collect();
+        let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
         Scenario::parse(text, name, &overrides).unwrap()
     }
 
     #[test]
-    fn whoever_waits_for_a_body_is_beside_it_unless_there_are_cores_for_all() {
+    fn roles_share_cores_with_the_bodies_they_wait_for_unless_cores_suffice() {
         let roles = [RoleId::Plant(0), RoleId::Plant(1), RoleId::Observer, RoleId::Controller];
         let places = |cores: &[usize], processes: &str| {
             let scenario = shipped("rigid-pair", &[processes]);
@@ -288,24 +290,24 @@ mod tests {
     }
 
     #[test]
-    fn nobody_is_bound_to_a_core_without_being_served_first_there() {
+    fn no_role_is_pinned_without_a_realtime_priority() {
         assert!(cores(&Realtime::default(), false).is_empty());
         assert!(!cores(&Realtime::default(), true).is_empty());
     }
 
     #[test]
-    fn a_core_that_no_machine_has_is_found_before_a_run() {
+    fn an_unavailable_core_is_found_before_a_run() {
         let cores =
             |list: &str| unavailable_cores(&shipped("rigid-pair", &[&format!("realtime.cores={list}")]).realtime);
         let allowed = sched_getaffinity(None).unwrap();
         let first = (0..CpuSet::MAX_CPU).find(|core| allowed.is_set(*core)).unwrap();
         assert_eq!(cores(&format!("[{first},1023]")), [1023]);
         assert!(cores("\"auto\"").is_empty());
-        assert_eq!(sched_getaffinity(None).unwrap(), allowed, "this thread is not bound by it");
+        assert_eq!(sched_getaffinity(None).unwrap(), allowed, "this thread keeps its affinity");
     }
 
     #[test]
-    fn what_is_not_granted_is_reported_with_a_remedy() {
+    fn a_refused_privilege_is_reported_with_a_remedy() {
         let overrides = ["realtime.lock_memory=false", "realtime.priority=0", "realtime.cores=[1023]"];
         let scenario = shipped("rigid-pair", &overrides);
         let Privileges { grants, has_realtime, co_located } = take_privileges(&scenario, RoleId::Observer);

@@ -1,43 +1,43 @@
-//! A role whose samples a function of a program's own computes, in the place of our observer, law or body. Links, clock, counters,
-//! guards and supervision stay those of every role.
+//! A role whose samples are computed by a function of the embedding program instead of the built-in observer, law or
+//! body. Links, clock, counters, guards and supervision stay the same.
 //!
-//! Must not keep anything of a tick: what a function remembers is its own, and ends with its process.
+//! Must not keep state between ticks: the function owns its state, which ends with its process.
 
 use super::error::NodeError;
 use super::node::ports::Ports;
 use crate::sample::{Field, Stamp};
 
-/// Words of a stamp.
+/// Length of a stamp, words.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
-/// One tick of a role, to be computed.
+/// The samples of one tick of a role.
 #[derive(Debug)]
 pub struct TickSamples<'a> {
-    /// Which.
+    /// The tick.
     pub tick: u64,
-    /// The samples that it reads, as words with their stamps, in the order of its seat; none where a sample is missing or was not
-    /// believed.
+    /// Input samples as words with stamps, in the order of the seat description; `None` where a sample is missing or
+    /// rejected by its guard.
     pub inputs: &'a [Option<&'a [u64]>],
-    /// The samples that it writes, as words without their stamps, in the order of its seat: zeros, but for `valid`, of which all
-    /// bits are set. A truth that is left so has the measurement's values.
+    /// Output samples as words without stamps, in the order of the seat description. Initially zero, except `valid`,
+    /// whose bits are all set. A truth that stays unchanged takes the measurement's values.
     pub outputs: &'a mut [Vec<u64>],
 }
 
-/// Computes what a role sends.
+/// A function that computes the output samples of a role.
 pub trait RoleFunction {
-    /// Computes one tick. It is waited for: in real time a tick that it takes too long for is late, as any other.
+    /// Computes one tick. The role waits for it: in real time a slow computation makes the tick late.
     ///
     /// # Errors
-    /// Why it cannot go on; the role ends with that.
+    /// The reason, as text; the role ends with it.
     fn compute(&mut self, tick: TickSamples<'_>) -> Result<(), String>;
 }
 
-/// A function with the samples that it fills.
+/// A role function with its sample buffers.
 pub(crate) struct FunctionRole {
     compute: Box<dyn RoleFunction>,
     blank: Vec<Vec<u64>>,
     outputs: Vec<Vec<u64>>,
-    /// Where a plant's measurement has what its truth has too: words from, words to, how many.
+    /// Fields common to a plant's measurement and truth: first word in each, and number of words.
     common: Vec<(usize, usize, usize)>,
 }
 
@@ -61,19 +61,19 @@ impl FunctionRole {
         Self { compute, outputs: blank.clone(), blank, common }
     }
 
-    /// Computes a tick.
+    /// Calls the function for one tick.
     pub fn tick(&mut self, tick: u64, inputs: &[Option<&[u64]>]) -> Result<(), NodeError> {
         self.outputs.iter_mut().zip(&self.blank).for_each(|(output, blank)| output.copy_from_slice(blank));
         let outputs = &mut self.outputs[..];
         self.compute.compute(TickSamples { tick, inputs, outputs }).map_err(|reason| NodeError::Computed { reason })
     }
 
-    /// Writes what was computed into a sample, after its stamp.
+    /// Copies output `index` into a sample, after the stamp.
     pub fn write(&self, index: usize, words: &mut [u64]) {
         words[STAMP..].copy_from_slice(&self.outputs[index]);
     }
 
-    /// The same for a plant's truth: what the function does not tell, its sensors say.
+    /// Copies the truth of a plant into a sample. If the function left it unchanged, the measured values replace it.
     pub fn write_truth(&self, words: &mut [u64]) {
         self.write(1, words);
         if self.outputs[1] == self.blank[1] {
@@ -84,7 +84,7 @@ impl FunctionRole {
     }
 }
 
-/// Where two samples have fields of one name and kind.
+/// Returns the fields of equal name, kind and length in two samples.
 fn common(from: &[Field], to: &[Field]) -> Vec<(usize, usize, usize)> {
     let place = |field: &Field| field.offset / size_of::<u64>() - STAMP;
     let same = |a: &Field, b: &Field| (a.name, a.kind, a.count) == (b.name, b.kind, b.count);

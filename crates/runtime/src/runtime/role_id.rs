@@ -1,8 +1,8 @@
-//! The roles of a scenario by name and number, and in whose process each runs. Must not open anything.
+//! The roles of a scenario by name and number, and the process of each. Must not open anything.
 
 use crate::config::{ClockKind, Settings};
 
-/// Which role of a scenario.
+/// A role of a scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoleId {
     /// The plant of the body with this index.
@@ -14,14 +14,14 @@ pub enum RoleId {
 }
 
 impl RoleId {
-    /// All roles of a scenario, in the order in which one tick passes through them.
+    /// Returns all roles of a scenario in the order of a tick.
     pub fn all(scenario: &Settings) -> Vec<Self> {
         let plants = (0..scenario.bodies.len()).map(Self::Plant);
         let driven = scenario.bodies.iter().any(|body| body.driven);
         plants.chain([Self::Observer]).chain(driven.then_some(Self::Controller)).collect()
     }
 
-    /// The role's name: a body's, `observer` or `controller`.
+    /// Returns the role's name: a body's, `observer` or `controller`.
     pub fn name(self, scenario: &Settings) -> &str {
         match self {
             Self::Plant(index) => &scenario.bodies[index].name,
@@ -30,13 +30,13 @@ impl RoleId {
         }
     }
 
-    /// The role of this name, if the scenario has one.
+    /// Returns the role of this name, if the scenario has one.
     pub fn named(scenario: &Settings, name: &str) -> Option<Self> {
         Self::all(scenario).into_iter().find(|role| role.name(scenario) == name)
     }
 
-    /// The role in whose process it runs: its own, unless the scenario gives it one together with others. Then it is the last of
-    /// them in the order of a tick.
+    /// Returns the role that the role's process is named after: itself, or the last one, in the order of a tick, of the
+    /// roles that share the process.
     pub fn process_role(self, scenario: &Settings) -> Self {
         let name = self.name(scenario);
         let process = scenario.processes.iter().find(|roles| roles.iter().any(|role| role == name));
@@ -46,14 +46,15 @@ impl RoleId {
         roles.pop().unwrap_or(self)
     }
 
-    /// The roles that run in its process, in the order of a tick; none if it is in another's.
+    /// Returns the roles in this role's process in the order of a tick; empty if the process is named after another
+    /// role.
     pub fn process_members(self, scenario: &Settings) -> Vec<Self> {
         let mut hosted = Self::all(scenario);
         hosted.retain(|role| role.process_role(scenario) == self);
         hosted
     }
 
-    /// What kind of role it is, as the command line calls it.
+    /// Returns the kind of role as on the command line.
     pub fn kind(self) -> &'static str {
         match self {
             Self::Plant(_) => "plant",

@@ -1,36 +1,36 @@
-//! Who takes a role's seat.
+//! The implementation of a role: built in, a function, or a device.
 
 use super::device::DeviceLink;
 use super::role_function::RoleFunction;
 use super::role_id::RoleId;
 use crate::telemetry::Ledger;
 
-/// Who takes a role's seat.
+/// The implementation of a role.
 pub enum RoleImpl {
-    /// This program, with other roles in the same process: these, in the order of a tick, with their ledgers.
+    /// The built-in role, with the other roles of its process in the order of a tick, each with its ledger.
     Role(RoleId, Vec<(RoleId, Ledger)>),
-    /// This program's node, whose samples a function computes.
+    /// A node of this program whose samples a function computes.
     Function(RoleId, Box<dyn RoleFunction>),
-    /// A device: a role, with others in the same device, as above.
+    /// A device, with its other roles in the order of a tick, each with its ledger.
     Device(RoleId, Vec<(RoleId, Ledger)>, Box<DeviceLink>),
 }
 
 impl RoleImpl {
-    /// The seat.
+    /// Returns the role of the process.
     pub fn role(&self) -> RoleId {
         match self {
             Self::Role(role, _) | Self::Function(role, _) | Self::Device(role, ..) => *role,
         }
     }
 
-    /// Its roles with their ledgers, in the order of a tick; `ledger` is that of the seat.
+    /// Returns all roles with their ledgers, in the order of a tick; `ledger` is that of [`role`](Self::role).
     pub(crate) fn ledgers(&self, ledger: &Ledger) -> Vec<(RoleId, Ledger)> {
-        let others = match self {
-            Self::Role(_, others) | Self::Device(_, others, _) => &others[..],
+        let companions = match self {
+            Self::Role(_, companions) | Self::Device(_, companions, _) => &companions[..],
             Self::Function(..) => &[],
         };
-        let others = others.iter().map(|(role, ledger)| (*role, ledger.reopened()));
-        others.chain([(self.role(), ledger.reopened())]).collect()
+        let companions = companions.iter().map(|(role, ledger)| (*role, ledger.reopened()));
+        companions.chain([(self.role(), ledger.reopened())]).collect()
     }
 }
 

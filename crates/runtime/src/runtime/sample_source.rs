@@ -1,8 +1,8 @@
-//! A device that computes the samples of the observer, of the controller, or of both: one exchange per tick, whoever of them
-//! begins it.
+//! Sources of a role's samples other than the built-in role: a function, or a device that computes the samples of
+//! observer, controller or both in one exchange per tick.
 //!
-//! The roles stay the nodes that they are, with links, guards, watchdog and counters; only what they send comes from the
-//! device. Must not invent anything: what is not answered before the next tick is due is missed.
+//! The roles keep their nodes with links, guards, watchdog and counters; only the content of their samples comes from
+//! the source. Must not invent anything: a tick without an answer before the next one is due is missed.
 
 use super::device::DeviceLink;
 use super::error::NodeError;
@@ -14,37 +14,37 @@ use crate::telemetry::{Latency, Outage};
 use std::cell::RefCell;
 use std::rc::Rc;
 
-/// Words of a stamp.
+/// Length of a stamp, words.
 const STAMP: usize = size_of::<Stamp>() / size_of::<u64>();
 
-/// What became of a tick that somebody else computes.
+/// State of a tick that is computed elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Progress {
-    /// It is there, to be written.
+    /// The samples are available.
     Done,
-    /// It is not there yet: ask again.
+    /// Not yet available: poll again.
     Waiting,
-    /// It will not be there.
+    /// The tick has no samples.
     Missed,
 }
 
-/// Who computes a role's samples in the place of our own.
+/// A source of a role's samples in place of the built-in role.
 pub(crate) enum SampleSource {
-    /// A function, which is waited for.
+    /// A function; the role waits for its return.
     Function(FunctionRole),
-    /// A device, which is asked until it has answered.
+    /// A device; the role polls until it answers.
     Device(DeviceHandle),
 }
 
 impl SampleSource {
-    /// Hands over the time grid; in real time.
+    /// Sets the time grid, in real time.
     pub fn start(&mut self, grid: Grid) {
-        if let Self::Device(share) = self {
-            share.exchange.borrow_mut().grid = Some(grid);
+        if let Self::Device(handle) = self {
+            handle.exchange.borrow_mut().grid = Some(grid);
         }
     }
 
-    /// Computes a tick, or asks for it, with the samples that the role reads.
+    /// Computes or requests a tick from the samples that the role reads.
     #[inline]
     pub fn tick<'a>(
         &mut self,
@@ -56,95 +56,95 @@ impl SampleSource {
                 let inputs: Vec<Option<&[u64]>> = inputs.collect();
                 function.tick(tick, &inputs).map(|()| Progress::Done)
             }
-            Self::Device(share) => share.tick(tick, inputs),
+            Self::Device(handle) => handle.tick(tick, inputs),
         }
     }
 
-    /// Whether there is a sample with this index, in the order of what the role writes.
+    /// Returns true if the role's output `index` has a sample.
     pub fn has(&self, index: usize) -> bool {
         match self {
             Self::Function(_) => true,
-            Self::Device(share) => share.exchange.borrow().outputs[share.part.first_output() + index].there,
+            Self::Device(handle) => handle.exchange.borrow().outputs[handle.part.first_output() + index].there,
         }
     }
 
-    /// Writes what was computed into a sample, after its stamp.
+    /// Copies the role's output `index` into a sample, after the stamp.
     pub fn write(&self, index: usize, words: &mut [u64]) {
         match self {
             Self::Function(function) => function.write(index, words),
-            Self::Device(share) => {
-                let exchange = share.exchange.borrow();
-                let bytes = &exchange.outputs[share.part.first_output() + index].bytes;
+            Self::Device(handle) => {
+                let exchange = handle.exchange.borrow();
+                let bytes = &exchange.outputs[handle.part.first_output() + index].bytes;
                 bytemuck::cast_slice_mut(&mut words[STAMP..]).copy_from_slice(bytes);
             }
         }
     }
 
-    /// The tick of which the device waits for what this role, a controller, reads beside the estimate.
+    /// Returns the tick for which the device still lacks the controller's inputs besides the estimate.
     pub fn lacks(&self) -> Option<u64> {
-        let Self::Device(share) = self else { return None };
-        let exchange = share.exchange.borrow();
-        exchange.tick.filter(|_| share.part == Part::Controller && exchange.asked_ns.is_none())
+        let Self::Device(handle) = self else { return None };
+        let exchange = handle.exchange.borrow();
+        exchange.tick.filter(|_| handle.part == Part::Controller && exchange.asked_ns.is_none())
     }
 
-    /// Gives it that, and asks.
+    /// Passes the controller's inputs to the device and sends the request.
     pub fn offer<'a>(&mut self, inputs: impl Iterator<Item = Option<&'a [u64]>>) {
-        if let Self::Device(share) = self {
-            let exchange = &mut *share.exchange.borrow_mut();
-            exchange.put(share.part, inputs);
+        if let Self::Device(handle) = self {
+            let exchange = &mut *handle.exchange.borrow_mut();
+            exchange.put(handle.part, inputs);
             exchange.ask(monotonic_ns());
         }
     }
 
-    /// When the device was asked for this tick, ns.
+    /// Returns the time of the request for this tick, ns.
     pub fn asked_ns(&self, tick: u64) -> Option<u64> {
-        let Self::Device(share) = self else { return None };
-        let exchange = share.exchange.borrow();
+        let Self::Device(handle) = self else { return None };
+        let exchange = handle.exchange.borrow();
         exchange.asked_ns.filter(|_| exchange.tick == Some(tick))
     }
 
-    /// Returns true if the device makes the estimate that this role, a controller, works on.
+    /// Returns true if the device also computes the estimate that this controller uses.
     pub fn makes_estimate(&self) -> bool {
-        matches!(self, Self::Device(share) if share.part == Part::Controller)
+        matches!(self, Self::Device(handle) if handle.part == Part::Controller)
     }
 
-    /// Whether an answer is waited for, or what is to be asked.
+    /// Returns true while a request is open or incomplete.
     pub fn pending(&self) -> bool {
-        let Self::Device(share) = self else { return false };
-        let exchange = share.exchange.borrow();
+        let Self::Device(handle) = self else { return false };
+        let exchange = handle.exchange.borrow();
         exchange.tick.is_some() && !exchange.answered
     }
 
-    /// Whether the device has lost the run, and begun anew.
+    /// Returns true if the device lost the run and restarted from its initial state.
     pub fn restarted(&self) -> bool {
-        let Self::Device(share) = self else { return false };
-        share.exchange.borrow().link.counters().restarts > 0
+        let Self::Device(handle) = self else { return false };
+        handle.exchange.borrow().link.counters().restarts > 0
     }
 
-    /// When the device was absent, for the role that tells it.
+    /// Returns the device's outages, for the role that reports them.
     pub fn outages(&self) -> Vec<Outage> {
         match self {
-            Self::Device(share) if share.part != Part::Controller => share.exchange.borrow().link.outages(),
+            Self::Device(handle) if handle.part != Part::Controller => handle.exchange.borrow().link.outages(),
             _ => Vec::new(),
         }
     }
 
-    /// The counters of the line and its round trips, for the role that tells them.
+    /// Returns the line's counters and round-trip times, for the role that reports them.
     pub fn line(&self) -> Option<(LineCounters, Latency)> {
-        let Self::Device(share) = self else { return None };
-        let exchange = share.exchange.borrow();
-        (share.part != Part::Controller).then(|| (exchange.link.counters(), exchange.serial.clone()))
+        let Self::Device(handle) = self else { return None };
+        let exchange = handle.exchange.borrow();
+        (handle.part != Part::Controller).then(|| (exchange.link.counters(), exchange.serial.clone()))
     }
 }
 
-/// Which of the device's roles a role is.
+/// The part of a device that a role uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Part {
-    /// The only one.
+    /// The whole device.
     All,
-    /// The observer of a flight computer: its measurement is the first input, its estimate the first output.
+    /// The observer of a flight computer: first input measurement, first output estimate.
     Observer,
-    /// The controller of a flight computer: it has all the others, and the estimate from the device itself.
+    /// The controller of a flight computer: all other inputs and outputs. The estimate stays in the device.
     Controller,
 }
 
@@ -154,19 +154,19 @@ impl Part {
     }
 }
 
-/// One role's share of a device.
+/// A role's handle on a device that roles may handle.
 pub(crate) struct DeviceHandle {
     exchange: Rc<RefCell<Exchange>>,
     part: Part,
 }
 
 impl DeviceHandle {
-    /// The only role of a device.
+    /// Creates the handle of a device with one role.
     pub fn all(link: Box<DeviceLink>) -> Self {
         Self { exchange: Rc::new(RefCell::new(Exchange::new(link))), part: Part::All }
     }
 
-    /// Observer and controller of a device.
+    /// Creates the handles of a device that is observer and controller.
     pub fn both(link: Box<DeviceLink>) -> [Self; 2] {
         let exchange = Rc::new(RefCell::new(Exchange::new(link)));
         [Part::Observer, Part::Controller].map(|part| Self { exchange: Rc::clone(&exchange), part })
@@ -177,7 +177,7 @@ impl DeviceHandle {
         if exchange.tick != Some(tick) {
             exchange.begin(tick);
             exchange.put(self.part, inputs);
-            // The observer's measurement goes together with the others.
+            // The observer's measurement is sent together with the controller's inputs.
             if self.part != Part::Observer {
                 exchange.ask(now_ns);
             }
@@ -194,20 +194,20 @@ impl DeviceHandle {
     }
 }
 
-/// The content of a sample, if it is there.
+/// The content of a sample, if present.
 struct Content {
     bytes: Vec<u8>,
     there: bool,
 }
 
-/// What passes between the host and such a device at one tick.
+/// The inputs and outputs of a device at one tick.
 struct Exchange {
     link: Box<DeviceLink>,
-    /// In real time.
+    /// The time grid, in real time.
     grid: Option<Grid>,
     inputs: Vec<Content>,
     outputs: Vec<Content>,
-    /// The tick at hand; when it was asked for, ns; whether it was answered.
+    /// The current tick; the time of its request, ns; true once answered.
     tick: Option<u64>,
     asked_ns: Option<u64>,
     answered: bool,
@@ -238,7 +238,7 @@ impl Exchange {
         self.inputs.iter_mut().for_each(|input| input.there = false);
     }
 
-    /// Asks no more for the tick at hand.
+    /// Ends the current tick and its request.
     fn end(&mut self) {
         if let Some(asked_ns) = self.asked_ns.filter(|_| !self.answered) {
             self.link.give_up();
@@ -249,7 +249,7 @@ impl Exchange {
         (self.tick, self.asked_ns, self.answered) = (None, None, false);
     }
 
-    /// Takes what one role reads; of a flight computer's controller all but the estimate.
+    /// Stores the inputs of one role; for the controller of a flight computer all but the estimate.
     fn put<'a>(&mut self, part: Part, samples: impl Iterator<Item = Option<&'a [u64]>>) {
         let (own, first) = match part {
             Part::All => (&mut self.inputs[..], 0),
@@ -276,7 +276,7 @@ impl Exchange {
         self.asked_ns = Some(now_ns);
     }
 
-    /// Serves the line.
+    /// Serves the line while a request is open.
     fn look(&mut self, now_ns: u64) -> Result<(), NodeError> {
         let Some(asked_ns) = self.asked_ns.filter(|_| !self.answered) else { return Ok(()) };
         let Self { link, outputs, answered, .. } = self;
@@ -291,7 +291,7 @@ impl Exchange {
     }
 }
 
-/// The lengths are those agreed upon: the host's end drops other answers.
+/// Stores an answer. Its lengths match the agreed ones: the host's end drops others.
 fn take(outputs: &mut [Content], answer: &Answer<'_>) {
     let mut bytes = answer.outputs.bytes;
     for (index, output) in outputs.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! The counters of the two ends of a link balance under every schedule of sends, looks, scripted faults and deaths.
+//! The counters of both ends of a link balance under every schedule of sends, reads, scripted faults and deaths.
 
 use super::tests::{Store, WORDS};
 use super::{AcceptedTicks, Extent, Input, Output};
@@ -17,35 +17,35 @@ use proptest::prelude::*;
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 
-/// A tick of the schedule, s: long, so that a tick does not become due while the test runs.
+/// Period of the schedule, ns: so long that no tick becomes due while the test runs.
 const PERIOD_NS: u64 = 1_000_000_000;
 
-/// An action of the reader where a schedule lets it look.
+/// The reader's action at a point of a schedule.
 #[derive(Debug, Clone, Copy)]
 enum Look {
-    /// Nothing.
+    /// No action.
     Away,
-    /// It takes what is new.
+    /// Reads all new samples.
     Advance,
-    /// It connects to the writer that there is now, and its next look goes to the queue too.
+    /// Connects to the current writer, then reads; the next poll also checks the queue.
     Refresh,
-    /// It sleeps until something is new.
+    /// Sleeps until a sample arrives.
     Sleep,
-    /// It dies; its successor goes on by what was committed last.
+    /// Dies. Its successor continues from the last commit.
     Restart,
 }
 
-/// An action of the writer at a tick.
+/// The writer's action at a tick.
 #[derive(Debug, Clone, Copy)]
 enum Turn {
-    /// It misses the tick.
+    /// Misses the tick.
     Miss,
-    /// It has no sample.
+    /// Sends a no-sample marker.
     Void,
-    /// It sends what it has.
+    /// Sends a sample.
     Send,
-    /// It dies after so many of its steps, with word of all samples that it sent, or of all but the last. A step puts a sample
-    /// on the channel or in the queues.
+    /// Dies after a number of steps, with all sent samples recorded, or all but the last. A step writes a sample to the
+    /// latest-value channel or to the queues.
     Die { steps: u64, marked: bool },
 }
 
@@ -53,11 +53,11 @@ enum Turn {
 struct Schedule {
     faults: Vec<String>,
     turns: Vec<Turn>,
-    /// Consumed one after the other: between the two steps of every sample, and three after every tick.
+    /// Consumed in order: one between the two steps of every sample, and three after every tick.
     looks: Vec<Look>,
 }
 
-/// The life of a writer: how far it gets, and what happens between its steps.
+/// The number of steps a writer lives, and a callback between its steps.
 struct Life {
     steps: Cell<u64>,
     taken: Cell<u64>,
@@ -76,7 +76,7 @@ impl Life {
     }
 }
 
-/// A bus on which a reader looks, and a writer dies, between the channel and the queues.
+/// A bus on which the reader may act and the writer may die between channel and queues.
 struct Interleaved<B> {
     bus: Rc<B>,
     life: Rc<Life>,
@@ -138,7 +138,7 @@ impl<B: Bus> Bus for Interleaved<B> {
     }
 }
 
-/// The reading end with what was committed of it last.
+/// The reading end with its last committed state.
 struct Reading<B: Bus> {
     input: Input<B, RateCommand>,
     committed: [Store; 2],
@@ -152,7 +152,7 @@ impl<B: Bus> Reading<B> {
         self.input.persist(&mut self.committed[1]);
     }
 
-    /// Does what the schedule has next; `open` opens the link for a successor.
+    /// Performs the next action; `open` opens the link for a successor.
     fn look(&mut self, open: impl FnOnce() -> Input<B, RateCommand>) {
         match self.looks.next().unwrap_or(Look::Away) {
             Look::Away => {}
@@ -176,7 +176,8 @@ impl<B: Bus> Reading<B> {
     }
 }
 
-/// Runs a schedule on a bus; `reader` reads by the channel or every sample. `service` tells the links of several runs apart.
+/// Runs a schedule on a bus; `reader` selects the channel or every sample. `service` keeps the links of several runs
+/// apart.
 fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader: Reader, lossless: bool) {
     let clock = if lossless { "lockstep" } else { "realtime" };
     let overrides = [format!("clock='{clock}'"), format!("fault=[{}]", schedule.faults.join(", "))];
@@ -304,7 +305,7 @@ fn schedule() -> impl Strategy<Value = Schedule> {
         .prop_map(|(faults, turns, looks)| Schedule { faults, turns, looks })
 }
 
-/// A quarter of the usual number of cases, which `PROPTEST_CASES` sets.
+/// Returns a quarter of the usual number of cases, which `PROPTEST_CASES` sets.
 fn config() -> ProptestConfig {
     let config = ProptestConfig::default();
     ProptestConfig { cases: config.cases / 4, failure_persistence: None, ..config }
@@ -330,7 +331,7 @@ fn a_link_of_every_sample_balances() {
     balances_over_shared_memory(Reader::Scorer);
 }
 
-/// Deaths on such a link are another test's.
+/// Another test covers deaths on such a link.
 #[test]
 fn a_link_that_loses_nothing_balances() {
     let bus = Rc::new(MemoryBus::new(Depths { role: 64, scorer: 64, history: 0 }));

@@ -1,7 +1,7 @@
-//! The reading end of a link with its counters and its guard: what was received, lost, not believed.
+//! The reading end of a link with its counters and its guard.
 //!
-//! Samples of generation 0 are warm-up: they pass through the link and go no further. Must not let a sample that its guard
-//! does not believe be seen.
+//! Samples of generation 0 are warm-up: they pass through the link and go no further. Must not return a sample that its
+//! guard rejects.
 
 use super::retained::RetainedSamples;
 use crate::bus::{Bus, BusError, Carried, Read, Reader, Topic};
@@ -13,38 +13,38 @@ use crate::state::{Persist, Words};
 use crate::telemetry::ReadCounters;
 use std::borrow::{Borrow, BorrowMut};
 
-/// What a reading end has for a tick.
+/// Result of a search for the sample of a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Seek {
-    /// The sample of that tick is at hand.
+    /// The sample of the tick is available.
     Found,
-    /// Nothing so new has arrived.
+    /// No sample of this or a later tick has arrived.
     NotYet,
-    /// Something later has arrived, or a void: that tick's will never come.
+    /// A later sample or a no-sample marker has arrived: the tick has no sample.
     Passed,
-    /// That tick's has arrived and is not believed.
+    /// The sample of the tick has arrived and was rejected.
     Rejected,
 }
 
-/// Which ticks a sample can have.
+/// The ticks that a sample may have.
 #[derive(Debug, Clone, Copy)]
 pub enum AcceptedTicks {
     /// Any.
     Unknown,
-    /// The next only: nothing is lost on this link.
+    /// The next tick only: this link loses nothing.
     Next,
-    /// Those that are due.
+    /// Ticks that are due.
     Due(Grid),
 }
 
-/// What has become of the newest sample.
+/// State of the newest sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Newest {
-    /// It is at hand.
+    /// Accepted by the guard.
     Usable,
-    /// It was of the tick that was due, and is not believed.
+    /// Of the expected tick, and rejected.
     Rejected,
-    /// There is none, or it was a void, or it was displaced by one of no use.
+    /// Missing, a no-sample marker, or displaced by an unusable sample.
     None,
 }
 
@@ -53,47 +53,47 @@ pub struct Input<B: Bus, S: Carried + ?Sized, G = AcceptAll> {
     port: S::Reader<B>,
     guard: G,
     accepted_ticks: AcceptedTicks,
-    /// Tick and generation of the newest tick that something is known of.
+    /// Tick and generation of the newest sample or marker.
     last: Option<(u64, u64)>,
-    /// Whatever arrives displaces what was at hand, usable or not.
+    /// Every arrival replaces the previous sample, usable or not.
     newest: Newest,
-    /// The generation of a sample that was taken for a predecessor's: if the next says the same, it is to be believed.
+    /// The lower generation of a rejected sample. If the next sample has it too, that one is accepted.
     suspect_generation: Option<u64>,
-    /// Whether what arrives may be what a predecessor of this end has counted already.
+    /// True while arrivals may repeat what a predecessor of this end has counted.
     pub(super) repeated: bool,
     recovery: Option<Recovery<S>>,
     late: Option<Box<LateSamples>>,
     counters: ReadCounters,
 }
 
-/// Goes on by what the writer keeps after a death at either end of the link, until the link is known to bring just what comes
-/// next: by itself it may lack something, or repeat it.
+/// Replaces the link by the writer's retained samples after a death at either end, because the link may then lose or
+/// repeat samples. Ends once the link is known to deliver the next sample.
 struct Recovery<S: Carried + ?Sized> {
-    kept: RetainedSamples,
-    /// Whether it goes on so at present.
+    retained: RetainedSamples,
+    /// True while samples come from the retained ones.
     active: bool,
-    /// The sample that was found last, if that is the one that was taken last.
+    /// True if the last sample taken is the one in `sample`.
     found: bool,
     sample: S::Owned,
-    /// The stamp of that sample, and whether it is known to differ from that of the sample before.
+    /// Stamp of the last retained sample, and true if it is known to differ from the one before.
     taken: Option<(Stamp, bool)>,
-    /// The stamp of the last sample that the link has brought meanwhile.
+    /// Stamp of the last sample that the link delivered meanwhile.
     brought: Option<Stamp>,
 }
 
 impl<S: Carried + ?Sized> Recovery<S> {
-    /// Begins at a sample that the link has brought and that is of another life of the writer: its predecessor may have sent it
-    /// too. A program that keeps nothing is believed.
+    /// Begins at a delivered sample of another generation of the writer, which may repeat an earlier one. Without
+    /// retained samples the link is used as it is.
     #[cold]
     fn begin(&mut self, brought: Stamp) {
-        self.active = self.kept.is_used();
+        self.active = self.retained.is_used();
         (self.brought, self.taken) = (Some(brought), None);
     }
 
-    /// Copies the sample of a number, if it is kept.
+    /// Copies the retained sample of this number, if present.
     #[cold]
     fn find(&mut self, number: u64) -> bool {
-        let found = self.kept.find(number, self.sample.borrow_mut().words_mut());
+        let found = self.retained.find(number, self.sample.borrow_mut().words_mut());
         if found {
             let stamp = *self.sample.borrow().stamp();
             self.taken = Some((stamp, self.taken.is_some_and(|(last, _)| last != stamp)));
@@ -102,8 +102,8 @@ impl<S: Carried + ?Sized> Recovery<S> {
         found
     }
 
-    /// Whether what the link brings next comes next, once everything that is kept is taken. A sample is kept before it is sent,
-    /// so nothing is taken that the link has still to bring, nor brought that is still to be taken.
+    /// Returns true once the link delivers the sample after the retained ones. A sample is retained before it is sent:
+    /// none is skipped, and none arrives twice.
     fn is_over(&self) -> bool {
         self.taken.is_some_and(|(taken, unique)| unique && self.brought == Some(taken))
     }
@@ -118,7 +118,7 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
         Self::open_many(bus, topic, 1, reader)
     }
 
-    /// The same for a signal of so many bodies.
+    /// Opens a signal of `bodies` bodies.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -137,23 +137,23 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
         })
     }
 
-    /// The same with a guard.
+    /// Adds a guard.
     pub fn with_guard<G: Guard<S>>(self, guard: G) -> Input<B, S, G> {
         let Self { port, accepted_ticks, last, newest, suspect_generation, repeated, recovery, late, counters, .. } =
             self;
         Input { port, guard, accepted_ticks, last, newest, suspect_generation, repeated, recovery, late, counters }
     }
 
-    /// The same where a scripted fault sends samples late.
+    /// Adds the scripted delays of the signal.
     pub fn with_late(self, late: Option<Box<LateSamples>>) -> Self {
         Self { late, ..self }
     }
 
-    /// The same with what the writer of a signal of so many bodies keeps; a successor begins with that.
-    pub fn with_recovery(self, kept: Option<RetainedSamples>, bodies: usize, successor: bool) -> Self {
-        let recovery = kept.map(|kept| Recovery {
-            active: successor && kept.is_used(),
-            kept,
+    /// Adds the writer's retained samples; a successor begins with those.
+    pub fn with_recovery(self, retained: Option<RetainedSamples>, bodies: usize, successor: bool) -> Self {
+        let recovery = retained.map(|retained| Recovery {
+            active: successor && retained.is_used(),
+            retained,
             found: false,
             sample: S::blank(bodies),
             taken: None,
@@ -164,12 +164,12 @@ impl<B: Bus, S: Carried + ?Sized> Input<B, S> {
 }
 
 impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
-    /// Says which ticks samples can have from now on.
+    /// Sets the ticks that samples may have from now on.
     pub fn expect(&mut self, accepted_ticks: AcceptedTicks) {
         self.accepted_ticks = accepted_ticks;
     }
 
-    /// Moves on to the sample of `tick`, or as far as there are older ones.
+    /// Moves to the sample of `tick`, or to the newest one before it.
     ///
     /// # Errors
     /// [`BusError::Receive`].
@@ -188,7 +188,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         }
     }
 
-    /// Moves on to the next real sample; false if there is none.
+    /// Moves to the next usable sample; returns false if no sample waits.
     ///
     /// # Errors
     /// [`BusError::Receive`].
@@ -202,7 +202,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         Ok(false)
     }
 
-    /// Takes one sample off the link, whatever it is worth; false if there is none.
+    /// Takes one sample or marker off the link, usable or not; returns false if the link is empty.
     #[inline]
     fn take(&mut self) -> Result<bool, BusError> {
         if self.recovers() {
@@ -226,7 +226,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         Ok(true)
     }
 
-    /// The same by what the writer keeps.
+    /// Takes one sample from the retained ones, or from the link once it has caught up.
     #[cold]
     fn recover(&mut self) -> Result<bool, BusError> {
         while let Some(recovery) = &mut self.recovery {
@@ -236,7 +236,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
                 return Ok(true);
             }
             if recovery.is_over() {
-                // The link has brought the same, and is as far.
+                // The link has caught up.
                 (recovery.active, recovery.found) = (false, false);
                 return self.take();
             }
@@ -251,17 +251,17 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         Ok(false)
     }
 
-    /// The sample that was taken last.
+    /// Returns the last sample taken, usable or not.
     #[inline]
     fn current(&self) -> Option<&S> {
         let recovered = self.recovery.as_ref().filter(|recovery| recovery.found);
         recovered.map_or(self.port.current(), |recovery| Some(recovery.sample.borrow()))
     }
 
-    /// Enters a sample into the counters.
+    /// Counts a sample and returns its state.
     ///
-    /// Ticks rise also from one generation of the sender to the next: a successor goes on with the grid. It may repeat the
-    /// tick in which its predecessor died.
+    /// Ticks also increase from one generation of the sender to the next, because a successor continues on the grid. It
+    /// may repeat the tick in which its predecessor died.
     #[inline]
     fn account(&mut self, stamp: &Stamp) -> Newest {
         if !stamp.is_warm_up() {
@@ -275,7 +275,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             None => (None, 0),
         };
         if let Some(tick) = newest_tick.filter(|tick| stamp.tick <= *tick) {
-            // What came before the last sample that a predecessor counted, and that one, are counted. Warm-up tells nothing.
+            // All samples up to the last one that the predecessor counted are counted already. Warm-up is ignored.
             if self.repeated {
                 self.repeated = stamp.tick < tick || generation == 0;
             } else if generation == known || self.lossless() && !stamp.is_warm_up() {
@@ -284,7 +284,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             return Newest::None;
         }
         if self.late.as_mut().is_some_and(|late| late.contains(stamp.tick)) {
-            // One that a successor of the writer sends may be a repetition: see `Output::dispatch_rest`.
+            // A successor of the writer may repeat a late sample: see `Output::dispatch_rest`.
             if !self.repeated && generation == known {
                 self.counters.stale();
             }
@@ -306,7 +306,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             self.counters.void(stamp.tick);
             return Newest::None;
         }
-        // Not by `current`: the guard is another part of this end.
+        // `current` would borrow the guard too.
         let recovered = self.recovery.as_ref().filter(|recovery| recovery.found);
         let sample = recovered.map_or(self.port.current(), |recovery| Some(recovery.sample.borrow()));
         if sample.is_some_and(|sample| self.guard.accepts(sample)) {
@@ -318,16 +318,16 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         Newest::Rejected
     }
 
-    /// Whether nothing is lost on this link, so that in every life of the writer a sample comes once.
+    /// Returns true if this link loses nothing, so that each generation of the writer sends a sample once.
     #[inline]
     fn lossless(&self) -> bool {
         matches!(self.accepted_ticks, AcceptedTicks::Next)
     }
 
-    /// Whether a sample can be of this tick, which is newer than the newest.
+    /// Returns true if a newer sample may have this tick.
     #[inline]
     fn possible(&self, tick: u64) -> bool {
-        // Where samples are late, one with a broken tick may come after the next one was sent.
+        // With delayed samples, one with a broken tick may arrive after the next one was sent.
         tick <= self.counters.covered() && self.late.is_none()
             || match self.accepted_ticks {
                 AcceptedTicks::Unknown => true,
@@ -336,7 +336,7 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
             }
     }
 
-    /// Sleeps until there may be something new, at most until `until_ns`.
+    /// Sleeps until a sample may have arrived, at most until `until_ns`.
     ///
     /// # Errors
     /// [`BusError::Receive`].
@@ -344,31 +344,31 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         self.port.sleep(until_ns)
     }
 
-    /// Whether something is known of this tick or of a later one: it is of no use to wait for it.
+    /// Returns true once a sample or marker of this tick or a later one has arrived: waiting is useless then.
     #[inline]
     pub fn knows(&self, tick: u64) -> bool {
         self.last.is_some_and(|(last, _)| last >= tick)
     }
 
-    /// The newest tick of which something is known: there was a sample, believed or not, or a void.
+    /// Returns the newest tick with a sample, accepted or rejected, or a marker.
     #[inline]
     pub fn last_tick(&self) -> Option<u64> {
         self.last.map(|(tick, _)| tick)
     }
 
-    /// The sample at hand, if there is one that can be used.
+    /// Returns the newest sample if it was accepted.
     #[inline]
     pub fn sample(&self) -> Option<&S> {
         self.current().filter(|_| self.newest == Newest::Usable)
     }
 
-    /// The stamp of the newest sample, if it was of the tick that was due and is not believed.
+    /// Returns the stamp of the newest sample if it was of the expected tick and rejected.
     #[inline]
     pub fn rejected(&self) -> Option<&Stamp> {
         self.current().filter(|_| self.newest == Newest::Rejected).map(S::stamp)
     }
 
-    /// Takes what waits and forgets it, to exercise the link. Before the first tick only.
+    /// Discards waiting samples, to exercise the link. Before the first tick only.
     ///
     /// # Errors
     /// [`BusError::Receive`].
@@ -378,25 +378,25 @@ impl<B: Bus, S: Carried + ?Sized, G: Guard<S>> Input<B, S, G> {
         Ok(())
     }
 
-    /// Finds the shortest way to the writer that there is now. Off the critical path.
+    /// Connects to the current writer by the fastest path. Off the critical path.
     pub fn refresh(&mut self) {
         self.port.refresh();
     }
 }
 
 impl<B: Bus, S: Carried + ?Sized, G> Input<B, S, G> {
-    /// Whether it goes on by what the writer keeps.
+    /// Returns true while samples come from the retained ones.
     #[inline]
     fn recovers(&self) -> bool {
         self.recovery.as_ref().is_some_and(|recovery| recovery.active)
     }
 
-    /// The counters.
+    /// Returns the counters.
     pub fn counters(&mut self) -> &mut ReadCounters {
         &mut self.counters
     }
 
-    /// Expects what a predecessor, which this end continues, may have had already.
+    /// Expects samples that the predecessor of this end may have counted.
     pub fn expect_repeats(&mut self) {
         self.repeated = B::REPEATS && !self.recovers();
     }

@@ -1,8 +1,8 @@
-//! The writing end of a link with its counters: what was sent, what was not, and its hash.
+//! The writing end of a link with its counters and hash.
 //!
-//! A sample is staged, which nobody sees; the role commits its state; only then is the sample dispatched. So nothing is ever
-//! sent that is not committed, and what is committed and was perhaps not sent is sent by a successor: readers tell a repeated
-//! sample by its tick. A void stands for a sample that does not exist, where everybody waits for inputs. Must not commit.
+//! A sample is staged, invisible to readers; the role commits its state; then the sample is dispatched. So nothing is
+//! sent that is not committed. A successor sends what is committed and perhaps not sent; readers recognise a repeated
+//! sample by its tick. In lockstep a no-sample marker replaces a sample that does not exist. Must not commit.
 
 use super::retained::RetainedSamples;
 use crate::bus::{Bus, BusError, Carried, Topic, Write};
@@ -14,69 +14,69 @@ use crate::state::{Persist, Words, persist_fields};
 use crate::telemetry::{Ledger, LinkWritten, Slots, WriteCounters};
 use std::borrow::{Borrow, BorrowMut};
 
-/// Words of a stamp.
+/// Length of a stamp, words.
 const STAMP_WORDS: usize = size_of::<Stamp>() / size_of::<u64>();
 
 /// The writing end of a signal.
 pub struct Output<B: Bus, S: Carried + ?Sized> {
     port: S::Writer<B>,
     generation: u64,
-    /// What is committed and not yet counted, and the sample that it is about, under the stamp that it was made with.
+    /// The staged sample: committed, not yet counted. `sample` holds its content under its original stamp.
     staged: Staged,
     sample: S::Owned,
-    /// Whether the port holds that sample already.
+    /// True if the port already holds the sample.
     filled: bool,
-    /// Whether a void takes the place of a sample that does not go out.
+    /// True if a no-sample marker replaces a sample that is not sent.
     markers: bool,
-    /// Whether samples are shown first, and published when there is time.
+    /// True if samples are first written to the latest-value channel and published later.
     writes_latest: bool,
-    /// Whether one is shown and not published.
+    /// True while a sample is in the channel and not published.
     unpublished: bool,
     disturbance: Option<Box<Disturbance<S>>>,
     counters: WriteCounters,
-    /// How many samples have been sent, for a successor.
+    /// Number of samples sent, for a successor.
     progress: Option<Slots>,
-    kept: Option<RetainedSamples>,
-    /// Whether it continues a predecessor and has sent nothing yet.
+    retained: Option<RetainedSamples>,
+    /// True until a successor has sent its first sample.
     succeeds: bool,
 }
 
-/// What a writing end is about to send for a tick.
+/// The samples to send for one tick.
 #[derive(Debug, Clone, Copy, Default)]
 struct Staged {
-    /// How many samples were sent before those of the tick.
+    /// Number of samples sent before this tick.
     before: u64,
     tick: u64,
-    /// One of the constants.
+    /// One of the constants below.
     kind: u64,
-    /// The stamp as it goes out: a scripted fault may have broken it.
+    /// The stamp to send; a scripted fault may have broken it.
     stamp: [u64; STAMP_WORDS],
-    /// Samples of earlier ticks, held back by scripted faults, that go out before this tick's.
+    /// Number of delayed samples of earlier ticks that go out before this one.
     late: u64,
-    /// How often this tick's sample goes out.
+    /// Number of copies of this tick's sample.
     copies: u64,
 }
 
 persist_fields!(Staged, before, tick, kind, stamp, late, copies);
 
 impl Staged {
-    /// Nothing, or what was staged is counted.
+    /// Nothing staged, or already counted.
     const NOTHING: u64 = 0;
     /// The sample of the tick.
     const SAMPLE: u64 = 1;
-    /// A sample was made, and does not go out as that of its tick.
+    /// A sample that is not sent as that of its tick.
     const WITHHELD: u64 = 2;
-    /// No sample was made.
+    /// No sample.
     const ABSENT: u64 = 3;
 
-    /// How many samples go out.
+    /// Returns the number of samples to send.
     #[inline]
     fn samples(&self, markers: bool) -> u64 {
         let marker = markers && matches!(self.kind, Self::WITHHELD | Self::ABSENT);
         self.late + self.copies + u64::from(marker)
     }
 
-    /// Counts it, the content of the sample given.
+    /// Counts the staged sample with the given content.
     #[inline]
     fn count(&mut self, counters: &mut WriteCounters, content: &[u8], markers: bool) {
         self.before += self.samples(markers);
@@ -89,24 +89,25 @@ impl Staged {
     }
 }
 
-/// How far a run goes, and how many samples are [kept](RetainedSamples): what decides how much a writing end keeps in a ledger.
+/// Length of the run and number of [retained samples](RetainedSamples): together the size of a writing end's part of
+/// the ledger.
 #[derive(Debug, Clone, Copy)]
 pub struct Extent {
     /// The last tick.
     pub last_tick: u64,
-    /// How many samples are kept.
+    /// Number of retained samples.
     pub retained_samples: u64,
 }
 
 impl Extent {
-    /// Words of the ledger beside the record, for samples of so many words.
+    /// Returns the ledger words besides the record, for samples of `length` words.
     pub fn words(self, length: usize) -> usize {
         1 + WriteCounters::words(self.last_tick) + RetainedSamples::words(self.retained_samples, length)
     }
 }
 
 impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
-    /// Opens a signal of so many bodies.
+    /// Opens a signal of `bodies` bodies.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -120,7 +121,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
     ) -> Result<Self, BusError> {
         let progress = Some(ledger.take(1)).filter(|_| ledger.is_shared());
         let counters = WriteCounters::open(ledger, extent.last_tick);
-        let kept = RetainedSamples::open(ledger, extent.retained_samples, S::length(bodies));
+        let retained = RetainedSamples::open(ledger, extent.retained_samples, S::length(bodies));
         Ok(Self {
             port: S::writer(bus, topic, bodies, generation)?,
             generation,
@@ -133,27 +134,27 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             disturbance: None,
             counters,
             progress,
-            kept,
+            retained,
             succeeds: generation > 1,
         })
     }
 
-    /// With voids in the place of samples that do not go out, for readers that wait for every tick.
+    /// Sends a no-sample marker in place of a missing sample, for readers that wait for every tick.
     pub fn with_markers(self, markers: bool) -> Self {
         Self { markers, ..self }
     }
 
-    /// Whose samples are shown to readers of the newest at first, and sent to the others by [`finish`](Self::finish).
+    /// Writes samples to the latest-value channel first; [`finish`](Self::finish) publishes them.
     pub fn latest_first(self) -> Self {
         Self { writes_latest: true, ..self }
     }
 
-    /// With scripted faults.
+    /// Adds scripted faults.
     pub fn disturbed(self, disturbance: Option<Box<Disturbance<S>>>) -> Self {
         Self { disturbance, ..self }
     }
 
-    /// Makes the sample of a tick. `fill` writes everything but the generation.
+    /// Stages the sample of a tick. `fill` writes everything but the generation.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -163,21 +164,21 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.stage_disturbed(fill);
             return Ok(());
         }
-        let (generation, kept) = (self.generation, self.sample.borrow_mut());
+        let (generation, retained) = (self.generation, self.sample.borrow_mut());
         self.port.fill(|sample| {
             fill(sample);
             sample.stamp_mut().generation = generation;
-            kept.assign(sample);
+            retained.assign(sample);
         })?;
         self.filled = true;
-        let stamp = *kept.stamp();
+        let stamp = *retained.stamp();
         let (before, stamp_words) = (self.staged.before, bytemuck::cast(stamp));
         self.staged = Staged { before, tick: stamp.tick, kind: Staged::SAMPLE, stamp: stamp_words, late: 0, copies: 1 };
         hooks::at(Failpoint::Staged);
         Ok(())
     }
 
-    /// Makes a sample as the scripted faults have it.
+    /// Stages a sample with scripted faults applied.
     #[cold]
     fn stage_disturbed(&mut self, fill: impl FnOnce(&mut S)) {
         let Some(disturbance) = &mut self.disturbance else { return };
@@ -192,7 +193,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.counters.injected();
         }
         let late = disturbance.due(stamp.tick);
-        // A sample with a broken stamp goes out as it is, but not as the one of its tick.
+        // A sample with a broken stamp is sent, but does not count as that of its tick.
         let sound = (sample.stamp().tick, sample.stamp().generation) == (stamp.tick, stamp.generation);
         let delivered = sound && !matches!(way, Some(Delivery::Dropped | Delivery::Late(_)));
         let copies = match way {
@@ -208,19 +209,19 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         let kind = if delivered { Staged::SAMPLE } else { Staged::WITHHELD };
         let (before, stamp_words) = (self.staged.before, bytemuck::cast(*sample.stamp()));
         self.staged = Staged { before, tick: stamp.tick, kind, stamp: stamp_words, late, copies };
-        let kept = self.sample.borrow_mut();
-        kept.assign(sample);
-        *kept.stamp_mut() = stamp;
+        let retained = self.sample.borrow_mut();
+        retained.assign(sample);
+        *retained.stamp_mut() = stamp;
         hooks::at(Failpoint::Staged);
     }
 
-    /// Says that there is no sample for this tick, where readers wait for one: an input was missing.
+    /// Stages a no-sample marker for a tick, if readers wait for one.
     pub fn stage_marker(&mut self, tick: u64) {
         let kind = if self.markers { Staged::ABSENT } else { Staged::NOTHING };
         self.staged = Staged { before: self.staged.before, tick, kind, ..Staged::default() };
     }
 
-    /// Sends what was staged, or what is left of it.
+    /// Sends the staged sample, or the part of it that is not sent.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -229,9 +230,9 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         if !std::mem::take(&mut self.filled) {
             return self.dispatch_rest();
         }
-        if let Some(kept) = &self.kept {
+        if let Some(retained) = &self.retained {
             let sample: &S = self.sample.borrow();
-            kept.keep(self.staged.before, sample.words().iter().copied());
+            retained.keep(self.staged.before, sample.words().iter().copied());
         }
         if self.writes_latest {
             self.port.write_latest()?;
@@ -244,7 +245,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         Ok(())
     }
 
-    /// Leaves word that so many samples of the tick have been sent.
+    /// Records that this number of samples of the tick has been sent.
     #[inline]
     fn sent(&self, samples: u64) {
         if let Some(progress) = &self.progress {
@@ -252,13 +253,13 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         }
     }
 
-    /// How many samples of the tick have been sent, by a predecessor.
+    /// Returns the number of samples of the tick that a predecessor has sent.
     fn already_sent(&self) -> u64 {
         let sent = self.progress.as_ref().map_or(0, |progress| progress.get(0));
         sent.saturating_sub(self.staged.before)
     }
 
-    /// Sends what a predecessor has not sent of what was staged.
+    /// Sends the staged samples that a predecessor has not sent.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -267,7 +268,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         self.filled = false;
         let Staged { before, tick, kind, late, copies, .. } = self.staged;
         let made = *self.sample.borrow().stamp();
-        // What was made in an earlier life goes out in this one, also where a scripted fault has broken the generation.
+        // A sample of an earlier generation gets the current one, also if a scripted fault has broken it.
         let lives = if kind == Staged::ABSENT { 0 } else { made.generation ^ self.generation };
         let own: Stamp = bytemuck::cast(self.staged.stamp);
         let marker = if kind == Staged::ABSENT {
@@ -279,9 +280,9 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
             self.port.prepare()?;
             let late =
                 self.disturbance.as_ref().and_then(|disturbance| disturbance.late(index)).filter(|_| index < late);
-            let (sample, kept): (&S, _) = (self.sample.borrow(), self.kept.as_ref());
-            // The predecessor may have sent the successor's first sample: its readers have to look at what is kept, or do not
-            // count it if it is late.
+            let (sample, retained): (&S, _) = (self.sample.borrow(), self.retained.as_ref());
+            // The predecessor may have sent this first sample. The new generation makes readers check the retained
+            // samples, or ignore a repeated late sample.
             let (first, generation) = (std::mem::take(&mut self.succeeds), self.generation);
             self.port.fill(|slot| {
                 match late {
@@ -295,15 +296,15 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
                         *slot.stamp_mut() = marker;
                     }
                 }
-                // Before anybody sees it.
-                if let Some(kept) = kept {
-                    kept.keep(before + index, slot.words().iter().copied());
+                // Before a reader can see it.
+                if let Some(retained) = retained {
+                    retained.keep(before + index, slot.words().iter().copied());
                 }
                 let stamp = slot.stamp_mut();
                 if late.is_none() {
                     stamp.generation ^= lives;
                 }
-                if first && (kept.is_some() || late.is_some()) {
+                if first && (retained.is_some() || late.is_some()) {
                     stamp.generation = generation | stamp.generation & NO_SAMPLE;
                 }
             })?;
@@ -314,7 +315,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         Ok(())
     }
 
-    /// Does what a dispatched sample leaves to be done: all readers, counters, hash, memory for the next. Off the critical path.
+    /// Completes a dispatched sample: publishes, counts, hashes, loans the next one. Off the critical path.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -343,7 +344,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         self.finish()
     }
 
-    /// Sends a sample that no role uses, to exercise the link.
+    /// Sends a warm-up sample, which no role uses.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -352,7 +353,7 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         self.port.prepare()
     }
 
-    /// Lets readers that have come later know of this end. Off the critical path.
+    /// Connects to readers that came later. Off the critical path.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -360,19 +361,19 @@ impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
         self.port.refresh()
     }
 
-    /// The last sample that was made.
+    /// Returns the last sample made.
     #[inline]
     pub fn last(&self) -> &S {
         self.sample.borrow()
     }
 
-    /// The counters, without what is staged.
+    /// Returns the counters, without the staged sample.
     pub fn counters(&self) -> &WriteCounters {
         &self.counters
     }
 }
 
-/// Its counters, and what it is committed to send.
+/// The counters and the staged sample.
 impl<B: Bus, S: Carried + ?Sized> Persist for Output<B, S> {
     #[inline]
     fn persist<W: Words>(&mut self, words: &mut W) {
@@ -383,13 +384,13 @@ impl<B: Bus, S: Carried + ?Sized> Persist for Output<B, S> {
 }
 
 impl<B: Bus, S: Carried + ?Sized> Output<B, S> {
-    /// Passes what scripted faults hold back; see [`Persist`].
+    /// Passes the delayed samples; see [`Persist`].
     pub fn persist_late<W: Words>(&mut self, words: &mut W) {
         self.disturbance.iter_mut().for_each(|disturbance| disturbance.persist(words));
     }
 }
 
-/// What the record of a role says of a signal of `length` words that it writes; what is committed counts as sent.
+/// Returns the counters of a written signal of `length` words from a role's record; a committed sample counts as sent.
 pub fn written(
     words: &mut impl Words,
     service: &str,

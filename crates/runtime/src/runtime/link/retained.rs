@@ -1,14 +1,14 @@
-//! The last samples of a signal in lockstep, where they outlive both ends of the link.
+//! The last samples of a signal in lockstep, retained beyond the life of either end of the link.
 //!
-//! What was on its way to a process that dies is lost with it, and whoever continues a writer sends again what it may not have
-//! sent. In lockstep nobody goes on without what is lost, and nothing may count twice: a reader finds here what was sent, once
-//! each and in order. Must not be looked at otherwise: the link is the way.
+//! A sample in flight is lost when its reader dies, and the successor of a writer repeats samples that may have been
+//! sent. In lockstep nothing may be lost or counted twice: a reader finds every sent sample here, once and in order.
+//! Used only for recovery; normally samples take the link.
 
 use crate::telemetry::{Ledger, Slots, find, keep};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// So many samples in the ledger of their writer, each in the place of the one that many before it. Beside the words of a
-/// sample there is its number + 1, or 0 while they are written. The first that is sent has number 0.
+/// A ring of samples in the writer's ledger. Each slot holds the sample's number + 1 (0 while it is written), then its
+/// words. Numbers begin at 0.
 #[derive(Debug)]
 pub struct RetainedSamples {
     slots: Slots,
@@ -17,12 +17,12 @@ pub struct RetainedSamples {
 }
 
 impl RetainedSamples {
-    /// Words of the ledger for so many samples of so many words.
+    /// Returns the ledger words for this number of samples of `length` words.
     pub fn words(samples: u64, length: usize) -> usize {
         samples as usize * (1 + length)
     }
 
-    /// Takes the words from a ledger. Nothing is kept of no samples, nor where nobody could find it.
+    /// Takes the words from a ledger. `None` for zero samples, and in a private ledger, which no successor could open.
     pub fn open(ledger: &Ledger, samples: u64, length: usize) -> Option<Self> {
         let slots = ledger.take(Self::words(samples, length));
         (samples > 0 && ledger.is_shared()).then_some(Self { slots, samples, length })
@@ -34,18 +34,18 @@ impl RetainedSamples {
         &self.slots.words()[begin..=begin + self.length]
     }
 
-    /// Keeps what is sent under a number.
+    /// Retains a sample under its number.
     #[inline]
     pub fn keep(&self, number: u64, words: impl Iterator<Item = u64>) {
         keep(self.place(number), number, words);
     }
 
-    /// Copies what was sent under a number; false if it is not kept, and then the words are of no use.
+    /// Copies the sample of a number. If it is not retained, returns false and `words` is undefined.
     pub fn find(&self, number: u64, words: &mut [u64]) -> bool {
         find(self.place(number), number, words)
     }
 
-    /// Whether the writer has ever kept anything: a foreign program does not.
+    /// Returns true if the writer has retained anything: a foreign program does not.
     pub fn is_used(&self) -> bool {
         (0..self.samples).any(|number| self.place(number)[0].load(Ordering::Relaxed) > 0)
     }

@@ -1,6 +1,6 @@
-//! A device in a plant's seat on a bus: command in and over the line; the device's answer out as measurement and truth.
+//! A device as a plant: reads the command, sends it over the line, and publishes the answer as measurement and truth.
 //!
-//! Must not invent anything: a tick that the device does not answer in time has no samples, and is counted as missed.
+//! Must not invent anything: a tick without an answer in time has no samples and counts as missed.
 
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
@@ -32,11 +32,11 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
-    /// Whether the device has been asked for the next tick, when, and when its command's chain began, ns.
+    /// True once the next tick is requested; the time of the request and the origin of its command, ns.
     asked: bool,
     asked_ns: u64,
     command_origin_ns: Option<u64>,
-    /// When the chain of the command that was applied last began, ns; it may still be held.
+    /// Origin of the command applied last, ns. The plant may still hold that command.
     acting_ns: Option<u64>,
     missed: MissedTicks,
     reply: Reply<R>,
@@ -45,7 +45,7 @@ pub struct BridgeNode<R: Rig, B: Bus> {
     age: Latency,
 }
 
-/// What the device answered, taken off the line.
+/// The device's last answer.
 struct Reply<R: Rig> {
     event: CommandEvent,
     measurement: Measurement<R>,
@@ -53,12 +53,12 @@ struct Reply<R: Rig> {
 }
 
 impl<R: Rig> Reply<R> {
-    /// The lengths are those agreed upon: the host's end drops other answers.
+    /// Stores an answer. Its lengths match the agreed ones: the host's end drops others.
     fn take(&mut self, answer: &Answer<'_>) {
         self.event = answer.event;
         let (measurement, truth) = answer.outputs.bytes.split_at(content_length::<Measurement<R>>());
         self.measurement.set_content(measurement);
-        // What a device does not know, its sensors say.
+        // The truth without content takes the measured values.
         if !self.truth.set_content(truth) {
             copy_fields(&self.measurement, &mut self.truth);
         }
@@ -103,7 +103,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         Ok(next == 0 || self.command.seek(next - 1)? != Seek::NotYet)
     }
 
-    /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
+    /// Counts the ticks before `tick` as missed, and records their lateness.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
         for missed in self.counters.next()..tick {
             self.lateness.record_missed(self.grid.due_ns(missed), now_ns);
@@ -111,7 +111,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         self.skip_to(tick);
     }
 
-    /// Asks the device for the next tick, with its command if that is there.
+    /// Requests the next tick from the device, with its command if present.
     #[inline]
     fn ask(&mut self, now_ns: u64) -> Result<(), NodeError> {
         let tick = self.counters.next();
@@ -124,7 +124,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         Ok(())
     }
 
-    /// Serves the line; publishes the measurement if the answer has come.
+    /// Serves the line; publishes the samples if the answer has arrived.
     #[inline]
     fn look(&mut self) -> Result<Poll, NodeError> {
         let (now_ns, reply) = (monotonic_ns(), &mut self.reply);
@@ -145,7 +145,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
             *sample = *measurement;
             *sample.stamp_mut() = stamp;
         })?;
-        // A successor could not ask the device for it: it was asked for once.
+        // Staged now, because a successor could not request this tick again.
         self.truth.stage(|sample| {
             *sample = *truth;
             *sample.stamp_mut() = stamp;
@@ -178,7 +178,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         Ok(Poll::Executed)
     }
 
-    /// Enters ticks that were missed into the stages, by when each was due: the command before them acted.
+    /// Records missed ticks in the stages from their due instants; the previous command acted on them.
     fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
         for due_ns in due_ns {
             self.serial.record_missed(due_ns, until_ns);
@@ -186,7 +186,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         }
     }
 
-    /// Does not execute the next tick, as a scripted fault has it: the device is not asked, and has missed it too.
+    /// Skips the next tick for a scripted fault; the device is not asked either.
     #[cold]
     fn miss(&mut self) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
@@ -199,7 +199,7 @@ impl<R: Rig, B: Bus> BridgeNode<R, B> {
         Ok(Poll::Missed)
     }
 
-    /// The period is over for this tick.
+    /// Gives up the current tick at its cutoff.
     fn give_up(&mut self) -> Poll {
         self.link.give_up();
         self.asked = false;
@@ -225,7 +225,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         Ok(())
     }
 
-    /// The device is where it is: it needs nothing of what a predecessor knew.
+    /// The device keeps its own state and needs nothing from a predecessor.
     fn start(&mut self, grid: Grid, first_tick: u64) -> Result<(), NodeError> {
         self.grid = grid;
         self.missed.start(self.clock, grid, self.counters.next());
@@ -278,7 +278,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
         None
     }
 
-    /// What it waits for comes over the line, or is a command.
+    /// Waits for the line or for a command.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         if self.asked {
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
@@ -343,7 +343,7 @@ impl<R: Rig, B: Bus> Node for BridgeNode<R, B> {
     }
 }
 
-/// In the order of a simulated plant's: whoever reads the counters does not know that there is a device.
+/// In the order of a simulated plant, so that readers of the counters need not distinguish the two.
 impl<R: Rig, B: Bus> Persistent for BridgeNode<R, B> {
     fn ledger(&self) -> &Ledger {
         &self.ledger

@@ -1,4 +1,4 @@
-//! What every node of a run shares: its bus, its settings, and the links and the ledger that follow from them.
+//! The context of a node: bus, settings, role, ledger and clock, and the links that follow from these.
 
 use super::ports::{ports, topic};
 use crate::bus::{Bus, BusError, Carried, Port, Reader, Signal, Topic};
@@ -12,10 +12,10 @@ use crate::runtime::window_ticks;
 use crate::state::{Persist, Restore};
 use crate::telemetry::{Ledger, TickCounters};
 
-/// Between two looks at a device's line, ns.
+/// Pause between two polls of a device's line, ns.
 pub(super) const LOOK_NS: u64 = 50_000;
 
-/// What every node of a run shares.
+/// The context from which a node opens its links.
 pub struct NodeContext<'a, B> {
     pub(super) bus: &'a B,
     pub(super) scenario: &'a Settings,
@@ -35,7 +35,7 @@ impl<B: Bus> NodeContext<'_, B> {
     where
         S: Carried + ?Sized,
     {
-        // Where inputs of one tick may come ticks apart, the newest of each is not enough.
+        // If inputs of one tick may arrive ticks apart, the newest sample of each is not enough.
         let lags = self.scenario.lag_ticks(self.role.name(self.scenario)) > 1;
         self.input_of(body, signal, guard, if lags { Reader::Scorer } else { Reader::Role })
     }
@@ -52,15 +52,15 @@ impl<B: Bus> NodeContext<'_, B> {
     {
         let topic = topic(self.scenario, &body.name, signal);
         let mut input = Input::open_many(self.bus, &topic, body.bodies(), reader)?
-            .with_recovery(self.kept(&topic), body.bodies(), self.generation > 1)
+            .with_recovery(self.retained(&topic), body.bodies(), self.generation > 1)
             .with_late(LateSamples::for_signal(self.scenario, signal, &body.name))
             .with_guard(guard);
         input.expect(accepted_ticks(self.scenario, None));
         Ok(input)
     }
 
-    /// What the writer of a signal keeps.
-    fn kept(&self, topic: &Topic) -> Option<RetainedSamples> {
+    /// Returns the retained samples of a signal's writer.
+    fn retained(&self, topic: &Topic) -> Option<RetainedSamples> {
         retained_samples(self.scenario, topic, |writer| {
             let path = self.ledger.path()?.with_file_name(ledger_file(self.scenario, writer));
             Ledger::shared(&path, ledger_words(self.scenario, writer)).ok()
@@ -75,7 +75,7 @@ impl<B: Bus> NodeContext<'_, B> {
         let topic = topic(self.scenario, &body.name, signal);
         let (bodies, extent) = (body.bodies(), extent(self.scenario));
         let output = Output::open(self.bus, &topic, bodies, self.generation, &self.ledger, extent)?;
-        // Nobody in the loop reads the truth, and the score is to tell what really happened.
+        // No role reads the truth, and the score must be based on the real state.
         let disturbance = match signal {
             Signal::Truth => None,
             _ => {
@@ -83,7 +83,7 @@ impl<B: Bus> NodeContext<'_, B> {
                 Disturbance::for_signal(self.scenario, role, &body.name, bodies, next_tick(&self.ledger))
             }
         };
-        // In a process with others whoever has a short way is served at once, and all others when the tick is done.
+        // In a shared process, readers of the latest value come first; all other readers follow once the tick is done.
         let alone = self.role.process_role(self.scenario).process_members(self.scenario).len() == 1;
         let output = if alone { output } else { output.latest_first() };
         Ok(output.with_markers(self.scenario.clock != ClockKind::Realtime).disturbed(disturbance))
@@ -95,7 +95,7 @@ impl<B: Bus> NodeContext<'_, B> {
     }
 }
 
-/// Where the samples of a signal are kept for the successors of its readers: in its writer's ledger, which `open` opens.
+/// Returns the retained samples of a signal, which lie in the ledger of its writer; `open` opens that ledger.
 pub fn retained_samples(
     scenario: &Settings,
     topic: &Topic,
@@ -112,7 +112,7 @@ pub fn retained_samples(
     })
 }
 
-/// Which ticks samples can have; in real time only once the grid is known.
+/// Returns the ticks that samples may have; in real time this needs the grid.
 pub fn accepted_ticks(scenario: &Settings, grid: Option<Grid>) -> AcceptedTicks {
     match (scenario.clock, grid) {
         (ClockKind::Realtime, None) => AcceptedTicks::Unknown,
@@ -121,7 +121,7 @@ pub fn accepted_ticks(scenario: &Settings, grid: Option<Grid>) -> AcceptedTicks 
     }
 }
 
-/// How many words of a role's ledger lie beside its record.
+/// Returns the number of words in a role's ledger besides its record.
 pub fn ledger_words(scenario: &Settings, role: RoleId) -> usize {
     words_of(&ports(scenario, role).writes, extent(scenario))
 }
@@ -130,18 +130,18 @@ pub(super) fn words_of(written: &[Port], extent: Extent) -> usize {
     written.iter().map(|port| extent.words(words(port))).sum()
 }
 
-/// The length of a sample, words.
+/// Returns the length of a sample, words.
 pub(super) fn words(port: &Port) -> usize {
     port.size / size_of::<u64>()
 }
 
-/// The name of the file that has a role's ledger.
+/// Returns the file name of a role's ledger.
 pub fn ledger_file(scenario: &Settings, role: RoleId) -> String {
     format!("{}.books", role.name(scenario))
 }
 
-/// What the writing ends of a scenario keep. Where every sample is waited for, one may be under way for as long as the fastest
-/// role may be ahead of what is scored, and a little longer: a tick is scored before its command is used. As links, twice that.
+/// Returns the size of the ledger's part for writing ends. In lockstep a sample may be in flight for the window and a
+/// little longer, because a tick is scored before its command is used; like links, this is twice the window.
 pub(super) fn extent(scenario: &Settings) -> Extent {
     let lockstep = scenario.clock == ClockKind::Lockstep;
     let retained_samples = if lockstep {
@@ -152,7 +152,7 @@ pub(super) fn extent(scenario: &Settings) -> Extent {
     Extent { last_tick: scenario.last_tick, retained_samples }
 }
 
-/// The tick that a role has not executed, by its ledger.
+/// Returns the next tick of a role according to its ledger.
 pub fn next_tick(ledger: &Ledger) -> u64 {
     let mut ticks = TickCounters::default();
     ticks.persist(&mut Restore(&ledger.record().unwrap_or_default()));

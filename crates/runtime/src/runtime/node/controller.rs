@@ -1,4 +1,4 @@
-//! A controller on a bus: the estimate and every driven body's measurement in, every driven body's command out.
+//! A controller on a bus: reads the estimate and the measurement of every driven body, sends a command to each.
 
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
@@ -20,25 +20,25 @@ use crate::serial::LineCounters;
 use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, Outage, StageReport, TickCounters, Ticks};
 
-/// What drives the bodies of a rig one by one.
+/// The channel of a single driven body.
 type Single<R, B> = Channel<<R as Rig>::Law, <R as Rig>::MeasurementGuard, B>;
-/// What drives its fleets.
+/// The channel of a fleet.
 type Many<R, B> = Channel<
     <<R as Rig>::Fleet as Fleet<Estimate<R>>>::Law,
     <<R as Rig>::Fleet as Fleet<Estimate<R>>>::MeasurementGuard,
     B,
 >;
 
-/// One driven body, or a fleet, seen from the controller.
+/// The controller's links to one driven body or fleet.
 struct Channel<L: Law<Measurement: Carried, Command: Carried>, G, B: Bus> {
     /// The body's index.
     body: usize,
     controller: Controller<L>,
     measurement: Input<B, L::Measurement, G>,
     command: Output<B, L::Command>,
-    /// Whether the measurement of the tick at hand is there, and a command is to be sent.
+    /// True while the measurement of the current tick is available and a command will be sent.
     ready: bool,
-    /// When the command at hand was begun and sent, ns; sent at 0 if there is none.
+    /// Start of the current command's computation, and its sending, ns; 0 if no command was sent.
     began_ns: u64,
     sent_ns: u64,
     missed: MissedTicks,
@@ -58,7 +58,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         Ok(Self { body: index, controller, measurement, command, ready: false, began_ns: 0, sent_ns: 0, missed })
     }
 
-    /// Looks for the measurement of a tick; whether it is known what has become of it.
+    /// Looks for the measurement of a tick; returns true once it has arrived or is known to be missing.
     #[inline]
     fn gather(&mut self, tick: u64) -> Result<bool, NodeError> {
         let found = self.measurement.seek(tick)?;
@@ -66,28 +66,28 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         Ok(found != Seek::NotYet)
     }
 
-    /// The body's index, as long as nothing is known of its measurement of this tick.
+    /// Returns the body's index while its measurement of this tick may still arrive.
     #[inline]
     fn late(&self, tick: u64) -> Option<usize> {
         (!self.measurement.knows(tick)).then_some(self.body)
     }
 
-    /// The measurement of the tick at hand, as words.
+    /// Returns the measurement of the current tick as words.
     fn words(&self) -> Option<&[u64]> {
         self.measurement.sample().filter(|_| self.ready).map(Message::words)
     }
 
-    /// There is no command for this tick.
+    /// Passes over a tick without command.
     fn pass_over(&mut self, tick: u64) -> Result<(), NodeError> {
-        // What is not used now will never be, and must not fill the link.
+        // Consumes the unused measurement, which must not fill the link.
         self.measurement.seek(tick)?;
         self.ready = false;
         self.command.stage_marker(tick);
         Ok(())
     }
 
-    /// Makes the command of this tick, begun at a time, unless the measurement is missing or the watchdog wants silence;
-    /// gives the time at which the next one is begun. Whether it was missing is added to `starved`.
+    /// Stages the command of this tick, begun at `began_ns`, unless the measurement is missing or the watchdog is
+    /// latched. Returns the start of the next command's computation; sets `starved` if the measurement is missing.
     #[inline]
     fn execute(
         &mut self,
@@ -99,7 +99,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     ) -> Result<u64, NodeError> {
         *starved |= !self.ready;
         if silent {
-            // There is to be no command: none is missed.
+            // The watchdog suppresses the command: it does not count as missed.
             let _ = self.missed.before(estimate.stamp().tick);
         }
         self.ready &= !silent && computed.is_none_or(|(source, index)| source.has(index));
@@ -120,7 +120,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         Ok(self.sent_ns)
     }
 
-    /// Takes in what a command leaves to be done.
+    /// Completes a sent command.
     #[inline]
     fn finish_tick(&mut self, stages: Option<&mut Stages>) -> Result<(), NodeError> {
         if let Some(stages) = stages.filter(|_| self.ready) {
@@ -132,7 +132,7 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
         Ok(self.command.finish()?)
     }
 
-    /// Enters the ticks before `tick`, which would be next, of which there were no commands until the end.
+    /// Records the missed commands before `tick` at the end of the run.
     fn enter_rest(&mut self, tick: u64, stages: &mut Stages) {
         let (missed, until_ns) = self.missed.rest(tick);
         stages.enter_missed(missed, until_ns);
@@ -159,11 +159,11 @@ impl<L: Law<Measurement: Carried, Command: Carried>, G: Guard<L::Measurement>, B
     }
 }
 
-/// The distributions of the stages, and the tick that is entered.
+/// The latency distributions, and the tick that is recorded.
 #[derive(Default)]
 struct Stages {
     tick: u64,
-    /// When the estimate at hand was due at its origin and sent, and when all inputs were there, ns.
+    /// Origin and sending of the current estimate, and arrival of the last input, ns.
     origin_ns: u64,
     estimate_sent_ns: u64,
     received_ns: u64,
@@ -174,7 +174,7 @@ struct Stages {
 }
 
 impl Stages {
-    /// Enters commands that there were none of, by when their ticks were due.
+    /// Records missed commands from their due instants.
     #[inline]
     fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
         for due_ns in due_ns {
@@ -195,9 +195,9 @@ pub struct ControllerNode<R: Rig, B: Bus> {
     watchdog: Watchdog,
     interruptions: Interruptions,
     ledger: Ledger,
-    /// What computes the commands in the place of the laws, if that is somebody else.
+    /// The source of the commands, if not the laws.
     source: Option<SampleSource>,
-    /// The body, counted over both kinds of channel, whose measurement is looked for in the next round of a wait.
+    /// The channel, counted over bodies and fleets, that the next idle poll reads.
     look: usize,
     stages: Stages,
 }
@@ -205,7 +205,7 @@ pub struct ControllerNode<R: Rig, B: Bus> {
 impl<R: Rig, B: Bus> ControllerNode<R, B> {
     pub fn open(rig: &R, context: &NodeContext<'_, B>, source: Option<SampleSource>) -> Result<Self, BusError> {
         let bodies = |fleets: bool| driven(rig.bodies()).filter(move |(_, body)| body.fleet.is_some() == fleets);
-        // In the order of the counters: everything written, then everything read; fleets last.
+        // In the order of the counters: all outputs, then all inputs; fleets last.
         let written = |(_, body)| context.output(body, Signal::Command);
         let commands: Vec<Output<B, Command<R>>> = bodies(false).map(written).collect::<Result<_, _>>()?;
         let written = |(_, body)| context.output(body, Signal::Command);
@@ -236,26 +236,25 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         })
     }
 
-    /// Whether nothing is known of the next tick's estimate.
+    /// Returns true while the estimate of the next tick may still arrive.
     pub fn lacks_estimate(&self) -> bool {
         !self.estimate.knows(self.counters.next())
     }
 
-    /// Looks for all inputs of the next tick, or of the first later one that has an estimate.
+    /// Looks for all inputs of the next tick, or of the first later one with an estimate.
     #[inline]
     fn gather(&mut self, overdue: bool) -> Result<bool, NodeError> {
         if self.estimate.seek(self.counters.next())? == Seek::NotYet {
             if let Some(tick) = self.source.as_ref().and_then(SampleSource::lacks) {
                 self.offer(tick, overdue)?;
             } else if self.clock == Clock::Monotonic {
-                // Meanwhile one of the others, so that the newest are at hand when the estimate comes, which is the last as a
-                // rule.
+                // Meanwhile read one measurement, so that all are there when the estimate arrives, usually last.
                 self.look_ahead()?;
             }
             return Ok(false);
         }
         let Some(tick) = self.estimate.sample().map(|estimate| estimate.stamp().tick) else {
-            // Where nothing is lost, counters must not tell who was faster.
+            // In lockstep the counters must not depend on the order of arrival.
             if self.clock == Clock::Monotonic || self.gather_measurements(self.counters.next())? {
                 self.pass_over()?;
             }
@@ -264,7 +263,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(self.gather_measurements(tick)? || overdue)
     }
 
-    /// Looks for the measurements of a tick; whether it is known of all what has become of them.
+    /// Looks for the measurements of a tick; returns true once each has arrived or is known to be missing.
     #[inline]
     fn gather_measurements(&mut self, tick: u64) -> Result<bool, NodeError> {
         let mut complete = true;
@@ -277,8 +276,8 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(complete)
     }
 
-    /// Gives a device that makes the estimate too the measurements of a tick, once it is known of all of them what has become of
-    /// them.
+    /// Passes the measurements of a tick to a device that also computes the estimate, once each has arrived or is known
+    /// to be missing.
     fn offer(&mut self, tick: u64, overdue: bool) -> Result<(), NodeError> {
         let mut complete = true;
         for channel in &mut self.channels {
@@ -290,7 +289,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(())
     }
 
-    /// Takes what has come for one channel, each time for another.
+    /// Reads one channel, the next one at each call.
     #[inline]
     fn look_ahead(&mut self) -> Result<(), NodeError> {
         let (single, all) = (self.channels.len(), self.channels.len() + self.fleets.len());
@@ -303,7 +302,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(())
     }
 
-    /// There is no estimate for the next tick that could be used, and so there are no commands.
+    /// Passes over ticks without a usable estimate.
     #[cold]
     fn pass_over(&mut self) -> Result<(), NodeError> {
         let next = self.counters.next();
@@ -314,7 +313,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(())
     }
 
-    /// Does not execute a tick, as a scripted fault has it, nor those before it.
+    /// Skips a tick, and those before it, for a scripted fault.
     #[cold]
     fn miss(&mut self, tick: u64) -> Result<Poll, NodeError> {
         self.skip_to(tick);
@@ -323,7 +322,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(Poll::Missed)
     }
 
-    /// Says that there are no commands of a tick, where somebody waits for them.
+    /// Passes over a tick on every channel, with no-sample markers where readers wait.
     fn send_nothing(&mut self, tick: u64) -> Result<(), NodeError> {
         self.channels.iter_mut().try_for_each(|channel| channel.pass_over(tick))?;
         self.fleets.iter_mut().try_for_each(|fleet| fleet.pass_over(tick))?;
@@ -332,7 +331,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         self.finish_commands()
     }
 
-    /// Sends the commands that are staged.
+    /// Sends the staged commands.
     #[inline]
     fn dispatch(&mut self) -> Result<(), NodeError> {
         self.channels.iter_mut().try_for_each(|channel| channel.command.dispatch())?;
@@ -344,31 +343,31 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         Ok(self.fleets.iter_mut().try_for_each(|fleet| fleet.command.finish())?)
     }
 
-    /// Holds the estimate against the physics. Whatever comes of it is up to the watchdog.
+    /// Passes the estimate's monitored quantities to the watchdog.
     #[inline]
     fn watch(&mut self) {
         let Some(estimate) = self.estimate.sample() else { return };
         let tick = estimate.stamp().tick;
         for (quantity, monitor) in R::monitors().iter().enumerate() {
             match monitor.watched {
-                Watched::Constant(of) if self.watchdog.watches(quantity, tick) => {
-                    self.watchdog.constant(quantity, tick, of(&self.rig, estimate));
+                Watched::Constant(quantity_of) if self.watchdog.watches(quantity, tick) => {
+                    self.watchdog.constant(quantity, tick, quantity_of(&self.rig, estimate));
                 }
-                Watched::Small(of) if self.watchdog.watches(quantity, tick) => {
-                    self.watchdog.magnitude(quantity, tick, of(&self.rig, estimate));
+                Watched::Small(quantity_of) if self.watchdog.watches(quantity, tick) => {
+                    self.watchdog.magnitude(quantity, tick, quantity_of(&self.rig, estimate));
                 }
                 _ => {}
             }
         }
     }
 
-    /// Holds the command of a channel against the physics.
+    /// Passes a command's monitored quantities to the watchdog.
     #[inline]
     fn watch_command(watchdog: &mut Watchdog, tick: u64, command: &Command<R>) {
         for (quantity, monitor) in R::monitors().iter().enumerate() {
-            if let Watched::Commanded(of) = monitor.watched
+            if let Watched::Commanded(quantity_of) = monitor.watched
                 && watchdog.watches(quantity, tick)
-                && let Some(value) = of(command)
+                && let Some(value) = quantity_of(command)
             {
                 watchdog.magnitude(quantity, tick, value);
             }
@@ -390,7 +389,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
             match source.tick(stamp.tick, estimate.chain(singles).chain(fleets))? {
                 Progress::Done => {
                     began_ns = source.asked_ns(stamp.tick).unwrap_or(began_ns);
-                    // A device that makes the estimate too was asked before that was sent.
+                    // A device that also computes the estimate was asked before the estimate was sent.
                     if !source.makes_estimate() {
                         self.stages.received_ns = began_ns;
                     }
@@ -480,7 +479,7 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
     fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let inputs = if let RunCondition::Inputs { up_to } = condition { Some(up_to) } else { None };
         let allowed = inputs.is_none_or(|up_to| self.counters.next() <= up_to);
-        // In real time nobody waits for what is not used.
+        // In real time a skipped tick does not wait for its inputs.
         if inputs.is_none() && self.interruptions.misses(self.counters.next()) {
             return self.miss(self.counters.next());
         }
@@ -494,11 +493,11 @@ impl<R: Rig, B: Bus> Node for ControllerNode<R, B> {
         Some(late.map_or(RoleId::Observer, RoleId::Plant))
     }
 
-    /// The estimate is nearly always the last to come: whoever waits for it finds the others there.
+    /// The estimate usually arrives last; the other inputs are there by then.
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         let tick = self.counters.next();
         if self.source.as_ref().is_some_and(SampleSource::pending) {
-            // What it waits for comes over a line.
+            // The line delivers the answer.
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
         } else if self.lacks_estimate() {
             self.estimate.sleep(until_ns)?;

@@ -1,8 +1,8 @@
-//! Several roles in one process (`launch.processes`), driven as one node: each tick passes through them in its order.
+//! Several roles in one process (`launch.processes`), driven as one node in the order of a tick.
 //!
-//! Each is what it is in a process of its own, with all its signals, state and counters, and its samples take the same links.
-//! In real time whoever has a short way to a sample sees it at once, and what else there is to do waits until all have done
-//! their tick, or one of them has to wait. Must not compute, nor change what any of them sends.
+//! Each role keeps its signals, state and counters, and its samples take the usual links. In real time a latest-value
+//! channel serves the members at once; publishing and other work waits until all members have done their tick or one
+//! has to wait. Must not compute, nor change what a member sends.
 
 use super::contract::{Node, Poll, ReadyNode, RunCondition};
 use crate::clock::{Grid, monotonic_ns};
@@ -10,23 +10,23 @@ use crate::runtime::error::NodeError;
 use crate::runtime::role_id::RoleId;
 use crate::telemetry::{LedgerError, StageReport, Ticks};
 
-/// So long a group sleeps on one input if it lacks several from outside, ns.
+/// Longest sleep of a group that lacks several outside inputs, ns.
 const NAP_NS: u64 = 50_000;
 
-/// Some roles of a run.
+/// Several roles as one node.
 pub struct GroupNode {
-    /// In the order in which a tick passes through them.
+    /// In the order of a tick.
     members: Vec<Member>,
     realtime: bool,
     last_tick: u64,
-    /// The tick that was begun and is not over, in real time.
+    /// The tick in progress, in real time.
     open: Option<u64>,
 }
 
 struct Member {
     role: RoleId,
     node: ReadyNode,
-    /// Whether it has executed a tick that is not settled.
+    /// True while an executed tick is not finished.
     executed: bool,
 }
 
@@ -37,7 +37,7 @@ impl Member {
 }
 
 impl GroupNode {
-    /// These roles, given in the order of a tick, for a run up to `last_tick`.
+    /// Groups these roles, given in the order of a tick, for a run up to `last_tick`.
     pub fn new(nodes: Vec<(RoleId, ReadyNode)>, realtime: bool, last_tick: u64) -> Self {
         let members = nodes.into_iter().map(|(role, node)| Member { role, node, executed: false }).collect();
         Self { members, realtime, last_tick, open: None }
@@ -47,12 +47,12 @@ impl GroupNode {
         self.members.iter_mut().map(|member| &mut member.node)
     }
 
-    /// The member is started by its next tick, and has one.
+    /// Returns true if the time grid starts the member's next tick.
     fn timed(&self, member: &Member) -> bool {
         self.realtime && member.node.time_triggered() && member.node.next_tick() <= self.last_tick
     }
 
-    /// Lockstep: everybody does what can be done.
+    /// Lockstep: every member executes what it can.
     fn poll_in_turn(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let mut polled = Poll::Waiting;
         for Member { node, .. } in &mut self.members {
@@ -66,7 +66,7 @@ impl GroupNode {
         Ok(polled)
     }
 
-    /// Real time: the tick, through everybody who has not done it.
+    /// Real time: executes the tick in every member that has not done it.
     #[inline]
     fn poll_on_grid(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let tick =
@@ -82,7 +82,7 @@ impl GroupNode {
             };
             let mut missed = false;
             while member.node.next_tick() <= tick {
-                // Who catches up executes several ticks here, and a link holds one sample at a time.
+                // A member that catches up executes several ticks here, and a link holds one sample at a time.
                 member.finish_tick()?;
                 match member.node.poll(condition)? {
                     Poll::Executed => member.executed = true,
@@ -92,7 +92,7 @@ impl GroupNode {
             }
             let next = member.node.next_tick();
             if missed {
-                // What it did not send nobody behind it will have.
+                // Later members will not get the sample of a missed tick.
                 return self.pass_over(index, next);
             }
             complete &= next > tick;
@@ -103,7 +103,7 @@ impl GroupNode {
         if complete || condition == RunCondition::Overdue {
             self.open = None;
         }
-        // Where only the missing sample could start a later tick, one sleeps on it: a spin here would starve its writer.
+        // If only the missing sample can start a later tick, the group sleeps on it: a spin would starve its writer.
         if complete || self.open.is_none() && self.next_tick() > tick {
             return Ok(Poll::Executed);
         }
@@ -111,8 +111,8 @@ impl GroupNode {
         Ok(Poll::Waiting)
     }
 
-    /// A member has executed a later tick, or missed this one: for those behind it, what they waited for will never come, and the
-    /// next tick has a cutoff of its own.
+    /// Skips members after one that executed a later tick or missed this one: their inputs will never arrive, and the
+    /// next tick has its own cutoff.
     #[cold]
     fn pass_over(&mut self, index: usize, tick: u64) -> Result<Poll, NodeError> {
         for Member { node, .. } in &mut self.members[index + 1..] {
@@ -125,7 +125,7 @@ impl GroupNode {
         Ok(Poll::Missed)
     }
 
-    /// The members whose next step needs a sample from outside, and nothing from inside before.
+    /// Returns the members whose next step lacks an outside sample and waits for no other member.
     fn lacking(&self) -> impl Iterator<Item = usize> {
         let inside = |role: RoleId| self.members.iter().find(|member| member.role == role).map(|member| &member.node);
         let lacks = move |member: &Member| {
@@ -144,7 +144,7 @@ impl Node for GroupNode {
         self.members.iter().any(|member| self.timed(member))
     }
 
-    /// In real time that of the members which the tick starts, as long as they have one.
+    /// In real time the next tick of the members that the grid starts, while they have one.
     fn next_tick(&self) -> u64 {
         let timed = self.members.iter().filter(|member| self.timed(member)).map(|member| member.node.next_tick());
         let all = || self.members.iter().map(|member| member.node.next_tick()).min();
@@ -169,7 +169,7 @@ impl Node for GroupNode {
         if self.realtime { self.poll_on_grid(condition) } else { self.poll_in_turn(condition) }
     }
 
-    /// Whom the first member awaits that lacks a sample from outside.
+    /// The sender that the first member with a missing outside sample waits for.
     fn awaits(&self) -> Option<RoleId> {
         self.lacking().next().and_then(|index| self.members[index].node.awaits())
     }
@@ -178,12 +178,12 @@ impl Node for GroupNode {
         let mut lacking = self.lacking();
         let (first, more) = (lacking.next(), lacking.next().is_some());
         drop(lacking);
-        // One can sleep on one input only.
+        // A process can sleep on one input only.
         let until_ns = if more { until_ns.min(monotonic_ns() + NAP_NS) } else { until_ns };
         first.map_or(Ok(false), |index| self.members[index].node.sleep(until_ns))
     }
 
-    /// The last in the tick first: others wait for what it has sent.
+    /// The last member first: other roles wait for its samples.
     #[inline]
     fn finish_tick(&mut self) -> Result<(), NodeError> {
         self.members.iter_mut().rev().try_for_each(Member::finish_tick)
@@ -237,7 +237,7 @@ mod tests {
     use crate::telemetry::Ledger;
 
     const LAST: u64 = 6;
-    /// The leader's measurement of this tick is dropped.
+    /// The tick whose measurement of the leader is dropped.
     const LOST: u64 = 3;
     const GROUP: [RoleId; 2] = [RoleId::Observer, RoleId::Controller];
 
@@ -257,9 +257,9 @@ mod tests {
         }
     }
 
-    /// A leader that says nothing may need the very core that they run on.
+    /// A silent leader may need the core of the group.
     #[test]
-    fn whoever_waits_for_what_is_long_overdue_sleeps() {
+    fn a_group_sleeps_on_an_input_that_is_overdue() {
         let (name, text) = SHIPPED[0];
         let overrides = ["clock=realtime", "duration_s=0.1", "accept={}"].map(str::to_owned);
         let scenario = &Scenario::parse(text, name, &overrides).unwrap();
@@ -274,9 +274,9 @@ mod tests {
         }
     }
 
-    /// Both die when the observer has passed a tick over, by a void that the controller has not taken: nobody has it any more.
+    /// The observer has passed over a tick with a marker that the controller has not read. Then both die.
     #[test]
-    fn a_void_that_was_on_its_way_between_the_two_is_not_lost_with_them() {
+    fn a_marker_in_flight_between_members_survives_their_death() {
         let (name, text) = SHIPPED[0];
         let fault = format!("fault=[{{kind=\"drop\", role=\"leader\", from_tick={LOST}}}]");
         let overrides = ["clock=lockstep", "duration_s=0.1", "accept={}", &fault].map(str::to_owned);
@@ -291,7 +291,7 @@ mod tests {
         let books = GROUP
             .map(|role| shared_ledger(scenario, role, &directory.path().join(ledger_file(scenario, role))).unwrap());
 
-        // Each alone, so that one can be ahead of the other.
+        // Separate nodes, so that one can be ahead of the other.
         let first_bus = enter(&domain, scenario);
         let [mut observer, mut controller] = [0, 1].map(|index: usize| {
             let mut node = build(scenario, GROUP[index], &first_bus, &books[index]).unwrap();

@@ -1,14 +1,14 @@
-//! Ticks that a role has passed over, for the distributions of its stages.
+//! Missed ticks of a role, for the latency distributions of its stages.
 //!
-//! As coordinated omission is corrected: each of them gets an entry, from when it was due until the role was at its next tick.
-//! Must not count ticks; the counters do.
+//! Corrects for coordinated omission: each missed tick gets an entry from its due instant to the role's next tick. Must
+//! not count ticks; the counters do.
 
 use crate::clock::{Clock, Grid, monotonic_ns};
 
-/// The first tick of which a stage has no entry.
+/// The first tick without an entry.
 #[derive(Debug, Default)]
 pub(super) struct MissedTicks {
-    /// None unless in real time, once the ticks run.
+    /// Set only in real time, once the ticks run.
     grid: Option<Grid>,
     next: u64,
 }
@@ -20,7 +20,7 @@ impl MissedTicks {
         self.next = next;
     }
 
-    /// Takes the entry of `tick` as made; returns the due instants of all ticks before it that have none, ns.
+    /// Marks `tick` as entered; returns the due instants of the ticks before it without an entry, ns.
     #[inline]
     pub fn before(&mut self, tick: u64) -> impl Iterator<Item = u64> + use<> {
         let ticks = self.next..tick;
@@ -28,7 +28,8 @@ impl MissedTicks {
         self.grid.into_iter().flat_map(move |grid| ticks.clone().map(move |tick| grid.due_ns(tick)))
     }
 
-    /// Returns the missed ticks at the end of the run, of which `tick` would be next; with the time until which they are missed, ns.
+    /// Returns the due instants of the ticks before `tick` without an entry at the end of the run, and the instant until
+    /// which each counts as missed, ns.
     pub fn rest(&mut self, tick: u64) -> (impl Iterator<Item = u64> + use<>, u64) {
         let end_ns = self.grid.map_or(0, |grid| grid.due_ns(tick).max(monotonic_ns()));
         (self.before(tick), end_ns)
@@ -58,7 +59,7 @@ mod tests {
         assert_eq!(missed.before(3).count(), 0, "the ticks do not run");
         missed.start(Clock::Monotonic, grid, 4);
         assert_eq!(missed.before(4).count(), 0);
-        assert_eq!(missed.before(7).collect::<Vec<_>>(), [1050, 1060], "a successor's, or a hog's");
+        assert_eq!(missed.before(7).collect::<Vec<_>>(), [1050, 1060], "missed by a restart or a busy core");
         assert_eq!(missed.before(8).count(), 0);
         let (rest, end_ns) = missed.rest(11);
         assert_eq!(rest.collect::<Vec<_>>(), [1090, 1100]);
@@ -77,7 +78,7 @@ mod tests {
         stages.iter().find(|report| report.stage == stage).map(|report| report.latency().percentiles()).unwrap()
     }
 
-    /// A controller that stands still: the command that acts grows older, and no tick is left out.
+    /// While the controller is stopped, the acting command grows older at every tick.
     #[test]
     fn the_age_is_that_of_the_command_that_acts_at_every_tick() {
         let scenario = scenario();
@@ -88,7 +89,7 @@ mod tests {
         let mut commands = bus.writer::<RateCommand>(&topic(&scenario, "follower", Signal::Command), 1).unwrap();
         let grid = Grid { epoch_ns: monotonic_ns() - 1000 * MS, period_ns: MS };
         follower.start(grid, 0).unwrap();
-        // Ticks 3 to 9 are missed, and there is a command of tick 0 alone.
+        // Ticks 3 to 9 are missed, and only tick 0 has a command.
         for tick in [0, 1, 2, 10] {
             if tick == 1 {
                 let stamp = Stamp { tick: 0, generation: 1, origin_ns: grid.due_ns(0), sent_ns: grid.due_ns(0) };
@@ -109,9 +110,9 @@ mod tests {
         assert!((step.max_us - 7e3).abs() < 20.0, "tick 3 was back at tick 10: {step:?}");
     }
 
-    /// A foreign leader whose clock is ahead, and that leaves ticks out.
+    /// A foreign leader with a clock that is ahead, and with missed ticks.
     #[test]
-    fn stamps_of_another_clock_are_told_and_give_no_figures() {
+    fn stamps_of_another_clock_are_counted_and_give_no_figures() {
         let scenario = scenario();
         let domain = OwnedDomain::create(0).unwrap();
         let bus = IoxBus::enter(domain.domain(), "test", depths(&scenario)).unwrap();
@@ -134,6 +135,6 @@ mod tests {
         assert_eq!((hop.ahead, hop.missed), (3, 3));
         assert!(!hop.are_shown() && hop.p50_us.is_nan() && hop.ahead_max_us > 9e5, "{hop:?}");
         let age = figures(&*observer, "age");
-        assert!(age.are_shown() && (age.count, age.missed) == (6, 3), "that began by this clock: {age:?}");
+        assert!(age.are_shown() && (age.count, age.missed) == (6, 3), "its origin is on this clock: {age:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! An observer on a bus: the leader's measurement in, the estimate out.
+//! An observer on a bus: reads the leader's measurement, sends the estimate.
 
 use super::context::{LOOK_NS, NodeContext};
 use super::contract::{Node, Poll, RunCondition};
@@ -37,7 +37,7 @@ pub struct ObserverNode<R: Rig, B: Bus> {
     counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
-    /// What computes the estimate in the place of the observer, if that is somebody else.
+    /// The source of the estimate, if not the observer.
     source: Option<SampleSource>,
     instants: Instants,
     missed: MissedTicks,
@@ -109,7 +109,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         Ok(Poll::Executed)
     }
 
-    /// There is no measurement for the next tick, and so there is no estimate.
+    /// Passes over ticks without measurement.
     #[cold]
     fn pass_over(&mut self) -> Result<Poll, NodeError> {
         let next = self.counters.next();
@@ -120,7 +120,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         Ok(Poll::Waiting)
     }
 
-    /// Does not execute a tick, as a scripted fault has it, nor those before it.
+    /// Skips a tick, and those before it, for a scripted fault.
     #[cold]
     fn miss(&mut self, tick: u64) -> Result<Poll, NodeError> {
         self.skip_to(tick);
@@ -129,7 +129,7 @@ impl<R: Rig, B: Bus> ObserverNode<R, B> {
         Ok(Poll::Missed)
     }
 
-    /// Enters ticks that were missed into every stage, by when each was due.
+    /// Records missed ticks in every stage from their due instants.
     #[inline]
     fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
         for due_ns in due_ns {
@@ -185,7 +185,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
     fn poll(&mut self, condition: RunCondition) -> Result<Poll, NodeError> {
         let inputs = if let RunCondition::Inputs { up_to } = condition { Some(up_to) } else { None };
         let allowed = inputs.is_none_or(|up_to| self.counters.next() <= up_to);
-        // In real time nobody waits for what is not used.
+        // In real time a skipped tick does not wait for its inputs.
         if inputs.is_none() && self.interruptions.misses(self.counters.next()) {
             return self.miss(self.counters.next());
         }
@@ -199,7 +199,7 @@ impl<R: Rig, B: Bus> Node for ObserverNode<R, B> {
 
     fn sleep(&mut self, until_ns: u64) -> Result<bool, NodeError> {
         if self.source.as_ref().is_some_and(SampleSource::pending) {
-            // What it waits for comes over a line.
+            // The line delivers the answer.
             sleep_until(until_ns.min(monotonic_ns() + LOOK_NS));
         } else {
             self.measurement.sleep(until_ns)?;

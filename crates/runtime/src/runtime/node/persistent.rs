@@ -1,17 +1,17 @@
-//! The part of a node that outlives its process: committed to its ledger, and restored from there.
+//! The persistent state of a node: committed to its ledger and restored from it.
 
 use crate::runtime::hooks::{self, Failpoint};
 use crate::state::{Count, Restore, Words};
 use crate::telemetry::{Ledger, LedgerError};
 
-/// What of a node outlives its process.
+/// A node with persistent state.
 pub(super) trait Persistent {
-    /// Where it is kept.
+    /// Returns the ledger.
     fn ledger(&self) -> &Ledger;
-    /// Passes the counters, and what is committed to be sent, in the order of the role's [`Ports`](super::Ports); see
+    /// Passes the counters and the staged samples, in the order of the role's [`Ports`](super::Ports); see
     /// [`report`](crate::runtime::report).
     fn counters<W: Words>(&mut self, words: &mut W);
-    /// Passes everything else.
+    /// Passes the rest of the state.
     fn state<W: Words>(&mut self, words: &mut W);
 
     fn pass<W: Words>(&mut self, words: &mut W) {
@@ -20,7 +20,7 @@ pub(super) trait Persistent {
     }
 }
 
-/// Commits the state of a node, where another process may have to continue from it.
+/// Commits the state of a node if a successor may continue from it.
 #[inline]
 pub(super) fn commit(node: &mut impl Persistent) {
     if node.ledger().is_shared() {
@@ -35,10 +35,10 @@ pub(super) fn commit(node: &mut impl Persistent) {
     }
 }
 
-/// Commits the state of a node for the last time, wherever it is kept.
+/// Commits the state of a node for the last time, also in private memory.
 pub(super) fn commit_last(node: &mut impl Persistent) {
     let ledger = node.ledger().reopened();
-    // Room in private memory can always be had, and that in shared memory was taken before the first tick.
+    // Private memory is always available; shared memory was reserved before the first tick.
     if ledger.reserve(length(node)).is_ok() {
         ledger.commit(|store| node.pass(store));
     }
@@ -50,18 +50,18 @@ pub(super) fn length(node: &mut impl Persistent) -> usize {
     count.0
 }
 
-/// What a node has of its predecessor.
+/// The state that a node takes from its predecessor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Inherited {
-    /// There was none, or it had not begun.
+    /// No predecessor, or one that committed nothing.
     Nothing,
-    /// The counters alone: the state is not trusted.
+    /// The counters only: the state is not trusted.
     Counters,
-    /// All.
+    /// Counters and state.
     All,
 }
 
-/// Reads what a predecessor committed.
+/// Restores the state that a predecessor committed.
 pub(super) fn restore(node: &mut impl Persistent) -> Result<Inherited, LedgerError> {
     let ledger = node.ledger().reopened();
     ledger.reserve(length(node))?;

@@ -1,4 +1,4 @@
-//! A plant on a bus: command in; measurement, then truth out; then the body moves on.
+//! A plant on a bus: reads the command, sends measurement and truth, then integrates.
 
 use super::context::NodeContext;
 use super::contract::{Node, Poll, RunCondition};
@@ -18,7 +18,7 @@ use crate::state::{Persist, Words};
 use crate::telemetry::{Latency, Ledger, LedgerError, StageReport, TickCounters, Ticks};
 use std::borrow::{Borrow, BorrowMut};
 
-/// A body whose samples links carry: one, or a fleet.
+/// A body or fleet whose samples links carry.
 pub trait LinkedBody: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist {}
 
 impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> LinkedBody for P {}
@@ -27,7 +27,7 @@ impl<P: Body<Truth: Carried, Measurement: Carried, Command: Carried> + Persist> 
 pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     plant: Plant<P>,
     command: Option<Input<B, P::Command, G>>,
-    /// What has come and is not due, where a command does not act at the tick after its own.
+    /// Commands that have arrived and are not due, with an actuation delay above one tick.
     line: Option<DelayLine<<P::Command as Carried>::Owned>>,
     measurement: Output<B, P::Measurement>,
     truth: Output<B, P::Truth>,
@@ -37,14 +37,14 @@ pub struct PlantNode<P: LinkedBody, G, B: Bus> {
     counters: TickCounters,
     interruptions: Interruptions,
     ledger: Ledger,
-    /// What computes the samples in the place of the body, if that is somebody else.
+    /// The function that computes the samples, if not the body.
     function: Option<FunctionRole>,
     inherited: Inherited,
-    /// The tick that was executed and is not settled: its truth is not sent, and the body has not moved on.
+    /// The executed tick whose truth is not sent and whose integration step is missing.
     unfinished: Option<u64>,
-    /// So many ticks up to the next were missed: the body moves over them by itself, at once, before it is looked at again.
+    /// Number of missed ticks: the body moves over them without commands before the next tick.
     behind: u64,
-    /// When the chain of the command that was applied last began at the leader, ns; it may still be held.
+    /// Origin of the command applied last, at the leader, ns. The plant may still hold that command.
     acting_ns: Option<u64>,
     missed: MissedTicks,
     lateness: Latency,
@@ -64,7 +64,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         let measurement = context.output(info, Signal::Measurement)?;
         let truth = context.output(info, Signal::Truth)?;
         let delay_ticks = scenario.actuation_delay_ticks;
-        // Where several commands may come before one is due, the newest is not enough.
+        // If several commands may arrive before one is due, the newest is not enough.
         let (delayed, bodies) = (delay_ticks > 1, info.bodies());
         let reader = if delayed { Reader::Scorer } else { Reader::Role };
         let command = info.driven.then(|| context.input_of(info, Signal::Command, guard, reader)).transpose()?;
@@ -102,8 +102,8 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         }
     }
 
-    /// Takes the commands up to that of a tick into the line, as far as they have come; whether it is known of all what has
-    /// become of them.
+    /// Moves the arrived commands up to `last` into the delay line; returns true once each has arrived or is known to
+    /// be missing.
     fn collect(&mut self, last: u64) -> Result<bool, NodeError> {
         let (Some(input), Some(line)) = (&mut self.command, &mut self.line) else { return Ok(true) };
         for tick in line.wanted_at(last + 1)..=last {
@@ -120,7 +120,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         Ok(true)
     }
 
-    /// Counts the ticks up to `tick` as missed, and their lateness too: nobody served them before now.
+    /// Counts the ticks before `tick` as missed, and records their lateness.
     fn catch_up(&mut self, tick: u64, now_ns: u64) {
         for missed in self.counters.next()..tick {
             self.lateness.record_missed(self.grid.due_ns(missed), now_ns);
@@ -128,7 +128,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         self.skip_to(tick);
     }
 
-    /// Enters ticks that were missed into the stages, by when each was due: the command before them acted.
+    /// Records missed ticks in the stages from their due instants; the previous command acted on them.
     #[inline]
     fn enter_missed(&mut self, due_ns: impl Iterator<Item = u64>, until_ns: u64) {
         for due_ns in due_ns {
@@ -137,7 +137,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         }
     }
 
-    /// Enters the age of the command that acts at a tick, be it that of the tick or held for want of one.
+    /// Records the age of the acting command; a held command counts as missed.
     #[inline]
     fn enter_age(&mut self, event: CommandEvent, now_ns: u64) {
         let Some(acting_ns) = self.acting_ns else { return };
@@ -147,7 +147,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         }
     }
 
-    /// Does what a predecessor was committed to. From then on its body moved by itself, and its actuators protected it.
+    /// Completes what a predecessor committed. From then on the body moves by itself, protected by its actuators.
     fn take_over(&mut self) -> Result<(), NodeError> {
         self.measurement.dispatch()?;
         self.measurement.finish()?;
@@ -161,7 +161,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         Ok(())
     }
 
-    /// Does not execute the next tick, as a scripted fault has it: no samples, no command, and the body moves by itself.
+    /// Skips the next tick for a scripted fault: no samples, no command; the body moves by itself.
     #[cold]
     fn miss(&mut self) -> Result<Poll, NodeError> {
         let tick = self.counters.next();
@@ -177,7 +177,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
         Ok(Poll::Missed)
     }
 
-    /// Executes the next tick, unless it is one that is to be missed.
+    /// Executes the next tick, unless a scripted fault skips it.
     #[inline]
     fn execute_or_miss(&mut self, now_ns: u64) -> Result<Poll, NodeError> {
         if self.interruptions.misses(self.counters.next()) { self.miss() } else { self.execute(now_ns) }
@@ -257,7 +257,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> PlantNode<P, G, B> {
     }
 }
 
-/// The command that is due at a tick, of what has come.
+/// Returns the command that is due at a tick.
 #[inline]
 fn due<'a, S: Carried + ?Sized, G: Guard<S>, B: Bus>(
     input: Option<&'a mut Input<B, S, G>>,
@@ -309,7 +309,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         if self.clock == Clock::None {
             self.skip_to(first_tick);
         }
-        // Else the first look at the grid skips what was missed, with whatever more is missed until then.
+        // Otherwise the first poll skips the ticks missed until then.
         Ok(())
     }
 
@@ -336,7 +336,7 @@ impl<P: LinkedBody, G: Guard<P::Command> + Persist, B: Bus> Node for PlantNode<P
         }
     }
 
-    /// In lockstep. In real time a body waits for the tick alone.
+    /// In lockstep; in real time a body waits for the time grid only.
     fn awaits(&self) -> Option<RoleId> {
         let last = self.counters.next().checked_sub(1)?;
         let lacks = self.command.as_ref().is_some_and(|command| !command.knows(last));

@@ -1,6 +1,6 @@
-//! Which signals a role writes and reads: the one list, for counters and for foreign programs.
+//! The signals that a role writes and reads: one list for counters and for foreign programs.
 //!
-//! In the order in which the nodes open them, which is that of their counters. Must not open anything.
+//! In the order in which nodes open them and persist their counters. Must not open anything.
 
 use crate::bus::{Port, Signal, Topic};
 use crate::config::{BodyInfo, Settings};
@@ -10,17 +10,17 @@ use crate::sample::{Health, Schedule};
 /// The signals of a role.
 #[derive(Debug, Clone)]
 pub struct Ports {
-    /// What it writes for the loop.
+    /// The loop's signals that the role writes.
     pub writes: Vec<Port>,
-    /// What it reads of the loop.
+    /// The loop's signals that the role reads.
     pub reads: Vec<Port>,
-    /// Its word to the launcher.
+    /// The role's heartbeat.
     pub health: Port,
-    /// The launcher's word to it.
+    /// The launcher's schedule.
     pub schedule: Port,
 }
 
-/// The driven bodies in the order in which a controller serves them: single ones, then fleets.
+/// Returns the driven bodies in the controller's order: single bodies, then fleets.
 pub(super) fn driven(bodies: &[BodyInfo]) -> impl Iterator<Item = (usize, &BodyInfo)> {
     let driven = || bodies.iter().enumerate().filter(|(_, body)| body.driven);
     driven().filter(|(_, body)| body.fleet.is_none()).chain(driven().filter(|(_, body)| body.fleet.is_some()))
@@ -29,7 +29,7 @@ pub(super) fn driven(bodies: &[BodyInfo]) -> impl Iterator<Item = (usize, &BodyI
 /// Returns the signals of a role.
 ///
 /// # Panics
-/// If the role is not one of the settings' own.
+/// If the settings do not have the role.
 pub fn ports(settings: &Settings, role: RoleId) -> Ports {
     let bodies = &settings.bodies;
     let port = |body: &BodyInfo, signal: Signal| {
@@ -57,7 +57,7 @@ pub fn ports(settings: &Settings, role: RoleId) -> Ports {
     }
 }
 
-/// The topic of a signal in a scenario.
+/// Returns the topic of a signal in a scenario.
 pub fn topic(scenario: &Settings, body: &str, signal: Signal) -> Topic {
     Topic { scenario: scenario.name.clone(), body: body.to_owned(), signal }
 }
@@ -76,7 +76,7 @@ mod tests {
 
     type Opened = RefCell<Vec<(Topic, &'static str)>>;
 
-    /// A bus that remembers what was opened.
+    /// A bus that records the opened signals.
     struct Watched {
         bus: MemoryBus,
         written: Opened,
@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn the_list_is_what_the_nodes_open() {
+    fn ports_lists_what_the_nodes_open() {
         for (name, text) in SHIPPED {
             let scenario = Scenario::parse(text, name, &[]).unwrap();
             for role in RoleId::all(&scenario) {
@@ -136,14 +136,14 @@ mod tests {
     }
 
     #[test]
-    fn the_order_is_the_nodes_and_the_layout_the_samples() {
+    fn ports_have_the_order_of_the_nodes_and_the_layout_of_the_samples() {
         let scenario = Scenario::parse(SHIPPED[2].1, "rigid-trio", &[]).unwrap();
         let signals = |ports: &[Port]| ports.iter().map(|port| port.topic.to_string()).collect::<Vec<_>>();
         let controller = ports(&scenario, RoleId::Controller);
-        let of = |name: &str| format!("corotate/rigid-trio/{name}");
-        assert_eq!(signals(&controller.writes), [of("follower-a/command"), of("follower-b/command")]);
+        let service = |name: &str| format!("corotate/rigid-trio/{name}");
+        assert_eq!(signals(&controller.writes), [service("follower-a/command"), service("follower-b/command")]);
         let reads = ["leader/estimate", "follower-a/measurement", "follower-b/measurement"];
-        assert_eq!(signals(&controller.reads), reads.map(of));
+        assert_eq!(signals(&controller.reads), reads.map(service));
         let plant = ports(&scenario, RoleId::Plant(1));
         assert_eq!(plant.writes[0].type_name, "corotate/rigid-body/measurement/v1");
         assert_eq!(plant.writes[0].size, 32 + 8 * 8);
