@@ -450,7 +450,7 @@ fn limits_and_watchdog_that_make_no_sense_are_refused() {
         ("faults", "limits.rate_rad_s=0.5", "is not above the 1.510 rad/s that a body may turn at"),
         ("faults", "limits.acceleration_rad_s2=0.0", "not above zero"),
         ("faults", "limits.speed_du_s=1.0", "unknown key"),
-        ("orbit-hold", "limits.speed_du_s=0.5", "is not above the 0.955 du/s that a body has or is to have"),
+        ("orbit-hold", "limits.speed_du_s=0.5", "is not above the 0.955 du/s of the initial states and the target"),
         ("faults", "watchdog.from_s=-1.0", "is before the run"),
         ("faults", "watchdog.energy_drift_max=0.0", "not above zero"),
         ("faults", "watchdog.latch_after_ticks=3", "is for on_breach = \"safe\""),

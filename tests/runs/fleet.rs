@@ -197,17 +197,17 @@ fn a_fleet_flies_beside_single_followers() {
 #[test]
 fn what_no_fleet_can_be_is_refused_with_its_reason() {
     for (set, said) in [
-        ("follower.0.count=0", "0 is no number of bodies that one process hosts; give 1 to 1000000"),
-        ("follower.0.count=-1", "-1 is no number of bodies"),
-        ("follower.0.count=1000000000", "1000000000 is no number of bodies"),
+        ("follower.0.count=0", "one process cannot host 0 bodies; give 1 to 1000000"),
+        ("follower.0.count=-1", "one process cannot host -1 bodies"),
+        ("follower.0.count=1000000000", "one process cannot host 1000000000 bodies"),
         ("follower.0.count=2.5", "give a whole number"),
         ("follower.0.initial_rate_spread_rad_s=[0.1, -0.1, 0.1]", "below zero; give 0 or more"),
         ("follower.0.initial_rate_spread_rad_s=[4000.0, 0.0, 0.0]", "it turns too far from one tick"),
-        ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "has no meaning for a fleet"),
-        ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "has no meaning for a fleet"),
-        ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "has no meaning for a fleet"),
-        ("controller.adaptation_gain=1.0", "learns the inertia of single followers"),
-        ("limits.repeats=10", "is not counted for the bodies of a fleet"),
+        ("follower.0.noise_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),
+        ("follower.0.bias_rad_s=[1e-3, 0.0, 0.0]", "is not supported for a fleet"),
+        ("follower.0.inertia_factor=[1.0, 1.1, 1.0]", "is not supported for a fleet"),
+        ("controller.adaptation_gain=1.0", "adapts to the inertia of single followers"),
+        ("limits.repeats=10", "is not supported for a fleet"),
         ("watchdog.lyapunov_rad2_s2_max=1.0", "is not published for a fleet"),
         (
             "follower=[{name=\"a\", initial_rate_rad_s=[0,0,0], initial_rate_spread_rad_s=[1,1,1]}]",

@@ -1,6 +1,6 @@
-//! What a rig is: the trait, its samples, and what it tells of itself.
+//! The contract of a rig: the trait [`Rig`], its samples, and the figures that it reports.
 //!
-//! Must not know any rig.
+//! This file does not know any particular rig.
 
 use super::fleet::Fleet;
 use super::pictures::{Picture, graphs};
@@ -10,67 +10,74 @@ use crate::sample::FleetSample;
 use crate::state::Persist;
 use serde::{Deserialize, Serialize};
 
-/// The samples of a rig, by signal.
+/// The full state of a rig's body, for recording and scoring.
 pub type Truth<R> = <<R as Rig>::Body as Body>::Truth;
-/// The samples of a rig, by signal.
+/// The sensor readings of a rig's body.
 pub type Measurement<R> = <<R as Rig>::Body as Body>::Measurement;
-/// The samples of a rig, by signal.
+/// The estimate of a rig's observer.
 pub type Estimate<R> = <<R as Rig>::Estimator as Estimator>::Estimate;
-/// The samples of a rig, by signal.
+/// The input of a rig's actuators.
 pub type Command<R> = <<R as Rig>::Body as Body>::Command;
 
-/// The samples of a rig's fleets, by signal.
+/// The full state of a rig's fleet.
 pub type FleetTruth<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Truth>;
-/// The samples of a rig's fleets, by signal.
+/// The sensor readings of a rig's fleet.
 pub type FleetMeasurement<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Measurement>;
-/// The samples of a rig's fleets, by signal.
+/// The input of the actuators of a rig's fleet.
 pub type FleetCommand<R> = FleetSample<<<R as Rig>::Fleet as Fleet<Estimate<R>>>::Command>;
 
-/// Where a loop begins that is analysed.
+/// The initial state of a loop for its analysis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Start {
-    /// As the scenario has it.
+    /// As the scenario defines it.
     Given,
-    /// Where it is to get: the driven body at what it follows, the observer at the truth.
+    /// The target: the driven body at its reference, the observer at the truth.
     Settled,
-    /// Off that by about so much in every component that the loop controls, in their units: by other parts of it in each, and
-    /// the guess by others than the body, so that every mode of the error is excited.
+    /// Displaced from the target by about this amount in every controlled component, in its unit. The factors differ between
+    /// components, and between body and guess, so that every mode of the error is excited.
     Off(f64),
-    /// Off that by so much in the one that it does not control ([`Rig::FREE`]).
+    /// Displaced from the target by this amount in the uncontrolled component ([`Rig::FREE`]).
     Shifted(f64),
 }
 
 /// A plant, an observer and a control law that belong together.
+///
+/// Body 0 is the observed one, usually the leader; the driven bodies follow it. Most rigs need only
+/// [`SimpleRig`](super::SimpleRig), which implements this trait. Implement `Rig` itself for fleets, guards of your own, several
+/// rig names, certificates or Lyapunov functions.
+///
+/// Every associated type that keeps state implements [`Persist`], so that a restarted role can continue.
 pub trait Rig: Clone + Send + Sync + 'static {
-    /// The kind of body.
+    /// The plant: a body with its sensors and actuators.
     type Body: SingleBody + Persist;
-    /// What observes the first body.
+    /// The observer of body 0.
     type Estimator: Estimator<Measurement = Measurement<Self>> + Persist;
-    /// What drives a driven body.
+    /// The control law of a driven body.
     type Law: Law<Estimate = Estimate<Self>, Measurement = Measurement<Self>, Command = Command<Self>> + Persist;
-    /// What keeps measurements that cannot be from observer and law.
+    /// The guard that rejects impossible measurements before observer and law use them.
     type MeasurementGuard: Guard<Measurement<Self>> + Persist;
-    /// What keeps estimates that cannot be from the law.
+    /// The guard that rejects impossible estimates before the law uses them.
     type EstimateGuard: Guard<Estimate<Self>> + Persist;
-    /// What keeps commands that cannot be from the actuators.
+    /// The guard that rejects impossible commands before the actuators apply them.
     type CommandGuard: Guard<Command<Self>> + Persist;
-    /// Many bodies in one process; [`NoFleet`](super::NoFleet) where the rig has none.
+    /// Many bodies in one process; [`NoFleet`](super::NoFleet) if the rig has none.
     type Fleet: Fleet<Estimate<Self>>;
-    /// By which a scenario's key `rig` names it.
+    /// The values of the scenario key `rig` that select this rig.
     const NAMES: &'static [&'static str];
-    /// The keys of a scenario that are its own, each of a list of tables.
+    /// The scenario keys that belong to this rig and hold a list of tables, such as `follower`.
     const LISTS: &'static [&'static str] = &[];
-    /// Of how many components, counted from the first, the `valid` word of measurements and estimates tells.
+    /// The number of leading components covered by the `valid` word of measurements and estimates.
     const AXES: usize = 0;
-    /// The fields of truths and estimates that the loop controls: their errors are to vanish.
+    /// The fields of truths and estimates that the loop controls: their errors must vanish.
     const CONTROLLED: &'static [&'static str] = &[];
-    /// The field of truths that the loop does not control, if there is one: a motion that is shifted in it is as good.
+    /// The field of truths that the loop does not control, if there is one, such as an orbit's phase. A motion shifted in this
+    /// field is equally good.
     const FREE: Option<&'static str> = None;
 
-    /// The keys of a scenario that are its own, each of one table.
+    /// Returns the scenario keys that belong to this rig and hold one table, such as `leader`.
     fn tables() -> Vec<&'static str>;
-    /// The rig of this name as its tables describe it, or none if `checks` noted a problem with it; and the tables with every
-    /// default filled in.
+    /// Reads the rig of the given name from its tables. Returns it with the same tables in which every default is filled in. The
+    /// rig is `None` if `checks` recorded a problem with it.
     ///
     /// # Errors
     /// [`ConfigError`] for keys that are unknown, missing or of the wrong type.
@@ -80,36 +87,36 @@ pub trait Rig: Clone + Send + Sync + 'static {
         context: Context,
         checks: &mut Checks<'_>,
     ) -> Result<(Option<Self>, toml::Table), ConfigError>;
-    /// The bodies; the first is the observed one.
+    /// Returns the bodies; the first is the observed one.
     fn bodies(&self) -> &[BodyInfo];
-    /// A body at its initial state.
+    /// Creates a body at its initial state.
     fn body(&self, index: usize) -> Self::Body;
-    /// The observer at its initial guess.
+    /// Creates the observer at its initial guess.
     fn estimator(&self) -> Self::Estimator;
-    /// The law of a driven body.
+    /// Creates the law of a driven body.
     fn law(&self, index: usize) -> Self::Law;
-    /// A guard for a body's measurements at a new reader, which `acts` on them or only observes.
+    /// Creates a reader's guard for a body's measurements. `acts` is true for a reader that controls with them.
     fn measurement_guard(&self, index: usize, acts: bool) -> Self::MeasurementGuard;
-    /// A guard for estimates at a new reader.
+    /// Creates a reader's guard for estimates.
     fn estimate_guard(&self) -> Self::EstimateGuard;
-    /// A guard for a body's commands.
+    /// Creates a guard for a body's commands.
     fn command_guard(&self, index: usize) -> Self::CommandGuard;
-    /// The fleet in the place of the body with this index, if there is one.
+    /// Returns the fleet that takes the place of the body with this index, if it is one.
     fn fleet(&self, _index: usize) -> Option<Self::Fleet> {
         None
     }
-    /// The physical bounds that the guards work with.
+    /// Returns the physical bounds that the guards use.
     fn limits(&self) -> Vec<Figure> {
         Vec::new()
     }
-    /// What the controller can hold against a bound of the scenario's `[watchdog]`; at most [`WATCHED_MAX`](crate::control::WATCHED_MAX).
+    /// Returns the quantities that `[watchdog]` can bound; at most [`WATCHED_MAX`](crate::control::WATCHED_MAX).
     fn monitors() -> &'static [Monitor<Self>] {
         &[]
     }
-    /// What a run is scored by; the unit is the last part of each name.
+    /// Returns the names of the metrics; the last part of each name is its unit.
     fn metrics(&self) -> Vec<&'static str>;
-    /// Writes one tick's value of every metric; NaN for what cannot be told without a missing sample, +inf once a body is
-    /// lost. `truth` gives the truth of a body by its index, `fleet` that of a fleet.
+    /// Writes one tick's value of every metric: NaN if a sample that it needs is missing, +inf once a body is lost. `truth` returns
+    /// the truth of the body with an index, `fleet` that of a fleet.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a Truth<Self>>,
@@ -117,25 +124,25 @@ pub trait Rig: Clone + Send + Sync + 'static {
         estimate: Option<&Estimate<Self>>,
         out: &mut [f64],
     );
-    /// How a body's motion has ended, as a verb with its object, if it has.
+    /// Returns how a body's motion has ended, as a verb with its object, such as `leaves the region`.
     fn loss(&self, _truth: &Truth<Self>) -> Option<&'static str> {
         None
     }
-    /// This rig with no other driven body than the one with this index, and that a single one, begun there, with or without
-    /// noise: for the analysis of its loop. None if the rig cannot tell where that is settled.
+    /// Returns this rig reduced to body 0 and the given driven body, which is made a single one, for the analysis of its loop.
+    /// The loop starts as `start` says, with sensor noise if `noisy`. Returns `None` if the target state is unknown.
     fn isolated(&self, _index: usize, _start: Start, _noisy: bool) -> Option<Self> {
         None
     }
-    /// What is proven of the closed loop, one entry per driven body.
+    /// Returns the proofs about the closed loop, one per driven body.
     fn certificates(&self) -> Vec<CertificateReport> {
         Vec::new()
     }
-    /// Whether a body applied what it was told to at this tick.
+    /// Returns true if a body's input at this tick was neither a held command nor the safe one.
     fn undisturbed(_truth: &Truth<Self>) -> bool {
         true
     }
-    /// V and the bound on V̇ of a driven body, of the true errors, if the rig has such a function: from the truths of the
-    /// observed body and of the driven one, and from the estimate.
+    /// Returns V and the bound on V̇ for a driven body, from the truths of the observed and the driven body and from the estimate.
+    /// Returns `None` if the rig has no Lyapunov function.
     fn true_lyapunov(
         &self,
         _observed: &Truth<Self>,
@@ -144,70 +151,70 @@ pub trait Rig: Clone + Send + Sync + 'static {
     ) -> Option<(f64, f64)> {
         None
     }
-    /// V and the bound on V̇ that a controller published with a command, if the rig has such a function: as it sees them.
+    /// Returns V and the bound on V̇ that the controller published with a command, computed from its inputs.
     fn lyapunov(_command: &Command<Self>) -> Option<(f64, f64)> {
         None
     }
-    /// What a report draws of the motion; every number of the truth over time unless the rig knows better.
+    /// Returns the pictures of the motion in a report; by default every number of the truth over time.
     fn pictures() -> Vec<Picture> {
         graphs::<Truth<Self>>()
     }
-    /// Overrides that make of this scenario one whose motion a report draws beside that of the run, if there is such a one.
+    /// Returns overrides that turn this scenario into a reference run, whose motion a report draws beside this one; empty for
+    /// none.
     fn counterpart(&self) -> &'static [&'static str] {
         &[]
     }
-    /// What a reader of the results must know of the scenario, such as a declared exception to a rule.
+    /// Returns notes for readers of the results, such as a declared exception to a rule.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// A quantity that the controller can watch.
+/// A quantity that the controller can watch and the scenario's `[watchdog]` can bound.
 pub struct Monitor<R: Rig> {
-    /// Its name, with its unit as the last part; the key of its bound is `<name>_max`.
+    /// The name, with the unit as the last part. The key of its bound is `<name>_max`.
     pub name: &'static str,
-    /// How it is told.
+    /// The value, and the way to judge it.
     pub watched: Watched<R>,
-    /// Why it cannot be watched in this scenario, if so.
+    /// Returns the reason why the quantity cannot be watched in a scenario, if there is one.
     pub absent: fn(&R) -> Option<&'static str>,
 }
 
-/// Of what a quantity that is watched is told, and how it is judged.
+/// The source of a watched quantity, and the way to judge it.
 pub enum Watched<R: Rig> {
-    /// Of what the law works on, and not of the truth: constant in a sound loop. Its drift relative to its first values is
-    /// judged.
+    /// A function of the law's inputs that is constant in a sound loop. Its drift relative to its first values is judged.
     Constant(fn(&R, &Estimate<R>) -> f64),
-    /// Of what the law works on: small in a sound loop.
+    /// A function of the law's inputs that is small in a sound loop.
     Small(fn(&R, &Estimate<R>) -> f64),
-    /// Of a command, if that tells it: small in a sound loop.
+    /// A function of a command that is small in a sound loop. `None`: this command does not carry it.
     Commanded(fn(&Command<R>) -> Option<f64>),
 }
 
-/// The observed body's entry of a list, and another one's unless that is the same.
-pub(super) fn pair<T: Clone>(of: &[T], other: usize) -> Vec<T> {
-    let others = (other > 0).then(|| of[other].clone());
-    core::iter::once(of[0].clone()).chain(others).collect()
+/// Returns the list reduced to the entry of body 0 and that of body `index`, if that is another one.
+pub(super) fn pair<T: Clone>(list: &[T], index: usize) -> Vec<T> {
+    let driven = (index > 0).then(|| list[index].clone());
+    core::iter::once(list[0].clone()).chain(driven).collect()
 }
 
-/// What is proven of one driven body's law in continuous time, and the conditions of stability when it is sampled.
+/// The proofs about one driven body's law in continuous time, and the stability conditions of the sampled law.
 #[derive(Debug, Clone, Serialize)]
 pub struct CertificateReport {
-    /// The driven body.
+    /// The name of the driven body.
     pub body: String,
     /// One entry per condition.
     pub conditions: Vec<ConditionReport>,
-    /// The slowest exponent of the continuous law's error, 1/s; none where the observer's is not constant.
+    /// The slowest exponent of the error under the continuous law, 1/s; `None` if the observer's gain varies.
     pub continuous_rate_per_s: Option<f64>,
-    /// What the conditions rest on.
+    /// The bounds that the conditions assume.
     pub bounds: Vec<Figure>,
-    /// What a careful engineer would change.
+    /// Advice on scenario keys to change.
     pub warnings: Vec<String>,
 }
 
-/// A number that a certificate rests on.
+/// A number with its name.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Figure {
-    /// What it is, with its unit.
+    /// The name, with the unit.
     pub name: String,
     /// Its value.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
@@ -217,15 +224,15 @@ pub struct Figure {
 /// One condition of a certificate.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ConditionReport {
-    /// Which one, with its source.
+    /// The condition and its source.
     pub name: String,
-    /// What is there.
+    /// The actual value.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub value: f64,
-    /// What it must exceed.
+    /// The value that the actual one must exceed.
     #[serde(deserialize_with = "crate::telemetry::number_or_nan")]
     pub required: f64,
-    /// Whether it does.
+    /// True if it does.
     pub holds: bool,
 }
 
@@ -235,19 +242,19 @@ pub(super) fn check_name<'a>(checks: &mut Checks<'_>, key: &str, name: &str, mut
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     checks.require(plain, key, "bad-name", || format!("`{name}` cannot name a process; use 1 to 32 of a-z, 0-9 and -"));
     let free =
-        !["leader", "observer", "controller", "recorder", "run"].contains(&name) && taken.all(|other| other != name);
+        !["leader", "observer", "controller", "recorder", "run"].contains(&name) && taken.all(|used| used != name);
     checks.require(free, key, "taken-name", || format!("`{name}` is taken already; choose another name"));
 }
 
-/// What a rig must know of the scenario around it.
+/// The settings of a scenario that a rig depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Context {
     /// The period h, s.
     pub tick_s: f64,
-    /// How long a run is, s.
+    /// The length of a run, s.
     pub duration_s: f64,
-    /// The seed of all randomness.
+    /// The seed of all random numbers.
     pub seed: u64,
-    /// From so many ticks after its measurement on a command acts.
+    /// The number of ticks from a measurement to the tick at which its command acts.
     pub actuation_delay_ticks: u64,
 }

@@ -1,51 +1,51 @@
-//! Commands between the tick of their measurement and the tick from which they act, where that is more than one tick later, at
-//! the plant that waits to apply them.
+//! The line of commands that a plant has received and not applied yet, for commands that act more than one tick after their
+//! measurement.
 //!
-//! Must not decide what a missing command means; the plant's expiry does.
+//! The plant's command expiry decides what a missing command means.
 
 use crate::state::{Persist, Words};
 
-/// What has become of a command.
+/// The state of a command that is due.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Due<C> {
-    /// It is here.
+    /// It has arrived and is accepted.
     Here(C),
-    /// It has come and is not believed.
+    /// It has arrived and was rejected.
     Rejected,
-    /// It has not come.
+    /// It has not arrived.
     Missing,
 }
 
-/// A command's place in the line.
+/// The place of a command in the line.
 #[derive(Debug)]
 struct Place<C> {
-    /// The tick after that of the command, or of the rejected one, that was put here last; 0 if none was.
+    /// The tick after that of the last command stored here, or 0 before the first.
     filled: u64,
     rejected: bool,
     command: C,
 }
 
-/// The commands that a plant has got and does not apply yet. `C` owns a sample.
+/// The commands that a plant has received and not applied yet. `C` owns a sample.
 #[derive(Debug)]
 pub struct DelayLine<C> {
     places: Vec<Place<C>>,
-    /// The first tick of which it is not known whether there is a command.
+    /// The first tick without a known outcome.
     next: u64,
 }
 
 impl<C> DelayLine<C> {
-    /// An empty line for commands that act so many ticks after their measurement.
+    /// Creates an empty line for commands that act `delay_ticks` after their measurement.
     pub fn new(delay_ticks: u64, blank: impl Fn() -> C) -> Self {
         let place = || Place { filled: 0, rejected: false, command: blank() };
         Self { places: (0..delay_ticks).map(|_| place()).collect(), next: 0 }
     }
 
-    /// The tick whose command is applied at a tick, if there is one.
+    /// Returns the tick whose command is applied at `tick`, if there is one.
     pub fn due_at(&self, tick: u64) -> Option<u64> {
         tick.checked_sub(self.places.len() as u64)
     }
 
-    /// The first tick of which nothing is known and whose command can still be applied at this tick or later.
+    /// Returns the first tick without a known outcome whose command can still be applied at `tick` or later.
     pub fn wanted_at(&self, tick: u64) -> u64 {
         self.next.max(self.due_at(tick).unwrap_or(0))
     }
@@ -56,25 +56,25 @@ impl<C> DelayLine<C> {
         &mut self.places[at]
     }
 
-    /// Room for the command of a tick, which is here.
+    /// Returns the place for the accepted command of a tick.
     pub fn put(&mut self, tick: u64) -> &mut C {
         let place = self.place(tick);
         (place.filled, place.rejected) = (tick + 1, false);
         &mut place.command
     }
 
-    /// The command of a tick has come and is not believed.
+    /// Records that the command of a tick was rejected.
     pub fn reject(&mut self, tick: u64) {
         let place = self.place(tick);
         (place.filled, place.rejected) = (tick + 1, true);
     }
 
-    /// The command of a tick will not come.
+    /// Records that the command of a tick will not arrive.
     pub fn lack(&mut self, tick: u64) {
         self.next = tick + 1;
     }
 
-    /// What has become of the command that is applied at a tick.
+    /// Returns the command that is applied at `tick`, or its state if it is not here.
     pub fn due(&self, tick: u64) -> Due<&C> {
         let Some(due) = self.due_at(tick) else { return Due::Missing };
         match &self.places[(due % self.places.len() as u64) as usize] {
@@ -84,7 +84,7 @@ impl<C> DelayLine<C> {
         }
     }
 
-    /// Passes the state, each command by this.
+    /// Saves or restores the state; `command` does so for one command.
     pub fn persist<W: Words>(&mut self, words: &mut W, mut command: impl FnMut(&mut C, &mut W)) {
         self.next.persist(words);
         for place in &mut self.places {
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_command_is_due_when_its_delay_is_over_and_then_gone() {
+    fn a_command_is_due_once_after_its_delay() {
         let mut line = DelayLine::new(3, || 0_u64);
         assert_eq!((line.due_at(2), line.due_at(3), line.due(0)), (None, Some(0), Due::Missing));
         for tick in 1..20 {
@@ -109,7 +109,7 @@ mod tests {
                 7 => line.reject(7),
                 before => *line.put(before) = 100 + before,
             }
-            assert_eq!(line.wanted_at(tick), tick, "all before it is known");
+            assert_eq!(line.wanted_at(tick), tick, "every earlier outcome is known");
             let expected = match tick.checked_sub(3) {
                 None | Some(5) => Due::Missing,
                 Some(7) => Due::Rejected,
@@ -117,7 +117,7 @@ mod tests {
             };
             assert_eq!(line.due(tick), expected);
         }
-        assert_eq!(line.wanted_at(100), 97, "what can be applied no more is not wanted");
+        assert_eq!(line.wanted_at(100), 97, "commands that can no longer be applied are not wanted");
         assert_eq!(line.due(100), Due::Missing);
     }
 }

@@ -1,29 +1,29 @@
-//! The design of the filter of a rig's observer, by the three keys of which a scenario gives one.
+//! The filter of a rig's observer, designed from one of three scenario keys.
 
 use crate::config::Checks;
 use crate::observe::{Filter, InvariantFilter, KalmanFilter, SecondOrderFilter};
 use nalgebra::SVector;
 
-/// How a filter is designed: its order, and what follows from that.
+/// The design of a filter: its order and its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum FilterDesign<const N: usize> {
-    /// The papers' filter, by its decay rates, 1/s.
+    /// The papers' first-order filter with these decay rates, 1/s.
     First([f64; N]),
-    /// Second order by its bandwidths, rad/s.
+    /// A second-order filter with these bandwidths, rad/s.
     Second([f64; N]),
-    /// Second order by the noise: density of what drives the unknown, (unit of the unknown)²/s.
+    /// A second-order Kalman filter with this spectral density of the process noise, (unit of the unknown)²/s.
     Kalman(f64),
 }
 
-/// The damping of filters of second order: the flattest pass band (Butterworth).
+/// The damping of second-order filters: the flattest pass band (Butterworth).
 const DAMPING: f64 = core::f64::consts::FRAC_1_SQRT_2;
-/// The standard deviation of a guess of which nothing is known, in the unit of the unknown.
+/// The standard deviation of an uninformed guess, in the unit of the unknown.
 pub(super) const UNKNOWN_DEVIATION: f64 = 10.0;
-/// Of white noise, so many standard deviations never occur: once in 10¹⁸ samples.
+/// The number of standard deviations that white noise never exceeds in practice: once in 10¹⁸ samples.
 pub(super) const SURE_DEVIATIONS: f64 = 9.0;
 
 impl<const N: usize> FilterDesign<N> {
-    /// Checks the three keys of which one must be given.
+    /// Checks that exactly one of the three keys is given, and its values.
     pub fn resolve(
         checks: &mut Checks<'_>,
         decay: Option<[f64; N]>,
@@ -35,7 +35,7 @@ impl<const N: usize> FilterDesign<N> {
             values.iter().flatten().for_each(|value| checks.positive(key, *value));
         }
         checks.require(density.1.is_none_or(|density| density >= 0.0), keys[2], "negative", || {
-            "a density below zero is none; give 0 for a perfect model, or more".to_owned()
+            "is negative; give 0 for a perfect model, or more".to_owned()
         });
         match (decay, bandwidth, density.1) {
             (Some(decay), None, None) => Some(Self::First(decay)),
@@ -54,14 +54,14 @@ impl<const N: usize> FilterDesign<N> {
                 checks.refuse(
                     last,
                     "conflicting-keys",
-                    format!("does not go with the other choice; give one of {}", keys.join(", ")),
+                    format!("conflicts with another filter key; give one of {}", keys.join(", ")),
                 );
                 None
             }
         }
     }
 
-    /// A filter of this design at a guess.
+    /// Creates a filter of this design that starts at a guess.
     pub fn filter(&self, guess: SVector<f64, N>) -> Filter<N> {
         match self {
             Self::First(decay) => Filter::First(InvariantFilter::new((*decay).into(), guess)),
@@ -73,7 +73,7 @@ impl<const N: usize> FilterDesign<N> {
         }
     }
 
-    /// The exponents of the error's decay, 1/s, where they are constant.
+    /// Returns the exponents of the error's decay, 1/s, if they are constant.
     pub fn decay_rates(&self) -> Option<[f64; N]> {
         match self {
             Self::First(decay) => Some(*decay),

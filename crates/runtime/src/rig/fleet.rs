@@ -1,47 +1,47 @@
-//! What a rig has to give for bodies that are many: one process simulates them all, one sample tells of all of them.
+//! The contract of a fleet: many bodies that one process simulates and one sample describes.
 
 use crate::role::{Body, Guard, Law};
 use crate::sample::{CommandLayout, FleetLayout, FleetSample, MeasurementLayout, Sample, TruthLayout};
 use crate::state::{Persist, Words};
 use std::marker::PhantomData;
 
-/// Many bodies of one kind, and everything that drives and guards them as one. `E` is what the law knows of the leader.
+/// Many bodies of one kind, driven and guarded as one. `E` is the leader's estimate, which the law reads.
 pub trait Fleet<E: Sample>: Sized + 'static {
-    /// The state of all.
+    /// The layout of the full states.
     type Truth: FleetLayout;
-    /// What their sensors report.
+    /// The layout of the sensor readings.
     type Measurement: FleetLayout;
-    /// What their actuators take.
+    /// The layout of the actuator inputs.
     type Command: FleetLayout;
-    /// All of them as one.
+    /// All bodies, as one [`Body`].
     type Body: Body<
             Truth = FleetSample<Self::Truth>,
             Measurement = FleetSample<Self::Measurement>,
             Command = FleetSample<Self::Command>,
         > + Persist;
-    /// What drives them.
+    /// The law that drives them.
     type Law: Law<Estimate = E, Measurement = FleetSample<Self::Measurement>, Command = FleetSample<Self::Command>>
         + Persist;
-    /// What keeps measurements that cannot be from the law: one that is impossible for one body is not believed for any.
+    /// The guard of measurements. It rejects a whole sample if the value of one body is impossible.
     type MeasurementGuard: Guard<FleetSample<Self::Measurement>> + Persist;
-    /// The same of commands.
+    /// The guard of commands. It rejects a whole sample if the value of one body is impossible.
     type CommandGuard: Guard<FleetSample<Self::Command>> + Persist;
 
-    /// The bodies at their initial states.
+    /// Creates the bodies at their initial states.
     fn body(&self) -> Self::Body;
-    /// The law.
+    /// Creates the law.
     fn law(&self) -> Self::Law;
-    /// A guard for measurements at a new reader.
+    /// Creates a reader's guard for measurements.
     fn measurement_guard(&self) -> Self::MeasurementGuard;
-    /// A guard for commands.
+    /// Creates a guard for commands.
     fn command_guard(&self) -> Self::CommandGuard;
 }
 
-/// The fleet of a rig that has none: there is no value of it.
+/// The fleet of a rig without fleets. The type has no values.
 #[derive(Debug, Clone, Copy)]
 pub enum NoFleet {}
 
-/// Its law.
+/// The law of [`NoFleet`].
 #[derive(Debug)]
 pub struct NoLaw<E>(NoFleet, PhantomData<E>);
 

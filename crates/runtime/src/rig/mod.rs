@@ -1,6 +1,7 @@
-//! Rigs: which plant, observer and control law belong together, with their parameters.
+//! Rigs: a plant, an observer and a control law that belong together, with their parameters.
 //!
-//! Must not know how roles are driven, nor what carries their samples.
+//! Start with [`SimpleRig`]; implement [`Rig`] for fleets, own guards or certificates. This module does not know how roles are
+//! driven or how their samples travel.
 
 mod contract;
 mod delay;
@@ -27,18 +28,17 @@ pub(crate) use simple::field_named;
 pub use simple::{Bounded, Difference, SimpleRig};
 pub use words::{WordGuard, WordView};
 
-/// Runs an expression with the rig at hand, whichever of those in this crate it is: for tests, and for the suite, which measures
-/// them.
+/// Evaluates an expression with the concrete rig behind an `AnyRig`, for tests and benchmarks of this crate's rigs.
 ///
 /// # Panics
-/// With any other rig.
+/// If the rig is not one of this crate's.
 #[macro_export]
 macro_rules! with_shipped_rig {
     ($any:expr, $rig:ident => $body:expr) => {
         if let Some($rig) = $any.downcast_ref::<$crate::rig::RigidBodyRig>() {
             $body
         } else {
-            let $rig = $any.downcast_ref::<$crate::rig::OrbitRig>().expect("this is for the rigs of this crate");
+            let $rig = $any.downcast_ref::<$crate::rig::OrbitRig>().expect("a rig of this crate");
             $body
         }
     };

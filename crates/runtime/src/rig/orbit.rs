@@ -1,8 +1,8 @@
-//! The rigs `orbit-hold` and `orbit-rendezvous`: bodies about a point mass of which the first one's velocity is not measured.
+//! The rigs `orbit-hold` and `orbit-rendezvous`: bodies around a point mass. The first body's velocity is not measured.
 //!
-//! In `orbit-hold` that body, the spacecraft, is itself driven to a circular orbit, \[S\]. In `orbit-rendezvous` it is a free
-//! leader, and followers, if there are any, are driven to move as it does. Parameters and scores; the glue is in `roles`, reading a scenario in
-//! `resolve`, the mathematics in `model`, `observe` and `control`.
+//! In `orbit-hold` the first body, the spacecraft, is itself driven to a circular orbit, \[S\]. In `orbit-rendezvous` it is a
+//! free leader, and any followers are driven to move as it does. This file holds parameters and scores. `roles` connects samples
+//! and vectors, `resolve` reads a scenario; the mathematics is in `model`, `observe` and `control`.
 
 mod design;
 mod limits;
@@ -28,8 +28,8 @@ use nalgebra::Vector2;
 use roles::{Aim, POSITION, VELOCITY};
 
 impl OrbitRig {
-    /// The radius (du) of the circular orbit about which the loop is linearised: the target, or the leader's pericentre,
-    /// where everything is fastest; where that is no place to be, the leader's present radius.
+    /// Returns the radius (du) of the circular orbit about which the loop is linearised: the target's, or the leader's pericentre,
+    /// where the motion is fastest. If the pericentre lies outside the region, it is the leader's present radius.
     fn certified_radius(&self) -> f64 {
         match self.aim {
             Aim::Circle { radius, .. } => radius,
@@ -41,7 +41,7 @@ impl OrbitRig {
     }
 
     fn certificate(&self, controller: &ControllerDesign) -> Result<OrbitCertificate, OrbitFault> {
-        // Full-state feedback does not wait for the observer; a gain that varies has no rate to be certified.
+        // Full-state feedback does not depend on the observer; a varying gain has no constant rate to certify.
         let full_state = matches!(self.aim, Aim::Circle { full_state: true, .. });
         let rates = self.filter.decay_rates().filter(|_| !full_state);
         let decay = rates.map_or(Vector2::repeat(f64::INFINITY), Vector2::from);
@@ -49,7 +49,7 @@ impl OrbitRig {
         OrbitCertificate::new(&self.field, law, gains, &decay, self.certified_radius(), self.tick_s, *delay_ticks)
     }
 
-    /// What a body is to be like, at the given state of the leader.
+    /// Returns the state that a driven body must reach, for the given state of the leader.
     fn reference(&self, leader: OrbitState) -> OrbitState {
         match self.aim {
             Aim::Circle { radius, .. } => self.field.circular(radius),
@@ -57,8 +57,8 @@ impl OrbitRig {
         }
     }
 
-    /// A driven body's reference and its own state as its law sees them at the first tick: by the sensors, but for the noise,
-    /// and by the guess where a velocity is not measured.
+    /// Returns a driven body's reference and its own state as its law sees them at the first tick: measured with bias but without
+    /// noise, and guessed where a velocity is not measured.
     fn first_seen(&self, index: usize) -> (OrbitState, OrbitState) {
         let measured = |index: usize| {
             let (state, [r, theta, vr, vtheta]) = (self.initial[index], self.sensors[index].bias);
@@ -98,7 +98,7 @@ impl OrbitRig {
         }
     }
 
-    /// Whether the loop does not wait for an observer whose gain varies.
+    /// Returns true if the loop's rate does not depend on an observer with a varying gain.
     fn constant_rate(&self) -> bool {
         self.filter.decay_rates().is_some() || matches!(self.aim, Aim::Circle { full_state: true, .. })
     }
@@ -121,7 +121,7 @@ impl OrbitRig {
         warnings
     }
 
-    /// Whether the leader's free orbit keeps between the central body and the escape radius.
+    /// Returns true if the leader's free orbit stays between the central body and the escape radius.
     fn leader_stays(&self) -> bool {
         let leader = &self.initial[0];
         let (energy, pericentre) = (self.field.energy(leader), self.field.pericentre(leader));
@@ -130,7 +130,8 @@ impl OrbitRig {
     }
 }
 
-/// What the controller can watch: orbital energy per mass, du²/s², and angular momentum per mass, du²/s, of a free leader.
+/// The quantities that the controller can watch: a free leader's orbital energy per mass, du²/s², and angular momentum per mass,
+/// du²/s.
 const MONITORS: [Monitor<OrbitRig>; 2] = [
     Monitor {
         name: "energy_drift",
@@ -150,10 +151,10 @@ fn estimated(estimate: &OrbitEstimate) -> OrbitState {
 }
 
 impl OrbitRig {
-    /// Why energy and momentum are nothing to watch, if so.
+    /// Returns the reason why energy and momentum cannot be watched, if there is one.
     fn no_constant(&self) -> Option<&'static str> {
-        let none = self.controller.is_none().then_some("is watched by the controller, and this scenario has none");
-        none.or(self.bodies[0]
+        let absent = self.controller.is_none().then_some("is watched by the controller, and this scenario has none");
+        absent.or(self.bodies[0]
             .driven
             .then_some("is not constant: thrust changes the energy and the momentum of the observed body"))
     }
@@ -194,7 +195,7 @@ impl Rig for OrbitRig {
         &self.bodies
     }
 
-    /// A follower measures its own velocity; the observed body only if full-state feedback is asked for.
+    /// A follower measures its own velocity; the observed body does so only with full-state feedback.
     fn body(&self, index: usize) -> OrbitPlant {
         let velocity_measured = index != 0 || matches!(self.aim, Aim::Circle { full_state: true, .. });
         OrbitPlant::new(self.field, self.initial[index], velocity_measured, self.sensors[index].noise.clone())
@@ -206,8 +207,8 @@ impl Rig for OrbitRig {
         OrbitObserver::new(relation, self.field, self.filter, self.initial_guess)
     }
 
-    /// A law acts on the position, and on the velocity where it takes that from the body's own sensors; an observer says
-    /// itself what it needs.
+    /// A law needs the position, and also the velocity if it takes that from the body's own sensors. An observer checks itself
+    /// which components it needs.
     fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
         let Sensors { deviation, bias, .. } = self.sensors[index];
         let own_velocity = !matches!(self.aim, Aim::Circle { full_state: false, .. });
@@ -247,8 +248,8 @@ impl Rig for OrbitRig {
         }
     }
 
-    /// |r − R| and |(Vr, Vθ) − (V_R, V_Θ)| of the worst driven body where one is, and the length of the velocity estimate's
-    /// error. All of them +inf once any body is lost.
+    /// Writes |r − R| and |(Vr, Vθ) − (V_R, V_Θ)| of the worst driven body, if there is one, and the magnitude of the velocity
+    /// estimate's error. All are +inf once any body is lost.
     fn score<'a>(
         &self,
         truth: impl Fn(usize) -> Option<&'a OrbitTruth>,
@@ -277,7 +278,7 @@ impl Rig for OrbitRig {
         }
     }
 
-    /// A frozen body would meet its end again, had it gone on.
+    /// A frozen body meets its end again if its last step is repeated, which tells the cause.
     fn loss(&self, truth: &OrbitTruth) -> Option<&'static str> {
         let thrust = truth.applied_du_s2.into();
         let end = || self.field.flow(&state(truth), &thrust, self.tick_s).err();
@@ -290,7 +291,7 @@ impl Rig for OrbitRig {
 
     fn certificates(&self) -> Vec<CertificateReport> {
         let Some(controller) = &self.controller else { return Vec::new() };
-        // A scenario whose loop could not be certified was refused.
+        // A scenario whose loop cannot be certified was refused.
         self.certificate(controller).map_or(Vec::new(), |certificate| {
             self.driven().map(|index| self.report(index, &controller.law, &certificate)).collect()
         })
@@ -332,9 +333,9 @@ impl Rig for OrbitRig {
             Picture::Plane(Plane {
                 title: "motion in the plane",
                 axes: ["x, du", "y, du"],
-                caption: "Paths in the plane; the cross is the central body, a dot is where a path begins.",
-                point: |of| {
-                    let (r, angle) = (of("radius_du", 0)?, of("angle_rad", 0)?);
+                caption: "Paths in the plane. The cross is the central body; a dot marks the start of a path.",
+                point: |element| {
+                    let (r, angle) = (element("radius_du", 0)?, element("angle_rad", 0)?);
                     Some([r * angle.cos(), r * angle.sin()])
                 },
                 centred: true,
@@ -346,22 +347,22 @@ impl Rig for OrbitRig {
             Picture::Plane(Plane {
                 title: "velocities in the plane Vr Vθ",
                 axes: ["Vr, du/s", "Vθ, du/s"],
-                caption: "Velocity as it was, and as the observer saw it, which begins at its guess.",
-                point: |of| Some([of("velocity_du_s", 0)?, of("velocity_du_s", 1)?]),
+                caption: "True and estimated velocity. The estimate starts at the observer's guess.",
+                point: |element| Some([element("velocity_du_s", 0)?, element("velocity_du_s", 1)?]),
                 centred: false,
                 compared: None,
             }),
             graph("radius_du", 0, "r, du", "Distance from the centre."),
             graph("velocity_du_s", 0, "Vr, du/s", "Radial velocity."),
             graph("velocity_du_s", 1, "Vθ, du/s", "Transverse velocity."),
-            graph("angle_rad", 0, "θ, rad", "Angle, growing on from turn to turn."),
+            graph("angle_rad", 0, "θ, rad", "Angle, counted on over full turns."),
             graph("applied_du_s2", 0, "Ur, du/s²", "Radial thrust per mass, as applied."),
             graph("applied_du_s2", 1, "Uθ, du/s²", "Transverse thrust per mass, as applied."),
             Picture::Onset,
         ]
     }
 
-    /// The same spacecraft with its law given the true velocity, \[S\] Fig. 1.
+    /// The same spacecraft under its law with the true velocity, \[S\] Fig. 1.
     fn counterpart(&self) -> &'static [&'static str] {
         let estimate = self.controller.is_some() && matches!(self.aim, Aim::Circle { full_state: false, .. });
         if estimate { &["controller.feedback=full-state"] } else { &[] }
@@ -395,7 +396,7 @@ fn errors(body: Option<OrbitState>, reference: Option<OrbitState>) -> [f64; 2] {
     }
 }
 
-/// The larger; NaN if either is.
+/// Returns the larger value; NaN if either is NaN.
 fn worse(a: f64, b: f64) -> f64 {
     if b > a || b.is_nan() { b } else { a }
 }
@@ -414,7 +415,7 @@ mod tests {
         Scenario::parse(text, "test", &overrides).unwrap().rig.downcast_ref::<OrbitRig>().unwrap().clone()
     }
 
-    /// What the roles' own code commands at the first tick, du/s².
+    /// Returns the largest thrust component that the roles command at the first tick, du/s².
     fn first_thrust(rig: &OrbitRig, index: usize) -> f64 {
         let measured = |index: usize| {
             let mut measurement = OrbitMeasurement::default();
@@ -429,7 +430,7 @@ mod tests {
         Vector2::from(command.thrust_du_s2).amax()
     }
 
-    /// A satellite in a low orbit, observed by nobody but itself, in metres.
+    /// A satellite in a low orbit that is observed and not followed, in metres.
     const LOW_ORBIT: &str = r#"
         name = "low-orbit"
         rig = "orbit-rendezvous"
@@ -474,7 +475,7 @@ mod tests {
             rig.score(|_| Some(&truth), |_| None, Some(&estimate), &mut errors);
             body.flow(rig.tick_s);
         }
-        assert!(errors[0] < 1e-6, "of 7600 du/s, {} are left", errors[0]);
+        assert!(errors[0] < 1e-6, "an error of {} of 7600 du/s is left", errors[0]);
     }
 
     #[test]
@@ -494,7 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn the_thrust_at_the_start_is_what_the_law_asks_for_by_what_it_sees() {
+    fn the_certificate_has_the_thrust_that_the_law_commands_first() {
         for (name, index, overrides) in [
             ("orbit-hold", 0, &[][..]),
             ("orbit-hold", 0, &["observer.initial_guess_du_s=[0.3, 0.7]"]),
@@ -503,10 +504,13 @@ mod tests {
             ("orbit-rendezvous", 1, &["observer.initial_guess_du_s=[0.0, 0.5]", "follower.0.bias.radius_du=0.1"]),
         ] {
             let rig = rig(name, &[overrides, &["controller.thrust_max_du_s2=100.0"]].concat());
-            let told = rig.certificates()[0].conditions[1].required;
+            let certified = rig.certificates()[0].conditions[1].required;
             let asked = first_thrust(&rig, index);
-            assert!((told - asked).abs() < 1e-12, "{name} {overrides:?}: told {told}, asked {asked}");
+            assert!((certified - asked).abs() < 1e-12, "{name} {overrides:?}: {certified} {asked}");
         }
-        assert!(!rig("orbit-hold", &[]).certificates()[0].warnings.is_empty(), "the guess of 0 asks for too much");
+        assert!(
+            !rig("orbit-hold", &[]).certificates()[0].warnings.is_empty(),
+            "the guess of 0 demands more than the limit"
+        );
     }
 }

@@ -1,56 +1,56 @@
-//! What a report draws of a rig's motion: which fields, beside which, under which names.
+//! The pictures of a rig's motion in a report: their fields, axes and captions.
 //!
-//! Must not draw.
+//! This file draws nothing.
 
 use crate::sample::{Field, FieldKind, Sample};
 
 /// A picture of the motion.
 #[derive(Debug, Clone)]
 pub enum Picture {
-    /// Every body, and the estimate of the observed one, in a plane.
+    /// The paths of every body, and of the observed body's estimate, in a plane.
     Plane(Plane),
-    /// Every body, and the estimate of the observed one, over time.
+    /// An element of every body's truth, and of the observed body's estimate, over time.
     Graph(Graph),
-    /// What each driven body applied, a picture for each body, a line for each component.
+    /// The applied input: one picture per driven body, one line per component.
     Inputs(Inputs),
-    /// A Lyapunov function that commands tell ([`super::Rig::lyapunov`]), in a section of its own.
+    /// A Lyapunov function published with commands ([`super::Rig::lyapunov`]), in a section of its own.
     Lyapunov(Lyapunov),
-    /// The errors over the logarithm of time too, where what happens in the first ticks has room.
+    /// The errors over the logarithm of time, which resolves the first ticks.
     Onset,
 }
 
 /// Paths in a plane.
 #[derive(Debug, Clone)]
 pub struct Plane {
-    /// What it shows; no other picture of the rig has the same title.
+    /// The title, unique among the pictures of the rig.
     pub title: &'static str,
     /// The names of the axes, with their units.
     pub axes: [&'static str; 2],
-    /// What a reader is told below it.
+    /// The caption.
     pub caption: &'static str,
-    /// Where a sample lies, from the elements of its fields by name and index; nowhere if it lacks one.
+    /// Returns the point of a sample, from a function that returns an element of a field by name and index.
     pub point: Point,
-    /// Whether the origin is marked, and both axes have one scale.
+    /// True if the origin is marked and both axes have the same scale.
     pub centred: bool,
-    /// Caption where the run is compared with [its counterpart](super::Rig::counterpart): only the observed body is drawn then.
+    /// The caption of the comparison with [its counterpart](super::Rig::counterpart), which draws only the observed body.
     pub compared: Option<&'static str>,
 }
 
-/// See [`Plane::point`].
+/// The function of [`Plane::point`]: `None` if the sample lacks a field.
 pub type Point = fn(&dyn Fn(&str, usize) -> Option<f64>) -> Option<[f64; 2]>;
 
 /// An element of a field over time.
 #[derive(Debug, Clone)]
 pub struct Graph {
-    /// What it shows.
+    /// The title.
     pub title: String,
-    /// The field of truths, and of the estimate if that has it too.
+    /// The field of truths, and of the estimate if it has the same field.
     pub field: &'static str,
-    /// Its element.
+    /// The index of the element.
     pub element: usize,
     /// The name of the axis, with its unit.
     pub axis: String,
-    /// What a reader is told below it.
+    /// The caption.
     pub caption: String,
 }
 
@@ -65,20 +65,20 @@ pub struct Inputs {
     pub components: &'static [&'static str],
 }
 
-/// V and how fast it falls.
+/// A Lyapunov function V and its rate of decrease.
 #[derive(Debug, Clone, Copy)]
 pub struct Lyapunov {
     /// The field of commands that is V.
     pub field: &'static str,
     /// The names of the axes of V and of −dV/dt, with their units.
     pub axes: [&'static str; 2],
-    /// What V is.
+    /// The definition of V.
     pub function: &'static str,
-    /// What bounds its fall.
+    /// The bound on the decrease of V.
     pub bound: &'static str,
 }
 
-/// Every number of a truth over time, by the names and units of its fields.
+/// Returns a graph over time of every number of a truth, named after its fields and units.
 pub fn graphs<S: Sample>() -> Vec<Picture> {
     let numbers = S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64);
     let graph = |field: &Field, element: usize| {
@@ -91,7 +91,7 @@ pub fn graphs<S: Sample>() -> Vec<Picture> {
     numbers.flat_map(|field| (0..field.count).map(move |element| graph(field, element))).collect()
 }
 
-/// The units that a field's name may end with, and how they are written.
+/// The units that may end a field's name, and their symbols.
 const UNITS: [(&str, &str); 21] = [
     ("rad", "rad"),
     ("deg", "deg"),
@@ -116,24 +116,24 @@ const UNITS: [(&str, &str); 21] = [
     ("t", "T"),
 ];
 
-/// A field's name as words, and its unit: `load_torque_n_m` is `load torque` in `N m`, `speed_rad_s` is `speed` in `rad/s`.
+/// Splits a field's name into words and unit: `load_torque_n_m` is `load torque` in `N m`, `speed_rad_s` is `speed` in `rad/s`.
 pub fn named(field: &str) -> (String, String) {
     let parts: Vec<&str> = field.split('_').collect();
     // A name has at least one word before its unit.
     let words = 1 + parts[1..].iter().rposition(|part| unit(part).is_none()).map_or(0, |last| last + 1);
-    let mut told = String::new();
+    let mut symbols = String::new();
     for part in &parts[words..] {
         let (text, power) = unit(part).unwrap_or_default();
-        let divides = text == "s" && !told.is_empty();
-        told += if divides { "/" } else { "" };
-        told += if told.is_empty() || divides { "" } else { " " };
-        told += text;
-        told += power;
+        let divides = text == "s" && !symbols.is_empty();
+        symbols += if divides { "/" } else { "" };
+        symbols += if symbols.is_empty() || divides { "" } else { " " };
+        symbols += text;
+        symbols += power;
     }
-    (parts[..words].join(" "), told)
+    (parts[..words].join(" "), symbols)
 }
 
-/// A part of a name as a unit and its power, if it is one.
+/// Returns the unit and power of a part of a name, if it is one.
 fn unit(part: &str) -> Option<(&'static str, &'static str)> {
     let (name, power) = match part.strip_suffix(['2', '3']) {
         Some(name) if part.ends_with('2') => (name, "²"),

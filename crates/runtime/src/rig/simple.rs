@@ -1,6 +1,6 @@
-//! A rig in its smallest form: a body, an estimator, a law, and one serde struct of parameters. All else has a default.
+//! The smallest form of a rig: a body, an estimator, a law, and one serde struct of parameters. Everything else has a default.
 //!
-//! Must not do anything that a [`Rig`] of its own could not.
+//! This file does nothing that a [`Rig`] implementation could not do.
 
 use super::{BodyInfo, Context, Estimate, FleetTruth, Measurement, Monitor, NoFleet, Picture, Rig, Truth, graphs};
 use crate::config::{Checks, ConfigError, Document, keys_of};
@@ -11,31 +11,142 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::borrow::Cow;
 
-/// A leader and a follower, or whatever [`bodies`](Self::bodies) says, of one kind.
+/// A rig with one kind of body: by default a leader, which is observed, and a follower, which is driven.
 ///
-/// The type itself is what a scenario says of it: its fields are the scenario's tables, with serde's defaults, and errors come
-/// out with file, line, key and remedy. Every `SimpleRig` is a [`Rig`].
+/// The type holds the scenario's parameters: each field is a table of the scenario file, read by serde with its defaults. A
+/// mistake in the file is reported with line, key and remedy. Every `SimpleRig` is a [`Rig`].
+///
+/// A cart moves at the commanded speed. The follower keeps beside the leader, which moves at a constant speed:
+///
+/// ```
+/// # extern crate corotate_core as corotate;
+/// use corotate::role::{Body, Estimator, Law};
+/// use corotate::{persist_fields, sample};
+/// use corotate_runtime::rig::{Difference, SimpleRig};
+/// use corotate_runtime::scenario::{RigKind, Scenario, register};
+/// use serde::{Deserialize, Serialize};
+///
+/// sample! { Truth = "cart/Truth/v1" { position_m: f64, speed_m_s: f64, status: u64, } }
+/// sample! { Measurement = "cart/Measurement/v1" { position_m: f64, status: u64, } }
+/// sample! { Estimate = "cart/Estimate/v1" { position_m: f64, status: u64, } }
+/// sample! { Command = "cart/Command/v1" { speed_m_s: f64, } }
+///
+/// struct Cart { position_m: f64, speed_m_s: f64 }
+/// persist_fields!(Cart, position_m, speed_m_s);
+/// impl Body for Cart {
+///     type Truth = Truth;
+///     type Measurement = Measurement;
+///     type Command = Command;
+///     fn apply(&mut self, command: &Command) -> bool {
+///         self.speed_m_s = command.speed_m_s;
+///         true
+///     }
+///     fn apply_safe(&mut self) {
+///         self.speed_m_s = 0.0;
+///     }
+///     fn truth(&self, status: u64, out: &mut Truth) {
+///         (out.position_m, out.speed_m_s, out.status) = (self.position_m, self.speed_m_s, status);
+///     }
+///     fn measure(&mut self, _tick: u64, status: u64, out: &mut Measurement) {
+///         (out.position_m, out.status) = (self.position_m, status);
+///     }
+///     fn flow(&mut self, dt_s: f64) {
+///         self.position_m += self.speed_m_s * dt_s;
+///     }
+/// }
+///
+/// /// The estimate is the last measured position.
+/// struct Last { position_m: f64 }
+/// persist_fields!(Last, position_m);
+/// impl Estimator for Last {
+///     type Measurement = Measurement;
+///     type Estimate = Estimate;
+///     fn start(&mut self, measurement: &Measurement) {
+///         self.position_m = measurement.position_m;
+///     }
+///     fn update(&mut self, measurement: &Measurement, _dt_s: f64) {
+///         self.position_m = measurement.position_m;
+///     }
+///     fn write(&self, status: u64, out: &mut Estimate) {
+///         (out.position_m, out.status) = (self.position_m, status);
+///     }
+/// }
+///
+/// #[derive(Clone, Serialize, Deserialize)]
+/// #[serde(deny_unknown_fields)]
+/// struct Parameters { leader_speed_m_s: f64, gain_per_s: f64 }
+/// persist_fields!(Parameters,);
+/// impl Law for Parameters {
+///     type Estimate = Estimate;
+///     type Measurement = Measurement;
+///     type Command = Command;
+///     fn command(&mut self, leader: &Estimate, own: &Measurement, out: &mut Command) {
+///         out.speed_m_s = self.leader_speed_m_s + self.gain_per_s * (leader.position_m - own.position_m);
+///     }
+/// }
+///
+/// #[derive(Clone, Serialize, Deserialize)]
+/// struct Carts { cart: Parameters }
+/// impl SimpleRig for Carts {
+///     type Body = Cart;
+///     type Estimator = Last;
+///     type Law = Parameters;
+///     const NAME: &'static str = "carts";
+///     const METRICS: &'static [Difference] = &[Difference::following("distance_m", "position_m")];
+///     fn body(&self, index: usize) -> Cart {
+///         match index {
+///             0 => Cart { position_m: 1.0, speed_m_s: self.cart.leader_speed_m_s },
+///             _ => Cart { position_m: 0.0, speed_m_s: 0.0 },
+///         }
+///     }
+///     fn estimator(&self) -> Last {
+///         Last { position_m: 0.0 }
+///     }
+///     fn law(&self, _index: usize) -> Parameters {
+///         self.cart.clone()
+///     }
+/// }
+///
+/// register(vec![RigKind::new::<Carts>()]);
+/// let text = r#"
+///     name = "two-carts"
+///     rig = "carts"
+///     tick_hz = 100.0
+///     duration_s = 10.0
+///     [cart]
+///     leader_speed_m_s = 0.5
+///     gain_per_s = 2.0
+///     [accept]
+///     settled_by_s = 5.0
+///     distance_m_max = 1e-3
+/// "#;
+/// let scenario = Scenario::parse(text, "two-carts.toml", &[])?;
+/// assert_eq!(scenario.rig.roles(), ["leader", "follower", "observer", "controller"]);
+/// # Ok::<(), corotate_runtime::config::ConfigError>(())
+/// ```
+///
+/// A program names its rigs with `Program::new().rig::<Carts>()`, which registers them.
 pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'static {
-    /// The kind of body.
+    /// The plant: a body with its sensors and actuators.
     type Body: SingleBody + Persist;
-    /// What observes the first body.
+    /// The observer of the first body.
     type Estimator: Estimator<Measurement = <Self::Body as Body>::Measurement> + Persist;
-    /// What drives a driven body.
+    /// The control law of a driven body.
     type Law: Law<
             Estimate = <Self::Estimator as Estimator>::Estimate,
             Measurement = <Self::Body as Body>::Measurement,
             Command = <Self::Body as Body>::Command,
         > + Persist;
-    /// By which a scenario's key `rig` names it.
+    /// The value of the scenario key `rig` that selects this rig.
     const NAME: &'static str;
-    /// Those of the type's fields that a scenario gives as a list of tables.
+    /// The fields of the type that a scenario gives as lists of tables.
     const LISTS: &'static [&'static str] = &[];
-    /// What a run is scored by.
+    /// The metrics of a run.
     const METRICS: &'static [Difference];
 
-    /// Notes what makes no sense, by its key; may keep what it must know of the scenario.
+    /// Checks the parameters and records problems by key, as `cart.gain_per_s`. May store what it needs of `_context`.
     fn check(&mut self, _context: Context, _checks: &mut Checks<'_>) {}
-    /// The bodies; the first is the observed one.
+    /// Returns the bodies; the first is the observed one. By default a free `leader` and a driven `follower`.
     fn bodies(&self) -> &[BodyInfo] {
         const PAIR: [BodyInfo; 2] = [
             BodyInfo { name: Cow::Borrowed("leader"), driven: false, fleet: None },
@@ -43,58 +154,59 @@ pub trait SimpleRig: Serialize + DeserializeOwned + Clone + Send + Sync + 'stati
         ];
         &PAIR
     }
-    /// A body at its initial state.
+    /// Creates the body with this index at its initial state.
     fn body(&self, index: usize) -> Self::Body;
-    /// The observer at its initial guess.
+    /// Creates the observer at its initial guess.
     fn estimator(&self) -> Self::Estimator;
-    /// The law of a driven body.
+    /// Creates the law of the driven body with this index.
     fn law(&self, index: usize) -> Self::Law;
-    /// How large a field can be, in every sample that has it: what is larger is not believed, nor what is not a number.
+    /// Returns the largest permitted magnitude per field name. Guards reject samples beyond it, and samples with NaN or infinity.
     fn bounds(&self) -> Vec<(&'static str, f64)> {
         Vec::new()
     }
-    /// What the controller can watch.
+    /// Returns the quantities that the controller can watch.
     fn monitors() -> &'static [Monitor<Self>] {
         &[]
     }
-    /// What a report draws of the motion.
+    /// Returns the pictures of the motion in a report; by default every number of the truth over time.
     fn pictures() -> Vec<Picture> {
         graphs::<Truth<Self>>()
     }
 }
 
-/// A metric that is the length of a field's difference from the first body's truth.
+/// A metric: the length of the difference between a field and the same field of the first body's truth.
 #[derive(Debug, Clone, Copy)]
 pub struct Difference {
     metric: &'static str,
     field: &'static str,
-    of: Of,
+    compared: Compared,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Of {
+enum Compared {
     Driven,
     Estimate,
 }
 
 impl Difference {
-    /// How far a field of the worst driven body's truth is from that of the first body. The metric's unit is its last part.
+    /// Creates a metric of the worst driven body: the distance of its true field from that of the first body. The last part of
+    /// `metric` is the unit.
     pub const fn following(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, of: Of::Driven }
+        Self { metric, field, compared: Compared::Driven }
     }
 
-    /// How far a field of the estimate is from the truth. The metric's unit is its last part.
+    /// Creates a metric of the estimate: the distance of its field from the truth. The last part of `metric` is the unit.
     pub const fn estimating(metric: &'static str, field: &'static str) -> Self {
-        Self { metric, field, of: Of::Estimate }
+        Self { metric, field, compared: Compared::Estimate }
     }
 
-    /// Checked when a program is built: a field that the samples do not have is a mistake of the rig.
+    /// Returns true if the samples have the field. Evaluated at compile time.
     const fn exists(&self, truth: &[Field], estimate: &[Field]) -> bool {
-        has(truth, self.field) && (matches!(self.of, Of::Driven) || has(estimate, self.field))
+        has(truth, self.field) && (matches!(self.compared, Compared::Driven) || has(estimate, self.field))
     }
 }
 
-/// Whether there are numbers of this name.
+/// Returns true if there is a numeric field of this name.
 const fn has(fields: &[Field], name: &str) -> bool {
     match field_named(fields, name) {
         Some(index) => matches!(fields[index].kind, FieldKind::F64),
@@ -102,7 +214,7 @@ const fn has(fields: &[Field], name: &str) -> bool {
     }
 }
 
-/// Which of the fields has a name, known when a program is built.
+/// Returns the index of the field with this name. Usable at compile time.
 pub(crate) const fn field_named(fields: &[Field], name: &str) -> Option<usize> {
     let mut index = 0;
     while index < fields.len() {
@@ -114,41 +226,41 @@ pub(crate) const fn field_named(fields: &[Field], name: &str) -> Option<usize> {
     None
 }
 
-const fn same(one: &[u8], other: &[u8]) -> bool {
+const fn same(a: &[u8], b: &[u8]) -> bool {
     let mut index = 0;
-    while index < one.len() && index < other.len() && one[index] == other[index] {
+    while index < a.len() && index < b.len() && a[index] == b[index] {
         index += 1;
     }
-    index == one.len() && index == other.len()
+    index == a.len() && index == b.len()
 }
 
-/// The numbers of a sample's field.
+/// Returns the numbers of a sample's field.
 fn numbers<'a, S: Sample>(sample: &'a S, name: &str) -> &'a [f64] {
     let field = S::FIELDS.iter().find(|field| field.name == name);
     let (from, count) = field.map_or((0, 0), |field| (field.offset / size_of::<f64>(), field.count));
     bytemuck::cast_slice(&sample.words()[from..from + count])
 }
 
-fn distance(one: &[f64], other: &[f64]) -> f64 {
-    libm::sqrt(one.iter().zip(other).map(|(one, other)| (one - other) * (one - other)).sum())
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    libm::sqrt(a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum())
 }
 
-/// Believes samples whose numbers are numbers, within their bounds.
+/// A guard that accepts samples whose numbers are finite and within their bounds.
 #[derive(Debug, Clone)]
 pub struct Bounded {
-    /// Word and largest magnitude of every number.
+    /// The word index and the largest magnitude of every number.
     bounds: Vec<(usize, f64)>,
 }
 
 impl Bounded {
     fn new<S: Sample>(bounds: &[(&'static str, f64)]) -> Self {
-        let of = |field: &Field| {
+        let words_of = |field: &Field| {
             let bound = bounds.iter().find(|(name, _)| *name == field.name).map_or(f64::MAX, |(_, bound)| *bound);
             let first = field.offset / size_of::<f64>();
             (first..first + field.count).map(move |word| (word, bound))
         };
         let numbers = S::FIELDS.iter().filter(|field| field.kind == FieldKind::F64);
-        Self { bounds: numbers.flat_map(of).collect() }
+        Self { bounds: numbers.flat_map(words_of).collect() }
     }
 }
 
@@ -170,7 +282,7 @@ impl Persist for Bounded {
     fn persist<W: Words>(&mut self, _words: &mut W) {}
 }
 
-/// A rig's metrics name fields that its samples have.
+/// A compile-time check that a rig's metrics name fields of its samples.
 struct Declared<R>(R);
 
 impl<R: SimpleRig> Declared<R> {
@@ -263,14 +375,14 @@ impl<R: SimpleRig> Rig for R {
         out: &mut [f64],
     ) {
         let () = Declared::<R>::EXIST;
-        for (value, Difference { field, of, .. }) in out.iter_mut().zip(R::METRICS) {
+        for (value, Difference { field, compared, .. }) in out.iter_mut().zip(R::METRICS) {
             let from = |to: Option<&[f64]>| match (to, truth(0)) {
                 (Some(to), Some(first)) => distance(to, numbers(first, field)),
                 _ => f64::NAN,
             };
-            *value = match of {
-                Of::Estimate => from(estimate.map(|estimate| numbers(estimate, field))),
-                Of::Driven => {
+            *value = match compared {
+                Compared::Estimate => from(estimate.map(|estimate| numbers(estimate, field))),
+                Compared::Driven => {
                     let bodies = SimpleRig::bodies(self).iter().enumerate().filter(|(_, body)| body.driven);
                     let errors = bodies.map(|(index, _)| from(truth(index).map(|truth| numbers(truth, field))));
                     errors.reduce(|a, b| if a.is_nan() || a > b { a } else { b }).unwrap_or(f64::NAN)

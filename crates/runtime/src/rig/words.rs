@@ -1,6 +1,6 @@
-//! Samples as words: what a reader asks of a rig whose sample types it does not know.
+//! Samples as words, for readers that do not know the rig's sample types.
 //!
-//! Must not interpret a sample that is shorter or longer than the rig's own.
+//! A sample of another length than the rig's own is never interpreted.
 
 use super::{Command, Estimate, FleetCommand, FleetMeasurement, FleetTruth, Measurement, Rig, Truth};
 use crate::bus::{Carried, Port, Signal, Topic};
@@ -8,7 +8,7 @@ use crate::config::BodyInfo;
 use crate::role::Guard;
 use crate::sample::{FleetSample, Sample};
 
-/// A guard of one reading end that is given a sample's words.
+/// A guard of one reading end that checks a sample's words.
 pub trait WordGuard {
     /// Returns true if the sample is accepted.
     fn accepts(&mut self, words: &[u64]) -> bool;
@@ -18,13 +18,13 @@ pub trait WordGuard {
 pub trait WordView {
     /// Returns the signals of all bodies in a scenario of this name.
     fn signals(&self, scenario: &str) -> Vec<Port>;
-    /// Returns the number of words of a body's sample; none if the body has no such signal, or not of this type.
+    /// Returns the number of words of a body's sample; `None` if the body has no such signal or the signal has another type.
     fn length(&self, body: usize, signal: Signal) -> Option<usize>;
-    /// Returns the guard of a reader that observes a body's signal; none for a signal without one.
+    /// Returns the guard of a reader that observes a body's signal; `None` for a signal without one.
     fn guard(&self, body: usize, signal: Signal) -> Option<Box<dyn WordGuard>>;
-    /// Returns the number of components of which the `valid` word of measurements and estimates tells.
+    /// Returns the number of leading components covered by the `valid` word of measurements and estimates.
     fn axes(&self) -> usize;
-    /// Writes one tick's value of every metric, as [`Rig::score`]; `words` gives the samples.
+    /// Writes one tick's value of every metric, as [`Rig::score`] does; `words` returns the samples.
     fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]);
     /// Returns V and the bound on V̇ that a command carries, as [`Rig::lyapunov`].
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)>;
@@ -80,9 +80,9 @@ impl<R: Rig> WordView for R {
     fn score_words<'a>(&self, words: &dyn Fn(usize, Signal) -> Option<&'a [u64]>, out: &mut [f64]) {
         let bodies = self.bodies();
         let truth = |index: usize| words(index, Signal::Truth);
-        let one = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
-        let many = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
-        self.score(one, many, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), out);
+        let single = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_none()).and_then(cast::<Truth<R>>);
+        let fleet = |index: usize| truth(index).filter(|_| bodies[index].fleet.is_some()).map(FleetSample::over);
+        self.score(single, fleet, words(0, Signal::Estimate).and_then(cast::<Estimate<R>>), out);
     }
 
     fn lyapunov_words(&self, command: &[u64]) -> Option<(f64, f64)> {
@@ -94,12 +94,12 @@ impl<R: Rig> WordView for R {
     }
 }
 
-/// The signal of a single body, or of a fleet.
-fn either<One: Carried, Many: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
-    if fleet.is_some() { Port::new::<Many>(topic, fleet) } else { Port::new::<One>(topic, None) }
+/// Creates the port of a single body's signal, or of a fleet's.
+fn either<Single: Carried, Fleet: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Port {
+    if fleet.is_some() { Port::new::<Fleet>(topic, fleet) } else { Port::new::<Single>(topic, None) }
 }
 
-/// Reads words as the sample that they are; none if they are not as many.
+/// Returns the words as a sample; `None` if their number differs.
 fn cast<S: Sample>(words: &[u64]) -> Option<&S> {
     bytemuck::try_from_bytes(bytemuck::cast_slice(words)).ok()
 }
@@ -124,7 +124,7 @@ mod tests {
     use crate::scenario::Scenario;
 
     #[test]
-    fn words_are_scored_as_the_samples_that_they_are() {
+    fn words_score_as_their_samples() {
         let scenario = Scenario::parse(SHIPPED[0].1, "test", &[]).unwrap();
         let truth = |rate: f64| RateTruth { omega_rad_s: [rate, 0.0, 0.0], ..RateTruth::default() };
         let (leader, follower) = (truth(1.0), truth(3.0));

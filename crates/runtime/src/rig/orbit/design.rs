@@ -1,4 +1,4 @@
-//! The parameters of an orbit rig, as a scenario resolves to them.
+//! The resolved parameters of an orbit rig.
 
 use super::limits::Limits;
 use super::roles::Aim;
@@ -8,7 +8,7 @@ use crate::model::{CentralField, Noise, OrbitState};
 use crate::rig::filter::FilterDesign;
 use nalgebra::Vector2;
 
-/// Bodies in a central field, the observer of the first one's velocity, and the law of the driven ones.
+/// Bodies in a central field, the observer of the first body's velocity, and the law of the driven bodies.
 #[derive(Debug, Clone)]
 pub struct OrbitRig {
     pub(super) bodies: Vec<BodyInfo>,
@@ -17,7 +17,7 @@ pub struct OrbitRig {
     pub(super) sensors: Vec<Sensors>,
     pub(super) filter: FilterDesign<2>,
     pub(super) initial_guess: Vector2<f64>,
-    /// None where no body is driven.
+    /// `None` if no body is driven.
     pub(super) controller: Option<ControllerDesign>,
     pub(super) aim: Aim,
     pub(super) limits: Limits,
@@ -29,12 +29,12 @@ pub struct OrbitRig {
 pub(super) struct ControllerDesign {
     pub(super) gains: OrbitGains,
     pub(super) law: OrbitHold,
-    /// From so many ticks after its measurement on a command acts.
+    /// The number of ticks from a measurement to the tick at which its command acts.
     pub(super) delay_ticks: u64,
     pub(super) predict: bool,
 }
 
-/// What a body's sensors add to (r, θ, Vr, Vθ).
+/// The errors that a body's sensors add to (r, θ, Vr, Vθ).
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sensors {
     pub(super) noise: Noise<4>,

@@ -1,6 +1,6 @@
-//! What bodies of the orbit rigs can do at the most, and the guards that hold samples against it.
+//! The physical limits of the orbit rigs' bodies, and the guards that check samples against them.
 //!
-//! Must not refuse what the model itself holds possible: the region between central body and escape.
+//! A guard accepts everything that the model permits: the region between central body and escape radius.
 
 use super::roles::{POSITION, VELOCITY};
 use crate::config::Checks;
@@ -13,11 +13,11 @@ use crate::state::persist_fields;
 use nalgebra::Vector4;
 use serde::{Deserialize, Serialize};
 
-/// A default speed limit lies so far above what the initial orbits reach.
+/// The factor from the fastest speed of the initial orbits to the default speed limit.
 const SPEED_MARGIN: f64 = 3.0;
-/// And above the speed of a fall to the central body.
+/// The factor from the speed of a fall to the central body to the default speed limit.
 const FALL_MARGIN: f64 = 1.5;
-/// Rounding of a limit that is itself a permitted value.
+/// The relative rounding error that a permitted limit value may have.
 const ROUNDING: f64 = 1e-12;
 
 /// The table `[limits]` as typed.
@@ -41,16 +41,16 @@ impl RawLimits {
 pub(super) struct Limits {
     pub field: CentralField,
     pub speed_du_s: f64,
-    /// How far a velocity estimate may err before it settles, du/s.
+    /// The largest error of a velocity estimate before it settles, du/s.
     pub transient_du_s: f64,
     pub thrust_du_s2: f64,
     pub tick_s: f64,
-    /// So often a measurement may repeat the one before to the last bit.
+    /// The number of consecutive bit-identical measurements that are accepted.
     pub repeats: u64,
 }
 
 impl Limits {
-    /// The speed given, or well above that of the initial orbits where they are fastest, of the target circle, and of a fall
+    /// Returns the given speed limit, or a default well above the speeds of the initial orbits, of the target circle, and of a fall
     /// to the central body.
     pub fn resolve(
         raw: &RawLimits,
@@ -71,19 +71,19 @@ impl Limits {
             checks.positive("limits.speed_du_s", limit);
             checks.require(limit > initial.max(circle), "limits.speed_du_s", "limit-too-low", || {
                 format!(
-                    "{limit} is not above the {:.3} du/s that a body has or is to have; raise it",
+                    "{limit} is not above the {:.3} du/s of the initial states and the target; raise it",
                     initial.max(circle)
                 )
             });
         }
         let fastest = states.iter().map(pericentre).fold(initial.max(circle), f64::max);
-        // A body that is thrust off its orbit falls to the centre at the worst.
+        // A body that is thrust off its orbit at worst falls to the centre.
         let energy = states.iter().map(|state| field.energy(state)).fold(0.0, f64::max);
         let falling = (2.0 * (energy + field.mu() / field.inner())).sqrt();
         raw.speed_du_s.unwrap_or((SPEED_MARGIN * fastest).max(FALL_MARGIN * falling))
     }
 
-    /// For people.
+    /// Returns the limits as figures for reports.
     pub fn figures(&self) -> Vec<Figure> {
         let figure = |name: &str, value| Figure { name: name.to_owned(), value };
         vec![
@@ -93,7 +93,7 @@ impl Limits {
         ]
     }
 
-    /// A guard for measurements with sensors of these standard deviations and biases of (r, θ, Vr, Vθ).
+    /// Creates a guard for measurements of sensors with these standard deviations and biases of (r, θ, Vr, Vθ).
     pub fn measurement(&self, deviation: [f64; 4], bias: [f64; 4], needed: u64) -> MeasurementGuard {
         let spread = Vector4::from(deviation) * SURE_DEVIATIONS;
         let offset = Vector4::from(bias).abs() + spread;
@@ -101,19 +101,19 @@ impl Limits {
         let bounds = Bounds {
             magnitude: [far, far, fast + offset[2], fast + offset[3]],
             slew_per_tick: [f64::INFINITY; 4],
-            // A noisy radius also blurs what follows from it.
+            // A noisy radius also blurs the quantities computed from it.
             allowance: (spread * 2.0 + Vector4::repeat(ROUNDING)).into(),
             repeats: self.repeats,
         };
         MeasurementGuard { limits: *self, radius_offset: offset[0], state: PlausibilityCheck::new(bounds), needed }
     }
 
-    /// A guard for estimates, whose radius is as measured with this standard deviation and bias.
+    /// Creates a guard for estimates, whose radius is measured with this standard deviation and bias.
     pub fn estimate(&self, deviation: [f64; 4], bias: [f64; 4]) -> EstimateGuard {
         EstimateGuard { limits: *self, radius_offset: bias[0].abs() + SURE_DEVIATIONS * deviation[0] }
     }
 
-    /// A guard for commands.
+    /// Creates a guard for commands.
     pub fn command(&self) -> CommandGuard {
         CommandGuard { thrust_du_s2: self.thrust_du_s2 * (1.0 + ROUNDING) }
     }
@@ -124,7 +124,7 @@ impl Limits {
     }
 }
 
-/// Guards measurements: the region, the speed, and how fast gravity and thrust let them change from where the body was.
+/// A guard of measurements: region, speed, and the rates of change that gravity and thrust permit.
 #[derive(Debug)]
 pub struct MeasurementGuard {
     limits: Limits,
@@ -134,11 +134,11 @@ pub struct MeasurementGuard {
 }
 
 impl Limits {
-    /// How far a component of (r, θ, Vr, Vθ) can have changed after so many ticks from `from`.
+    /// Returns the largest possible change of a component of (r, θ, Vr, Vθ) within `ticks` ticks from the state `from`.
     #[inline]
     fn change(&self, i: usize, from: &[f64; 4], ticks: f64) -> f64 {
         let (time, speed) = (ticks * self.tick_s, self.speed_du_s);
-        // The nearest that it can have come to the centre meanwhile.
+        // The smallest possible distance from the centre in this time.
         let r = (from[0] - speed * time).max(self.field.inner());
         match i {
             0 => speed * time,
@@ -179,7 +179,7 @@ impl Guard<OrbitMeasurement> for MeasurementGuard {
     }
 }
 
-/// Guards estimates: the region, the speed, and that components which are not valid are said to be guesses.
+/// A guard of estimates: region, speed, and that invalid components are marked as guesses.
 #[derive(Debug)]
 pub struct EstimateGuard {
     limits: Limits,
@@ -193,11 +193,11 @@ impl Guard<OrbitEstimate> for EstimateGuard {
     fn accepts(&mut self, sample: &OrbitEstimate) -> bool {
         let speed = self.limits.speed_du_s + self.limits.transient_du_s;
         let all = POSITION | VELOCITY;
-        let told = sample.valid & all == all || sample.status & status::INITIAL != 0;
+        let complete = sample.valid & all == all || sample.status & status::INITIAL != 0;
         let placed =
             sample.valid & POSITION != POSITION || self.limits.radius_possible(sample.radius_du, self.radius_offset);
         let [vr, vtheta] = sample.velocity_du_s;
-        told && placed && sample.angle_rad.is_finite() && vr.abs() <= speed && vtheta.abs() <= speed
+        complete && placed && sample.angle_rad.is_finite() && vr.abs() <= speed && vtheta.abs() <= speed
     }
 
     fn refusal(&self, sample: &OrbitEstimate) -> Refusal {
@@ -209,7 +209,7 @@ impl Guard<OrbitEstimate> for EstimateGuard {
     }
 }
 
-/// Guards commands: the thrusters can do what is asked.
+/// A guard of commands: the thrusters can apply what is commanded.
 #[derive(Debug)]
 pub struct CommandGuard {
     thrust_du_s2: f64,
@@ -262,18 +262,18 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_region_nobody_is() {
+    fn samples_outside_the_region_are_rejected() {
         for r in [f64::NAN, 0.0, -1.0, 0.04, 10.1, f64::INFINITY] {
             assert!(!guard().accepts(&at(0, r, 0.0, 0.9)), "{r}");
         }
         for sample in [at(0, 1.0, f64::NAN, 0.9), at(0, 1.0, 0.0, 2.1), at(0, 1.0, 0.0, f64::NAN)] {
             assert!(!guard().accepts(&sample), "{sample:?}");
         }
-        assert!(guard().accepts(&at(0, 1.0, 1e9, 0.9)), "an angle may be any");
+        assert!(guard().accepts(&at(0, 1.0, 1e9, 0.9)), "any angle is valid");
     }
 
     #[test]
-    fn nobody_jumps_and_everybody_gets_there_in_time() {
+    fn a_jump_is_rejected_until_enough_time_has_passed() {
         for (jump, first) in [((1.5, 0.0, 0.9), 250), ((1.0, 0.5, 0.9), 200), ((1.0, 0.0, 1.8), 60)] {
             let (mut guard, (r, angle, velocity)) = (guard(), jump);
             assert!(guard.accepts(&at(0, 1.0, 0.0, 0.9)));
@@ -285,14 +285,14 @@ mod tests {
     }
 
     #[test]
-    fn what_the_thrusters_cannot_do_is_neither_applied_nor_reported() {
+    fn thrust_beyond_the_limit_is_rejected_in_commands_and_measurements() {
         let command = |thrust| OrbitCommand { thrust_du_s2: [0.0, thrust], ..OrbitCommand::default() };
         assert!(limits().command().accepts(&command(-0.5)) && !limits().command().accepts(&command(0.51)));
         assert!(!guard().accepts(&OrbitMeasurement { applied_du_s2: [0.0, 0.51], ..at(0, 1.0, 0.0, 0.9) }));
     }
 
     #[test]
-    fn an_estimate_that_lacks_a_component_says_why_or_is_not_believed() {
+    fn an_incomplete_estimate_is_accepted_only_with_its_reason() {
         let estimate = |valid, status| OrbitEstimate { radius_du: 1.0, valid, status, ..OrbitEstimate::default() };
         let mut guard = limits().estimate([0.0; 4], [0.0; 4]);
         assert!(

@@ -1,6 +1,6 @@
 //! Reads and checks the sections of the orbit rigs.
 //!
-//! Must name the key and the remedy of everything it refuses, all at once.
+//! Every refusal names the key and the remedy, and all refusals are reported at once.
 
 use super::design::{ControllerDesign, OrbitRig, Sensors};
 use super::limits::{Limits, RawLimits};
@@ -87,7 +87,7 @@ struct RawObserver {
     initial_guess_du_s: [f64; 2],
 }
 
-/// What a body's sensors add to the truth: the standard deviations of white noise, or constant biases.
+/// The errors that a body's sensors add to the truth: standard deviations of white noise, or constant biases.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct RawSensor {
@@ -131,7 +131,7 @@ struct RawGain {
     transverse_per_s: f64,
 }
 
-/// Where the law of `orbit-hold` takes the velocity from.
+/// The source of the velocity in the law of `orbit-hold`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum Feedback {
@@ -197,15 +197,15 @@ pub(super) fn rendezvous(
     Ok((parts.build(context, checks), table))
 }
 
-/// What the tables of both rigs say.
+/// The tables of both rigs in common form.
 struct Parts<'a> {
     central_body: &'a RawCentralBody,
-    /// The observed body, and what its table is called.
+    /// The name of the observed body and of its table.
     name: &'static str,
     observed: &'a RawBody,
     followers: &'a [RawFollower],
     observer: &'a RawObserver,
-    /// Gains, greatest thrust, and whether it predicts.
+    /// Gains, largest thrust, and true if the law predicts.
     controller: Option<(&'a RawGain, f64, bool)>,
     aim: Aim,
     limits: &'a RawLimits,
@@ -217,7 +217,7 @@ impl Parts<'_> {
         let mut review = Review { checks, sound: &mut sound };
         let field = review.field(self.central_body);
         review.place(&format!("{}.initial_radius_du", self.name), self.observed.initial_radius_du, field.as_ref());
-        // A body that holds an orbit is driven itself.
+        // The body that holds an orbit is itself driven.
         let (driven, target) = match self.aim {
             Aim::Circle { radius, .. } => (true, Some(radius)),
             Aim::Leader => (false, None),
@@ -269,7 +269,7 @@ fn sensor(context: Context, stream: u64, noise: &RawSensor, bias: &RawSensor) ->
     }
 }
 
-/// An estimate errs by its guess until it settles; one that weighs noise may err by more.
+/// Returns the limits. Until it settles, an estimate errs by its guess; a filter that weighs noise may err by more.
 fn limits(
     field: CentralField,
     speed_du_s: f64,
@@ -304,7 +304,7 @@ impl RawGain {
     }
 }
 
-/// Checks that remember whether one of them failed.
+/// Checks that record whether one of them failed.
 struct Review<'a, 'd> {
     checks: &'a mut Checks<'d>,
     sound: &'a mut bool,
@@ -335,7 +335,7 @@ impl Review<'_, '_> {
         }
     }
 
-    /// A radius at which a body is to be.
+    /// Checks a radius at which a body starts or ends.
     fn place(&mut self, key: &str, r: f64, field: Option<&CentralField>) {
         match field {
             Some(field) => self.require(field.holds(r), key, "out-of-range", || {
@@ -350,7 +350,7 @@ impl Review<'_, '_> {
 
     fn followers(&mut self, followers: &[RawFollower], field: Option<&CentralField>) {
         for (index, follower) in followers.iter().enumerate() {
-            let taken = followers[..index].iter().map(|other| other.name.as_str());
+            let taken = followers[..index].iter().map(|follower| follower.name.as_str());
             check_name(self.checks, &format!("follower[{index}].name"), &follower.name, taken);
             self.place(&format!("follower[{index}].initial_radius_du"), follower.initial_radius_du, field);
             self.sensor(&format!("follower[{index}]"), &follower.noise);
@@ -371,7 +371,7 @@ impl Review<'_, '_> {
         design
     }
 
-    /// A controller for followers, and none without.
+    /// Checks that there is a controller exactly if there are followers.
     fn controller(&mut self, controller: Option<(&RawGain, f64, bool)>, alone: bool) {
         match controller {
             Some((gain, thrust_max, _)) => self.loops(gain, thrust_max),
@@ -394,7 +394,7 @@ impl Review<'_, '_> {
 
 fn check_loop(rig: &OrbitRig, checks: &mut Checks<'_>) {
     let circle = rig.field.circular(rig.certified_radius());
-    // Without a loop, the motion alone.
+    // Without a loop, check the free motion.
     let sampled = match &rig.controller {
         Some(controller) => rig.certificate(controller).map(|certificate| Some(certificate.sampled)),
         None => rig.field.flow(&circle, &Vector2::zeros(), rig.tick_s).map(|_| None),

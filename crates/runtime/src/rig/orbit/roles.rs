@@ -1,6 +1,6 @@
-//! Body, observer and law of the orbit rigs: the glue between samples and vectors.
+//! Body, observer and law of the orbit rigs: the conversion between samples and vectors.
 //!
-//! Must not compute what `model`, `observe` and `control` compute.
+//! The computations themselves are in `model`, `observe` and `control`.
 
 use crate::control::{InFlight, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
@@ -17,22 +17,22 @@ pub(super) const POSITION: u64 = 0b0011;
 /// The bits of Vr and Vθ.
 pub(super) const VELOCITY: u64 = 0b1100;
 
-/// A body in a central field with its sensors and thrusters.
+/// A body in a central field, with its sensors and thrusters.
 #[derive(Debug)]
 pub struct OrbitPlant {
     field: CentralField,
     state: OrbitState,
     applied: Vector2<f64>,
-    /// What its sensors add to (r, θ, Vr, Vθ).
+    /// The errors that its sensors add to (r, θ, Vr, Vθ).
     noise: Noise<4>,
-    /// What its sensors measure, as bits.
+    /// The bits of the measured components.
     measured: u64,
-    /// [`status::FAULT`] once the model has ended, or 0.
+    /// [`status::FAULT`] once the body's motion has ended in the model, or 0.
     fault: u64,
 }
 
 impl OrbitPlant {
-    /// A body whose sensors measure its position, and its velocity too if `velocity_measured`.
+    /// Creates a body whose sensors measure its position, and its velocity if `velocity_measured`.
     pub(super) fn new(field: CentralField, state: OrbitState, velocity_measured: bool, noise: Noise<4>) -> Self {
         let measured = if velocity_measured { POSITION | VELOCITY } else { POSITION };
         Self { field, state, applied: Vector2::zeros(), noise, measured, fault: 0 }
@@ -80,7 +80,7 @@ impl Body for OrbitPlant {
         out.status = status | self.fault;
     }
 
-    /// Freezes for good at the last good state where the model ends.
+    /// Moves the body. If the model ends, the body freezes at its last valid state for the rest of the run.
     #[inline]
     fn flow(&mut self, dt_s: f64) {
         if self.fault != 0 {
@@ -103,13 +103,13 @@ pub struct OrbitObserver {
     guess: Vector2<f64>,
     filter: Filter<2>,
     last: Option<OrbitSample>,
-    /// Where the model has taken the body since, while no measurement was usable.
+    /// The state to which the model has advanced the body since the last usable measurement.
     coasted: Option<OrbitState>,
     status: u64,
 }
 
 impl OrbitObserver {
-    /// An observer of the two inertial components of the velocity, with a guess of (Vr, Vθ) in du/s.
+    /// Creates an observer of the two inertial velocity components, with a guess of (Vr, Vθ) in du/s.
     pub(super) fn new(
         relation: OrbitVelocity,
         field: CentralField,
@@ -120,7 +120,7 @@ impl OrbitObserver {
         Self { relation, field, design, guess, filter, last: None, coasted: None, status: status::INITIAL }
     }
 
-    /// The motion as estimated; at rest in the centre before anything was measured.
+    /// Returns the estimated motion; before the first measurement at rest in the centre.
     #[inline]
     fn estimate(&self) -> OrbitState {
         self.coasted.unwrap_or_else(|| {
@@ -142,7 +142,7 @@ impl Estimator for OrbitObserver {
     type Measurement = OrbitMeasurement;
     type Estimate = OrbitEstimate;
 
-    /// What a frozen body reports is no motion to learn from.
+    /// A frozen body's measurements carry no motion to learn from.
     #[inline]
     fn usable(&self, measurement: &OrbitMeasurement) -> bool {
         let OrbitSample { r, theta, thrust } = Self::seen(measurement);
@@ -171,7 +171,7 @@ impl Estimator for OrbitObserver {
         self.coasted = None;
     }
 
-    /// Under the thrust that was reported last. Where the model ends, the estimate stays.
+    /// Advances under the last reported thrust. Where the model ends, the estimate stays.
     fn coast(&mut self, dt_s: f64) {
         if let Some(OrbitSample { thrust, .. }) = &self.last {
             let from = self.estimate();
@@ -181,7 +181,7 @@ impl Estimator for OrbitObserver {
 
     #[inline]
     fn write(&self, status: u64, out: &mut OrbitEstimate) {
-        // Without any measurement there is nothing that could be said, and no bit says that there was.
+        // Before the first measurement the content is meaningless, and `valid` is 0.
         let OrbitState { r, vr, theta, vtheta } = self.estimate();
         out.radius_du = r;
         out.angle_rad = theta;
@@ -195,13 +195,13 @@ impl Estimator for OrbitObserver {
     }
 }
 
-/// What a law takes its body to, and what it knows of it.
+/// The target of a law, and the sources of its inputs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Aim {
-    /// A circular orbit of this radius, du. The body is the observed one; its velocity is the estimate's, unless
-    /// `full_state`: then its own sensors'.
+    /// A circular orbit of this radius, du, for the observed body. Its velocity comes from the estimate, or from its own sensors
+    /// if `full_state`.
     Circle { radius: f64, full_state: bool },
-    /// The leader's motion, its velocity as estimated; the body measures its own.
+    /// The leader's motion, with estimated velocity. The driven body measures its own velocity.
     Leader,
 }
 
@@ -210,17 +210,17 @@ pub(super) enum Aim {
 pub struct OrbitLaw {
     law: OrbitHold,
     aim: Aim,
-    /// What a law that predicts has sent and what does not act yet, du/s².
+    /// The commands that a predicting law has sent and that do not act yet, du/s².
     in_flight: InFlight<[f64; 2]>,
 }
 
 impl OrbitLaw {
-    /// The law of a body whose motion it is to predict over so many ticks, if it predicts.
+    /// Creates the law of one body. A predicting law predicts its motion over `predicted_ticks`.
     pub(super) fn new(law: OrbitHold, aim: Aim, predicted_ticks: u64) -> Self {
         Self { law, aim, in_flight: InFlight::new(predicted_ticks, || [0.0; 2]) }
     }
 
-    /// The thrust, or none to be asked for: a lost body, or nothing known of the leader yet.
+    /// Returns the thrust. `None` asks for no thrust: the body is lost, or the leader is still unknown.
     #[inline]
     fn thrust(&self, estimate: &OrbitEstimate, measurement: &OrbitMeasurement) -> Option<Vector2<f64>> {
         let sound = measurement.status & status::FAULT == 0 && estimate.valid & POSITION == POSITION;
@@ -247,7 +247,7 @@ impl OrbitLaw {
         })
     }
 
-    /// A body one tick before a new command begins to act, and what acts in that tick: the law itself predicts the last.
+    /// Returns a body one tick before a new command acts, and the input of that tick: the law itself predicts the last tick.
     #[inline]
     fn ahead(&self, tick: u64, body: OrbitState, applied: [f64; 2]) -> (OrbitState, Vector2<f64>) {
         let (mut body, mut acts) = (body, Vector2::from(applied));
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lost_body_freezes_says_so_and_is_left_alone() {
+    fn a_lost_body_freezes_reports_a_fault_and_gets_no_thrust() {
         for start in [
             OrbitState { r: 0.06, vr: -2.0, ..OrbitState::default() },
             OrbitState { r: 9.9, vr: 3.0, ..OrbitState::default() },
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn the_guess_is_polar_and_nothing_is_said_before_the_first_measurement() {
+    fn the_guess_is_polar_and_invalid_before_the_first_measurement() {
         let (mut observer, mut estimate) = (observer(), OrbitEstimate::default());
         observer.write(status::UNUSABLE, &mut estimate);
         assert_eq!((estimate.valid, estimate.radius_du), (0, 0.0));

@@ -1,4 +1,4 @@
-//! The sections of a scenario that belong to this rig: as typed, with their checks.
+//! The tables of a scenario that belong to this rig, as typed, with their checks.
 
 use super::limits::RawLimits;
 use super::playback::RawPlayback;
@@ -31,7 +31,7 @@ pub(super) struct RawLeader {
     pub inertia_kg_m2: [f64; 3],
     #[serde(skip_serializing_if = "Option::is_none")]
     pub initial_rate_rad_s: Option<[f64; 3]>,
-    /// A log whose motion it repeats.
+    /// A log whose motion the leader plays back.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub data: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -46,13 +46,13 @@ pub(super) struct RawLeader {
 }
 
 impl RawLeader {
-    /// Where it begins, rad/s.
+    /// Returns the initial rate, rad/s.
     pub fn initial(&self) -> Vector3<f64> {
         self.initial_rate_rad_s.unwrap_or_default().into()
     }
 }
 
-/// A gyro that is dead from one tick to another.
+/// A gyro that is dead from one time to another.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RawOutage {
@@ -84,23 +84,23 @@ fn identical() -> [f64; 3] {
 }
 
 impl RawFollower {
-    /// How many bodies it is, if it is a fleet.
+    /// Returns the number of bodies if this follower is a fleet.
     pub fn fleet(&self) -> Option<usize> {
         self.count.and_then(|count| usize::try_from(count).ok())
     }
 
-    /// How far the initial rates of a fleet's bodies are from the one given, at the most.
+    /// Returns the largest distance of a body's initial rate from the given one, rad/s.
     pub fn spread_rad_s(&self) -> [f64; 3] {
         self.initial_rate_spread_rad_s.unwrap_or_default()
     }
 
-    /// The fastest initial rate of a body, rad/s.
+    /// Returns a bound on the initial rates of all bodies, rad/s.
     pub fn fastest(&self) -> Vector3<f64> {
         Vector3::from(self.initial_rate_rad_s).abs() + Vector3::from(self.spread_rad_s())
     }
 }
 
-/// What the observer is for.
+/// The purpose of the observer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Kind {
@@ -109,7 +109,7 @@ pub(super) enum Kind {
     HiddenRate,
     /// Learns the inertia while all components are measured, and supplies one that is lost.
     Inertia,
-    /// The same for a body that is known to be axisymmetric.
+    /// As `Inertia`, for a body known to be axisymmetric.
     AxisymmetricInertia,
 }
 
@@ -138,7 +138,7 @@ pub(super) struct RawObserver {
     pub symmetry_axis: Option<usize>,
 }
 
-/// How fast the identifier's error decays, per unit of excitation: rates per component, or minus a matrix.
+/// The decay of the identifier's error per unit of excitation: one rate per component, or minus a matrix.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
@@ -167,7 +167,7 @@ pub(super) struct RawController {
     pub adaptation_gain: f64,
 }
 
-/// Which mass distribution the law works with.
+/// The mass distribution that the law uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Coefficients {
@@ -178,7 +178,7 @@ pub(super) enum Coefficients {
     Learned,
 }
 
-/// Checks what can be told from the text alone, whatever the observer is for.
+/// Checks the text alone, independently of the observer's kind.
 pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     check_followers(&raw.follower, checks);
     check_noise(checks, "leader", &raw.leader.noise_rad_s);
@@ -204,7 +204,7 @@ pub(super) fn check(raw: &Raw, checks: &mut Checks<'_>) {
     }
 }
 
-/// The leader moves by its own dynamics or by a log.
+/// Checks that the leader moves either by its own dynamics or by a log.
 fn check_motion(leader: &RawLeader, checks: &mut Checks<'_>) {
     match (leader.initial_rate_rad_s, &leader.data) {
         (None, None) => {
@@ -213,12 +213,12 @@ fn check_motion(leader: &RawLeader, checks: &mut Checks<'_>) {
         (Some(_), Some(_)) => checks.refuse(
             "leader.initial_rate_rad_s",
             "conflicting-keys",
-            "has no meaning where leader.data tells the motion; remove one of them",
+            "conflicts with leader.data, which gives the motion; remove one of them",
         ),
         _ => {}
     }
     checks.require(leader.playback.is_none() || leader.data.is_some(), "leader.playback", "unused-key", || {
-        "says how a log is read, and there is none; add leader.data".to_owned()
+        "describes how to read a log, and no log is given; add leader.data".to_owned()
     });
 }
 
@@ -232,7 +232,7 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
     ] {
         match (given, needed) {
             (false, true) => checks.refuse(key, "missing-key", "is missing for this observer.kind; add it"),
-            (true, false) => checks.refuse(key, "unused-key", "has no meaning for this observer.kind; remove it"),
+            (true, false) => checks.refuse(key, "unused-key", "is unused with this observer.kind; remove it"),
             _ => {}
         }
     }
@@ -245,7 +245,10 @@ fn check_observer(observer: &RawObserver, checks: &mut Checks<'_>) {
             observer.identifier_decay.is_none(),
             "observer.identifier_bandwidth",
             "conflicting-keys",
-            || "is of second order, and observer.identifier_decay of first; give one of them".to_owned(),
+            || {
+                "is for a second-order filter and observer.identifier_decay for a first-order one; give one of them"
+                    .to_owned()
+            },
         );
     }
 }
@@ -263,7 +266,7 @@ fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
     });
     for (index, follower) in followers.iter().enumerate() {
         let (key, name) = (format!("follower[{index}].name"), &follower.name);
-        check_name(checks, &key, name, followers[..index].iter().map(|other| other.name.as_str()));
+        check_name(checks, &key, name, followers[..index].iter().map(|follower| follower.name.as_str()));
         check_noise(checks, &format!("follower[{index}]"), &follower.noise_rad_s);
         for factor in follower.inertia_factor {
             checks.positive(&format!("follower[{index}].inertia_factor"), factor);
@@ -271,25 +274,25 @@ fn check_followers(followers: &[RawFollower], checks: &mut Checks<'_>) {
     }
 }
 
-/// What fleets are, and what they do without.
+/// Checks the keys of fleets, including keys that a fleet does not support.
 fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
     for (index, follower) in raw.follower.iter().enumerate() {
         let key = |name: &str| format!("follower[{index}].{name}");
         let spread = follower.initial_rate_spread_rad_s;
         let Some(count) = follower.count else {
             checks.require(spread.is_none(), &key("initial_rate_spread_rad_s"), "unused-key", || {
-                "is for many bodies, and this follower is one; give count, or remove it".to_owned()
+                "is for a fleet, and this follower is a single body; give count, or remove it".to_owned()
             });
             continue;
         };
         checks.require((1..=MAX_BODIES).contains(&count), &key("count"), "out-of-range", || {
-            format!("{count} is no number of bodies that one process hosts; give 1 to {MAX_BODIES}")
+            format!("one process cannot host {count} bodies; give 1 to {MAX_BODIES}")
         });
         checks.require(
             spread.iter().flatten().all(|spread| *spread >= 0.0),
             &key("initial_rate_spread_rad_s"),
             "negative",
-            || "is a distance to either side and below zero; give 0 or more".to_owned(),
+            || "is a half-width and must not be negative; give 0 or more".to_owned(),
         );
         for (name, plain) in [
             ("inertia_factor", follower.inertia_factor == identical()),
@@ -297,7 +300,7 @@ fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
             ("bias_rad_s", follower.bias_rad_s == [0.0; 3]),
         ] {
             checks.require(plain, &key(name), "fleet-key", || {
-                "has no meaning for a fleet, whose bodies are like the leader and perfectly measured; remove it or count"
+                "is not supported for a fleet, whose bodies equal the leader and are measured without error; remove it or count"
                     .to_owned()
             });
         }
@@ -305,31 +308,32 @@ fn check_fleets(raw: &Raw, checks: &mut Checks<'_>) {
     if raw.follower.iter().any(|follower| follower.count.is_some()) {
         let adapts = raw.controller.as_ref().is_some_and(|controller| controller.adaptation_gain > 0.0);
         checks.require(!adapts, "controller.adaptation_gain", "fleet-key", || {
-            "learns the inertia of single followers, and a fleet's is the leader's; give 0 or leave the fleet out"
+            "adapts to the inertia of single followers, and a fleet has the leader's; give 0 or remove the fleet"
                 .to_owned()
         });
         checks.require(raw.limits.repeats.is_none(), "limits.repeats", "fleet-key", || {
-            "is not counted for the bodies of a fleet; remove it or the fleet".to_owned()
+            "is not supported for a fleet; remove it or the fleet".to_owned()
         });
     }
 }
 
-/// The component that the observer supplies, 1 to 3: the one that is not measured, or the one that fails.
-///
-/// An observer that learns needs all three to begin with.
+/// Returns the component that the observer supplies, 1 to 3: the unmeasured one, or the one that fails. An observer that learns
+/// needs all three components at first.
 pub(super) fn hidden_axis(raw: &Raw, checks: &mut Checks<'_>) -> Option<usize> {
     let measured = &raw.leader.measured_axes;
     let hidden: Vec<usize> = (1..=3).filter(|axis| !measured.contains(axis)).collect();
     let expected = if raw.observer.kind == Kind::HiddenRate { 2 } else { 3 };
     if measured.len() != expected || hidden.len() != 3 - expected {
         let remedy = match expected {
-            2 => "does not leave exactly one axis hidden; name two different axes of 1, 2 and 3",
-            _ => "is not all axes, which learning needs; give [1, 2, 3] and let one fail with [[leader.outage]]",
+            2 => "must leave exactly one axis hidden; name two different axes of 1, 2 and 3",
+            _ => {
+                "must name all axes, because the observer learns; give [1, 2, 3] and let one fail with [[leader.outage]]"
+            }
         };
         checks.refuse("leader.measured_axes", "bad-axes", format!("{measured:?} {remedy}"));
         return None;
     }
     let supplied = hidden.first().or(raw.leader.outage.first().map(|outage| &outage.axis));
-    // An outage of an axis that no body has is refused elsewhere.
+    // An outage of a nonexistent axis is refused elsewhere.
     supplied.copied().filter(|axis| (1..=3).contains(axis))
 }

@@ -1,4 +1,4 @@
-//! The parameters of the rigid-body rig, as a scenario resolves to them.
+//! The resolved parameters of the rigid-body rig.
 
 use super::limits::Limits;
 use super::plant::Outage;
@@ -17,22 +17,24 @@ use std::sync::Arc;
 pub struct RigidBodyRig {
     pub(super) bodies: Vec<BodyInfo>,
     pub(super) inertia: Inertia,
-    /// Per body: initial rate, and inertia over the nominal one.
+    /// Per body: the initial rate, rad/s.
     pub(super) initial_rates: Vec<Vector3<f64>>,
-    /// Per body, how far a fleet's initial rates are spread to either side, and what the draws follow from.
+    /// Per body: the half-width of a fleet's initial rates, rad/s.
     pub(super) spreads: Vec<Vector3<f64>>,
+    /// The seed of all random numbers.
     pub(super) seed: u64,
+    /// Per body: the inertia over the nominal one.
     pub(super) inertia_factors: Vec<Vector3<f64>>,
     /// Bit i set: the leader's component i has a gyro.
     pub(super) measured: u64,
     pub(super) outages: Vec<Outage>,
-    /// The motion that the leader repeats instead of moving by itself.
+    /// The motion that the leader plays back instead of moving freely.
     pub(super) playback: Option<Arc<Playback>>,
     /// The component that the observer supplies, 1 to 3.
     pub(super) supplied_axis: Option<usize>,
     pub(super) observer: ObserverDesign,
     pub(super) controller: Option<ControllerDesign>,
-    /// Per body, what its gyros add, and of which standard deviation and bias that is.
+    /// Per body: the errors of its gyros, and their standard deviation and bias.
     pub(super) noise: Vec<Noise<3>>,
     pub(super) deviations_rad_s: Vec<Vector3<f64>>,
     pub(super) biases_rad_s: Vec<Vector3<f64>>,
@@ -40,7 +42,7 @@ pub struct RigidBodyRig {
     pub(super) notes: Vec<String>,
     pub(super) tick_s: f64,
     pub(super) actuation_delay_ticks: u64,
-    /// What is proven of any follower: they differ in nothing that it knows of.
+    /// The certificate of every follower: followers differ in nothing that it depends on.
     pub(super) certificate: Option<Certificate>,
 }
 

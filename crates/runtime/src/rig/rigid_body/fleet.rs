@@ -1,7 +1,7 @@
-//! A fleet of rigid bodies: many followers that are like the leader, simulated, driven and guarded as one.
+//! A fleet of rigid bodies: many followers with the leader's inertia, simulated, driven and guarded as one.
 //!
-//! Each of them gets the bits that it would get alone. Must not treat bodies differently: what is missing, late or impossible
-//! for one is so for all.
+//! The results of each body are bit-identical to those of a single follower. All bodies are treated alike: a sample that is
+//! missing, late or impossible for one body is rejected for all.
 
 use super::RigidBodyRig;
 use super::limits::Motion;
@@ -15,14 +15,14 @@ use crate::sample::{
 use crate::state::{Persist, Words, persist_fields};
 use nalgebra::Vector3;
 
-/// Where a vector lies in its samples.
+/// The indices of the vectors in their samples.
 const OMEGA: usize = 0;
 const APPLIED: usize = 1;
 const ACCELERATION: usize = 0;
-/// After a gap of so many ticks in what was believed, a sample must also continue what came just before it, as that of a
-/// single body.
+/// The longest gap in ticks after which the next sample is compared only with the last accepted one. After a longer gap it must
+/// also continue the sample before it, as for a single body.
 const SHORT_GAP_TICKS: u64 = 2;
-/// The draws of fleets are not those of sensors.
+/// The offset of the fleets' random streams from those of the sensors.
 const STREAMS: u64 = 1 << 32;
 
 /// One number per body, for each component.
@@ -44,21 +44,21 @@ fn assign(to: [&mut [f64]; 3], from: [&[f64]; 3]) {
     to.into_iter().zip(from).for_each(|(to, from)| to.copy_from_slice(from));
 }
 
-/// The largest |rate − reference| of all bodies, rad/s; not a number if one of them is none.
+/// Returns the largest |rate − reference| of all bodies, rad/s; NaN if one of them is NaN.
 pub(super) fn farthest(rates: [&[f64]; 3], reference: &Vector3<f64>) -> f64 {
     let [r1, r2, r3] = rates;
     let errors = r1.iter().zip(r2).zip(r3).map(|((r1, r2), r3)| (Vector3::new(*r1, *r2, *r3) - reference).norm());
     errors.fold(0.0, |worst: f64, error| if error > worst || error.is_nan() { error } else { worst })
 }
 
-/// A fleet as a scenario has it.
+/// The definition of a fleet in a scenario.
 #[derive(Debug)]
 pub struct RateFleet {
     body: RigidBody,
     initial: Arrays,
     law: FleetLaw,
     learned: bool,
-    /// How far the law predicts, ticks, if it does.
+    /// The number of ticks that the law predicts, if it predicts.
     delay_ticks: u64,
     bounds: Bounds<3>,
     motion: Option<Motion>,
@@ -66,14 +66,14 @@ pub struct RateFleet {
 }
 
 impl RateFleet {
-    /// The fleet of `count` bodies in the place of the body with this index.
+    /// Creates the fleet of `count` bodies that takes the place of the body with this index.
     pub(super) fn new(rig: &RigidBodyRig, index: usize, count: usize) -> Self {
         let (law, controller) = rig.synchronizer();
         let acceleration_max_rad_s2 = rig.limits.acceleration_rad_s2;
         let mut draw = uniform(rig.seed, STREAMS | index as u64);
         let (centre, spread) = (rig.initial_rates[index], rig.spreads[index]);
         let mut initial = zeros(count);
-        // Body by body, so that the first ones of a larger fleet are those of a smaller one.
+        // Body by body, so that a larger fleet starts with the bodies of a smaller one.
         let [r1, r2, r3] = &mut initial;
         for ((r1, r2), r3) in r1.iter_mut().zip(r2).zip(r3) {
             [*r1, *r2, *r3] = (centre + spread.map(|spread| spread * (2.0 * draw() - 1.0))).into();
@@ -121,10 +121,10 @@ impl Fleet<RateEstimate> for RateFleet {
             pursuits: vec![MotionCheck::default(); self.count()],
             pursuing: false,
             acceleration_max_rad_s2: self.acceleration_max_rad_s2,
-            believed: zeros(self.count()),
-            believed_tick: None,
-            doubted: zeros(self.count()),
-            doubted_tick: None,
+            accepted: zeros(self.count()),
+            accepted_tick: None,
+            suspect: zeros(self.count()),
+            suspect_tick: None,
         }
     }
 
@@ -187,15 +187,15 @@ fn persist_arrays<W: Words>(arrays: &mut Arrays, words: &mut W) {
     all_mut(arrays).into_iter().for_each(|array| array.persist(words));
 }
 
-/// The synchronising law of all followers of a fleet. No V is published.
+/// The synchronising law of all followers of a fleet. It publishes no V.
 #[derive(Debug)]
 pub struct FleetRateLaw {
     law: FleetLaw,
-    /// Whether the law works with the coefficients that the observer has learned.
+    /// True if the law uses the coefficients that the observer has learned.
     learned: bool,
-    /// Room for the predicted rates, if there is a prediction.
+    /// Buffers of the predicted rates, if the law predicts.
     ahead: Arrays,
-    /// What was sent and does not act yet, rad/s², if there is a prediction.
+    /// The commands that were sent and do not act yet, rad/s², if the law predicts.
     in_flight: InFlight<Arrays>,
 }
 
@@ -236,26 +236,26 @@ impl Law for FleetRateLaw {
     }
 }
 
-/// Guards measurements of a fleet as [`MeasurementGuard`](super::MeasurementGuard) does those of a body: a sample is believed
-/// for all bodies or for none.
+/// A guard of a fleet's measurements, as [`MeasurementGuard`](super::MeasurementGuard) is of a single body's. It accepts or
+/// rejects a sample for all bodies.
 #[derive(Debug)]
 pub struct FleetMeasurementGuard {
     bounds: Bounds<3>,
     motion: Option<Motion>,
-    /// One per body; all of them are active if `pursuing`, else none.
+    /// One check per body. All are active if `pursuing`; otherwise none is.
     pursuits: Vec<MotionCheck<3>>,
     pursuing: bool,
     acceleration_max_rad_s2: f64,
-    /// The last rates that were believed, and their tick.
-    believed: Arrays,
-    believed_tick: Option<u64>,
-    /// The rates of the sample before, if that was not believed.
-    doubted: Arrays,
-    doubted_tick: Option<u64>,
+    /// The last accepted rates, and their tick.
+    accepted: Arrays,
+    accepted_tick: Option<u64>,
+    /// The rates of the previous sample if it was rejected, and its tick.
+    suspect: Arrays,
+    suspect_tick: Option<u64>,
 }
 
 impl FleetMeasurementGuard {
-    /// Whether all rates are in range and can have come from these by now.
+    /// Returns true if all rates can have changed from `from` to these since tick `since`.
     fn reached(&self, rates: [&[f64]; 3], from: &Arrays, since: u64, tick: u64) -> bool {
         let ticks = tick.saturating_sub(since).max(1) as f64;
         (0..3).all(|axis| {
@@ -268,7 +268,7 @@ impl FleetMeasurementGuard {
         rates.into_iter().zip(self.bounds.magnitude).all(|(rates, limit)| within(rates, limit))
     }
 
-    /// Judges a sample that is out of range, or comes after one: every body is to move as it must.
+    /// Checks a sample that is out of range, or follows such a sample: every body must move by its equations of motion.
     #[cold]
     fn follows(&mut self, sample: &FleetMeasurement) -> bool {
         let (Some(motion), [r1, r2, r3], [a1, a2, a3]) = (self.motion, sample.vector(OMEGA), sample.vector(APPLIED))
@@ -295,23 +295,23 @@ impl FleetMeasurementGuard {
 
     fn possible(&self, rates: [&[f64]; 3], tick: u64) -> bool {
         let in_range = self.in_range(rates);
-        let Some(since) = self.believed_tick.filter(|_| in_range) else { return in_range };
-        let smooth = match self.doubted_tick {
-            Some(doubted) if tick.saturating_sub(since) > SHORT_GAP_TICKS => {
-                self.reached(rates, &self.doubted, doubted, tick)
+        let Some(since) = self.accepted_tick.filter(|_| in_range) else { return in_range };
+        let smooth = match self.suspect_tick {
+            Some(suspect) if tick.saturating_sub(since) > SHORT_GAP_TICKS => {
+                self.reached(rates, &self.suspect, suspect, tick)
             }
             _ => true,
         };
-        smooth && self.reached(rates, &self.believed, since, tick)
+        smooth && self.reached(rates, &self.accepted, since, tick)
     }
 }
 
 impl Persist for FleetMeasurementGuard {
     fn persist<W: Words>(&mut self, words: &mut W) {
-        persist_arrays(&mut self.believed, words);
-        self.believed_tick.persist(words);
-        persist_arrays(&mut self.doubted, words);
-        self.doubted_tick.persist(words);
+        persist_arrays(&mut self.accepted, words);
+        self.accepted_tick.persist(words);
+        persist_arrays(&mut self.suspect, words);
+        self.suspect_tick.persist(words);
         self.pursuits.persist(words);
         self.pursuing.persist(words);
     }
@@ -320,7 +320,7 @@ impl Persist for FleetMeasurementGuard {
 impl Guard<FleetMeasurement> for FleetMeasurementGuard {
     fn accepts(&mut self, sample: &FleetMeasurement) -> bool {
         let limit = self.acceleration_max_rad_s2;
-        let whole = sample.declared_bodies() == self.believed[0].len() as u64;
+        let whole = sample.declared_bodies() == self.accepted[0].len() as u64;
         if !(whole && sample.vector(APPLIED).into_iter().all(|applied| within(applied, limit))) {
             return false;
         }
@@ -330,20 +330,20 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
         if usual && self.pursuing {
             self.stop();
         }
-        let believed = usual || ((self.pursuing || !self.in_range(rates)) && self.follows(sample));
-        if believed {
-            assign(all_mut(&mut self.believed), rates);
-            (self.believed_tick, self.doubted_tick) = (Some(stamp.tick), None);
+        let accepted = usual || ((self.pursuing || !self.in_range(rates)) && self.follows(sample));
+        if accepted {
+            assign(all_mut(&mut self.accepted), rates);
+            (self.accepted_tick, self.suspect_tick) = (Some(stamp.tick), None);
         } else {
-            assign(all_mut(&mut self.doubted), rates);
-            self.doubted_tick = Some(stamp.tick);
+            assign(all_mut(&mut self.suspect), rates);
+            self.suspect_tick = Some(stamp.tick);
         }
-        believed
+        accepted
     }
 
     fn refusal(&self, sample: &FleetMeasurement) -> Refusal {
         let (rates, applied) = (sample.vector(OMEGA), sample.vector(APPLIED));
-        if sample.declared_bodies() != self.believed[0].len() as u64 {
+        if sample.declared_bodies() != self.accepted[0].len() as u64 {
             Refusal::Incomplete
         } else if !applied.into_iter().all(|applied| within(applied, self.acceleration_max_rad_s2)) {
             of_vectors(applied)
@@ -355,7 +355,7 @@ impl Guard<FleetMeasurement> for FleetMeasurementGuard {
     }
 }
 
-/// Guards commands of a fleet: the actuators can do all that is asked.
+/// A guard of a fleet's commands: the actuators can apply what is commanded.
 #[derive(Debug)]
 pub struct FleetCommandGuard {
     count: u64,
@@ -380,21 +380,21 @@ impl Guard<FleetCommand> for FleetCommandGuard {
     }
 }
 
-/// Why vectors of all bodies fail a bound on their magnitude.
+/// Returns the reason why the vectors of all bodies fail a bound on their magnitude.
 fn of_vectors(vectors: [&[f64]; 3]) -> Refusal {
     let finite = |values: &&[f64]| Refusal::of_values(values) != Refusal::NotFinite;
     if vectors.iter().all(finite) { Refusal::OutOfRange } else { Refusal::NotFinite }
 }
 
-/// Whether all values are at most so large; what is no number is not.
+/// Returns true if all values are at most `limit` in magnitude. NaN is not.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
 fn within(values: &[f64], limit: f64) -> bool {
-    // Bits, not a branch: they are gathered in any order, and so in vectors.
+    // Bits instead of branches: they combine in any order, so the compiler can vectorise.
     values.iter().fold(1, |all, value| all & u64::from(value.abs() <= limit)) == 1
 }
 
-/// Whether all values are at most so far from these; what is no number is not.
+/// Returns true if all values differ from those in `from` by at most `change`. NaN does not.
 #[multiversion::multiversion(targets = "simd")]
 #[allow(unsafe_code, reason = "the macro calls what it has found the machine to have")]
 fn near(values: &[f64], from: &[f64], change: f64) -> bool {
@@ -416,9 +416,9 @@ mod tests {
         scenario.rig.downcast_ref::<RigidBodyRig>().unwrap().clone()
     }
 
-    /// Over whatever comes: steady motion, jumps, gaps, numbers that are none, new lives of the sender.
+    /// Compares both guards over steady motion, jumps, gaps, NaN and infinity, and restarts of the sender.
     #[test]
-    fn a_fleet_s_guard_judges_as_that_of_a_single_body() {
+    fn a_fleet_s_guard_agrees_with_that_of_a_single_body() {
         let mut single = rig(&[]).measurement_guard(1, true);
         let mut many = rig(&["follower.0.count=5"]).fleet(1).unwrap().measurement_guard();
         let (mut draw, mut sample) = (uniform(3, 0), FleetBuffer::<MeasurementLayout>::new(5));
@@ -429,37 +429,42 @@ mod tests {
             stamp.generation += u64::from(event == 4);
             let reach = if (5..8).contains(&event) { 1.0 } else { 2e-3 };
             rate = rate.map(|rate| (rate + reach * (draw() - 0.5)).clamp(-2.5, 2.5));
-            let (mut told, mut applied) = (rate, [0.1; 3]);
+            let (mut measured, mut applied) = (rate, [0.1; 3]);
             match event {
-                10 => told[1] = f64::NAN,
-                11 => told[2] = f64::INFINITY,
+                10 => measured[1] = f64::NAN,
+                11 => measured[2] = f64::INFINITY,
                 12 => applied[0] = f64::NAN,
-                13 => told[0] = 1e3,
+                13 => measured[0] = 1e3,
                 _ => {}
             }
-            let one =
-                RateMeasurement { stamp, omega_rad_s: told, applied_rad_s2: applied, valid: 7, ..Default::default() };
+            let single_sample = RateMeasurement {
+                stamp,
+                omega_rad_s: measured,
+                applied_rad_s2: applied,
+                valid: 7,
+                ..Default::default()
+            };
             let all = sample.sample_mut();
             all.set_status(0);
             *all.stamp_mut() = stamp;
             for axis in 0..3 {
-                // The others stay where they are: they are always possible.
-                all.vector_mut(OMEGA)[axis][3] = told[axis];
+                // The other bodies stay where they are, which is always possible.
+                all.vector_mut(OMEGA)[axis][3] = measured[axis];
                 all.vector_mut(APPLIED)[axis][3] = applied[axis];
             }
-            let believed = single.accepts(&one);
-            assert_eq!(believed, many.accepts(sample.sample()), "{one:?}");
-            verdicts[usize::from(believed)] += 1;
+            let accepted = single.accepts(&single_sample);
+            assert_eq!(accepted, many.accepts(sample.sample()), "{single_sample:?}");
+            verdicts[usize::from(accepted)] += 1;
         }
         assert!(verdicts.iter().all(|count| *count > 1000), "{verdicts:?}");
     }
 
     #[test]
-    fn a_sample_for_another_number_of_bodies_is_none() {
+    fn a_sample_for_another_number_of_bodies_is_rejected() {
         let fleet = rig(&["follower.0.count=5"]).fleet(1).unwrap();
         let (mut measurement, mut command) =
             (FleetBuffer::<MeasurementLayout>::new(5), FleetBuffer::<CommandLayout>::new(5));
-        assert!(!fleet.measurement_guard().accepts(measurement.sample()), "it says that it is for none");
+        assert!(!fleet.measurement_guard().accepts(measurement.sample()), "it declares no bodies");
         assert!(!fleet.command_guard().accepts(command.sample()));
         measurement.sample_mut().set_status(0);
         command.sample_mut().set_status(0);
@@ -480,8 +485,11 @@ mod tests {
             ];
             rig(&overrides.each_ref().map(|text| &**text)).fleet(1).unwrap().initial
         };
-        let (few, many, other) = (initial(10, 1), initial(1000, 1), initial(10, 2));
-        assert!(few[0] == many[0][..10] && few[0] != other[0], "a larger fleet begins as a smaller one");
+        let (few, many, reseeded) = (initial(10, 1), initial(1000, 1), initial(10, 2));
+        assert!(
+            few[0] == many[0][..10] && few[0] != reseeded[0],
+            "a larger fleet starts with the bodies of a smaller one"
+        );
         assert!(many[0].iter().all(|rate| (rate - 0.5).abs() <= 0.25) && many[1].iter().all(|rate| *rate == 0.0));
         let mean = many[2].iter().sum::<f64>() / 1000.0;
         assert!(many[2].iter().all(|rate| (rate + 1.0).abs() <= 2.0) && (mean + 1.0).abs() < 0.1, "{mean}");

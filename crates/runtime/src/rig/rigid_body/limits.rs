@@ -1,6 +1,6 @@
-//! What bodies of this rig can do at the most, and the guards that hold samples against it.
+//! The physical limits of this rig's bodies, and the guards that check samples against them.
 //!
-//! Must not depend on what is unknown: the limits of an observer that learns the inertia hold for every body.
+//! Limits do not depend on unknowns: those of an observer that learns the inertia hold for every inertia.
 
 use crate::config::Checks;
 use crate::model::RigidBody;
@@ -13,9 +13,9 @@ use crate::state::persist_fields;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-/// The largest turn of a body in one tick, rad: half a turn cannot be told from its complement.
+/// The largest turn of a body in one tick, rad. A half turn is indistinguishable from the opposite one.
 pub(super) const MAX_TURN_RAD: f64 = 3.0;
-/// A default rate limit lies so far above what the initial rates allow.
+/// The factor from what the initial rates permit to the default rate limit.
 const RATE_MARGIN: f64 = 2.0;
 
 /// The table `[limits]` as typed.
@@ -36,18 +36,18 @@ impl RawLimits {
     }
 }
 
-/// What the limits follow from where they are not given.
+/// The quantities that determine the default limits.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Circumstances {
     /// The bound M on the leader's rate, rad/s.
     pub leader_rad_s: f64,
     /// The fastest initial rate of a follower, rad/s.
     pub follower_rad_s: f64,
-    /// How far the first guess is from the hidden rate, rad/s: so far the law drives a follower off at first.
+    /// The error of the first guess of the hidden rate, rad/s. The law first drives a follower off by this much.
     pub guess_error_rad_s: f64,
-    /// How far an estimate may err before it settles, rad/s.
+    /// The largest error of an estimate before it settles, rad/s.
     pub transient_rad_s: f64,
-    /// How fast the observer moves an estimate that errs, 1/s; +inf where nothing bounds that.
+    /// The rate at which the observer corrects an estimate, 1/s; +inf if it is not bounded.
     pub correction_per_s: f64,
     /// The largest gain of the law, 1/s.
     pub gain_per_s: f64,
@@ -64,10 +64,10 @@ pub(super) struct Limits {
 }
 
 impl Limits {
-    /// The limits given, or those that follow from the circumstances.
+    /// Returns the given limits, or defaults.
     ///
-    /// By default the acceleration is what the law can ask for on whatever passes the other limits, the coefficients of a
-    /// body being at most 1.
+    /// The default acceleration is the largest that the law can command for inputs within the other limits; the coefficients of a
+    /// body are at most 1.
     pub fn resolve(raw: &RawLimits, about: &Circumstances, checks: &mut Checks<'_>) -> Self {
         for (key, value) in
             [("limits.rate_rad_s", raw.rate_rad_s), ("limits.acceleration_rad_s2", raw.acceleration_rad_s2)]
@@ -95,7 +95,7 @@ impl Limits {
         }
     }
 
-    /// For people.
+    /// Returns the limits as figures for reports.
     pub fn figures(&self) -> Vec<Figure> {
         let figure = |name: &str, value| Figure { name: name.to_owned(), value };
         vec![
@@ -105,7 +105,7 @@ impl Limits {
         ]
     }
 
-    /// A guard for a body's measurements; without the components in `needed` a measurement is of no use to the reader.
+    /// Creates a guard for a body's measurements. A measurement without all components in `needed` is rejected.
     pub fn measurement(&self, body: &Sensed, tick_s: f64, needed: u64) -> MeasurementGuard {
         MeasurementGuard {
             rate: PlausibilityCheck::new(self.bounds(body, tick_s)),
@@ -116,7 +116,7 @@ impl Limits {
         }
     }
 
-    /// What a body's measured rates can be.
+    /// Returns the bounds of a body's measured rates.
     pub fn bounds(&self, body: &Sensed, tick_s: f64) -> Bounds<3> {
         let free = body.recorded_rad_s2.unwrap_or(body.coefficients * (self.rate_rad_s * self.rate_rad_s));
         let driven = if body.driven.is_some() {
@@ -134,7 +134,7 @@ impl Limits {
         }
     }
 
-    /// A guard for estimates of a body whose |a| are at most `coefficients`.
+    /// Creates a guard for estimates of a body whose |a| are at most `coefficients`.
     pub fn estimate(&self, coefficients: &Vector3<f64>, tick_s: f64) -> EstimateGuard {
         let free = coefficients * (self.estimate_rad_s * self.estimate_rad_s);
         let corrected = Vector3::repeat(self.correction_per_s * 2.0 * self.estimate_rad_s);
@@ -147,25 +147,25 @@ impl Limits {
         EstimateGuard { rate: PlausibilityCheck::new(bounds) }
     }
 
-    /// A guard for commands.
+    /// Creates a guard for commands.
     pub fn command(&self) -> CommandGuard {
         CommandGuard { acceleration_rad_s2: self.acceleration_rad_s2 }
     }
 }
 
-/// A body as its measurements show it.
+/// The properties of a body that its measurements show.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sensed {
-    /// Bounds on |a| of \[D\](2).
+    /// The bounds on |a| of \[D\](2).
     pub coefficients: Vector3<f64>,
-    /// Inertia over the nominal one.
+    /// The inertia over the nominal one.
     pub factor: Vector3<f64>,
-    /// As it moves; none if it is free, for then its energy bounds its rate.
+    /// The dynamics of a driven body; `None` if the body is free, since its energy then bounds its rate.
     pub driven: Option<RigidBody>,
-    /// Of the sensors, rad/s.
+    /// The standard deviation and bias of its sensors, rad/s.
     pub deviation: Vector3<f64>,
     pub bias: Vector3<f64>,
-    /// How fast it changes, if it repeats a recorded motion, rad/s².
+    /// Bounds on the angular acceleration of a motion that is played back, rad/s².
     pub recorded_rad_s2: Option<Vector3<f64>>,
 }
 
@@ -175,7 +175,7 @@ impl Sensed {
     }
 }
 
-/// How a driven body moves in one tick.
+/// The motion of a driven body over one tick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Motion {
     body: RigidBody,
@@ -184,9 +184,8 @@ pub(super) struct Motion {
 }
 
 impl Motion {
-    /// Whether a sample of the body is believed although it lies beyond the range, or follows one that does: it moves as
-    /// Euler's equations and what is applied say. Nothing is followed that turns too far in a tick to be told from its mirror
-    /// image.
+    /// Returns true if a sample beyond the range, or after such a sample, is accepted: the body moves by Euler's equations under the
+    /// applied input. A body that turns too far in a tick to be distinguished from its mirror image is never accepted.
     pub fn follows(
         &self,
         pursuit: &mut MotionCheck<3>,
@@ -206,8 +205,8 @@ impl Motion {
     }
 }
 
-/// Guards measurements: their range, and how fast Euler's equations and the actuators let them change. A driven body beyond
-/// its range is believed once it was seen to move as it must.
+/// A guard of measurements: range, and the rates of change that Euler's equations and the actuators permit. A driven body
+/// beyond its range is accepted after some samples of motion by its equations.
 #[derive(Debug)]
 pub struct MeasurementGuard {
     rate: PlausibilityCheck<3>,
@@ -220,7 +219,7 @@ pub struct MeasurementGuard {
 persist_fields!(MeasurementGuard, rate, pursuit);
 
 impl MeasurementGuard {
-    /// Judges a sample that is out of range, or comes after one.
+    /// Checks a sample that is out of range, or follows such a sample.
     #[cold]
     fn follows(&mut self, sample: &RateMeasurement) -> bool {
         let (Some(motion), ALL) = (self.motion, sample.valid) else { return false };
@@ -257,8 +256,8 @@ impl Guard<RateMeasurement> for MeasurementGuard {
     }
 }
 
-/// Guards estimates: their range, how fast the body and the observer's correction let them change, and that a component
-/// which is not valid is said to be a guess. Without a filter of first order on quiet sensors their slew is not bounded.
+/// A guard of estimates: range, the rates of change that the body and the observer's correction permit, and that an invalid
+/// component is marked as a guess. The rate of change is bounded only for a first-order filter on noise-free sensors.
 #[derive(Debug)]
 pub struct EstimateGuard {
     rate: PlausibilityCheck<3>,
@@ -269,8 +268,9 @@ persist_fields!(EstimateGuard, rate);
 impl Guard<RateEstimate> for EstimateGuard {
     #[inline]
     fn accepts(&mut self, sample: &RateEstimate) -> bool {
-        let told = sample.valid & ALL == ALL || sample.status & (status::INITIAL | status::DEGRADED) != 0;
-        told && within(&sample.coefficients, f64::MAX)
+        let complete = sample.valid & ALL == ALL || sample.status & (status::INITIAL | status::DEGRADED) != 0;
+        complete
+            && within(&sample.coefficients, f64::MAX)
             && sample.innovation_rad_s.is_finite()
             && self.rate.accepts(&sample.stamp, &sample.omega_rad_s, ALL)
     }
@@ -286,7 +286,7 @@ impl Guard<RateEstimate> for EstimateGuard {
     }
 }
 
-/// Guards commands: the actuators can do what is asked.
+/// A guard of commands: the actuators can apply what is commanded.
 #[derive(Debug)]
 pub struct CommandGuard {
     acceleration_rad_s2: f64,
@@ -305,7 +305,7 @@ impl Guard<RateCommand> for CommandGuard {
     }
 }
 
-/// Whether all components are at most so large; what is no number is not.
+/// Returns true if all components are at most `limit` in magnitude. NaN is not.
 #[inline]
 fn within(values: &[f64; 3], limit: f64) -> bool {
     values.iter().all(|value| value.abs() <= limit)
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_body_changes_by_its_dynamics_and_a_driven_one_by_its_actuators_too() {
+    fn dynamics_and_actuators_bound_the_rate_of_change() {
         for (driven, slew) in [(false, 0.5 * 4.0), (true, 0.5 * 4.0 + 8.0 / 2.0)] {
             let mut guard = LIMITS.measurement(&sensed(driven), 1e-3, ALL);
             assert!(guard.accepts(&measurement(0, 1.0)));
@@ -353,8 +353,8 @@ mod tests {
         }
     }
 
-    /// A body under a constant command that was driven beyond its range, as its sensor shows it: through `seen`.
-    fn believed(seen: impl Fn(u64, Vector3<f64>) -> Vector3<f64>) -> Vec<u64> {
+    /// Returns the accepted ticks of a body that a constant command drives beyond its range, as seen by its sensor `seen`.
+    fn accepted(seen: impl Fn(u64, Vector3<f64>) -> Vector3<f64>) -> Vec<u64> {
         let (sensed, applied) = (sensed(true), Vector3::new(4.0, -2.0, 1.0));
         let (body, mut rate) = (sensed.driven.unwrap(), Vector3::new(2.5, -1.0, 1.5));
         let mut guard = LIMITS.measurement(&sensed, 1e-3, ALL);
@@ -369,32 +369,32 @@ mod tests {
     }
 
     #[test]
-    fn a_body_beyond_its_range_that_moves_as_it_must_is_believed_after_a_few_doubts() {
-        assert_eq!(believed(|_, rate| rate), (1 + SUSPECT_SAMPLES..100).collect::<Vec<_>>());
+    fn a_body_that_moves_beyond_its_range_by_its_equations_is_accepted_after_a_few_samples() {
+        assert_eq!(accepted(|_, rate| rate), (1 + SUSPECT_SAMPLES..100).collect::<Vec<_>>());
     }
 
     #[test]
-    fn a_sensor_beyond_the_range_that_lies_is_not_believed() {
+    fn a_faulty_sensor_beyond_the_range_is_rejected() {
         const NEVER: [u64; 0] = [];
         let stuck = Vector3::new(2.5, -1.0, 1.5);
-        assert_eq!(believed(|_, _| stuck), NEVER);
-        assert_eq!(believed(|_, rate| 1.5 * rate), NEVER);
-        assert_eq!(believed(|_, rate| rate + Vector3::new(50.0, 0.0, 0.0)), NEVER);
-        assert_eq!(believed(|tick, rate| if tick % 5 == 0 { 3.0 * rate } else { rate }), NEVER);
-        assert_eq!(believed(|_, _| Vector3::repeat(f64::MAX)), NEVER);
-        let then_stuck = believed(|tick, rate| if tick < 30 { rate } else { stuck });
+        assert_eq!(accepted(|_, _| stuck), NEVER);
+        assert_eq!(accepted(|_, rate| 1.5 * rate), NEVER);
+        assert_eq!(accepted(|_, rate| rate + Vector3::new(50.0, 0.0, 0.0)), NEVER);
+        assert_eq!(accepted(|tick, rate| if tick % 5 == 0 { 3.0 * rate } else { rate }), NEVER);
+        assert_eq!(accepted(|_, _| Vector3::repeat(f64::MAX)), NEVER);
+        let then_stuck = accepted(|tick, rate| if tick < 30 { rate } else { stuck });
         assert_eq!(then_stuck, (1 + SUSPECT_SAMPLES..30).collect::<Vec<_>>());
     }
 
     #[test]
-    fn a_reader_that_needs_a_component_does_not_do_without() {
-        let lame = RateMeasurement { valid: 0b011, ..measurement(0, 1.0) };
-        assert!(LIMITS.measurement(&sensed(false), 1e-3, 0b011).accepts(&lame));
-        assert!(!LIMITS.measurement(&sensed(false), 1e-3, ALL).accepts(&lame));
+    fn a_measurement_without_a_needed_component_is_rejected() {
+        let incomplete = RateMeasurement { valid: 0b011, ..measurement(0, 1.0) };
+        assert!(LIMITS.measurement(&sensed(false), 1e-3, 0b011).accepts(&incomplete));
+        assert!(!LIMITS.measurement(&sensed(false), 1e-3, ALL).accepts(&incomplete));
     }
 
     #[test]
-    fn an_estimate_that_lacks_a_component_says_why_or_is_not_believed() {
+    fn an_incomplete_estimate_is_accepted_only_with_its_reason() {
         let estimate = |valid, status| RateEstimate { valid, status, ..RateEstimate::default() };
         let mut guard = LIMITS.estimate(&Vector3::repeat(1.0), 1e-3);
         assert!(guard.accepts(&estimate(ALL, 0)) && guard.accepts(&estimate(0b011, status::INITIAL)));
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quiet_estimate_moves_with_the_body_and_the_correction() {
+    fn body_and_correction_bound_the_rate_of_change_of_a_noise_free_estimate() {
         let limits = Limits { correction_per_s: 6.0, ..LIMITS };
         let slew = 0.5 * 9.0 + 6.0 * 6.0;
         let estimate = |tick, rate| {
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_beyond_the_actuators_is_refused() {
+    fn a_command_beyond_the_actuators_is_rejected() {
         let command = |value| RateCommand { acceleration_rad_s2: [0.0, value, 0.0], ..RateCommand::default() };
         let mut guard = LIMITS.command();
         assert!(guard.accepts(&command(-8.0)));

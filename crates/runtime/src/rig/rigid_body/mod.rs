@@ -1,7 +1,8 @@
-//! The rig `rigid-body`: a leader with a component of its angular velocity unmeasured or lost, and followers that turn as
+//! The rig `rigid-body`: a leader with one component of its angular velocity unmeasured or lost, and followers that turn as
 //! it does.
 //!
-//! Parameters, and the glue between samples and vectors; the mathematics is in `model`, `observe` and `control`.
+//! This module holds parameters and the conversion between samples and vectors. The mathematics is in `model`, `observe` and
+//! `control`.
 
 mod config;
 mod design;
@@ -35,13 +36,13 @@ use limits::{MAX_TURN_RAD, Sensed};
 use nalgebra::{Vector1, Vector3};
 
 impl RigidBodyRig {
-    /// The component that the observer supplies, 0 to 2; where there is none, any serves.
+    /// Returns the component that the observer supplies, 0 to 2. If it supplies none, any component serves.
     #[inline]
     fn supplied(&self) -> usize {
         self.supplied_axis.unwrap_or(3) - 1
     }
 
-    /// Bounds on the leader's |a|: what an observer has to learn is not used in guarding it either.
+    /// Returns bounds on the leader's |a|. Coefficients that an observer must learn are not used by the guards either.
     fn leader_coefficients(&self) -> Vector3<f64> {
         match &self.observer {
             ObserverDesign::Hidden { .. } => self.inertia.coefficients().abs(),
@@ -80,7 +81,7 @@ impl RigidBodyRig {
             checks.require(guess_rad_s.abs() < limit_rad_s, "observer.initial_guess_rad_s", "ambiguous-phase", || {
                 format!("at {guess_rad_s} rad/s the phase would be ambiguous from tick to tick; guess nearer to 0")
             });
-            // A leader at rest needs no observer and passes.
+            // A leader at rest needs no observer and passes this check.
             let floor_rad_s = relation.floor_rad_s();
             checks.require(m == 0.0 || floor_rad_s < m, "observer.observability_floor_rad_s", "never-observed", || {
                 format!(
@@ -101,13 +102,13 @@ impl RigidBodyRig {
         }
     }
 
-    /// A body as it moves, with its own inertia.
+    /// Returns a body's dynamics with its own inertia.
     fn moved(&self, index: usize) -> RigidBody {
         let own = self.inertia.moments_kg_m2().component_mul(&self.inertia_factors[index]);
         Inertia::new(own.into()).map_or(RigidBody::new(&self.inertia), |own| RigidBody::new(&own))
     }
 
-    /// A body as its measurements show it.
+    /// Returns the properties that a body's measurements show.
     fn sensed(&self, index: usize) -> Sensed {
         Sensed {
             // A follower may have another inertia.
@@ -120,7 +121,7 @@ impl RigidBodyRig {
         }
     }
 
-    /// The law of any follower but for what it keeps of its own.
+    /// Returns the law that all followers share, and its parameters.
     fn synchronizer(&self) -> (Synchronizer, ControllerDesign) {
         let Some(controller) = self.controller else {
             unreachable!("a scenario with a follower has a controller: checked when it was resolved")
@@ -129,23 +130,23 @@ impl RigidBodyRig {
         (Synchronizer::new(RigidBody::new(&self.inertia), controller.gain_per_s, lead_s), controller)
     }
 
-    /// The delay that the law does not predict over, ticks.
+    /// Returns the delay that the law does not predict, ticks.
     fn unpredicted_ticks(&self, controller: &ControllerDesign) -> u64 {
         if controller.predict { 0 } else { self.actuation_delay_ticks }
     }
 
-    /// Over how many ticks the law predicts, if it does.
+    /// Returns the number of ticks that the law predicts, if it predicts.
     fn predicted_ticks(&self, controller: &ControllerDesign) -> u64 {
         if controller.predict { self.actuation_delay_ticks } else { 1 }
     }
 
     fn certify(&self) -> Option<Certificate> {
         let controller = self.controller?;
-        // It is about leaders that move freely.
+        // The certificate applies to leaders that move freely.
         if self.playback.is_some() {
             return None;
         }
-        // The papers' conditions are about the papers' filter.
+        // The papers' conditions apply to the papers' filter.
         let decay_rate_per_s = match &self.observer {
             ObserverDesign::Hidden { filter: FilterDesign::First([decay]), .. } => *decay,
             ObserverDesign::Hidden { .. } => return None,
@@ -164,7 +165,7 @@ impl RigidBodyRig {
 }
 
 impl RigidBodyRig {
-    /// Which of all metrics there are, the first and the one after the last: without a follower there is only the inertia.
+    /// Returns the range of the metrics that apply, as first and end index. Without a follower only the inertia is scored.
     fn scored(&self) -> (usize, usize) {
         match (&self.observer, self.controller) {
             (ObserverDesign::Hidden { .. }, _) => (0, 2),
@@ -173,13 +174,14 @@ impl RigidBodyRig {
         }
     }
 
-    /// Why nothing can be watched, if so.
+    /// Returns the reason why nothing can be watched, if there is one.
     fn uncontrolled(&self) -> Option<&'static str> {
         self.controller.is_none().then_some("is watched by the controller, and this scenario has none")
     }
 }
 
-/// What the controller can watch. Energy and momentum are per I1, which is what a free motion tells of the inertia.
+/// The quantities that the controller can watch. Energy and momentum are divided by I1: a free motion reveals only ratios of the
+/// moments of inertia.
 const MONITORS: [Monitor<RigidBodyRig>; 4] = [
     Monitor {
         name: "energy_drift",
@@ -212,7 +214,7 @@ const MONITORS: [Monitor<RigidBodyRig>; 4] = [
     },
 ];
 
-/// The angular momentum per I1 in the body's axes, as estimated.
+/// Returns the estimated angular momentum divided by I1, in the body's axes.
 fn momentum(estimate: &RateEstimate) -> Vector3<f64> {
     let [second, third] = estimate.inertia_ratios;
     Vector3::from(estimate.omega_rad_s).component_mul(&Vector3::new(1.0, second, third))
@@ -301,7 +303,7 @@ impl Rig for RigidBodyRig {
         })
     }
 
-    /// A law acts on all components; an observer says itself which it needs.
+    /// A law needs all components. An observer checks itself which components it needs.
     fn measurement_guard(&self, index: usize, acts: bool) -> MeasurementGuard {
         self.limits.measurement(&self.sensed(index), self.tick_s, if acts { ALL } else { 0 })
     }
@@ -332,7 +334,8 @@ impl Rig for RigidBodyRig {
         ["sync_error_rad_s", "estimate_error_rad_s", "coefficient_error"][first..end].to_vec()
     }
 
-    /// |p − ω| of the worst follower, of all bodies of fleets too, |ω̂ − ω|, |â − a|; as [`metrics`](Rig::metrics) lists them.
+    /// Writes |p − ω| of the worst follower, all bodies of fleets included, |ω̂ − ω| and |â − a|, as [`metrics`](Rig::metrics) lists
+    /// them.
     #[inline]
     fn score<'a>(
         &self,
@@ -363,7 +366,7 @@ impl Rig for RigidBodyRig {
     }
 
     fn isolated(&self, index: usize, start: Start, noisy: bool) -> Option<Self> {
-        // What is proven and computed of a loop is about a leader that moves freely.
+        // Certificate and loop analysis apply to a leader that moves freely.
         if self.playback.is_some() {
             return None;
         }
@@ -388,7 +391,7 @@ impl Rig for RigidBodyRig {
             match &mut rig.observer {
                 ObserverDesign::Hidden { guess_rad_s, .. } => *guess_rad_s = leader[self.supplied()] + off,
                 ObserverDesign::Learner(parts) => {
-                    // Coefficients are at most 1 where rates are of the leader's size.
+                    // Coefficients are at most 1; the displacement is scaled by the size of the leader's rates.
                     let off = off / leader.norm().max(f64::MIN_POSITIVE);
                     let begun = self.inertia.coefficients() + Vector3::new(1.0, -0.6, 0.8) * off;
                     parts.identifier = parts.identifier.clone().with_guess(&begun);
@@ -400,7 +403,7 @@ impl Rig for RigidBodyRig {
 
     fn pictures() -> Vec<Picture> {
         let plane = |title, axes, point| {
-            let caption = "Angular velocity in a plane. A dot is where a path begins.";
+            let caption = "Angular velocity in a plane. A dot marks the start of a path.";
             Picture::Plane(Plane { title, axes, caption, point, centred: false, compared: None })
         };
         let graph = |axis: usize| {
@@ -418,17 +421,17 @@ impl Rig for RigidBodyRig {
                 field: "coefficients",
                 element: axis - 1,
                 axis: format!("a{axis}"),
-                caption: format!("The coefficient a{axis} of [D](2) as it is learned."),
+                caption: format!("The coefficient a{axis} of [D](2) as the observer learns it."),
             })
         };
         let inputs =
             Inputs { field: "applied_rad_s2", axis: "control acceleration, rad/s²", components: &["u1", "u2", "u3"] };
         vec![
-            plane("angular velocities in the plane ω1 ω2", ["ω1, rad/s", "ω2, rad/s"], |of| {
-                Some([of("omega_rad_s", 0)?, of("omega_rad_s", 1)?])
+            plane("angular velocities in the plane ω1 ω2", ["ω1, rad/s", "ω2, rad/s"], |element| {
+                Some([element("omega_rad_s", 0)?, element("omega_rad_s", 1)?])
             }),
-            plane("angular velocities in the plane ω2 ω3", ["ω2, rad/s", "ω3, rad/s"], |of| {
-                Some([of("omega_rad_s", 1)?, of("omega_rad_s", 2)?])
+            plane("angular velocities in the plane ω2 ω3", ["ω2, rad/s", "ω3, rad/s"], |element| {
+                Some([element("omega_rad_s", 1)?, element("omega_rad_s", 2)?])
             }),
             graph(1),
             graph(2),

@@ -8,7 +8,7 @@ use crate::state::persist_fields;
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// A gyro that is dead for a while.
+/// A time in which a gyro is dead.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Outage {
     /// The component, 0 to 2.
@@ -24,15 +24,15 @@ pub(super) struct Outage {
 pub struct RatePlant {
     pub(super) body: RigidBody,
     pub(super) rate: Vector3<f64>,
-    /// What the last command asked for, and what it does to this body.
+    /// The commanded acceleration, before the body's own inertia acts on it.
     pub(super) asked: Vector3<f64>,
-    /// This body's inertia over the nominal one, per axis: torques are sized by the latter.
+    /// This body's inertia over the nominal one, per axis. Torques are sized by the nominal one.
     pub(super) inertia_factor: Vector3<f64>,
     /// Bit i set: component i has a gyro.
     pub(super) measured: u64,
     pub(super) noise: Noise<3>,
     pub(super) outages: Vec<Outage>,
-    /// What it repeats instead of moving by itself, and how far it is, s.
+    /// The motion that it plays back instead of moving freely, and the time played so far, s.
     pub(super) playback: Option<Arc<Playback>>,
     pub(super) played_s: f64,
 }

@@ -1,6 +1,6 @@
-//! A leader that repeats a motion which was recorded: angular velocities from a log, joined by cubics.
+//! A leader that plays back a recorded motion: angular velocities from a log, interpolated by cubics.
 //!
-//! Must not know of ticks, nor repair what the log lacks: its segment is taken as the reader gives it.
+//! This file knows no ticks, and does not repair the log: a segment is taken as the reader returns it.
 
 use crate::data::{DataError, Log, Options, RateUnit, TimeUnit};
 use nalgebra::{Matrix3, Vector3};
@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3Default;
 
-/// The logs that ship with the program, for its scenarios: name and text.
+/// The logs that ship with the program, by name, for its scenarios.
 const SHIPPED: [(&str, &str); 1] = [("tumbling-throw.csv", include_str!("../../../config/tumbling-throw.csv"))];
-/// By how much axes may miss being a rotation.
+/// The largest deviation of the axes from a rotation.
 const ROTATION: f64 = 1e-6;
 
-/// How a log is read and played, as typed.
+/// The options of reading and playing a log, as typed.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct RawPlayback {
@@ -38,30 +38,30 @@ pub(super) struct RawPlayback {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub headerless: Option<bool>,
     pub at_end: AtEnd,
-    /// Of what was read; filled in when a scenario is resolved.
+    /// The hash of the samples, filled in when a scenario is resolved.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub hash: Option<String>,
 }
 
-/// What becomes of a run that is longer than the log.
+/// The treatment of a run that is longer than the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum AtEnd {
-    /// It is refused.
+    /// The run is refused.
     #[default]
     Refuse,
-    /// The motion begins again, joined to its end over one usual interval.
+    /// The motion starts again; one usual interval joins its end and start.
     Repeat,
 }
 
-/// Why there is no motion to play.
+/// An error of loading a motion.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub(super) enum PlaybackError {
     #[error(transparent)]
     #[strum(transparent)]
     Data(#[from] DataError),
-    #[error("`{0}` is no unit {1}")]
+    #[error("`{0}` is not a unit {1}")]
     #[strum(serialize = "unknown-unit")]
     Unit(String, &'static str),
     #[error("{path} has {segments} segments; name one with leader.playback.segment, one of: {names}")]
@@ -70,23 +70,21 @@ pub(super) enum PlaybackError {
     #[error("{path} has no segment `{segment}`; it has: {names}")]
     #[strum(serialize = "no-such-segment")]
     NoSegment { path: String, segment: String, names: String },
-    #[error(
-        "the motion in {path} has {samples} samples, and two are the least that can be joined; name a longer segment"
-    )]
+    #[error("the motion in {path} has {samples} samples, and interpolation needs two; name a longer segment")]
     #[strum(serialize = "log-too-short")]
     Short { path: String, samples: usize },
     #[error(
-        "{path} is not what it was when this scenario was resolved: its samples have the hash {found}; bring the old file \
-         back, or remove leader.playback.hash"
+        "{path} has changed since this scenario was resolved: its samples have the hash {found}; restore the old file, \
+         or remove leader.playback.hash"
     )]
     #[strum(serialize = "log-changed")]
     Changed { path: String, found: String },
-    #[error("the axes are no rotation: their columns must be of length 1, at right angles, and right-handed")]
+    #[error("the axes are not a rotation: their columns must have length 1, be at right angles, and be right-handed")]
     #[strum(serialize = "no-rotation")]
     Axes,
 }
 
-/// One sample with the slope of the motion there.
+/// One sample with the slope of the motion at it.
 #[derive(Debug, Clone, Copy)]
 struct Knot {
     time_s: f64,
@@ -98,15 +96,15 @@ struct Knot {
 #[derive(Debug)]
 pub(super) struct Playback {
     knots: Vec<Knot>,
-    /// How many samples there are, also of those that are not kept.
+    /// The number of samples, including those that are not kept.
     count: usize,
-    /// When it is over, or begins again, s.
+    /// The time at which the motion is over or starts again, s.
     end_s: f64,
     repeats: bool,
     hash: u64,
 }
 
-/// The samples of a motion as they are read.
+/// The samples of a motion while they are read.
 struct Motion {
     samples: Vec<(f64, Vector3<f64>)>,
     keep_s: f64,
@@ -117,7 +115,7 @@ struct Motion {
 }
 
 impl Motion {
-    /// None yet; those that are needed up to a time are kept.
+    /// Creates an empty motion that keeps the samples needed up to `keep_s`.
     fn new(keep_s: f64) -> Self {
         Self { samples: Vec::new(), keep_s, begin_s: 0.0, end_s: 0.0, count: 0, hash: Xxh3Default::new() }
     }
@@ -128,7 +126,7 @@ impl Motion {
         }
         (self.count, self.end_s) = (self.count + 1, time_s - self.begin_s);
         [self.end_s, rate.x, rate.y, rate.z].iter().for_each(|value| self.hash.update(&value.to_bits().to_le_bytes()));
-        // The slope at the sample behind the end takes one more.
+        // The slope at the sample after the end needs one more.
         let behind = self.samples.iter().rev().take(2).filter(|(time_s, _)| *time_s > self.keep_s).count();
         if behind < 2 {
             self.samples.push((self.end_s, rate));
@@ -136,15 +134,15 @@ impl Motion {
     }
 }
 
-/// So many names of segments are told.
-const NAMES_TOLD: usize = 12;
+/// The largest number of segment names in an error.
+const NAMES_LISTED: usize = 12;
 
 impl RawPlayback {
     fn options(&self) -> Result<Options, PlaybackError> {
-        let unit = |name: &Option<String>, of: &'static str| name.clone().map(|name| (name, of));
+        let unit = |name: &Option<String>, quantity: &'static str| name.clone().map(|name| (name, quantity));
         let time_unit = unit(&self.time_unit, "of time: s, ms, us or ns");
         let rate_unit = unit(&self.rate_unit, "of angular velocity: rad/s or deg/s");
-        let unknown = |(name, of): (String, &'static str)| PlaybackError::Unit(name, of);
+        let unknown = |(name, quantity): (String, &'static str)| PlaybackError::Unit(name, quantity);
         Ok(Options {
             topic: self.topic.clone(),
             time: self.time.clone(),
@@ -161,12 +159,12 @@ impl RawPlayback {
     fn rotation(&self) -> Result<Matrix3<f64>, PlaybackError> {
         let axes = self.axes.map_or_else(Matrix3::identity, |rows| Matrix3::from_fn(|row, column| rows[row][column]));
         let defect = (axes.transpose() * axes - Matrix3::identity()).amax();
-        // What is no number is no rotation either.
+        // The comparison also rejects NaN.
         if defect < ROTATION && axes.determinant() > 0.0 { Ok(axes.transpose()) } else { Err(PlaybackError::Axes) }
     }
 
     /// Reads the motion in a file, or in a log that ships with the program if there is no such file. A log may be larger than
-    /// memory: unless it is repeated, nothing is kept of it that is not played in `duration_s`.
+    /// memory: unless the motion repeats, only what is played in `duration_s` is kept.
     pub fn load(&self, path: &Path, duration_s: f64) -> Result<Playback, PlaybackError> {
         let (options, own) = (self.options()?, self.rotation()?);
         let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
@@ -188,13 +186,13 @@ impl RawPlayback {
             }
         }
         let path = log.path().display().to_string();
-        let told = || names.iter().take(NAMES_TOLD).cloned().collect::<Vec<_>>().join(", ");
+        let listed = || names.iter().take(NAMES_LISTED).cloned().collect::<Vec<_>>().join(", ");
         match &self.segment {
             None if names.len() > 1 => {
-                return Err(PlaybackError::Several { path, segments: names.len(), names: told() });
+                return Err(PlaybackError::Several { path, segments: names.len(), names: listed() });
             }
             Some(segment) if motion.count == 0 => {
-                return Err(PlaybackError::NoSegment { path, segment: segment.clone(), names: told() });
+                return Err(PlaybackError::NoSegment { path, segment: segment.clone(), names: listed() });
             }
             _ if motion.count < 2 => return Err(PlaybackError::Short { path, samples: motion.count }),
             _ => {}
@@ -207,7 +205,7 @@ impl RawPlayback {
     }
 }
 
-/// Where a log is: one that ships with the program by its name alone.
+/// Returns the path of a log: its name alone for a log that ships with the program, otherwise an absolute path.
 pub(super) fn locate(path: PathBuf) -> PathBuf {
     let shipped = SHIPPED.iter().find(|(name, _)| path.file_name().is_some_and(|own| own == *name) && !path.exists());
     match shipped {
@@ -217,8 +215,8 @@ pub(super) fn locate(path: PathBuf) -> PathBuf {
 }
 
 impl Playback {
-    /// The motion through at least two samples at rising times, which begins at the first. The slope at a sample is that
-    /// of the parabola through it and its neighbours.
+    /// Creates the motion through at least two samples at rising times; it starts at the first. The slope at a sample is that of
+    /// the parabola through it and its neighbours.
     fn new(motion: Motion, repeats: bool) -> Self {
         let Motion { samples, count, mut end_s, hash, .. } = motion;
         let mut knots = joined(&samples);
@@ -226,45 +224,45 @@ impl Playback {
             let mut intervals: Vec<f64> = samples.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
             intervals.sort_by(f64::total_cmp);
             end_s += intervals[intervals.len() / 2];
-            // The motion itself is the same as if it were not repeated.
+            // Repetition does not change the motion itself.
             knots.push(Knot { time_s: end_s, ..knots[0] });
         }
         Self { knots, count, end_s, repeats, hash: hash.digest() }
     }
 
-    /// The samples' identity.
+    /// Returns the hash of the samples.
     pub fn hash(&self) -> String {
         format!("{:016x}", self.hash)
     }
 
-    /// How long it is, s: after that it begins again, or there is nothing.
+    /// Returns the length of the motion, s. After it, the motion starts again or is over.
     pub fn length_s(&self) -> f64 {
         self.end_s
     }
 
-    /// How many samples it has, and the largest distance of those that are played, s.
+    /// Returns the number of samples, and the largest interval between played ones, s.
     pub fn sampling(&self) -> (usize, f64) {
         let longest_s = self.knots.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).fold(0.0, f64::max);
         (self.count, longest_s)
     }
 
-    /// Whether it begins again at its end.
+    /// Returns true if the motion starts again at its end.
     pub fn repeats(&self) -> bool {
         self.repeats
     }
 
-    /// The angular velocity at a time since the beginning, rad/s; at the end the last one, or that of the motion begun again.
+    /// Returns the angular velocity at a time since the start, rad/s. After the end it is the last one, or that of the repetition.
     pub fn at(&self, time_s: f64) -> Vector3<f64> {
         let time_s = if self.repeats { time_s % self.length_s() } else { time_s };
         at(&self.knots, time_s)
     }
 
-    /// Bounds on the magnitude and on each component of the slope between all samples, rad/s and rad/s².
+    /// Returns bounds on the magnitude, rad/s, and on each component of the slope, rad/s², at all times.
     pub fn bounds(&self) -> (f64, Vector3<f64>) {
         let (mut rate, mut slope) = (0.0_f64, Vector3::zeros());
         for pair in self.knots.windows(2) {
             let ([from, to], span_s) = ([pair[0], pair[1]], pair[1].time_s - pair[0].time_s);
-            // A cubic lies within the hull of its Bézier points, and its derivative within that of its own.
+            // A cubic lies within the hull of its Bézier points, and its derivative within the hull of its own.
             let inner = [from.rate + from.slope * (span_s / 3.0), to.rate - to.slope * (span_s / 3.0)];
             for point in [from.rate, inner[0], inner[1], to.rate] {
                 rate = rate.max(point.norm());
@@ -276,10 +274,10 @@ impl Playback {
         (rate, slope)
     }
 
-    /// By how much the motion through every second sample misses the others, at the most, rad/s: with samples twice as far
-    /// apart. That of all samples misses what lies between them by about an eighth of that, the noise aside.
+    /// Returns the largest error of interpolating every second sample, measured at the others, rad/s. Interpolation of all samples
+    /// errs by about an eighth of it, apart from noise.
     pub fn coarse_error_rad_s(&self) -> Option<f64> {
-        // The knot by which it is repeated is no sample.
+        // The knot that closes the repetition is not a sample.
         let own = &self.knots[..self.knots.len() - usize::from(self.repeats)];
         let samples: Vec<(f64, Vector3<f64>)> = own.iter().map(|knot| (knot.time_s, knot.rate)).collect();
         let kept: Vec<_> = samples.iter().step_by(2).copied().collect();
@@ -292,7 +290,7 @@ impl Playback {
     }
 }
 
-/// The samples with their slopes.
+/// Returns the samples with their slopes.
 fn joined(samples: &[(f64, Vector3<f64>)]) -> Vec<Knot> {
     let chord = |from: usize| (samples[from + 1].1 - samples[from].1) / (samples[from + 1].0 - samples[from].0);
     let last = samples.len() - 1;
@@ -300,7 +298,7 @@ fn joined(samples: &[(f64, Vector3<f64>)]) -> Vec<Knot> {
         if last == 1 {
             return chord(0);
         }
-        // At an end the parabola is that of the three samples there.
+        // At an end, use the parabola through the three samples there.
         let middle = at.clamp(1, last - 1);
         let (before, after) = (chord(middle - 1), chord(middle));
         let [t0, t1, t2] = [middle - 1, middle, middle + 1].map(|index| samples[index].0);
@@ -310,7 +308,7 @@ fn joined(samples: &[(f64, Vector3<f64>)]) -> Vec<Knot> {
     (0..samples.len()).map(|at| Knot { time_s: samples[at].0, rate: samples[at].1, slope: slope(at) }).collect()
 }
 
-/// The cubic through both neighbours with their slopes (Hermite); beyond the ends what is there.
+/// Evaluates the cubic Hermite interpolant between the neighbouring knots; beyond the ends the rate of the end.
 fn at(knots: &[Knot], time_s: f64) -> Vector3<f64> {
     let behind = knots.partition_point(|knot| knot.time_s <= time_s);
     let (Some(from), Some(to)) = (behind.checked_sub(1).map(|index| knots[index]), knots.get(behind)) else {
@@ -327,7 +325,7 @@ fn at(knots: &[Knot], time_s: f64) -> Vector3<f64> {
 mod tests {
     use super::*;
 
-    /// A motion with known derivatives, sampled at uneven times.
+    /// Returns a motion with known derivatives.
     fn wave(time_s: f64) -> Vector3<f64> {
         Vector3::new((3.0 * time_s).sin(), (2.0 * time_s).cos(), 0.3 * time_s)
     }
@@ -351,20 +349,20 @@ mod tests {
     }
 
     #[test]
-    fn samples_are_met_and_the_error_between_them_falls_with_their_distance() {
+    fn the_motion_meets_its_samples_and_its_error_falls_with_their_distance() {
         let fine = through(&sampled(0.01, 201), false);
         for (time_s, rate) in sampled(0.01, 201) {
             assert!((fine.at(time_s - 5.0) - rate).norm() < 1e-12);
         }
         let coarse = through(&sampled(0.02, 101), false);
         let [fine_error, coarse_error] = [worst(&fine, 2.0), worst(&coarse, 2.0)];
-        assert!(fine_error < coarse_error / 6.0, "{fine_error} {coarse_error}: of third order at least");
-        let told = fine.coarse_error_rad_s().unwrap();
-        assert!(told > fine_error && told < 2.0 * coarse_error, "{told} {fine_error} {coarse_error}");
+        assert!(fine_error < coarse_error / 6.0, "{fine_error} {coarse_error}: at least of third order");
+        let reported = fine.coarse_error_rad_s().unwrap();
+        assert!(reported > fine_error && reported < 2.0 * coarse_error, "{reported} {fine_error} {coarse_error}");
     }
 
     #[test]
-    fn its_bounds_hold_everywhere() {
+    fn the_bounds_hold_at_all_times() {
         let playback = through(&sampled(0.05, 40), true);
         let (rate, slope) = playback.bounds();
         let step_s = 1e-4;
@@ -376,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn it_ends_or_begins_again() {
+    fn the_motion_ends_or_repeats() {
         let samples = [(1.0, Vector3::x()), (2.0, Vector3::y()), (3.0, Vector3::z())];
         let once = through(&samples, false);
         assert_eq!(
@@ -396,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_played_is_not_kept_and_yet_counted() {
+    fn samples_that_are_not_played_are_counted_but_not_kept() {
         let mut motion = Motion::new(0.5);
         sampled(0.01, 1001).iter().for_each(|(time_s, rate)| motion.add(*time_s, *rate));
         assert_eq!(motion.samples.len(), 53);
@@ -406,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn one_segment_is_played_and_it_is_said_which_there_are() {
+    fn one_segment_is_played_and_errors_list_the_segments() {
         let text = "throw,t,wx,wy,wz\na,0,1,2,3\na,0.1,2,2,3\nb,0,5,0,0\nb,0.1,6,0,0\nb,0.2,7,0,0\nc,0,1,1,1\n";
         let by = RawPlayback { by: Some("throw".into()), ..RawPlayback::default() };
         let refused = load(text, &by).unwrap_err().to_string();
@@ -420,11 +418,14 @@ mod tests {
         assert_eq!(load(text, &kept).unwrap().hash(), found.hash());
         assert!(matches!(load(&text.replace("6,0,0", "6,0,1"), &kept), Err(PlaybackError::Changed { .. })));
         let bad = RawPlayback { rate_unit: Some("rpm".into()), ..named("b") };
-        assert_eq!(load(text, &bad).unwrap_err().to_string(), "`rpm` is no unit of angular velocity: rad/s or deg/s");
+        assert_eq!(
+            load(text, &bad).unwrap_err().to_string(),
+            "`rpm` is not a unit of angular velocity: rad/s or deg/s"
+        );
     }
 
     #[test]
-    fn axes_turn_the_motion_and_must_be_a_rotation() {
+    fn axes_rotate_the_motion_and_must_be_a_rotation() {
         let text = "t,wx,wy,wz\n0,1,2,3\n0.1,1,2,3\n";
         let turned =
             RawPlayback { axes: Some([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), ..RawPlayback::default() };

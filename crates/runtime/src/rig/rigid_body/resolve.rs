@@ -1,6 +1,6 @@
-//! Reads and checks the sections of this rig, and designs what follows from them.
+//! Reads and checks the tables of this rig, and designs observer, law and limits from them.
 //!
-//! Must name the key and the remedy of everything it refuses, all at once.
+//! Every refusal names the key and the remedy, and all refusals are reported at once.
 
 use super::config::{self, Coefficients, IdentifierDecay, Kind, Raw, RawLeader, RawObserver};
 use super::design::{ControllerDesign, ObserverDesign, RigidBodyRig};
@@ -16,11 +16,11 @@ use crate::rig::{BodyInfo, Context};
 use nalgebra::{Matrix3, Vector1, Vector3};
 use std::sync::Arc;
 
-/// Part of the leader's rate by which rounding may move the estimate of the hidden component. With fewer than three digits it
-/// is no estimate; a floor between that and the usual one is told with the loop's claim.
+/// The largest part of the leader's rate by which rounding may move the hidden component's estimate. Beyond it the estimate has
+/// fewer than three digits and is refused. A floor between this and the usual one is reported with the loop's claim.
 const LARGEST_ROUNDING: f64 = 1e-3;
 
-/// Reads and checks the sections of this rig.
+/// Reads and checks the tables of this rig.
 pub(super) fn resolve(
     sections: &Document,
     context: Context,
@@ -86,15 +86,15 @@ pub(super) fn resolve(
     Ok((Some(rig), table))
 }
 
-/// Settings of axes that the leader does not measure, and so without effect.
+/// Returns warnings about settings of axes that the leader does not measure: they have no effect.
 fn unmeasured(leader: &RawLeader) -> impl Iterator<Item = String> {
-    let of = |key: &'static str, values: [f64; 3]| {
+    let warnings = |key: &'static str, values: [f64; 3]| {
         let measured = &leader.measured_axes;
         (1..=3).filter(move |axis| values[axis - 1] != 0.0 && !measured.contains(axis)).map(move |axis| {
             format!("leader.{key} is set for axis {axis}, which is not measured: it has no effect there")
         })
     };
-    of("noise_rad_s", leader.noise_rad_s).chain(of("bias_rad_s", leader.bias_rad_s))
+    warnings("noise_rad_s", leader.noise_rad_s).chain(warnings("bias_rad_s", leader.bias_rad_s))
 }
 
 fn noise(context: Context, stream: u64, deviation: [f64; 3], bias: [f64; 3]) -> Noise<3> {
@@ -139,12 +139,12 @@ fn resolve_outages(raw: &Raw, tick_s: f64, checks: &mut Checks<'_>) -> Vec<Outag
     outages
 }
 
-/// A bound on the leader's rate, rad/s.
+/// Returns a bound on the leader's rate, rad/s.
 fn leader_bound_rad_s(leader: &RawLeader, inertia: &Inertia, playback: Option<&Playback>) -> f64 {
     playback.map_or_else(|| inertia.rate_bound_rad_s(&leader.initial()), |playback| playback.bounds().0)
 }
 
-/// The motion that the leader repeats, if it repeats one; its file and its samples are named in the scenario from here on.
+/// Loads the motion that the leader plays back, if any, and records its file and the hash of its samples in the scenario.
 fn load_playback(
     leader: &mut RawLeader,
     context: Context,
@@ -169,7 +169,7 @@ fn load_playback(
     ));
     if let Some(error) = playback.coarse_error_rad_s() {
         notes.push(format!(
-            "leader.data: through every second sample the cubics miss the others by at most {error:.3e} rad/s, noise included"
+            "leader.data: cubics through every second sample miss the other samples by at most {error:.3e} rad/s, noise included"
         ));
     }
     raw.hash = Some(playback.hash());
@@ -190,7 +190,7 @@ fn design_limits(raw: &Raw, leader_rad_s: f64, hidden: Option<usize>, checks: &m
             .map_or(0.0, |axis| (raw.observer.initial_guess_rad_s - raw.leader.initial()[axis - 1]).abs()),
         transient_rad_s: raw.observer.initial_guess_rad_s.abs()
             + if noisy { SURE_DEVIATIONS * UNKNOWN_DEVIATION } else { 0.0 },
-        // The reconstruction that the filter follows divides noise by the tick; without noise it is the truth.
+        // The filter follows a reconstruction that divides noise by the tick. Without noise the reconstruction is exact.
         correction_per_s: match raw.observer.decay_rate_per_s {
             Some(decay) if !noisy && raw.observer.kind == Kind::HiddenRate => decay,
             _ => f64::INFINITY,
@@ -211,7 +211,7 @@ fn design_observer(
     let (observer, coefficients) = (&raw.observer, inertia.coefficients());
     let floor_rad_s = observer.observability_floor_rad_s;
     if let Some(axis) = supplied_axis {
-        // Whether it can be observed at all is a matter of the true body, also where the observer has to learn it.
+        // Observability depends on the true body, even if the observer must learn it.
         let relation = checks.accept("leader.inertia_kg_m2", HiddenRate::new(&coefficients, axis, floor_rad_s))?;
         check_digits(&relation, inertia, &raw.leader.initial(), tick_s, checks);
     }
@@ -228,7 +228,7 @@ fn design_observer(
             "observer.process_noise_rad2_s3",
             "no-noise",
             || {
-                "weighs noise, and leader.noise_rad_s has none on a measured axis; give it, or choose another filter"
+                "needs sensor noise, and leader.noise_rad_s is 0 on a measured axis; give it, or choose another filter"
                     .to_owned()
             },
         );
@@ -244,7 +244,7 @@ fn design_observer(
                 checks.refuse(
                     "observer.kind",
                     "wrong-filter",
-                    "learns with a filter of first order; give observer.decay_rate_per_s instead",
+                    "needs a first-order filter to learn; give observer.decay_rate_per_s instead",
                 );
                 return None;
             };
@@ -254,9 +254,9 @@ fn design_observer(
     }
 }
 
-/// Rounding leaves the hidden component its digits. A body whose moments are all but equal keeps its initial rates for as long
-/// as any run lasts, so they stand for the whole motion. Where they tell nothing at all, the motion is at fault, not the body:
-/// that is for the analysis of the loop to say.
+/// Checks that rounding leaves enough digits of the hidden component. A body with nearly equal moments keeps its initial rates
+/// for the whole run, so they represent its motion. If they carry no information at all, the cause is the motion and not the
+/// body, and the analysis of the loop reports it.
 fn check_digits(
     relation: &HiddenRate,
     inertia: &Inertia,
@@ -323,7 +323,7 @@ fn design_identifier(
     Some(Identifier::asymmetric(relation, filter, slowest))
 }
 
-/// A body that is said to be axisymmetric is, and spins.
+/// Checks that a body declared as axisymmetric is so, and that it spins.
 fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_s: f64, checks: &mut Checks<'_>) {
     if !(1..=3).contains(&axis) {
         return;
@@ -331,8 +331,8 @@ fn check_symmetry(leader: &RawLeader, inertia: &Inertia, axis: usize, floor_rad_
     let (spin_rad_s, moments) = (leader.initial()[axis - 1], inertia.moments_kg_m2());
     checks.require(spin_rad_s.abs() > floor_rad_s, "leader.initial_rate_rad_s", "no-spin", || {
         format!(
-            "the body does not spin about its symmetry axis {axis} ({spin_rad_s} rad/s, for ever), so its motion tells \
-             nothing of its inertia; give component {axis} a rate"
+            "the body never spins about its symmetry axis {axis} ({spin_rad_s} rad/s), so its motion carries \
+             no information on its inertia; give component {axis} a rate"
         )
     });
     checks.require(moments[axis % 3] == moments[(axis + 1) % 3], "leader.inertia_kg_m2", "not-symmetric", || {
