@@ -1,50 +1,50 @@
-//! Axes: from values to places between 0 and 1, with ticks that people can read.
+//! Axes: map values to positions between 0 and 1, with ticks at round values.
 
-/// About so many labels are on an axis; a time axis has room for more.
+/// The approximate number of labels on an axis, and on a time axis, which has room for more.
 const LABELS: f64 = 7.0;
 const TIME_LABELS: f64 = 10.0;
-/// Of a logarithmic axis no more than so many decades below its top are shown.
+/// The largest number of decades on a logarithmic axis, counted from its top.
 const DECADES: f64 = 36.0;
 
-/// With fewer labels than this a logarithmic axis has some between its decades.
+/// A logarithmic axis with fewer labels than this gets labels between its decades.
 const FEW: usize = 3;
-/// A name on an axis has at most so many letters, each so many px wide and high.
+/// The largest number of letters of a name on an axis; the width and height of a letter, px.
 const NAME: usize = 14;
 const LETTER: f64 = 6.9;
 const LINE: f64 = 17.0;
 
-/// Values that differ by less than this part of them are told by what they differ by.
+/// A range narrower than this fraction of its values is labelled by offsets from a common value.
 const SAME: f64 = 1e-3;
-/// From here to there values are told without an exponent.
+/// The range of values that are written without an exponent.
 const SMALL: f64 = 1e-2;
 const LARGE: f64 = 1e5;
 
-/// An axis.
+/// The scale of an axis with its label and ticks.
 #[derive(Debug, Clone)]
 pub struct Axis {
-    /// What it shows, with its unit.
+    /// The quantity, with its unit.
     pub label: String,
     low: f64,
     high: f64,
     logarithmic: bool,
-    /// Values that are marked, with their labels.
+    /// The marked values, with their labels.
     pub ticks: Vec<(f64, String)>,
 }
 
 impl Axis {
-    /// A linear axis from one value to another.
+    /// Returns a linear axis between two values.
     pub fn linear(label: &str, low: f64, high: f64) -> Self {
         let (low, high) = widened(low, high);
         Self::marked(label, low, high, LABELS)
     }
 
-    /// The time in the run up to its end, s.
+    /// Returns a linear axis of the time in the run, s.
     pub fn time(end_s: f64) -> Self {
         let (low, high) = widened(0.0, end_s);
         Self::marked("time in the run, s", low, high, TIME_LABELS)
     }
 
-    /// The time in the run from its first tick to its end on a logarithmic axis, s.
+    /// Returns a logarithmic axis of the time in the run, s, from the first tick on.
     pub fn log_time(tick_s: f64, end_s: f64) -> Self {
         let mut axis = Self::decades("time in the run, s, logarithmic", (tick_s, end_s));
         (axis.low, axis.high) = (tick_s.log10(), end_s.log10());
@@ -57,14 +57,14 @@ impl Axis {
         Self { label, low, high, logarithmic: false, ticks }
     }
 
-    /// A linear axis with some room on either side of the values.
+    /// Returns a linear axis with a margin of 5 % on either side of the values.
     pub fn around(label: &str, (low, high): (f64, f64)) -> Self {
         let (low, high) = widened(low, high);
         let room = 0.05 * (high - low);
         Self::linear(label, low - room, high + room)
     }
 
-    /// A logarithmic axis of whole decades over positive values. Values below it are drawn at its foot.
+    /// Returns a logarithmic axis of whole decades over positive values. Smaller values are drawn at its lower end.
     pub fn decades(label: &str, (low, high): (f64, f64)) -> Self {
         let high = if high > 0.0 && high.is_finite() { high.log10().ceil() } else { 0.0 };
         let low = if low > 0.0 && low.is_finite() { low.log10().floor() } else { high - 1.0 };
@@ -76,7 +76,7 @@ impl Axis {
         Self { label: label.to_owned(), low, high, logarithmic: true, ticks }.in_values()
     }
 
-    /// A logarithmic axis from one positive value to another, with labels between the decades where there are few of these.
+    /// Returns a logarithmic axis between two positive values, with labels between the decades if there are few decades.
     pub fn log_between(label: &str, low: f64, high: f64) -> Self {
         let mut axis = Self::decades(label, (low, high));
         let (bottom, top) = (low.log10(), high.log10());
@@ -99,7 +99,7 @@ impl Axis {
         axis
     }
 
-    /// An axis of so many equal places, each with a name; every so-manyth is written so that letters find room in `room` px.
+    /// Returns an axis of names at equal distances. If they do not fit into `room` px, only every n-th name is written.
     pub fn names(label: &str, names: &[String], room: f64, across: bool) -> Self {
         let longest = names.iter().map(|name| name.chars().count()).max().unwrap_or(0).min(NAME);
         let each = if across { LETTER * (longest as f64 + 1.5) } else { LINE };
@@ -114,10 +114,10 @@ impl Axis {
         }
     }
 
-    /// An axis of 1/(1 − p), labelled by p in percent.
+    /// Returns an axis of 1/(1 − p), labelled by p in percent.
     pub fn percentiles(greatest: f64) -> Self {
         let greatest = greatest.max(10.0);
-        let mut axis = Self::decades("percentile, on an axis of 1/(1 − p)", (1.0, greatest));
+        let mut axis = Self::decades("percentile p, scaled by 1/(1 − p)", (1.0, greatest));
         axis.high = greatest.log10();
         axis.ticks.retain(|(value, _)| *value <= greatest);
         for (index, (_, label)) in axis.ticks.iter_mut().enumerate() {
@@ -131,13 +131,13 @@ impl Axis {
         axis
     }
 
-    /// Ticks as values, where they were exponents.
+    /// Replaces the exponents in the ticks by their values.
     fn in_values(mut self) -> Self {
         self.ticks.iter_mut().for_each(|(value, _)| *value = 10_f64.powf(*value));
         self
     }
 
-    /// Where a value is: 0 at the foot, 1 at the top; what is beyond is at the edge.
+    /// Returns the position of a value: 0 at the lower end, 1 at the upper end. Values beyond an end are clamped to it.
     pub fn place(&self, value: f64) -> f64 {
         let value = if !self.logarithmic {
             value
@@ -149,23 +149,23 @@ impl Axis {
         ((value - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
     }
 
-    /// Its ends: values, or their logarithms to base 10.
+    /// The ends: values, or on a logarithmic axis their logarithms to base 10.
     pub fn ends(&self) -> [f64; 2] {
         [self.low, self.high]
     }
 
-    /// Whether equal ratios have equal distances.
+    /// Returns true if the axis is logarithmic.
     pub fn is_logarithmic(&self) -> bool {
         self.logarithmic
     }
 
-    /// The least value on it.
+    /// The smallest value on the axis.
     pub fn foot(&self) -> f64 {
         if self.logarithmic { 10_f64.powf(self.low) } else { self.low }
     }
 }
 
-/// A name that finds room on an axis.
+/// Shortens a name to the letters that fit on an axis.
 fn shortened(name: &str) -> String {
     if name.chars().count() <= NAME {
         return name.to_owned();
@@ -173,15 +173,15 @@ fn shortened(name: &str) -> String {
     name.chars().take(NAME - 1).chain(['…']).collect()
 }
 
-/// A range that can be divided: neither empty nor beyond what a difference holds.
+/// Returns a range with finite ends and a width that is not zero.
 fn widened(low: f64, high: f64) -> (f64, f64) {
-    let sane = |value: f64| if value.is_finite() { value.clamp(-1e30, 1e30) } else { 0.0 };
-    let (low, high) = (sane(low.min(high)), sane(high.max(low)));
+    let bounded = |value: f64| if value.is_finite() { value.clamp(-1e30, 1e30) } else { 0.0 };
+    let (low, high) = (bounded(low.min(high)), bounded(high.max(low)));
     let least = 1e-9 * low.abs().max(high.abs()).max(1e-6);
     if high - low < least { (low - least, high + least) } else { (low, high) }
 }
 
-/// Ticks at round values, with labels of few digits: what all of them have in common stands in the name of the axis.
+/// Returns ticks at round values. Their common offset and power of ten are moved into the label of the axis.
 fn linear_ticks(name: &str, low: f64, high: f64, labels: f64) -> (String, Vec<(f64, String)>) {
     let raw = (high - low) / (labels - 1.0);
     let decade = 10_f64.powf(raw.log10().floor());
@@ -190,7 +190,7 @@ fn linear_ticks(name: &str, low: f64, high: f64, labels: f64) -> (String, Vec<(f
     let count = (last - first).clamp(0.0, 2.0 * labels) as usize;
     let value = |n: usize| {
         let value = (first + n as f64) * step;
-        // No label says −0.
+        // Rounding must not give the label −0.
         if value.abs() < 1e-9 * step { 0.0 } else { value }
     };
     let values: Vec<f64> = (0..=count).map(value).collect();
@@ -223,12 +223,12 @@ fn linear_ticks(name: &str, low: f64, high: f64, labels: f64) -> (String, Vec<(f
     (title, values.into_iter().map(|value| (value, label(value))).collect())
 }
 
-/// How many decimals tell multiples of a step apart.
+/// Returns the number of decimals that distinguish multiples of a step.
 fn decimals(step: f64) -> usize {
     (-(step.log10() + 1e-9).floor()).max(0.0) as usize
 }
 
-/// 0.01 to 1000 as they are, the others with an exponent.
+/// Formats a power of ten: 0.01 to 1000 as a number, any other with an exponent.
 pub fn power_of_ten(exponent: i32) -> String {
     if (-2..=3).contains(&exponent) {
         return format!("{}", 10_f64.powi(exponent));
@@ -260,9 +260,9 @@ mod tests {
         assert_eq!(labels(&Axis::percentiles(20_000.0))[..5], ["0 %", "90 %", "99 %", "99.9 %", "99.99 %"]);
     }
 
-    /// A signal that is constant, or all but, or of rounding alone.
+    /// Constant and nearly constant signals, and signals of rounding errors.
     #[test]
-    fn labels_are_short_and_the_name_says_what_they_lack() {
+    fn labels_are_short_and_the_axis_label_has_the_offset_and_the_exponent() {
         let named = |low, high| {
             let axis = Axis::linear("ω1, rad/s", low, high);
             let (label, labels) = (axis.label.clone(), labels(&axis).join(" "));
@@ -282,14 +282,14 @@ mod tests {
     }
 
     #[test]
-    fn places_are_within_the_axis_whatever_the_values_are() {
-        let strange = [0.0, -1.0, 1.0, 1e300, -1e300, f64::INFINITY, f64::NAN, f64::MIN_POSITIVE, 0.877, 0.877 + 1e-16];
-        for low in strange {
-            for high in strange {
+    fn positions_are_within_the_axis_for_any_values() {
+        let extreme = [0.0, -1.0, 1.0, 1e300, -1e300, f64::INFINITY, f64::NAN, f64::MIN_POSITIVE, 0.877, 0.877 + 1e-16];
+        for low in extreme {
+            for high in extreme {
                 for axis in [Axis::linear("", low, high), Axis::around("", (low, high)), Axis::decades("", (low, high))]
                 {
                     assert!(axis.ticks.len() < 40, "{axis:?}");
-                    for value in strange.into_iter().filter(|value| !value.is_nan()) {
+                    for value in extreme.into_iter().filter(|value| !value.is_nan()) {
                         assert!((0.0..=1.0).contains(&axis.place(value)), "{axis:?} {value}");
                     }
                 }
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_logarithmic_axis_puts_decades_at_equal_distances() {
+    fn decades_are_at_equal_distances_on_a_logarithmic_axis() {
         let axis = Axis::decades("", (1e-4, 1.0));
         assert!((axis.place(1e-2) - 0.5).abs() < 1e-12 && axis.place(0.0) == 0.0 && axis.place(1e9) == 1.0);
     }

@@ -1,7 +1,7 @@
-//! Pictures as SVG: lines over axes, paths in a plane, strips of colour. Drawn with classes; the page's style has the colours.
+//! Charts as SVG: lines over axes, paths in a plane, strips of colour. Elements have classes; the page's style has the colours.
 //!
-//! Own code instead of a plotting library: a picture follows the reader's light or dark and the printer's paper by style
-//! alone, and every value that reaches it has gone through [`Columns`].
+//! Own code instead of a plotting library: the style alone adapts a chart to light or dark mode and to print, and every
+//! value has passed through [`Columns`].
 
 use super::axis::Axis;
 use super::columns::{Column, Columns, Extremes};
@@ -9,31 +9,31 @@ use super::frame::{BOTTOM, Frame, HEIGHT, LEFT, Line, RIGHT, TOP, WIDE, WIDTH};
 use super::html::escape;
 use std::fmt::Write;
 
-/// A picture over time as wide as the page, and what is named above it: a row of names, and the width of a letter in it.
-/// Pictures over time have one of two sizes, so that one drawing of the marks serves all of a size.
+/// The height of a page-wide chart over time, of a row of labels above it, and the width of a letter in it.
+/// Charts over time have one of two sizes, so that all charts of a size share one drawing of the marks.
 const WIDE_HEIGHT: f64 = 400.0;
 const ROW: f64 = 12.0;
 const LETTER: f64 = 5.6;
-/// Side of a picture of a plane.
+/// The side of a plot of a plane.
 const SQUARE: f64 = 420.0;
-/// The darkest shade of a strip; 0 is the lightest.
+/// The number of shades of a strip, from 0, the lightest.
 pub const SHADES: usize = 8;
 
-/// A picture with what its legend says.
+/// A chart with its legend.
 #[derive(Debug, Clone)]
 pub struct Picture {
     /// The SVG.
     pub svg: String,
-    /// Draws it for a screen on which a picture as wide as the page has no room.
+    /// The SVG for narrow screens, if the chart is page-wide.
     pub narrow: Option<String>,
-    /// What it is called.
+    /// The title.
     pub title: String,
-    /// Class and label of every line.
+    /// The class and label of every line.
     pub legend: Vec<(&'static str, String)>,
 }
 
 impl Picture {
-    /// The picture with its legend below it: on a page that is the caption's.
+    /// Returns the SVG with the legend below the chart. On a page the legend is in the caption.
     pub fn alone(&self) -> String {
         const KEY: f64 = 34.0;
         const LEGEND_LETTER: f64 = 6.9;
@@ -57,26 +57,26 @@ impl Picture {
         format!("{}{keys}</svg>", inside.replacen(size, &format!("0 0 {width} {whole}"), 1))
     }
 
-    /// Whether it is made to be as wide as the page.
+    /// Returns true if the chart is as wide as the page.
     pub fn is_wide(&self) -> bool {
         self.svg.starts_with(&format!("<svg viewBox=\"0 0 {WIDE} "))
     }
 }
 
-/// What is marked on every time axis, by time in s.
+/// The marks on every time axis; times in s.
 #[derive(Debug, Clone, Default)]
 pub struct Marks {
-    /// From when to when a scripted fault may act, its number, and what it is.
+    /// The start, end, number and description of every injected fault.
     pub faults: Vec<(f64, f64, usize, String)>,
-    /// When a role failed, and which.
+    /// The time and description of every incident.
     pub incidents: Vec<(f64, String)>,
-    /// From when to when samples are missing.
+    /// The intervals in which samples are missing.
     pub missing: Vec<(f64, f64)>,
-    /// From when to when an estimate lacked something.
+    /// The intervals in which the estimate is degraded or unobservable.
     pub unseen: Vec<(f64, f64)>,
 }
 
-/// Least and greatest of all values of some columns; only positive ones if `positive`.
+/// Returns the smallest and largest value of all columns; of positive values only if `positive`.
 pub fn range<'a>(all: impl IntoIterator<Item = &'a Columns<Extremes>>, positive: bool) -> (f64, f64) {
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for extremes in all.into_iter().flat_map(|columns| columns.iter().map(|(_, extremes)| extremes)) {
@@ -88,12 +88,12 @@ pub fn range<'a>(all: impl IntoIterator<Item = &'a Columns<Extremes>>, positive:
     (low, high)
 }
 
-/// Marks are drawn once in each size that pictures over time have.
+/// The size of a chart over time.
 #[derive(Debug, Clone, Copy)]
 pub enum Size {
-    /// Two beside each other.
+    /// Half as wide as the page.
     Half,
-    /// As wide as the page, with so many rows of names above it.
+    /// As wide as the page, with the given number of rows of labels above the plot.
     Whole(usize),
 }
 
@@ -117,12 +117,12 @@ fn legend(lines: &[Line]) -> Vec<(&'static str, String)> {
     lines.iter().filter(|line| !line.label.is_empty()).map(|line| (line.class, line.label.clone())).collect()
 }
 
-/// Lines over time, with the marks.
+/// Draws lines over time, with the marks.
 pub fn over_time(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
     over_time_in(Size::Half, title, x, y, lines)
 }
 
-/// The same in any size.
+/// Draws lines over time in a given size, with the marks.
 pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
     let (frame, name) = (size.frame(), size.name());
     let mut svg = frame.open_over_time(title, x, y);
@@ -139,14 +139,14 @@ pub fn over_time_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line])
     Picture { svg, narrow, legend: legend(lines), title: title.to_owned() }
 }
 
-/// Lines over any axis.
+/// Draws lines over any axis, without marks.
 pub fn plain(title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
     plain_in(Size::Half, title, x, y, lines)
 }
 
-/// The same in any size.
+/// Draws lines over any axis in a given size, without marks.
 pub fn plain_in(size: Size, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Picture {
-    // Without the rows of names, which are those of linear time.
+    // The rows of labels belong to the linear time axis only.
     let Size::Whole(_) = size else { return draw(&size.frame(), title, x, y, lines) };
     Picture { narrow: Some(plain(title, x, y, lines).svg), ..draw(&Size::Whole(0).frame(), title, x, y, lines) }
 }
@@ -159,7 +159,7 @@ fn draw(frame: &Frame, title: &str, x: &Axis, y: &Axis, lines: &[Line]) -> Pictu
     Picture { svg, narrow: None, legend: legend(lines), title: title.to_owned() }
 }
 
-/// Paths in a plane, both axes of one scale.
+/// Draws paths in a plane, with the same scale on both axes.
 pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Picture {
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     let centre_point = centre.then_some((0.0, 0.0));
@@ -168,7 +168,7 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
             (low[axis], high[axis]) = (low[axis].min(value), high[axis].max(value));
         }
     }
-    // A picture is wider than high by its margins alone.
+    // The plot itself is square.
     let half = 0.525 * (high[0] - low[0]).max(high[1] - low[1]);
     let axis = |i: usize| {
         let middle = (low[i] + high[i]) / 2.0;
@@ -186,8 +186,7 @@ pub fn plane(title: &str, names: [&str; 2], lines: &[Line], centre: bool) -> Pic
     picture
 }
 
-/// The marks of all pictures over time, to be drawn once in either size and used by each; and the larger size, with a row for
-/// every name that finds no room in those above it.
+/// Draws the marks of all charts over time once per size, and returns the page-wide size with the rows that the labels need.
 pub fn marks(x: &Axis, marks: &Marks) -> (String, Size) {
     let (rows, names) = names(x, marks);
     let whole = Size::Whole(rows);
@@ -225,7 +224,7 @@ fn marks_in(size: Size, x: &Axis, marks: &Marks, svg: &mut String) {
     let _ = write!(svg, "<path class=\"missing\" d=\"{rug}\"/></g>");
 }
 
-/// The numbers of faults above a small picture, as far as there is room, and a flag for every incident.
+/// Draws the numbers of faults above a small chart, as far as they fit, and a flag for every incident.
 fn numbers(x: &Axis, marks: &Marks, svg: &mut String) {
     let frame = Frame::TIME;
     svg.push_str("<g id=\"names-half\">");
@@ -247,13 +246,13 @@ fn numbers(x: &Axis, marks: &Marks, svg: &mut String) {
     svg.push_str("</g>");
 }
 
-/// What every fault and every incident is, above a large picture, each in the lowest row that has room; and how many rows.
+/// Draws a label for every fault and incident above a large chart, each in the lowest free row; returns the number of rows.
 fn names(x: &Axis, marks: &Marks) -> (usize, String) {
     let frame = Frame::sized(WIDE, WIDE_HEIGHT, TOP);
     let faults = marks.faults.iter().map(|(from, _, number, what)| (*from, "number", format!("{number} {what}")));
     let incidents = marks.incidents.iter().map(|(time, what)| (*time, "number bad", format!("▾ {what}")));
     let mut all: Vec<(f64, &str, String)> = faults.chain(incidents).collect();
-    all.sort_by(|one, other| one.0.total_cmp(&other.0));
+    all.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut ends: Vec<f64> = Vec::new();
     let placed: Vec<(f64, usize)> = all
         .iter()
@@ -275,7 +274,7 @@ fn names(x: &Axis, marks: &Marks) -> (usize, String) {
     (rows, svg)
 }
 
-/// Rows of shades over time; `shade` gives 0 to 1 for a column, none where there is nothing.
+/// Draws rows of shades over time; `shade` returns 0 to 1 for a column, `None` for a column without values.
 pub fn strip<C: Column>(
     title: &str,
     x: &Axis,
@@ -317,11 +316,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_picture_is_well_formed_whatever_its_names_are() {
+    fn charts_are_well_formed_for_any_label() {
         let mut columns = Columns::<Extremes>::default();
         [1.0, -2.0, f64::NAN, 3.0].iter().enumerate().for_each(|(tick, value)| columns.at(tick as u64).take(*value));
-        let line = Line::of("k", "<&\">", &columns, 1e-3);
-        assert_eq!(line.parts.iter().map(Vec::len).collect::<Vec<_>>(), [4, 2], "the gap is one");
+        let line = Line::over_time("k", "<&\">", &columns, 1e-3);
+        assert_eq!(line.parts.iter().map(Vec::len).collect::<Vec<_>>(), [4, 2], "the gap divides the line");
         let (x, y) = (Axis::linear("t <s>", 0.0, 1.0), Axis::around("\"&\"", range([&columns], false)));
         for picture in [over_time("a<b", &x, &y, std::slice::from_ref(&line)), plane("p", ["<", ">"], &[line], true)] {
             let document = roxmltree::Document::parse(&picture.svg).unwrap();
@@ -331,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn the_range_of_positive_values_leaves_out_zero() {
+    fn the_range_of_positive_values_excludes_zero() {
         let mut columns = Columns::<Extremes>::default();
         [0.0, 1e-9, 2.0].iter().enumerate().for_each(|(tick, value)| columns.at(tick as u64).take(*value));
         assert_eq!(range([&columns], true), (1e-9, 2.0));

@@ -1,18 +1,18 @@
-//! A signal of any length in a bounded number of columns that keep its extremes: what a picture of it can show, and no less.
+//! A signal of any length in a bounded number of columns that keep its extremes.
 //!
-//! Columns are as wide as they must be: when one more would not fit, pairs become one. Must not smooth or sample: whatever
-//! the signal reached within a column is in it.
+//! When the number of columns would exceed the limit, each pair is merged into one. Must not smooth or sample: a column
+//! contains every value that the signal reached in its ticks.
 
-/// Never more columns than this; at least half as many once there are as many ticks.
+/// The largest number of columns. A signal with at least as many ticks has at least half as many columns.
 pub const COLUMNS: usize = 1400;
 
-/// What a column keeps of its ticks.
+/// The values that a column keeps of its ticks.
 pub trait Column: Clone + Default {
-    /// Takes over what the column after this one has kept.
+    /// Merges the following column into this one.
     fn absorb(&mut self, later: &Self);
 }
 
-/// Columns of equal width, from tick 0 on.
+/// Columns of equal width, starting at tick 0.
 #[derive(Debug, Clone)]
 pub struct Columns<C> {
     /// Ticks per column, a power of two.
@@ -20,7 +20,7 @@ pub struct Columns<C> {
     columns: Vec<C>,
 }
 
-/// Least and greatest value, and the first one.
+/// The first, smallest and largest value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extremes {
     pub first: f64,
@@ -28,11 +28,11 @@ pub struct Extremes {
     pub max: f64,
 }
 
-/// A path's first point, and those that are farthest to each side, with their ticks.
+/// The first point of a path and its outermost points on each side, with their ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Corners([Option<(u64, f64, f64)>; 5]);
 
-/// How many.
+/// A number of ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Count(pub u64);
 
@@ -43,7 +43,7 @@ impl<C> Default for Columns<C> {
 }
 
 impl<C: Column> Columns<C> {
-    /// The column of a tick, to be written.
+    /// Returns the column of a tick, for writing.
     pub fn at(&mut self, tick: u64) -> &mut C {
         while tick / self.stride >= COLUMNS as u64 {
             self.halve();
@@ -69,28 +69,28 @@ impl<C: Column> Columns<C> {
         self.stride
     }
 
-    /// Every column with its first tick.
+    /// Returns every column with its first tick.
     pub fn iter(&self) -> impl Iterator<Item = (u64, &C)> {
         self.columns.iter().enumerate().map(|(index, column)| (index as u64 * self.stride, column))
     }
 }
 
 impl Default for Extremes {
-    /// Of nothing: the least of no values is above all others.
+    /// The extremes of no value: `min` is greater than `max`.
     fn default() -> Self {
         Self { first: f64::NAN, min: f64::INFINITY, max: f64::NEG_INFINITY }
     }
 }
 
 impl Extremes {
-    /// Takes a value in; what is not finite has no place in a picture.
+    /// Adds a value; ignores one that is not finite.
     pub fn take(&mut self, value: f64) {
         if value.is_finite() {
             self.absorb(&Self { first: value, min: value, max: value });
         }
     }
 
-    /// Whether there is no value.
+    /// Returns true if no value has been added.
     pub fn is_empty(&self) -> bool {
         self.min > self.max
     }
@@ -106,14 +106,14 @@ impl Column for Extremes {
 }
 
 impl Corners {
-    /// Takes a point in.
+    /// Adds a point; ignores one that is not finite.
     pub fn take(&mut self, tick: u64, x: f64, y: f64) {
         if x.is_finite() && y.is_finite() {
             self.absorb(&Self([Some((tick, x, y)); 5]));
         }
     }
 
-    /// The points, in the order of time.
+    /// Returns the points in the order of time.
     pub fn points(&self) -> Vec<(f64, f64)> {
         let mut points: Vec<(u64, f64, f64)> = self.0.iter().flatten().copied().collect();
         points.sort_by_key(|point| point.0);
@@ -127,11 +127,11 @@ impl Column for Corners {
         type Farther = fn((u64, f64, f64), (u64, f64, f64)) -> bool;
         let farther: [Farther; 5] =
             [|_, _| false, |a, b| b.1 < a.1, |a, b| b.1 > a.1, |a, b| b.2 < a.2, |a, b| b.2 > a.2];
-        for ((own, other), farther) in self.0.iter_mut().zip(later.0).zip(farther) {
-            if let Some(other) = other
-                && own.is_none_or(|own| farther(own, other))
+        for ((own, later), farther) in self.0.iter_mut().zip(later.0).zip(farther) {
+            if let Some(later) = later
+                && own.is_none_or(|own| farther(own, later))
             {
-                *own = Some(other);
+                *own = Some(later);
             }
         }
     }
@@ -147,9 +147,9 @@ impl Column for Count {
 mod tests {
     use super::*;
 
-    /// A spike of one tick among very many, up and down, is in the picture, wherever it is.
+    /// Columns keep a spike of one tick among 100 000, in either direction and at any place.
     #[test]
-    fn no_extreme_is_lost_however_many_ticks_there_are() {
+    fn merged_columns_keep_every_extreme() {
         for spike in [0, 1, 77_777, 99_999] {
             let (mut wave, mut path) = (Columns::<Extremes>::default(), Columns::<Corners>::default());
             for tick in 0..100_000_u64 {
@@ -160,33 +160,33 @@ mod tests {
                 path.at(tick).take(tick, up, down);
             }
             assert!(wave.iter().count() <= COLUMNS && wave.iter().count() > COLUMNS / 2, "{}", wave.iter().count());
-            let of = wave.iter().find(|(_, column)| column.max == 5.0).unwrap();
-            assert!(of.0 <= spike && spike < of.0 + wave.stride() && of.1.min == -7.0, "{spike}: {of:?}");
-            let most = path.iter().flat_map(|(_, corners)| corners.points()).filter(|point| *point == (5.0, -7.0));
-            assert_eq!(most.count(), 1, "{spike}");
+            let (first, column) = wave.iter().find(|(_, column)| column.max == 5.0).unwrap();
+            assert!(first <= spike && spike < first + wave.stride() && column.min == -7.0, "{spike}: {column:?}");
+            let outermost = path.iter().flat_map(|(_, corners)| corners.points()).filter(|point| *point == (5.0, -7.0));
+            assert_eq!(outermost.count(), 1, "{spike}");
         }
     }
 
     #[test]
-    fn few_ticks_are_kept_one_by_one_with_their_gaps() {
+    fn a_short_signal_has_one_column_per_tick_and_keeps_its_gaps() {
         let mut columns = Columns::<Extremes>::default();
         for tick in [0, 1, 4] {
             columns.at(tick).take(tick as f64);
         }
         columns.at(3).take(f64::NAN);
-        let told: Vec<_> = columns.iter().map(|(tick, column)| (tick, !column.is_empty())).collect();
-        assert_eq!(told, [(0, true), (1, true), (2, false), (3, false), (4, true)]);
+        let present: Vec<_> = columns.iter().map(|(tick, column)| (tick, !column.is_empty())).collect();
+        assert_eq!(present, [(0, true), (1, true), (2, false), (3, false), (4, true)]);
     }
 
     #[test]
-    fn counts_add_up_over_all_columns() {
+    fn merging_columns_preserves_the_total_count() {
         let mut counts = Columns::<Count>::default();
         (0..123_456).for_each(|tick| counts.at(tick).0 += 1);
         assert_eq!(counts.iter().map(|(_, count)| count.0).sum::<u64>(), 123_456);
     }
 
     #[test]
-    fn a_tick_that_nobody_can_have_counted_costs_no_memory() {
+    fn the_largest_possible_tick_takes_no_more_columns() {
         let mut counts = Columns::<Count>::default();
         counts.at(3).0 += 1;
         counts.at(u64::MAX).0 += 1;

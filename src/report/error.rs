@@ -1,25 +1,24 @@
-//! Why there is no report.
-
+//! The errors of reports.
 use crate::campaign::JournalError;
 use crate::config::{ConfigError, RunId};
 use crate::record::RecordError;
 use std::io;
 use std::path::PathBuf;
 
-/// Why there is no report.
+/// The reason that no report can be made.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum ReportError {
-    /// There is no such file or directory.
+    /// The file or directory does not exist.
     #[error("{} does not exist; give the directory of a run, or its run.mcap", path.display())]
     #[strum(serialize = "no-such-run")]
     Nothing {
-        /// What was given.
+        /// The given path.
         path: PathBuf,
     },
-    /// The directory is no run's.
+    /// The directory contains neither a summary nor a recording.
     #[error(
-        "{} has neither summary.json nor run.mcap; give the directory that `corotate run` named at its end",
+        "{} has neither summary.json nor run.mcap; give the directory that `corotate run` printed at its end",
         path.display()
     )]
     #[strum(serialize = "no-results")]
@@ -33,38 +32,38 @@ pub enum ReportError {
     Read {
         /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// The error of the system.
         source: io::Error,
     },
-    /// The summary is none of this version's.
-    #[error("{} is no summary that can be shown: {reason}; use the version that wrote it", path.display())]
+    /// The summary is not of this version.
+    #[error("cannot read the summary {}: {reason}; use the version of corotate that wrote it", path.display())]
     #[strum(serialize = "unreadable-summary")]
     Summary {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The part that is invalid.
         reason: String,
     },
-    /// A latency distribution is none.
-    #[error("{} is no percentile distribution: {reason}; remove it, or run again", path.display())]
+    /// A latency distribution is invalid.
+    #[error("{} is not a percentile distribution: {reason}; remove it, or run again", path.display())]
     #[strum(serialize = "unreadable-latency")]
     Latency {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The part that is invalid.
         reason: String,
     },
-    /// The directory holds files of two runs.
+    /// The directory contains files of two runs.
     #[error(
-        "{} is of {} and {} of {}: a page shows one run; remove the files of one, or give its run.mcap alone",
+        "{} belongs to {} and {} to {}: a report shows one run; remove the files of one, or give its run.mcap alone",
         files[0].0.display(), named(files[0].1), files[1].0.display(), named(files[1].1)
     )]
     TwoRuns {
-        /// Two of them, each with its run.
+        /// Two files with different runs, each with its run.
         files: Box<[(PathBuf, Option<RunId>); 2]>,
     },
     /// The scenario is refused.
-    #[error("the run's scenario is refused by this version: {0}")]
+    #[error("this version refuses the scenario of the run: {0}")]
     #[strum(serialize = "refused-scenario")]
     Scenario(#[from] ConfigError),
     /// The recording cannot be used.
@@ -75,29 +74,29 @@ pub enum ReportError {
     #[error(transparent)]
     #[strum(transparent)]
     Campaign(#[from] JournalError),
-    /// A campaign has a page of its own.
-    #[error("{} holds a campaign, which is shown alone and has no fields; give it without {with}", path.display())]
+    /// A campaign was given with an option or a second path that applies to runs only.
+    #[error("{} is a campaign: its page shows neither fields nor a second run; give it without {with}", path.display())]
     #[strum(serialize = "campaign-alone")]
     CampaignWith {
         /// The directory.
         path: PathBuf,
-        /// What it was given with.
+        /// The option or the second path.
         with: &'static str,
     },
-    /// There is no such field.
-    #[error("the recording shows no field `{name}`; it has: {known}")]
+    /// The recording has no field of this name.
+    #[error("the recording has no field `{name}`; its fields are: {known}")]
     #[strum(serialize = "no-such-field")]
     Field {
-        /// As given.
+        /// The given name.
         name: String,
-        /// Those there are.
+        /// The names of all fields.
         known: String,
     },
-    /// The run to compare with failed.
-    #[error("the same motion with full state, for comparison, failed: {reason}")]
+    /// The reference run failed.
+    #[error("cannot compute the reference run with full state: {reason}")]
     #[strum(serialize = "counterpart-failed")]
     Counterpart {
-        /// Why.
+        /// The error of the run.
         reason: String,
     },
     /// The page cannot be written.
@@ -106,7 +105,7 @@ pub enum ReportError {
     Write {
         /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// The error of the system.
         source: io::Error,
     },
 }

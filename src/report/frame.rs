@@ -1,23 +1,23 @@
-//! Where a picture's axes lie, and what is drawn by them: grid, labels, lines.
+//! The layout of a chart: the area of its plot, and the grid, labels and lines in it.
 //!
-//! Must not know what a picture is of.
+//! Must not know the quantities of a chart.
 
 use super::axis::Axis;
 use super::columns::{Columns, Corners, Extremes};
 use super::html::escape;
 use std::fmt::Write;
 
-/// Small pictures, and the margins of all.
+/// The size of small charts, and the margins of all charts.
 pub const WIDTH: f64 = 640.0;
 pub const HEIGHT: f64 = 250.0;
 pub const LEFT: f64 = 64.0;
 pub const RIGHT: f64 = 22.0;
 pub const TOP: f64 = 18.0;
 pub const BOTTOM: f64 = 42.0;
-/// The width of a picture as wide as the page.
+/// The width of a page-wide chart.
 pub const WIDE: f64 = 1200.0;
 
-/// Where a picture's axes lie: its size, and the margins around them.
+/// The size of a chart and the margins around its plot.
 #[derive(Debug, Clone, Copy)]
 pub struct Frame {
     pub width: f64,
@@ -28,36 +28,36 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A small picture over time.
+    /// The frame of a small chart over time.
     pub const TIME: Self = Self::sized(WIDTH, HEIGHT, TOP);
 
-    /// With the usual margins at its sides.
+    /// Returns a frame with the usual margins at its sides.
     pub const fn sized(width: f64, height: f64, top: f64) -> Self {
         Self { width, height, top, left: LEFT, right: RIGHT }
     }
 
-    /// Where a value of the level axis is.
+    /// Returns the x coordinate of a value.
     pub fn x(&self, axis: &Axis, value: f64) -> f64 {
         self.left + axis.place(value) * self.plot_width()
     }
 
-    /// Where a value of the upright axis is.
+    /// Returns the y coordinate of a value.
     pub fn y(&self, axis: &Axis, value: f64) -> f64 {
         self.foot() - axis.place(value) * (self.foot() - self.top)
     }
 
-    /// The foot of the plot.
+    /// Returns the y coordinate of the lower edge of the plot.
     pub fn foot(&self) -> f64 {
         self.height - BOTTOM
     }
 
-    /// Opens a picture.
+    /// Returns the opening tag of a chart.
     pub fn open(&self, title: &str) -> String {
         let (w, h, title) = (self.width, self.height, escape(title));
         format!("<svg viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{title}\">")
     }
 
-    /// Opens a picture whose lines a reader may look at closely: where its axes lie, and from what to what they go.
+    /// Returns the opening tag of a chart that the page's script can zoom: it has the plot's position and the axes' ends.
     pub fn open_over_time(&self, title: &str, x: &Axis, y: &Axis) -> String {
         let ([x0, x1], [y0, y1], title) = (x.ends(), y.ends(), escape(title));
         let Self { width, height, top, left, .. } = self;
@@ -79,7 +79,7 @@ impl Frame {
         self.foot() - self.top
     }
 
-    /// Grid, labels and frame.
+    /// Draws the grid, labels and frame.
     pub fn axes(&self, x: &Axis, y: &Axis, svg: &mut String) {
         self.time_axis(x, svg);
         let (left, top, right, foot) = (self.left, self.top, self.width - self.right, self.foot());
@@ -91,7 +91,7 @@ impl Frame {
         }
         let (middle, below, label) = ((left + right) / 2.0, self.height - 8.0, escape(&x.label));
         let _ = write!(svg, "<text class=\"name\" x=\"{middle}\" y=\"{below}\" text-anchor=\"middle\">{label}</text>");
-        // The name of the upright axis.
+        // The label of the y axis.
         let (middle, label) = ((top + foot) / 2.0, escape(&y.label));
         let turn = format!("rotate(-90 14 {middle})");
         let _ = write!(
@@ -101,7 +101,7 @@ impl Frame {
         self.frame(svg);
     }
 
-    /// The grid of the level axis, with its labels.
+    /// Draws the grid of the x axis, with its labels.
     pub fn time_axis(&self, x: &Axis, svg: &mut String) {
         let (top, foot) = (self.top, self.foot());
         svg.push_str("<g class=\"ticks\">");
@@ -114,13 +114,13 @@ impl Frame {
         svg.push_str("</g>");
     }
 
-    /// The edge of the plot.
+    /// Draws the edge of the plot.
     pub fn frame(&self, svg: &mut String) {
         let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
         let _ = write!(svg, "<rect class=\"frame\" x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\"/>");
     }
 
-    /// Draws lines and marks in a window of their own, which cuts off what lies beyond the axes.
+    /// Draws lines and marks in a nested SVG, which clips them at the axes.
     pub fn window(&self, draw: impl FnOnce(&mut String), svg: &mut String) {
         let (left, top, width, height) = (self.left, self.top, self.plot_width(), self.plot_height());
         let _ = write!(
@@ -146,7 +146,7 @@ impl Frame {
                 }
             }
             if count == 1 {
-                // A single point is seen as a dot.
+                // A single point becomes a dot.
                 path.push_str("h.1");
             }
         }
@@ -159,22 +159,22 @@ impl Frame {
     }
 }
 
-/// A line of a picture.
+/// A line of a chart.
 #[derive(Debug, Clone)]
 pub struct Line {
-    /// Its classes: a colour and a dash pattern, see the page's style.
+    /// The classes of colour and dash pattern in the page's style.
     pub class: &'static str,
-    /// What it is, for the legend.
+    /// The label in the legend.
     pub label: String,
-    /// Its parts, in the units of the axes.
+    /// The parts, in the units of the axes; there is a gap between two parts.
     pub parts: Vec<Vec<(f64, f64)>>,
-    /// Where it begins is marked by a dot.
+    /// True if a dot marks the first point.
     pub dot: bool,
 }
 
 impl Line {
-    /// A signal's extremes over time: within a column it goes from one to the other.
-    pub fn of(class: &'static str, label: &str, columns: &Columns<Extremes>, tick_s: f64) -> Self {
+    /// Returns a line of a signal's extremes over time. Within a column it connects the smallest and largest value.
+    pub fn over_time(class: &'static str, label: &str, columns: &Columns<Extremes>, tick_s: f64) -> Self {
         let (mut parts, mut part, mut before) = (Vec::new(), Vec::new(), f64::NAN);
         for (tick, extremes) in columns.iter() {
             if extremes.is_empty() {
@@ -183,7 +183,7 @@ impl Line {
             }
             let time = (tick as f64 + 0.5 * (columns.stride() - 1) as f64) * tick_s;
             let mut ends = [extremes.min, extremes.max];
-            // The nearer end first, so that a line is no thicker than the signal.
+            // The nearer extreme comes first, so that the line is not thicker than the signal.
             if (before - extremes.max).abs() < (before - extremes.min).abs() {
                 ends.reverse();
             }
@@ -194,13 +194,13 @@ impl Line {
         Self { class, label: label.to_owned(), parts, dot: false }
     }
 
-    /// A path in a plane.
+    /// Returns a path in a plane.
     pub fn path(class: &'static str, label: &str, columns: &Columns<Corners>) -> Self {
         let points = columns.iter().flat_map(|(_, corners)| corners.points()).collect();
         Self { class, label: label.to_owned(), parts: vec![points], dot: true }
     }
 
-    /// A line through some points.
+    /// Returns a line through the given points.
     pub fn through(class: &'static str, label: &str, points: Vec<(f64, f64)>) -> Self {
         Self { class, label: label.to_owned(), parts: vec![points], dot: false }
     }

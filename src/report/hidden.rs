@@ -1,6 +1,6 @@
-//! The page of a log's hidden component: reconstructed beside measured, what is left, where nothing was told.
+//! The page of a log's hidden component: estimate and measurement, their difference, and unobservable intervals.
 //!
-//! Of every segment a bounded number of points is kept, and of a log a bounded number of segments. Must not hide which.
+//! Keeps a bounded number of segments, and of points per segment. Must not omit any without a note.
 
 use super::axis::Axis;
 use super::chart::{Picture, plain};
@@ -11,11 +11,11 @@ use crate::estimate::SegmentScore;
 use crate::telemetry::sorted;
 use std::mem::take;
 
-/// So many points of a segment are kept at most; then every other one is dropped.
+/// The largest number of points of a segment. When it is reached, every other point is dropped.
 const POINTS: usize = 4096;
-/// So many segments are kept.
+/// The largest number of segments that are kept.
 const SEGMENTS: usize = 128;
-/// So many are drawn.
+/// The largest number of segments that are drawn.
 const DRAWN: usize = 6;
 
 /// One point of a segment.
@@ -27,38 +27,38 @@ struct Point {
     observed: bool,
 }
 
-/// A segment as it is drawn.
+/// The points of a segment.
 #[derive(Debug, Clone, Default)]
 struct Trace {
     points: Vec<Point>,
-    /// Every so many rows there is a point.
+    /// Rows per point.
     stride: usize,
     rows: usize,
 }
 
-/// A page in the making: takes the rows of a log in their order.
+/// A builder of the page; takes the rows of a log in their order.
 #[derive(Debug, Clone, Default)]
 pub struct HiddenPage {
     traces: Vec<Trace>,
     segments: usize,
 }
 
-/// What a page tells beside its pictures.
+/// The content of the page besides its charts.
 #[derive(Debug, Clone)]
 pub struct HiddenFacts<'a> {
     /// The log's name.
     pub title: String,
     /// The letter of the hidden axis.
     pub axis: &'a str,
-    /// The method.
+    /// Paragraphs about the method.
     pub paragraphs: Vec<String>,
-    /// Names and scores of all segments, in their order.
+    /// The name and score of every segment, in their order.
     pub segments: &'a [(String, SegmentScore)],
 }
 
 impl HiddenPage {
-    /// Takes in a row: whether it begins a segment, when it is in s, the estimate and the measured rate in rad/s (not a number
-    /// where they are not known), and whether the step to it told anything.
+    /// Adds a row: `begins` is true for the first row of a segment, the time is in s, `estimate` and `measured` are rates in
+    /// rad/s (NaN if unknown), and `observed` is true if the step to this row was observable.
     pub fn push(&mut self, begins: bool, time_s: f64, estimate: f64, measured: f64, observed: bool) {
         if begins {
             self.segments += 1;
@@ -70,7 +70,7 @@ impl HiddenPage {
         if trace.rows.is_multiple_of(trace.stride) {
             trace.points.push(Point { time_s, estimate, measured, observed });
         } else if let (false, Some(last)) = (observed, trace.points.last_mut()) {
-            // What was not told is not dropped with the rows between.
+            // A dropped row still marks its point as unobservable.
             last.observed = false;
         }
         trace.rows += 1;
@@ -84,12 +84,12 @@ impl HiddenPage {
         }
     }
 
-    /// The page as HTML.
+    /// Returns the page as HTML.
     pub fn html(&self, facts: &HiddenFacts<'_>) -> String {
         let scored = |index: &usize| facts.segments[*index].1.error_rad_s;
         let known = self.traces.len().min(facts.segments.len());
         let mut order: Vec<usize> = (0..known).collect();
-        // Those without a score last.
+        // Segments without a score come last.
         order.sort_by(|a, b| scored(a).total_cmp(&scored(b)));
         let shown = spread(&order);
         let mut sections = vec![Section { id: "result", title: "Result", blocks: result(facts) }];
@@ -125,22 +125,23 @@ impl HiddenPage {
             };
             let (motion, rest) = trace.pictures(name, facts.axis);
             figures.push((motion, format!("segment {name}: {error}{every}")));
-            figures.extend(rest.map(|rest| (rest, format!("segment {name}: estimate less measured{every}"))));
+            figures.extend(rest.map(|rest| (rest, format!("segment {name}: estimate − measured{every}"))));
         }
         let text = match facts.segments.len() {
-            0 | 1 => "The segment.".to_owned(),
+            0 | 1 => String::new(),
             count if count > self.traces.len() => format!(
-                "Of the first {} of {count} segments, {} from the best to the worst.",
-                self.traces.len(),
-                shown.len()
+                "{} of the first {} of {count} segments, from the smallest to the largest error.",
+                shown.len(),
+                self.traces.len()
             ),
-            count => format!("{} of {count} segments, from the best to the worst.", shown.len()),
+            count => format!("{} of {count} segments, from the smallest to the largest error.", shown.len()),
         };
-        vec![Block::Text(text), Block::Figures(figures)]
+        let text = (!text.is_empty()).then_some(Block::Text(text));
+        text.into_iter().chain([Block::Figures(figures)]).collect()
     }
 }
 
-/// Some places from first to last, in equal steps.
+/// Selects elements from the first to the last in equal steps.
 fn spread(order: &[usize]) -> Vec<usize> {
     if order.len() <= DRAWN {
         return order.to_vec();
@@ -157,17 +158,20 @@ fn result(facts: &HiddenFacts<'_>) -> Vec<Block> {
         let points = errors.iter().enumerate().map(|(n, error)| (100.0 * n as f64 / last, *error)).collect();
         let line = Line::through("b", "rms error", points);
         let (x, y) = (
-            Axis::linear("part of the segments, %", 0.0, 100.0),
+            Axis::linear("segments, %", 0.0, 100.0),
             Axis::around("rms error, rad/s", (0.0, errors[errors.len() - 1])),
         );
-        let caption = format!("So many of {} segments have no greater error over their second half.", errors.len());
+        let caption = format!(
+            "Percentage of {} segments whose rms error over the second half is at most the given value.",
+            errors.len()
+        );
         blocks.push(Block::Figures(vec![(plain("rms error of the segments", &x, &y, &[line]), caption)]));
     }
     blocks
 }
 
 impl Trace {
-    /// Estimate and measured rate over time; and what is left, if it was measured.
+    /// Draws the estimate and the measured rate over time, and their difference if the rate was measured.
     fn pictures(&self, name: &str, axis: &str) -> (Picture, Option<Picture>) {
         let start = self.points.first().map_or(0.0, |point| point.time_s);
         let end = self.points.last().map_or(1.0, |point| point.time_s - start);
@@ -179,33 +183,33 @@ impl Trace {
         };
         let line = |class, label: &str, parts| Line { class, label: label.to_owned(), parts, dot: false };
         let (estimate, measured) = (path(|point| point.estimate), path(|point| point.measured));
-        // A filter's start may be far away; the axis is that of the motion.
+        // The initial error of a filter may be large, so the axis follows the measured rate.
         let range_of = if measured.iter().flatten().next().is_some() { &measured } else { &estimate };
         let (low, high) = range(&[range_of]);
         let room = 0.25 * (high - low);
         let y = Axis::around(&format!("rate about {axis}, rad/s"), (low - room, high + room));
         let foot = low - room;
-        let blind = self.blind(start, foot);
+        let unobservable = self.unobservable(start, foot);
         let mut lines = vec![line("o", "reconstructed", estimate)];
         if measured.iter().flatten().next().is_some() {
             lines.insert(0, line("k d1", "measured", measured));
         }
-        if !blind.is_empty() {
-            lines.push(line("p wide", "nothing told", blind));
+        if !unobservable.is_empty() {
+            lines.push(line("p wide", "unobservable", unobservable));
         }
         let picture = plain(&format!("rate about {axis}, segment {name}"), &time, &y, &lines);
-        let left = self.parts(start, |point| point.estimate - point.measured);
-        // The second half says how large what is left is.
-        let late = left.iter().flatten().filter(|point| point.0 >= 0.25 * end).map(|point| point.1.abs());
+        let error = self.parts(start, |point| point.estimate - point.measured);
+        // The axis excludes the first quarter, in which the filter converges.
+        let late = error.iter().flatten().filter(|point| point.0 >= 0.25 * end).map(|point| point.1.abs());
         let largest = late.fold(0.0, f64::max);
-        let residual = left.iter().flatten().next().is_some().then(|| {
+        let residual = error.iter().flatten().next().is_some().then(|| {
             let y = Axis::around("estimate − measured, rad/s", (-largest, largest));
-            plain(&format!("what is left, segment {name}"), &time, &y, &[line("b", "estimate − measured", left)])
+            plain(&format!("error, segment {name}"), &time, &y, &[line("b", "estimate − measured", error)])
         });
         (picture, residual)
     }
 
-    /// A line with a gap where the value is not known.
+    /// Returns the parts of a line, with a gap where the value is unknown.
     fn parts(&self, start: f64, value: fn(&Point) -> f64) -> Vec<Vec<(f64, f64)>> {
         let (mut parts, mut part) = (Vec::new(), Vec::new());
         for point in &self.points {
@@ -220,8 +224,8 @@ impl Trace {
         parts
     }
 
-    /// Where nothing was told, as strokes at a height.
-    fn blind(&self, start: f64, height: f64) -> Vec<Vec<(f64, f64)>> {
+    /// Returns the unobservable intervals as strokes at a height.
+    fn unobservable(&self, start: f64, height: f64) -> Vec<Vec<(f64, f64)>> {
         let steps = self.points.windows(2).filter(|pair| !pair[1].observed);
         steps.map(|pair| vec![(pair[0].time_s - start, height), (pair[1].time_s - start, height)]).collect()
     }
@@ -232,7 +236,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_of_any_log_is_well_formed_and_bounded() {
+    fn a_page_is_well_formed_and_bounded_for_any_log() {
         let mut page = HiddenPage::default();
         let mut segments = Vec::new();
         for segment in 0..200_u32 {
@@ -263,8 +267,8 @@ mod tests {
         assert!(html.len() < 1 << 20, "{}", html.len());
         let document = roxmltree::Document::parse(html.trim_start_matches("<!DOCTYPE html>")).unwrap();
         assert!(document.descendants().filter(|node| node.has_tag_name("figure")).count() >= DRAWN);
-        assert!(html.contains("Of the first 128 of 200 segments") && !html.contains("NaN"));
-        assert!(html.contains("<p>&amp;<br/>\n1</p>") && !html.contains("class=\"verdict"), "nothing is judged");
+        assert!(html.contains("6 of the first 128 of 200 segments") && !html.contains("NaN"));
+        assert!(html.contains("<p>&amp;<br/>\n1</p>") && !html.contains("class=\"verdict"), "a log has no verdict");
         let empty = HiddenPage::default().html(&HiddenFacts { segments: &[], ..facts });
         assert!(roxmltree::Document::parse(empty.trim_start_matches("<!DOCTYPE html>")).is_ok());
     }

@@ -1,6 +1,6 @@
-//! Text for a page: nothing that comes from a file is ever read as markup.
+//! Escaping of text: text from a file never becomes markup.
 
-/// A text as it stands in markup and in its attributes. What XML cannot hold is replaced, and what commands a terminal.
+/// Escapes a text for markup and attributes. Replaces characters that XML forbids and control characters.
 pub fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for letter in text.chars() {
@@ -24,7 +24,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_escaped_reads_back_as_it_was() {
+    fn a_parser_restores_the_escaped_text() {
         let text = "<script>alert('\"&amp;')</script> ω é\n";
         let page = format!("<p title=\"{}\">{}</p>", escape(text).replace('\n', "&#10;"), escape(text));
         let document = roxmltree::Document::parse(&page).unwrap();

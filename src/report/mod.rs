@@ -1,23 +1,23 @@
-//! A run, or a campaign, as one page that is looked at: pictures and tables in a single file of HTML that needs nothing beside it.
+//! Reports of a run, two runs or a campaign: charts and tables in one self-contained HTML file.
 //!
 //! | file | duty |
 //! |---|---|
-//! | `source` | what there is: a run's directory, or a recording alone |
-//! | `traces` | one pass over a recording |
-//! | `columns` | signals of any length in a bounded number of columns, their extremes kept |
-//! | `hidden` | another page: the hidden component of a log |
-//! | `counterpart` | the run that an orbit's is compared with |
+//! | `source` | input: a run's directory, or a recording alone |
+//! | `traces` | signals and metrics from one pass over a recording |
+//! | `columns` | signals of any length in a bounded number of columns that keep the extremes |
+//! | `hidden` | the page of a log's hidden component |
+//! | `counterpart` | the reference run that an orbit is compared with |
 //! | `percentiles` | latency distributions as curves |
-//! | `model` | what a page is made of: sections of facts, tables and figures |
-//! | `single` | what is shown of a run, in which order |
-//! | `pair` | the same for two runs over each other |
-//! | `pictures` | which pictures the samples give |
-//! | `tables` | the tables of the summary |
-//! | `campaign` | another page: the table of a campaign |
-//! | `axis`, `frame`, `chart` | pictures as SVG |
-//! | `html`, `page` | the page |
+//! | `model` | the content of a page: sections of text, tables and figures |
+//! | `single` | the page of one run |
+//! | `pair` | the page of two runs |
+//! | `pictures` | charts from the samples of a run |
+//! | `tables` | tables from the summary |
+//! | `campaign` | the page of a campaign |
+//! | `axis`, `frame`, `chart` | charts as SVG |
+//! | `html`, `page` | HTML |
 //!
-//! Must not judge a run: verdicts are those of its summary. Must not leave out silently: what is missing is said.
+//! Must not judge a run: the verdict comes from its summary. Must not omit anything silently: a remark names what is missing.
 
 mod axis;
 mod campaign;
@@ -45,7 +45,7 @@ use crate::campaign::Table;
 use source::Source;
 use std::path::Path;
 
-/// A page.
+/// A page with its figures and remarks.
 #[derive(Debug)]
 pub struct Report {
     html: String,
@@ -55,27 +55,27 @@ pub struct Report {
 }
 
 impl Report {
-    /// Whether its recording is damaged, and shown as far as it can be believed.
+    /// Returns true if a recording is damaged, so that the page shows only the readable part.
     pub fn is_damaged(&self) -> bool {
         self.damaged
     }
 
-    /// The page: HTML that is well-formed XML too.
+    /// The page as HTML that is also well-formed XML.
     pub fn html(&self) -> &str {
         &self.html
     }
 
-    /// What a reader must know before all else: what is missing, and how to get it.
+    /// The remarks at the top of the page: missing parts, and how to get them.
     pub fn remarks(&self) -> &[String] {
         &self.remarks
     }
 
-    /// Its figures, each a picture (SVG) that needs no page: name and text.
+    /// The name and standalone SVG of every figure.
     pub fn figures(&self) -> &[(String, String)] {
         &self.figures
     }
 
-    /// Writes every figure to a file of its own in a directory, as SVG.
+    /// Writes every figure to an SVG file in a directory.
     ///
     /// # Errors
     /// [`ReportError::Write`].
@@ -101,8 +101,8 @@ impl Report {
     }
 }
 
-/// Makes a page of a run's directory, of a recording alone, or of a campaign's directory; of a run with the fields that are `shown` by name, such as
-/// `leader/estimate.omega_rad_s` or `leader/estimate.omega_rad_s[2]`.
+/// Makes the page of a run's directory, a recording, or a campaign's directory. The page of a run also shows the fields
+/// named by `shown`, such as `leader/estimate.omega_rad_s` or `leader/estimate.omega_rad_s[2]`.
 ///
 /// # Errors
 /// [`ReportError`].
@@ -124,13 +124,13 @@ fn campaign(directory: &Path, shown: &[String]) -> Result<Report, ReportError> {
     Ok(Report { html: page::page(&model), figures: page::figures(&model), remarks: model.remarks, damaged: false })
 }
 
-/// Makes a page of two runs over each other, with the fields that are `shown` by name.
+/// Makes the page that compares two runs, with the fields named by `shown`.
 ///
 /// # Errors
 /// [`ReportError`].
 pub fn report_pair(a: &Path, b: &Path, shown: &[String]) -> Result<Report, ReportError> {
     if let Some(path) = [a, b].into_iter().find(|path| Table::is_in(path)) {
-        return Err(ReportError::CampaignWith { path: path.to_owned(), with: "another" });
+        return Err(ReportError::CampaignWith { path: path.to_owned(), with: "a second path" });
     }
     let (a, b) = (Source::open(a)?, Source::open(b)?);
     let model = pair::model(&a, &b, shown)?;

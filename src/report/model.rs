@@ -1,71 +1,71 @@
-//! What a page is made of: sections of facts, tables and figures. Must not know how a page is written.
+//! The content of a page: sections of text, tables and figures. Must not know HTML.
 
 use super::chart::Picture;
 use crate::config::RunId;
 
-/// A page.
+/// The content of a page.
 #[derive(Debug)]
 pub struct Model {
-    /// What it is of.
+    /// The name of the scenario, campaign or log.
     pub title: String,
-    /// The run, if it is known.
+    /// The identifier of the run, if it is known.
     pub run: Option<RunId>,
-    /// When and how that was made.
+    /// The clock, rate, date and version of the run.
     pub subtitle: String,
-    /// The verdict in a word, and whether it is a good one; none where nothing was judged. Empty where there is nothing to judge.
+    /// The verdict in words, and true if it is good; `None` if the run was not judged. An empty text hides the verdict.
     pub verdict: (String, Option<bool>),
-    /// What a reader must know before all else.
+    /// Remarks below the heading.
     pub remarks: Vec<String>,
-    /// The marks that all pictures over time use.
+    /// The SVG definitions of the marks that all charts over time use.
     pub marks: String,
-    /// What is shown.
+    /// The sections in their order.
     pub sections: Vec<Section>,
 }
 
-/// A part with a heading.
+/// A section with a heading.
 #[derive(Debug)]
 pub struct Section {
-    /// What links name it by.
+    /// The element id, the target of links.
     pub id: &'static str,
-    /// Its heading.
+    /// The heading.
     pub title: &'static str,
-    /// Its content.
+    /// The content.
     pub blocks: Vec<Block>,
 }
 
-/// A piece of a section.
+/// A block of a section.
 #[derive(Debug)]
 pub enum Block {
-    /// A paragraph, with the breaks of its lines.
+    /// A paragraph; its line breaks are kept.
     Text(String),
-    /// Rows under a head. Cells that are numbers stand to the right; one between backticks is a command.
+    /// A table. Columns of numbers are aligned right; a cell between backticks is a command.
     Table {
-        /// What it is, if the heading does not say.
+        /// The caption; empty if the heading suffices.
         caption: String,
-        /// The names of its columns.
+        /// The names of the columns.
         head: Vec<String>,
         /// The rows.
         rows: Vec<Vec<String>>,
     },
-    /// Pictures beside each other as far as there is room, each with its caption.
+    /// Charts with their captions, side by side where they fit.
     Figures(Vec<(Picture, String)>),
-    /// The shades of a strip and what they mean.
+    /// The key of a strip: a label for each shade.
     Scale(Vec<String>),
-    /// A text to be opened.
+    /// A summary and a text that unfolds below it.
     Details(String, String),
 }
 
 impl Block {
-    /// A table.
+    /// Returns a table.
     pub fn table<H: Into<String>>(caption: &str, head: Vec<H>, rows: Vec<Vec<String>>) -> Self {
         Self::Table { caption: caption.to_owned(), head: head.into_iter().map(H::into).collect(), rows }
     }
 }
 
-/// Distributions of latencies, and their figures.
-pub fn latency_section(latencies: Vec<(String, String, Picture)>, figures_of: Block) -> Section {
+/// Returns the section with the charts of latencies and the table of their percentiles.
+pub fn latency_section(latencies: Vec<(String, String, Picture)>, percentiles: Block) -> Section {
     let figures = latencies.into_iter().map(|(stage, what, picture)| (picture, format!("{stage}: {what}"))).collect();
-    let text = "Every value is counted, none is removed; the end of a curve is its largest value.".to_owned();
-    let blocks = vec![Block::Text(text), Block::Figures(figures), figures_of];
+    let text = "Every measured value is counted. A curve ends at the largest value.".to_owned();
+    let blocks = vec![Block::Text(text), Block::Figures(figures), percentiles];
     Section { id: "latency", title: "Latency", blocks }
 }

@@ -1,9 +1,9 @@
-/* Pictures over time: a cursor with the values under it, and a closer look at a part of the time, in all of them at once. */
-/* Drag to look at a part; double click to see all again. Without this script the page is whole. */
+/* Charts over time: a cursor that shows the values, and a zoom that applies to all charts. Drag to zoom; double click to reset. */
+/* Without this script the page is complete. */
 "use strict";
 (() => {
   const SVG = document.querySelector("svg")?.namespaceURI;
-  /* Where a figure tells what is under the pointer; one for both of its sizes. */
+  /* The element below a figure that shows the values at the pointer; both sizes of a chart share it. */
   const readoutOf = (svg) => {
     const caption = svg.closest("figure").querySelector("figcaption");
     const readout = caption.querySelector(".readout") || document.createElement("span");
@@ -23,8 +23,8 @@
       logarithmic: svg.dataset.scale === "log", names: svg.querySelector("use.names"), ticks: svg.querySelector("g.ticks"),
       all: svg.querySelector("g.ticks").innerHTML };
   });
-  /* What is seen of the time, as parts of it. */
-  let seen = [0, 1];
+  /* The visible part of the time axis, as fractions of it. */
+  let visible = [0, 1];
   const element = (name, attributes, text) => {
     const made = document.createElementNS(SVG, name);
     Object.entries(attributes).forEach(([key, value]) => made.setAttribute(key, value));
@@ -32,7 +32,7 @@
     return made;
   };
   const show = (from, to) => {
-    seen = [from, to];
+    visible = [from, to];
     for (const chart of charts) {
       const { plot, left, top, width, height, ticks, names, time } = chart;
       plot.setAttribute("viewBox", `${left + from * width} ${top} ${(to - from) * width} ${height}`);
@@ -50,36 +50,36 @@
       }
     }
   };
-  /* Where a pointer is, as a part of the width of a plot. */
+  /* Returns the position of the pointer as a fraction of the width of the plot. */
   const part = ({ svg, left, width }, event) => {
     const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
     return Math.min(1, Math.max(0, (at.x - left) / width));
   };
   const point = (chart, at) => {
     const { left, top, width, height, lines, time, value, logarithmic } = chart;
-    const whole = seen[0] + at * (seen[1] - seen[0]), x = left + whole * width;
-    const told = (y) => {
+    const whole = visible[0] + at * (visible[1] - visible[0]), x = left + whole * width;
+    const valueAt = (y) => {
       const between = value[0] + (1 - (y - top) / height) * (value[1] - value[0]);
       return (logarithmic ? 10 ** between : between).toPrecision(3);
     };
     const texts = lines.map(({ label, points }) => {
-      /* Lines that go back, as the extremes of a column do, have several values at a time. */
+      /* A column of a line has a smallest and a largest value at one time. */
       const nearest = Math.min(...points.map(([px]) => Math.abs(px - x)));
       if (!(nearest <= width / 100)) return "";
-      const values = points.filter(([px]) => Math.abs(px - x) <= nearest + 0.05).map(([, y]) => told(y));
+      const values = points.filter(([px]) => Math.abs(px - x) <= nearest + 0.05).map(([, y]) => valueAt(y));
       const ends = [...new Set([values[0], values.at(-1)])];
       return `${label}: ${ends.join(" to ")}`;
     });
     const now = time[0] + whole * (time[1] - time[0]);
     chart.readout.textContent = [`t = ${now.toPrecision(4)} s`, ...texts.filter(Boolean)].join("; ");
   };
-  /* What a cell or a case is, under its picture, also where nothing hovers. */
+  /* Shows the description of a cell or case below its chart, for touch screens too. */
   for (const svg of document.querySelectorAll("figure > svg:not(.time)")) {
     if (!svg.querySelector("title")) continue;
     const readout = readoutOf(svg);
-    const tell = ({ target }) => { readout.textContent = target.querySelector(":scope > title")?.textContent || ""; };
-    svg.addEventListener("pointerover", tell);
-    svg.addEventListener("pointerdown", tell);
+    const describe = ({ target }) => { readout.textContent = target.querySelector(":scope > title")?.textContent || ""; };
+    svg.addEventListener("pointerover", describe);
+    svg.addEventListener("pointerdown", describe);
   }
   for (const chart of charts) {
     const { svg, left, top, width, height } = chart;
@@ -95,8 +95,8 @@
     svg.addEventListener("pointermove", move);
     svg.addEventListener("pointerleave", () => { begun = null; cursor.setAttribute("d", ""); chart.readout.textContent = ""; });
     svg.addEventListener("pointerup", (event) => {
-      const [from, to] = [begun === null ? 0 : begun, part(chart, event)].sort((one, other) => one - other);
-      if (begun !== null && to - from > 0.01) show(...[from, to].map((at) => seen[0] + at * (seen[1] - seen[0])));
+      const [from, to] = [begun === null ? 0 : begun, part(chart, event)].sort((a, b) => a - b);
+      if (begun !== null && to - from > 0.01) show(...[from, to].map((at) => visible[0] + at * (visible[1] - visible[0])));
       begun = null;
     });
     svg.addEventListener("dblclick", () => show(0, 1));

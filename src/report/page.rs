@@ -1,5 +1,6 @@
-//! The page: a report's content as HTML that is well-formed XML too, with its style inside and a script by which pictures over
-//! time are looked at closely; without it nothing is missing. No address.
+//! Writes a page as HTML that is also well-formed XML, with its style and script inside.
+//!
+//! The script adds a cursor and zoom to charts over time; without it the page is complete. Must not refer to any address.
 
 use super::chart::Picture;
 use super::html::escape;
@@ -16,7 +17,7 @@ pub fn page(model: &Model) -> String {
     let title = [&*model.title, &model.verdict.0].into_iter().filter(|part| !part.is_empty()).map(escape);
     let title = title.collect::<Vec<_>>().join(": ");
     let run = model.run.map_or(String::new(), |run| format!(", {}", run.comment()));
-    // Writing to a string does not fail.
+    // Writing to a string cannot fail.
     let _ = write!(
         html,
         "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
@@ -30,13 +31,13 @@ pub fn page(model: &Model) -> String {
     html
 }
 
-/// Every figure as a picture of its own: name, and SVG that looks as on a white page.
+/// Returns the name and standalone SVG of every figure, in the colours of a white page.
 pub fn figures(model: &Model) -> Vec<(String, String)> {
     let style = plain_style();
     let blocks = model.sections.iter().flat_map(|section| &section.blocks);
     let pictures =
         blocks.filter_map(|block| if let Block::Figures(figures) = block { Some(figures) } else { None }).flatten();
-    let of = |(index, (picture, _)): (usize, &(Picture, String))| {
+    let standalone = |(index, (picture, _)): (usize, &(Picture, String))| {
         let letters = picture.title.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
         let name = letters.collect::<String>().split('-').filter(|word| !word.is_empty()).collect::<Vec<_>>().join("-");
         let svg = picture.alone().replacen("<svg ", "<svg xmlns=\"http://www.w3.org/2000/svg\" ", 1);
@@ -44,10 +45,10 @@ pub fn figures(model: &Model) -> Vec<(String, String)> {
         let svg = format!("{}<style>{style}</style>{}{}", &svg[..inside], model.marks, &svg[inside..]);
         (format!("{:02}-{}", index + 1, name.to_lowercase()), svg)
     };
-    pictures.enumerate().map(of).collect()
+    pictures.enumerate().map(standalone).collect()
 }
 
-/// The style of pictures with its colours in their places: what draws for paper knows no variables.
+/// Returns the style of charts with colours in place of variables, which many SVG programs do not support.
 fn plain_style() -> String {
     let (light, rest) = STYLE.split_once('}').unwrap_or_default();
     let colours = light.split("--").skip(1).filter_map(|entry| entry.split_once(':'));
@@ -58,7 +59,7 @@ fn plain_style() -> String {
     colours.iter().fold(pictures.to_owned(), |style, (name, value)| style.replace(&format!("var(--{name})"), value))
 }
 
-/// Where the style of pictures begins.
+/// The comment at which the style of charts begins.
 const PICTURES: &str = "/* Pictures. */";
 
 fn header(model: &Model, html: &mut String) {
@@ -120,7 +121,7 @@ fn block(block: &Block, html: &mut String) {
     }
 }
 
-/// A name that is broken on a small screen at its joints, not at any letter.
+/// Escapes a name and allows line breaks after `/` and `_` only.
 fn breakable(text: &str) -> String {
     escape(text).replace('/', "/<wbr/>").replace('_', "_<wbr/>")
 }
@@ -130,7 +131,7 @@ fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String
     if !caption.is_empty() {
         let _ = writeln!(html, "<caption>{}</caption>", escape(caption));
     }
-    // A column stands to the right if all of it is numbers.
+    // A column of numbers only is aligned right.
     let numeric = |column: usize| {
         let cells = || rows.iter().filter_map(|row| row.get(column)).filter(|cell| *cell != "–");
         cells().next().is_some() && cells().all(|cell| cell.parse::<f64>().is_ok())
@@ -145,8 +146,9 @@ fn table(caption: &str, head: &[String], rows: &[Vec<String>], html: &mut String
         html.push_str("<tr>");
         for (cell, class) in row.iter().zip(&classes) {
             let command = cell.strip_prefix('`').and_then(|cell| cell.strip_suffix('`'));
-            let told = command.map_or_else(|| breakable(cell), |command| format!("<code>{}</code>", escape(command)));
-            let _ = write!(html, "<td{class}>{told}</td>");
+            let content =
+                command.map_or_else(|| breakable(cell), |command| format!("<code>{}</code>", escape(command)));
+            let _ = write!(html, "<td{class}>{content}</td>");
         }
         html.push_str("</tr>\n");
     }

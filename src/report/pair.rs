@@ -1,6 +1,6 @@
-//! Two runs on one page: where their samples differ first, and their errors, motion and latencies drawn over each other.
+//! The page of two runs: the first difference of their samples, and their errors, motion and latencies in the same charts.
 //!
-//! Must not judge which of them is better.
+//! Must not judge which run is better.
 
 use super::axis::Axis;
 use super::chart::{Marks, Picture, Size, marks, over_time, over_time_in, plane, range};
@@ -19,15 +19,15 @@ use crate::record::{Comparison, RecordError, Recording, Tolerances, diff};
 use crate::rig;
 use std::collections::BTreeSet;
 
-/// The first run is drawn solid and thin on the second, which is dashed and wide: where they are the same, both are seen.
+/// Line classes of both runs: A is solid and thin, B is dashed and wide, so both are visible where they coincide.
 const CLASSES: [[&str; 2]; 4] =
     [["o d0", "o d1 wide"], ["b d0", "b d1 wide"], ["g d0", "g d1 wide"], ["p d0", "p d1 wide"]];
-/// Lists of more values are compared by their elements.
+/// The longest list of values that is shown in one row; longer lists are compared element by element.
 const LISTED: usize = 12;
-/// What the runs are called in legends.
+/// The names of the runs in legends.
 const NAMES: [&str; 2] = ["A", "B"];
 
-/// A run with what its recording shows.
+/// A run with the traces of its recording.
 struct Run<'a> {
     name: &'static str,
     source: &'a Source,
@@ -36,7 +36,7 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn of(name: &'static str, source: &'a Source) -> Result<Self, ReportError> {
+    fn new(name: &'static str, source: &'a Source) -> Result<Self, ReportError> {
         let traces = match (&source.recording, &source.scenario) {
             (Some(recording), Some(scenario)) => Some(trace(recording, scenario)?),
             _ => None,
@@ -51,13 +51,13 @@ impl<'a> Run<'a> {
 
     fn line(&self, place: usize, label: &str, columns: &Columns<Extremes>) -> Line {
         let which = usize::from(self.name == NAMES[1]);
-        Line::of(CLASSES[place % CLASSES.len()][which], &format!("{label}, {}", self.name), columns, self.tick_s)
+        Line::over_time(CLASSES[place % CLASSES.len()][which], &format!("{label}, {}", self.name), columns, self.tick_s)
     }
 }
 
-/// Draws up the page of two runs, with the fields that are asked for by name.
+/// Builds the page of two runs, with the fields named by `shown`.
 pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportError> {
-    let runs = [Run::of(NAMES[0], a)?, Run::of(NAMES[1], b)?];
+    let runs = [Run::new(NAMES[0], a)?, Run::new(NAMES[1], b)?];
     let compared = match (&a.recording, &b.recording) {
         (Some(a), Some(b)) => Some(compare(a, b)?),
         _ => None,
@@ -66,7 +66,7 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     let time = Axis::time(runs.iter().map(Run::end_s).fold(runs[0].tick_s.max(1e-9), f64::max));
     let flag = first.map(|(_, first)| (first.tick as f64 * runs[0].tick_s, "first difference".to_owned()));
     let (marks, whole) = marks(&time, &Marks { incidents: flag.into_iter().collect(), ..Marks::default() });
-    let mut sections = vec![told(&runs), scenarios(&runs), differences(compared.as_ref(), runs[0].tick_s)];
+    let mut sections = vec![verdicts(&runs), scenarios(&runs), differences(compared.as_ref(), runs[0].tick_s)];
     if !shown.is_empty() {
         let figures = shown.iter().map(|name| field(name, &runs, whole, &time)).collect::<Result<_, _>>()?;
         sections.push(Section { id: "fields", title: "Fields", blocks: vec![Block::Figures(figures)] });
@@ -79,8 +79,8 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     sections.retain(|section| !section.blocks.is_empty());
     let verdict = match (&compared, first) {
         (Some(Ok(found)), _) if found.same() => ("no value differs".to_owned(), Some(true)),
-        (Some(Ok(_)), Some((_, first))) => (format!("they differ from tick {} on", first.tick), None),
-        (Some(Ok(_)), None) => ("no value differs, but one has more samples".to_owned(), None),
+        (Some(Ok(_)), Some((_, first))) => (format!("first difference at tick {}", first.tick), None),
+        (Some(Ok(_)), None) => ("common samples are equal; one run has more".to_owned(), None),
         _ => ("samples not compared".to_owned(), None),
     };
     let title =
@@ -94,10 +94,10 @@ pub fn model(a: &Source, b: &Source, shown: &[String]) -> Result<Model, ReportEr
     Ok(Model { title, run: None, subtitle, verdict, remarks, marks, sections })
 }
 
-/// What of two recordings differs, or why their samples cannot be compared.
+/// Compares two recordings; the inner error is the reason that their samples cannot be compared.
 fn compare(a: &Recording, b: &Recording) -> Result<Result<Comparison, String>, ReportError> {
     match diff(a, b, Tolerances::default()) {
-        Err(RecordError::Layout { service, .. }) => Ok(Err(format!("{service} has another layout in each"))),
+        Err(RecordError::Layout { service, .. }) => Ok(Err(format!("the layouts of {service} differ"))),
         found => Ok(Ok(found?)),
     }
 }
@@ -111,17 +111,17 @@ fn about(source: &Source) -> String {
     let run = source.run().map_or(String::new(), |run| format!(" (run {run})"));
     let recorded = source.recording.as_ref().map(|recording| {
         let info = recording.info();
-        format!("{}, {}, begun {}", info.scenario_name, info.clock, info.started_utc)
+        format!("{}, {}, started {}", info.scenario_name, info.clock, info.started_utc)
     });
-    let told = source.summary.as_ref().map(|s| format!("{}, {}, started {}", s.scenario, s.clock, s.started_utc));
-    format!("{}{run}", told.or(recorded).unwrap_or_default())
+    let summarised = source.summary.as_ref().map(|s| format!("{}, {}, started {}", s.scenario, s.clock, s.started_utc));
+    format!("{}{run}", summarised.or(recorded).unwrap_or_default())
 }
 
-/// A figure of a metric.
+/// An accessor of one statistic of a metric.
 type Pick = fn(&MetricScore) -> Option<f64>;
 
-/// What the launchers of both said.
-fn told(runs: &[Run<'_>; 2]) -> Section {
+/// Returns the section with the verdicts and metrics from both summaries.
+fn verdicts(runs: &[Run<'_>; 2]) -> Section {
     let number = |value: Option<f64>| value.map_or("–".to_owned(), digits);
     let summary = |run: &Run<'_>| run.source.summary.as_ref().map_or("–".to_owned(), |s| s.verdict.clone());
     let metric = |run: &'_ Run<'_>, name: &str, pick: Pick| {
@@ -129,9 +129,9 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
         number(metrics.filter(|metric| metric.name == name).find_map(pick))
     };
     let mut names: Vec<&str> = Vec::new();
-    for told in runs.iter().filter_map(|run| run.source.summary.as_ref()).flat_map(|summary| &summary.score.metrics) {
-        if !names.contains(&told.name.as_str()) {
-            names.push(&told.name);
+    for metric in runs.iter().filter_map(|run| run.source.summary.as_ref()).flat_map(|summary| &summary.score.metrics) {
+        if !names.contains(&metric.name.as_str()) {
+            names.push(&metric.name);
         }
     }
     let mut rows = vec![vec!["verdict".to_owned(), summary(&runs[0]), summary(&runs[1])]];
@@ -142,8 +142,8 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
         ("within its limit from, s", |metric| metric.settled_at_s),
     ];
     for name in names {
-        for (what, pick) in figures {
-            rows.push(vec![format!("{name}, {what}"), metric(&runs[0], name, pick), metric(&runs[1], name, pick)]);
+        for (statistic, pick) in figures {
+            rows.push(vec![format!("{name}, {statistic}"), metric(&runs[0], name, pick), metric(&runs[1], name, pick)]);
         }
     }
     let ticks = |run: &Run<'_>, role: &str| {
@@ -162,10 +162,10 @@ fn told(runs: &[Run<'_>; 2]) -> Section {
         }
     }
     let table = Block::table("", vec!["", "A", "B"], rows);
-    Section { id: "verdict", title: "What was told of them", blocks: vec![table] }
+    Section { id: "verdict", title: "Verdicts and metrics", blocks: vec![table] }
 }
 
-/// The keys of the scenarios that differ.
+/// Returns the section with the keys whose values differ between the scenarios.
 fn scenarios(runs: &[Run<'_>; 2]) -> Section {
     let [a, b] = runs.each_ref().map(|run| run.source.scenario.as_ref());
     let block = match (a, b) {
@@ -173,13 +173,13 @@ fn scenarios(runs: &[Run<'_>; 2]) -> Section {
             let mut rows = Vec::new();
             differing_tables("", &a.resolved, &b.resolved, &mut rows);
             match rows.len() {
-                0 => Block::Text("Both ran the same scenario: every key has the same value.".to_owned()),
+                0 => Block::Text("Both runs have the same scenario.".to_owned()),
                 _ => Block::table("", vec!["key", "A", "B"], rows),
             }
         }
-        _ => Block::Text("The scenarios cannot be compared: one of the runs does not tell its own.".to_owned()),
+        _ => Block::Text("The scenarios cannot be compared: a scenario is missing.".to_owned()),
     };
-    Section { id: "scenarios", title: "What differs between the scenarios", blocks: vec![block] }
+    Section { id: "scenarios", title: "Scenario differences", blocks: vec![block] }
 }
 
 fn differing_tables(key: &str, a: &toml::Table, b: &toml::Table, rows: &mut Vec<Vec<String>>) {
@@ -190,17 +190,19 @@ fn differing_tables(key: &str, a: &toml::Table, b: &toml::Table, rows: &mut Vec<
     }
 }
 
-/// Adds a row for every key below this one whose values differ.
+/// Adds a row for every key at or below `key` whose values differ.
 fn differing(key: &str, a: Option<&toml::Value>, b: Option<&toml::Value>, rows: &mut Vec<Vec<String>>) {
     use toml::Value::{Array, Table};
-    let none = toml::Table::new();
+    let empty = toml::Table::new();
     match (a, b) {
         _ if a == b => {}
         (Some(Table(a)), Some(Table(b))) => differing_tables(key, a, b, rows),
-        (Some(Table(of)), None) if !of.is_empty() => differing_tables(key, of, &none, rows),
-        (None, Some(Table(of))) if !of.is_empty() => differing_tables(key, &none, of, rows),
-        // Lists of tables, and those too long to be read, by their elements.
-        (Some(Array(of)), _) | (_, Some(Array(of))) if of.len() > LISTED || of.iter().any(toml::Value::is_table) => {
+        (Some(Table(a)), None) if !a.is_empty() => differing_tables(key, a, &empty, rows),
+        (None, Some(Table(b))) if !b.is_empty() => differing_tables(key, &empty, b, rows),
+        // Lists of tables and long lists are compared element by element.
+        (Some(Array(list)), _) | (_, Some(Array(list)))
+            if list.len() > LISTED || list.iter().any(toml::Value::is_table) =>
+        {
             let lists = [a, b].map(|value| value.and_then(toml::Value::as_array).map_or(&[][..], Vec::as_slice));
             for index in 0..lists[0].len().max(lists[1].len()) {
                 let [a, b] = lists.map(|list| list.get(index));
@@ -214,17 +216,16 @@ fn differing(key: &str, a: Option<&toml::Value>, b: Option<&toml::Value>, rows: 
     }
 }
 
-/// The first difference, and every signal's.
+/// Returns the section with the first difference, and the differences of every signal.
 fn differences(compared: Option<&Result<Comparison, String>>, tick_s: f64) -> Section {
     let mut blocks = Vec::new();
     match compared {
-        None => blocks.push(Block::Text("Samples are compared where both runs were recorded.".to_owned())),
-        Some(Err(reason)) => blocks.push(Block::Text(format!("Samples cannot be compared: {reason}."))),
+        None => blocks.push(Block::Text("The samples cannot be compared: only recorded runs have samples.".to_owned())),
+        Some(Err(reason)) => blocks.push(Block::Text(format!("The samples cannot be compared: {reason}."))),
         Some(Ok(found)) => {
             blocks.push(Block::Text(match found.first() {
                 Some((signal, first)) => format!(
-                    "The first value that differs: {} {} at tick {} ({} s): {:e} in A, {:e} in B. It is marked on every \
-                     time axis.",
+                    "First difference: {} {} at tick {} ({} s), {:e} in A and {:e} in B. It is marked on every time axis.",
                     signal.name,
                     first.field,
                     first.tick,
@@ -232,7 +233,7 @@ fn differences(compared: Option<&Result<Comparison, String>>, tick_s: f64) -> Se
                     first.values[0],
                     first.values[1]
                 ),
-                None => "No value differs, bit for bit.".to_owned(),
+                None => "All common values are equal bit for bit.".to_owned(),
             }));
             let row = |signal: &crate::record::SignalDiff| {
                 let (max, at) = signal.max.as_ref().map_or(("0".to_owned(), "–".to_owned()), |(max, field, tick)| {
@@ -252,17 +253,18 @@ fn differences(compared: Option<&Result<Comparison, String>>, tick_s: f64) -> Se
                 ]
             };
             let rows = found.signals.iter().map(row).collect();
-            let head = vec!["signal", "ticks of both", "only A", "only B", "differs from tick", "largest", "at", "rms"];
-            blocks.push(Block::table("Signals that both have", head, rows));
-            for (which, names) in NAMES.iter().zip(&found.only).filter(|(_, names)| !names.is_empty()) {
-                blocks.push(Block::Text(format!("Only {which} has {}.", names.join(", "))));
+            let head =
+                vec!["signal", "common ticks", "only in A", "only in B", "first at tick", "largest", "at", "rms"];
+            blocks.push(Block::table("Differences of common signals", head, rows));
+            for (run, names) in NAMES.iter().zip(&found.only).filter(|(_, names)| !names.is_empty()) {
+                blocks.push(Block::Text(format!("Only in {run}: {}.", names.join(", "))));
             }
         }
     }
-    Section { id: "differences", title: "Where they differ", blocks }
+    Section { id: "differences", title: "Sample differences", blocks }
 }
 
-/// A field of both, by its name.
+/// Draws a named field of both runs.
 fn field(name: &str, runs: &[Run<'_>; 2], whole: Size, time: &Axis) -> Result<(Picture, String), ReportError> {
     let mut found: Vec<(&Run<'_>, &Key, &Columns<Extremes>)> = Vec::new();
     for run in runs {
@@ -280,25 +282,25 @@ fn field(name: &str, runs: &[Run<'_>; 2], whole: Size, time: &Axis) -> Result<(P
         run.line(key.3, &format!("{}[{}]", key.2, key.3), columns)
     };
     let lines: Vec<Line> = found.iter().map(line).collect();
-    Ok((over_time_in(whole, name, time, &y, &lines), format!("{name}; the last part of a field's name is its unit.")))
+    Ok((over_time_in(whole, name, time, &y, &lines), format!("{name}; the suffix of a field's name is its unit.")))
 }
 
 fn errors(runs: &[Run<'_>; 2], whole: Size, time: &Axis) -> Section {
-    let of = |run| {
+    let scored = |run| {
         let Run { traces, .. }: &Run<'_> = run;
         let metrics = traces.iter().flat_map(|traces| &traces.metrics);
         metrics.map(move |metric| (run, metric)).filter(|(_, metric)| metric.values.iter().any(|(_, e)| !e.is_empty()))
     };
-    let caption = "Every tick of each run, scored from its own recording.";
+    let caption = "Errors at every tick, computed from the recordings. Zeros are drawn at the bottom.";
     let figure = |(unit, shown): (String, Vec<(&Run<'_>, &MetricTrace)>)| {
         let (y, title) = error_axis(&unit, shown.iter().map(|(_, metric)| &metric.values));
         let place = |name| shown.iter().position(|(_, metric)| metric.name == name).unwrap_or(0);
         let line = |(run, metric): &(&Run<'_>, &MetricTrace)| run.line(place(metric.name), metric.name, &metric.values);
         let lines: Vec<Line> = shown.iter().map(line).collect();
-        let title = format!("{title} of both over time, logarithmic");
+        let title = format!("{title} of both runs over time, logarithmic");
         Block::Figures(vec![(over_time_in(whole, &title, time, &y, &lines), caption.to_owned())])
     };
-    let blocks = by_unit(runs.iter().flat_map(of), |(_, metric)| metric.name).into_iter().map(figure).collect();
+    let blocks = by_unit(runs.iter().flat_map(scored), |(_, metric)| metric.name).into_iter().map(figure).collect();
     Section { id: "errors", title: "Errors", blocks }
 }
 
@@ -307,8 +309,8 @@ fn motion(runs: &[Run<'_>; 2], time: &Axis) -> Section {
     let pictures = runs[0].source.scenario.as_ref().map(|scenario| scenario.rig.pictures()).unwrap_or_default();
     for picture in pictures {
         match picture {
-            rig::Picture::Plane(of) => figures.extend(paths(&of, runs)),
-            rig::Picture::Graph(of) => figures.extend(graph(&of, runs, time)),
+            rig::Picture::Plane(plane) => figures.extend(paths(&plane, runs)),
+            rig::Picture::Graph(graph) => figures.extend(graph_figure(&graph, runs, time)),
             rig::Picture::Inputs(_) | rig::Picture::Lyapunov(_) | rig::Picture::Onset => {}
         }
     }
@@ -316,51 +318,51 @@ fn motion(runs: &[Run<'_>; 2], time: &Axis) -> Section {
     Section { id: "motion", title: "Motion", blocks }
 }
 
-/// The truth of every body in both, and the estimate's.
-fn graph(of: &rig::Graph, runs: &[Run<'_>; 2], time: &Axis) -> Option<(Picture, String)> {
+/// Draws the truth of every body and the estimate of both runs over time.
+fn graph_figure(graph: &rig::Graph, runs: &[Run<'_>; 2], time: &Axis) -> Option<(Picture, String)> {
     let (mut lines, mut columns) = (Vec::new(), Vec::new());
     for run in runs {
         let Some(traces) = &run.traces else { continue };
-        let seen = traces.bodies.first().map(|body| (body, "estimate", "observer"));
+        let estimate = traces.bodies.first().map(|body| (body, "estimate", "observer"));
         let truths = traces.bodies.iter().map(|body| (body, "truth", body.as_str()));
-        for (place, (body, signal, label)) in truths.chain(seen).enumerate() {
-            if let Some(found) = traces.get(body, signal, of.field, of.element) {
+        for (place, (body, signal, label)) in truths.chain(estimate).enumerate() {
+            if let Some(found) = traces.get(body, signal, graph.field, graph.element) {
                 lines.push(run.line(place, label, found));
                 columns.push(found);
             }
         }
     }
-    let y = Axis::around(&of.axis, range(columns, false));
-    (!lines.is_empty()).then(|| (over_time(&of.title, time, &y, &lines), of.caption.clone()))
+    let y = Axis::around(&graph.axis, range(columns, false));
+    (!lines.is_empty()).then(|| (over_time(&graph.title, time, &y, &lines), graph.caption.clone()))
 }
 
-/// The first body's path in a plane, in both.
-fn paths(of: &rig::Plane, runs: &[Run<'_>; 2]) -> Option<(Picture, String)> {
-    let path = |(which, run): (usize, &Run<'_>)| {
+/// Draws the path of the first body of both runs in a plane.
+fn paths(view: &rig::Plane, runs: &[Run<'_>; 2]) -> Option<(Picture, String)> {
+    let path = |(place, run): (usize, &Run<'_>)| {
         let traces = run.traces.as_ref()?;
         let body = traces.bodies.first()?.clone();
         let label = format!("{body}, {}", run.name);
-        traces.paths.get(&(body, of.title)).map(|columns| Line::path(CLASSES[which][which], &label, columns))
+        traces.paths.get(&(body, view.title)).map(|columns| Line::path(CLASSES[place][place], &label, columns))
     };
     let lines: Vec<Line> = runs.iter().enumerate().filter_map(path).collect();
-    (!lines.is_empty()).then(|| (plane(of.title, of.axes, &lines, of.centred), of.caption.to_owned()))
+    (!lines.is_empty()).then(|| (plane(view.title, view.axes, &lines, view.centred), view.caption.to_owned()))
 }
 
-/// The latencies of both, each role by the name of its run.
+/// Returns the latency curves of both runs, with the name of the run after each role.
 fn curves(runs: &[Run<'_>; 2]) -> Vec<Curve> {
-    let of = |run: &Run<'_>| {
+    let renamed = |run: &Run<'_>| {
         let name = run.name;
         let named = move |curve: &Curve| Curve { role: format!("{}, {name}", curve.role), ..curve.clone() };
         run.source.curves.iter().map(named).collect::<Vec<_>>()
     };
-    let mut curves: Vec<Curve> = runs.iter().flat_map(of).collect();
-    // The two of a role beside each other.
-    curves.sort_by(|one, other| (&one.stage, &one.role).cmp(&(&other.stage, &other.role)));
+    let mut curves: Vec<Curve> = runs.iter().flat_map(renamed).collect();
+    // Both runs of a role are adjacent.
+    curves.sort_by(|a, b| (&a.stage, &a.role).cmp(&(&b.stage, &b.role)));
     curves
 }
 
 fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
-    let of = |run: &Run<'_>| {
+    let rows_of_run = |run: &Run<'_>| {
         let name = run.name;
         let stages = run.source.summary.iter().flat_map(|summary| &summary.latencies);
         let row = move |stage: &StageFigures| {
@@ -370,8 +372,8 @@ fn latency_rows(runs: &[Run<'_>; 2]) -> Block {
         };
         stages.map(row).collect::<Vec<_>>()
     };
-    let mut rows: Vec<Vec<String>> = runs.iter().flat_map(of).collect();
-    // Stable: stages stay in the order of the summary, the two of one beside each other.
+    let mut rows: Vec<Vec<String>> = runs.iter().flat_map(rows_of_run).collect();
+    // A stable sort keeps the order of the summary and puts both runs of a stage next to each other.
     let places: Vec<(String, String)> = rows.iter().map(|row| (row[0].clone(), row[1].clone())).collect();
     rows.sort_by_key(|row| places.iter().position(|place| place.0 == row[0] && place.1 == row[1]));
     let head = vec!["role", "stage", "run", "count", "missed", "50 %, µs", "99 %, µs", "99.9 %, µs", "max, µs"];

@@ -1,50 +1,50 @@
-//! Latency distributions as curves over 1/(1 − p), from HdrHistogram's text form, and their pictures.
+//! Latency distributions as curves over 1/(1 − p), read from HdrHistogram's text format, and their charts.
 
 use super::axis::Axis;
 use super::chart::{Picture, plain};
 use super::frame::Line;
 use crate::config::RunId;
 
-/// The stages in the order in which they are shown, and what each is.
+/// The stages in the order of the page, each with its definition.
 const STAGES: [(&str, &str); 7] = [
     (
         "lateness",
-        "wake − due of a plant's tick, beside the baseline: the bare wake lateness of the core, nothing of ours running",
+        "wake − due of a plant's tick; the baseline is the wake lateness of the idle core, measured without the loop",
     ),
     ("hop", "received − sent"),
-    ("step", "one estimate, one command, or one tick of motion, computed and written in place"),
+    ("step", "time to compute one estimate, one command or one tick of motion"),
     (
         "age",
-        "from when the tick was due until the sample was sent; at a follower, until the command acts (a period by design)",
+        "use − due of a tick at the leader: until the sample is sent; at a follower, until the command acts (one period by design)",
     ),
     ("serial", "request sent − answer received"),
-    ("outage", "from when a failure was noticed until the successor ran"),
-    ("recovery", "from a failed role's last tick until every limit held again"),
+    ("outage", "from the detection of a failure until the successor runs"),
+    ("recovery", "from the last tick of a failed role until all limits hold again"),
 ];
-/// What is drawn into the picture of a stage beside it.
+/// The stage that is drawn as a reference in the chart of the lateness.
 const BASELINE: &str = "baseline";
-/// Colour and dash pattern of each role's curve.
+/// The classes of colour and dash pattern of the roles.
 const CLASSES: [&str; 6] = ["k d0", "o d1", "b d2", "g d3", "p d4", "y d1"];
 
-/// One stage's distribution.
+/// The latency distribution of a role's stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
     /// The role.
     pub role: String,
     /// The stage.
     pub stage: String,
-    /// The run that it is of.
+    /// The run that measured it.
     pub run: Option<RunId>,
-    /// 1/(1 − p) and the latency in µs, rising. The last is the largest of all, at the number of values.
+    /// Points of 1/(1 − p) and latency in µs, rising. The last point is the largest value, at the number of values.
     pub points: Vec<(f64, f64)>,
 }
 
-/// Reads a percentile distribution; otherwise says where it is none.
+/// Reads a percentile distribution. The error names the invalid line.
 pub fn read_curve(text: &str) -> Result<Vec<(f64, f64)>, String> {
     let mut points: Vec<(f64, f64)> = Vec::new();
     let rows = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
     for (index, line) in rows.skip(1) {
-        let broken = || format!("line {}: `{}` is no row of value, percentile and count", index + 1, line.trim());
+        let broken = || format!("line {}: `{}` is not a row of value, percentile and count", index + 1, line.trim());
         let numbers = line.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>().map_err(|_| broken())?;
         let (value, x) = match numbers[..] {
             [value, quantile, _, inverse] if quantile < 1.0 => (value, inverse),
@@ -60,19 +60,19 @@ pub fn read_curve(text: &str) -> Result<Vec<(f64, f64)>, String> {
     if points.is_empty() { Err("it has no rows".to_owned()) } else { Ok(points) }
 }
 
-/// One picture per stage: title, explanation and picture.
+/// Draws a chart for each stage: name, definition and chart.
 pub fn pictures(curves: &[Curve]) -> Vec<(String, String, Picture)> {
-    // A role has its colour in every picture.
+    // A role has the same colour in every chart.
     let mut roles: Vec<&str> = Vec::new();
     for curve in curves.iter().filter(|curve| curve.stage != BASELINE) {
         if !roles.contains(&curve.role.as_str()) {
             roles.push(&curve.role);
         }
     }
-    let shown = STAGES.iter().filter_map(|(stage, what)| {
+    let shown = STAGES.iter().filter_map(|(stage, definition)| {
         let with = |curve: &&Curve| curve.stage == *stage || (*stage == "lateness" && curve.stage == BASELINE);
         let curves: Vec<&Curve> = curves.iter().filter(with).collect();
-        (!curves.is_empty()).then(|| ((*stage).to_owned(), (*what).to_owned(), picture(stage, &curves, &roles)))
+        (!curves.is_empty()).then(|| ((*stage).to_owned(), (*definition).to_owned(), picture(stage, &curves, &roles)))
     });
     shown.collect()
 }
@@ -100,7 +100,7 @@ mod tests {
     use crate::telemetry::{Latency, write_hgrm};
 
     #[test]
-    fn a_distribution_reads_back_as_it_was_written() {
+    fn a_written_distribution_is_read_back() {
         let mut latency = Latency::default();
         (1..=1000).for_each(|us| latency.record(0, us * 1000));
         let mut text = Vec::new();
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_distribution_is_refused_with_its_line() {
+    fn an_invalid_distribution_is_refused_with_its_line() {
         assert!(read_curve("").is_err() && read_curve("Value Percentile\n").is_err());
         for row in ["1 2", "x 0.5 3 2", "inf 0.5 3 2", "1 0.5 3 nan"] {
             let error = read_curve(&format!("Value\n\n1.0 0.0 1 1.0\n{row}\n")).unwrap_err();

@@ -1,4 +1,4 @@
-//! Which pictures the samples of a run give: motion, errors, V, and how late what was sent.
+//! Charts from the samples of a run: motion, errors, V and lateness.
 
 use super::axis::Axis;
 use super::chart::{Picture, SHADES, Size, over_time, over_time_in, plain_in, plane, range, strip};
@@ -13,30 +13,31 @@ use crate::rig;
 use crate::scenario::Scenario;
 use crate::scenario::claims;
 
-/// Errors below this are drawn at the foot: less than rounding of numbers about 1.
+/// The smallest error on an axis, below the rounding error of numbers about 1. Smaller errors are drawn at the bottom.
 const ERROR_FLOOR: f64 = 1e-18;
-/// V below this is drawn at the foot: the square of that.
+/// The smallest V on an axis, about the square of the smallest error. Smaller values are drawn at the bottom.
 const LYAPUNOV_FLOOR: f64 = 1e-34;
-/// Colour and dash pattern of the driven bodies.
+/// The classes of colour and dash pattern of the driven bodies.
 const FOLLOWERS: [&str; BODIES_SHOWN] = ["o d0 wide", "g d3 wide", "p d4 wide", "y d1 wide"];
-/// Colour and dash pattern of three components, or of several metrics.
+/// The classes of colour and dash pattern of components and metrics.
 const COMPONENTS: [&str; 4] = ["o d0", "b d1", "g d3", "p d4"];
-/// Lateness from the lightest to the darkest shade, µs: 1 µs to 100 ms, more is as dark.
+/// The decades of lateness from the lightest to the darkest shade, starting at 1 µs.
 const SHADE_DECADES: f64 = 5.0;
 
-/// What the observed body's motion is called beside that of its counterpart.
+/// The labels of a body's motion with the observer, and of the reference run.
 const OBSERVED: &str = "with the observer (this run)";
 const COMPARED: &str = "with full state (computed here)";
 
 type Figures = Vec<(Picture, String)>;
 
-/// What all pictures over time share: their axis, and the size of those that are as wide as the page.
+/// The time axis of all charts, and the size of page-wide ones.
 pub struct Frames<'a> {
     pub time: &'a Axis,
     pub whole: Size,
 }
 
-/// The sections that the samples give, of this run and of the one that it is compared with, and the fields `shown` by name.
+/// Builds the sections with charts of the samples, of the reference run `full` if there is one, and of the fields named by
+/// `shown`.
 pub fn sections(
     source: &Source,
     traces: &Traces,
@@ -55,8 +56,8 @@ pub fn sections(
     sections.push(errors(source, scenario, traces, frames));
     let pictures = scenario.rig.pictures().into_iter();
     let certificate: Figures = pictures
-        .filter_map(|picture| if let rig::Picture::Lyapunov(of) = picture { Some(of) } else { None })
-        .flat_map(|of| lyapunov(&of, traces, time, tick_s))
+        .filter_map(|picture| if let rig::Picture::Lyapunov(lyapunov) = picture { Some(lyapunov) } else { None })
+        .flat_map(|lyapunov| lyapunov_figures(&lyapunov, traces, time, tick_s))
         .collect();
     if !certificate.is_empty() {
         let blocks = vec![Block::Figures(certificate)];
@@ -65,7 +66,7 @@ pub fn sections(
     Ok(sections)
 }
 
-/// A field by its name, as `leader/estimate.omega_rad_s` or, one element of it, `leader/estimate.omega_rad_s[2]`.
+/// Draws a field, such as `leader/estimate.omega_rad_s`, or one of its elements, such as `leader/estimate.omega_rad_s[2]`.
 fn field(name: &str, traces: &Traces, frames: &Frames<'_>, tick_s: f64) -> Result<(Picture, String), ReportError> {
     let lines: Vec<(&Key, &Columns<Extremes>)> = traces.named(name).collect();
     let Some((key, _)) = lines.first() else {
@@ -74,10 +75,10 @@ fn field(name: &str, traces: &Traces, frames: &Frames<'_>, tick_s: f64) -> Resul
     let y = Axis::around(&key.2, range(lines.iter().map(|(_, columns)| *columns), false));
     let line = |(place, (key, columns)): (usize, &(&Key, &Columns<Extremes>))| {
         let label = format!("{}[{}]", key.2, key.3);
-        Line::of(COMPONENTS[place % COMPONENTS.len()], &label, columns, tick_s)
+        Line::over_time(COMPONENTS[place % COMPONENTS.len()], &label, columns, tick_s)
     };
     let lines: Vec<Line> = lines.iter().enumerate().map(line).collect();
-    let caption = format!("{}; the last part of a field's name is its unit.", name);
+    let caption = format!("{name}; the suffix of a field's name is its unit.");
     Ok((over_time_in(frames.whole, name, frames.time, &y, &lines), caption))
 }
 
@@ -86,9 +87,9 @@ fn motion(scenario: &Scenario, traces: &Traces, full: Option<&Traces>, time: &Ax
     let mut figures = Vec::new();
     for picture in scenario.rig.pictures() {
         match picture {
-            rig::Picture::Plane(of) => figures.extend(plane_figure(&of, traces, full)),
-            rig::Picture::Graph(of) => figures.extend(graph(&of, traces, full, time, tick_s)),
-            rig::Picture::Inputs(of) => figures.extend(inputs(&of, traces, time, tick_s)),
+            rig::Picture::Plane(plane) => figures.extend(plane_figure(&plane, traces, full)),
+            rig::Picture::Graph(graph) => figures.extend(graph_figure(&graph, traces, full, time, tick_s)),
+            rig::Picture::Inputs(inputs) => figures.extend(input_figures(&inputs, traces, time, tick_s)),
             rig::Picture::Lyapunov(_) | rig::Picture::Onset => {}
         }
     }
@@ -96,34 +97,34 @@ fn motion(scenario: &Scenario, traces: &Traces, full: Option<&Traces>, time: &Ax
     blocks.extend(unseen(traces));
     let hidden = traces.bodies.len().saturating_sub(BODIES_SHOWN + 1);
     if hidden > 0 {
-        blocks.push(Block::Text(format!("{hidden} more bodies are scored and not drawn.")));
+        blocks.push(Block::Text(format!("{hidden} more bodies are scored but not drawn.")));
     }
     if scenario.rig.bodies().iter().any(|body| body.fleet.is_some()) {
-        blocks.push(Block::Text("A fleet is a band from the least to the greatest of its bodies.".to_owned()));
+        blocks.push(Block::Text("A fleet is drawn as a band from its smallest to its largest value.".to_owned()));
     }
     blocks.push(Block::Figures(figures));
     Section { id: "motion", title: "Motion", blocks }
 }
 
-/// What the grey bands of the pictures over time are, if there are any.
+/// Explains the grey bands of the charts over time, if there are any.
 fn unseen(traces: &Traces) -> Option<Block> {
     let names: Vec<&str> = traces.unseen.keys().copied().collect();
     let text =
-        format!("A grey band over time is where the estimate lacked something and said so: {}.", names.join(", "));
+        format!("Grey bands mark intervals in which the estimate reported a degraded status: {}.", names.join(", "));
     (!names.is_empty()).then_some(Block::Text(text))
 }
 
-/// How much a column of a picture stands for.
+/// Describes how many ticks a column of a chart contains.
 fn decimation(traces: &Traces, tick_s: f64) -> String {
     let stride = traces.values.values().map(Columns::stride).max().unwrap_or(1);
     let ticks = traces.ticks.map_or(0, |(first, last)| last - first + 1);
     if stride == 1 {
-        return format!("Every one of {ticks} ticks is drawn.");
+        return format!("All {ticks} ticks are drawn.");
     }
     let span = stride as f64 * tick_s;
     format!(
-        "{ticks} ticks are drawn in columns of {stride} ({span} s): each column goes from the least to the greatest value \
-         in it, so no excursion is left out, however short."
+        "{ticks} ticks are drawn in columns of {stride} ({span} s). A column spans its smallest to its largest value, so \
+         the charts show every peak."
     )
 }
 
@@ -133,7 +134,7 @@ fn present<'a>(
     lines.into_iter().flatten().unzip()
 }
 
-/// The paths of all bodies and of the observer in a plane.
+/// Draws the paths of all bodies and of the observer in a plane.
 fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
     let path = |owner: &str, class, label: &str| {
         traces.paths.get(&(owner.to_owned(), name)).map(|columns| Line::path(class, label, columns))
@@ -143,87 +144,86 @@ fn paths(traces: &Traces, name: &'static str) -> Vec<Line> {
     followers.chain([path(leader, "k d0", leader), path("observer", "b d1", "observer")]).flatten().collect()
 }
 
-/// A plane with all its paths, or with the observed body's beside that of its counterpart.
-fn plane_figure(of: &rig::Plane, traces: &Traces, full: Option<&Traces>) -> Option<(Picture, String)> {
+/// Draws a plane with all paths, or with the path of the observed body and its reference.
+fn plane_figure(view: &rig::Plane, traces: &Traces, full: Option<&Traces>) -> Option<(Picture, String)> {
     let path = |traces: &Traces, class, label: &str| {
         let body = traces.bodies.first().cloned().unwrap_or_default();
-        traces.paths.get(&(body, of.title)).map(|columns| Line::path(class, label, columns))
+        traces.paths.get(&(body, view.title)).map(|columns| Line::path(class, label, columns))
     };
-    let (lines, caption) = match (full, of.compared) {
+    let (lines, caption) = match (full, view.compared) {
         (Some(full), Some(caption)) => {
             let both = [path(full, "k d0", COMPARED), path(traces, "b d1", OBSERVED)];
             (both.into_iter().flatten().collect(), caption)
         }
-        _ => (paths(traces, of.title), of.caption),
+        _ => (paths(traces, view.title), view.caption),
     };
-    (!lines.is_empty()).then(|| (plane(of.title, of.axes, &lines, of.centred), caption.to_owned()))
+    (!lines.is_empty()).then(|| (plane(view.title, view.axes, &lines, view.centred), caption.to_owned()))
 }
 
-/// An element of a field over time: of every body, of the estimate, and of the counterpart.
-fn graph(
-    of: &rig::Graph,
+/// Draws an element of a field over time: of every body, of the estimate and of the reference run.
+fn graph_figure(
+    graph: &rig::Graph,
     traces: &Traces,
     full: Option<&Traces>,
     time: &Axis,
     tick_s: f64,
 ) -> Option<(Picture, String)> {
-    let line = |class, label: &str, columns| (columns, Line::of(class, label, columns, tick_s));
+    let line = |class, label: &str, columns| (columns, Line::over_time(class, label, columns, tick_s));
     let first = traces.bodies.first().map(String::as_str).unwrap_or_default();
     let own_classes = if full.is_some() { ["b d1", "s d2"] } else { ["k d0", "b d1"] };
     let own_label = if full.is_some() { OBSERVED } else { first };
-    let compared = full.and_then(|full| full.get(first, "truth", of.field, of.element));
+    let compared = full.and_then(|full| full.get(first, "truth", graph.field, graph.element));
     let compared = compared.map(|columns| line("k d0", COMPARED, columns));
-    let followers =
-        traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
-            traces.get(body, "truth", of.field, of.element).map(|columns| line(class, body, columns))
-        });
-    let own = traces.get(first, "truth", of.field, of.element);
+    let followers = traces.bodies.iter().skip(1).zip(FOLLOWERS).map(|(body, class)| {
+        traces.get(body, "truth", graph.field, graph.element).map(|columns| line(class, body, columns))
+    });
+    let own = traces.get(first, "truth", graph.field, graph.element);
     let own = own.map(|columns| line(own_classes[0], own_label, columns));
-    let seen = traces.get(first, "estimate", of.field, of.element);
-    let seen = seen.map(|columns| line(own_classes[1], "observer", columns));
-    // What the sensors said, where that is not the truth.
-    let measured = traces.get(first, "measurement", of.field, of.element);
+    let estimate = traces.get(first, "estimate", graph.field, graph.element);
+    let estimate = estimate.map(|columns| line(own_classes[1], "observer", columns));
+    // The measurement is drawn only if it differs from the truth.
+    let measured = traces.get(first, "measurement", graph.field, graph.element);
     let truth = own.as_ref().map(|(columns, _)| *columns);
     let noisy = measured.filter(|measured| truth.is_some_and(|truth| !same(measured, truth)));
     let noisy = noisy.map(|columns| line("grey d0 thin", "measured", columns));
-    // What is known from the beginning and never learned is no motion.
-    let learned = seen
+    // A known constant without a truth is not drawn.
+    let learned = estimate
         .as_ref()
         .is_none_or(|(columns, _)| truth.is_some() || range([*columns], false).0 < range([*columns], false).1);
     if !learned {
         return None;
     }
-    let (columns, lines) = present([noisy].into_iter().chain(followers).chain([compared, own, seen]));
-    let y = Axis::around(&of.axis, range(columns, false));
-    (!lines.is_empty()).then(|| (over_time(&of.title, time, &y, &lines), of.caption.clone()))
+    let (columns, lines) = present([noisy].into_iter().chain(followers).chain([compared, own, estimate]));
+    let y = Axis::around(&graph.axis, range(columns, false));
+    (!lines.is_empty()).then(|| (over_time(&graph.title, time, &y, &lines), graph.caption.clone()))
 }
 
-/// Whether one signal is the other wherever both are known.
-fn same(one: &Columns<Extremes>, other: &Columns<Extremes>) -> bool {
-    one.iter().zip(other.iter()).all(|((_, one), (_, other))| one.is_empty() || one == other)
+/// Returns true if both signals are equal wherever the first has values.
+fn same(a: &Columns<Extremes>, b: &Columns<Extremes>) -> bool {
+    a.iter().zip(b.iter()).all(|((_, a), (_, b))| a.is_empty() || a == b)
 }
 
-/// What the actuators of each driven body applied.
-fn inputs(of: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
+/// Draws the applied commands of each driven body.
+fn input_figures(inputs: &rig::Inputs, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
     for body in traces.bodies.iter().take(BODIES_SHOWN + 1) {
         let component = |(element, name): (usize, &&str)| {
-            let columns = traces.get(body, "truth", of.field, element)?;
-            Some((columns, Line::of(COMPONENTS[element % COMPONENTS.len()], name, columns, tick_s)))
+            let columns = traces.get(body, "truth", inputs.field, element)?;
+            Some((columns, Line::over_time(COMPONENTS[element % COMPONENTS.len()], name, columns, tick_s)))
         };
-        let (columns, lines) = present(of.components.iter().enumerate().map(component));
+        let (columns, lines) = present(inputs.components.iter().enumerate().map(component));
         let (low, high) = range(columns, false);
-        // A body that nobody drives has nothing to show.
+        // An undriven body has no chart.
         if low < 0.0 || high > 0.0 {
             let title = format!("control of {body} over time");
-            let picture = over_time(&title, time, &Axis::around(of.axis, (low, high)), &lines);
-            figures.push((picture, format!("What the actuators of {body} applied.")));
+            let picture = over_time(&title, time, &Axis::around(inputs.axis, (low, high)), &lines);
+            figures.push((picture, format!("Command applied by the actuators of {body}.")));
         }
     }
     figures
 }
 
-/// Returns what is measured in each unit, in the order in which the units occur: an axis has one.
+/// Groups metrics by unit, in the order in which the units occur.
 pub fn by_unit<T>(metrics: impl IntoIterator<Item = T>, name: impl Fn(&T) -> &str) -> Vec<(String, Vec<T>)> {
     let mut units: Vec<(String, Vec<T>)> = Vec::new();
     for metric in metrics {
@@ -236,7 +236,7 @@ pub fn by_unit<T>(metrics: impl IntoIterator<Item = T>, name: impl Fn(&T) -> &st
     units
 }
 
-/// The logarithmic axis of errors in a unit, and the name of their picture.
+/// Returns the logarithmic axis of errors in a unit, and the title of their chart.
 pub fn error_axis<'a>(unit: &str, all: impl IntoIterator<Item = &'a Columns<Extremes>>) -> (Axis, String) {
     let (low, high) = range(all, true);
     let (label, title) = match unit {
@@ -247,8 +247,8 @@ pub fn error_axis<'a>(unit: &str, all: impl IntoIterator<Item = &'a Columns<Extr
 }
 
 fn errors(source: &Source, scenario: &Scenario, traces: &Traces, frames: &Frames<'_>) -> Section {
-    let told = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
-    let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(told).collect();
+    let has_values = |metric: &&MetricTrace| metric.values.iter().any(|(_, extremes)| !extremes.is_empty());
+    let shown: Vec<&MetricTrace> = traces.metrics.iter().filter(has_values).collect();
     let rates = rates(scenario, &shown);
     let end_s = traces.ticks.map_or(0.0, |(_, last)| last as f64 * scenario.tick_s());
     let figures = by_unit(shown, |metric| metric.name)
@@ -258,7 +258,7 @@ fn errors(source: &Source, scenario: &Scenario, traces: &Traces, frames: &Frames
     Section { id: "errors", title: "Errors", blocks }
 }
 
-/// The errors that have one unit over time, and over its logarithm for a rig that wants that.
+/// Draws the errors of one unit over time, and over the logarithm of time if the rig requests it.
 fn errors_in(
     unit: &str,
     shown: &[&MetricTrace],
@@ -269,33 +269,32 @@ fn errors_in(
 ) -> Vec<Block> {
     let tick_s = scenario.tick_s();
     let (y, title) = error_axis(unit, shown.iter().map(|metric| &metric.values));
-    let of = |(metric, class): (&&MetricTrace, &'static str)| Line::of(class, metric.name, &metric.values, tick_s);
-    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS.into_iter().cycle()).map(of).collect();
+    let line =
+        |(metric, class): (&&MetricTrace, &'static str)| Line::over_time(class, metric.name, &metric.values, tick_s);
+    let mut lines: Vec<Line> = shown.iter().zip(COMPONENTS.into_iter().cycle()).map(line).collect();
     lines.extend(limits(scenario, shown, end_s));
     let mut early = lines.clone();
     let falling: Vec<Line> = rates.iter().filter_map(|rate| rate.line(shown, y.foot(), end_s)).collect();
-    let mut caption = "Every tick scored as the launcher scores it. Zeros are drawn at the foot.".to_owned();
+    let mut caption = "Errors at every tick. Zeros are drawn at the bottom.".to_owned();
     if !falling.is_empty() {
-        caption += " A straight line falls at the rate that its label gives, from the first error on: that is the rate once the \
-                    error is small.";
+        caption += " A straight grey line is the decay rate of small errors, drawn from the first error on.";
     }
     lines.extend(falling);
     let picture = over_time_in(frames.whole, &format!("{title} over time, logarithmic"), frames.time, &y, &lines);
     let mut figures = vec![Block::Figures(vec![(picture, caption)])];
     let onset = scenario.rig.pictures().iter().any(|picture| matches!(picture, rig::Picture::Onset));
     if onset && end_s > tick_s {
-        // What begins at tick 0 is drawn from the first tick on.
+        // Tick 0 is drawn at the first tick, since a logarithmic axis has no zero.
         let later = |(at, value): &(f64, f64)| (at.max(tick_s), *value);
         early.iter_mut().flat_map(|line| &mut line.parts).for_each(|part| *part = part.iter().map(later).collect());
         let (title, time) = (format!("{title} over the logarithm of time"), Axis::log_time(tick_s, end_s));
-        let caption =
-            "The same over the logarithm of time, from the first tick on: what happens at the beginning has room.";
+        let caption = "The same errors over the logarithm of time, which shows the first ticks in detail.";
         figures.push(Block::Figures(vec![(plain_in(frames.whole, &title, &time, &y, &early), caption.to_owned())]));
     }
     figures
 }
 
-/// A rate at which a metric is to fall.
+/// A predicted decay rate of a metric.
 struct Rate {
     metric: &'static str,
     class: &'static str,
@@ -303,10 +302,10 @@ struct Rate {
     per_s: f64,
 }
 
-/// The loop's rate, where one is claimed, of the first metric; and the observer's, of the estimate's error.
+/// Returns the claimed rate of the loop for the first metric, and the observer's rate for the estimation error.
 fn rates(scenario: &Scenario, shown: &[&MetricTrace]) -> Vec<Rate> {
     let rates: Vec<Option<f64>> = claims(scenario).iter().map(|claim| claim.loop_rate_per_s).collect();
-    // The plot shows the worst body: no line unless there is one for every body.
+    // The metric is that of the worst body, so a rate is drawn only if every body has one.
     let claimed =
         rates.iter().copied().collect::<Option<Vec<f64>>>().and_then(|rates| rates.into_iter().reduce(f64::min));
     let estimate = shown.iter().find(|metric| metric.name.starts_with("estimate_error"));
@@ -320,7 +319,7 @@ fn rates(scenario: &Scenario, shown: &[&MetricTrace]) -> Vec<Rate> {
 }
 
 impl Rate {
-    /// A line that falls at this rate from the first error on, if its metric is among those that are shown.
+    /// Returns a line with this decay rate from the first error on, if its metric is shown.
     fn line(&self, shown: &[&MetricTrace], foot: f64, end_s: f64) -> Option<Line> {
         let metric = shown.iter().find(|metric| metric.name == self.metric)?;
         let from = metric.values.iter().find(|(_, extremes)| !extremes.is_empty())?.1.first;
@@ -331,7 +330,7 @@ impl Rate {
     }
 }
 
-/// What `[accept]` allows, from when on it does.
+/// Returns the limits of `[accept]` as lines that begin at the time from which they apply.
 fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> {
     const SETTLED: [&str; 4] = ["limit o d1", "limit b d1", "limit g d1", "limit p d1"];
     const DECLARED: [&str; 4] = ["limit o d2", "limit b d2", "limit g d2", "limit p d2"];
@@ -341,10 +340,10 @@ fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> 
         ("declared bound of", &accept.metric_peak, accept.peak_from_s, DECLARED),
     ];
     let mut lines = Vec::new();
-    for (what, limits, from_s, classes) in kinds {
+    for (kind, limits, from_s, classes) in kinds {
         for (metric, class) in shown.iter().zip(classes.into_iter().cycle()) {
             if let Some(limit) = limits.get(metric.name).filter(|_| from_s < end_s) {
-                let label = format!("{what} {}", metric.name);
+                let label = format!("{kind} {}", metric.name);
                 lines.push(Line::through(class, &label, vec![(from_s, *limit), (end_s, *limit)]));
             }
         }
@@ -352,26 +351,27 @@ fn limits(scenario: &Scenario, shown: &[&MetricTrace], end_s: f64) -> Vec<Line> 
     lines
 }
 
-/// The rate that the observer of first order was designed for, 1/s; the slower where there are two.
+/// The design decay rate of the first-order observer, 1/s; the slower one if there are two.
 fn observer_rate(scenario: &Scenario) -> Option<f64> {
     let value = scenario.resolved.get("observer")?.get("decay_rate_per_s")?;
     let rates = value.as_array().cloned().unwrap_or_else(|| vec![value.clone()]);
     rates.iter().filter_map(toml::Value::as_float).reduce(f64::min)
 }
 
-/// The metrics as the recording's samples give them.
+/// Returns the table of metrics, from the recording and from the run.
 fn rescored(source: &Source, traces: &Traces) -> Block {
     let number = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.4e}"));
     let row = |metric: &MetricTrace| {
-        let told = source.summary.as_ref().and_then(|s| s.score.metrics.iter().find(|told| told.name == metric.name));
+        let metrics = source.summary.iter().flat_map(|summary| &summary.score.metrics);
+        let scored = metrics.into_iter().find(|scored| scored.name == metric.name);
         vec![
             metric.name.to_owned(),
             number(Some(metric.last).filter(|last| !last.is_nan())),
-            number(told.map(|told| told.last).filter(|last| last.is_finite())),
+            number(scored.map(|scored| scored.last).filter(|last| last.is_finite())),
             number(metric.settled_max),
-            number(told.and_then(|told| told.settled_max)),
-            number(told.and_then(|told| told.peak)),
-            told.and_then(|told| told.settled_at_s).map_or("–".to_owned(), digits),
+            number(scored.and_then(|scored| scored.settled_max)),
+            number(scored.and_then(|scored| scored.peak)),
+            scored.and_then(|scored| scored.settled_at_s).map_or("–".to_owned(), digits),
         ]
     };
     let head = vec![
@@ -381,63 +381,67 @@ fn rescored(source: &Source, traces: &Traces) -> Block {
         "largest settled (recording)",
         "largest settled (run)",
         "peak (run)",
-        "within from, s",
+        "within limit from, s",
     ];
-    let caption = format!("Metrics, {} ticks scored with every sample", traces.scored_ticks);
+    let caption = format!("Metrics ({} ticks with all samples)", traces.scored_ticks);
     Block::table(&caption, head, traces.metrics.iter().map(row).collect())
 }
 
-fn lyapunov(of: &rig::Lyapunov, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
+fn lyapunov_figures(lyapunov: &rig::Lyapunov, traces: &Traces, time: &Axis, tick_s: f64) -> Figures {
     let mut figures = Vec::new();
     let bodies = traces.bodies.iter().skip(1).zip(COMPONENTS);
     let v = bodies.filter_map(|(body, class)| {
-        let columns = traces.get(body, "command", of.field, 0)?;
-        Some((columns, Line::of(class, body, columns, tick_s)))
+        let columns = traces.get(body, "command", lyapunov.field, 0)?;
+        Some((columns, Line::over_time(class, body, columns, tick_s)))
     });
     let (columns, lines): (Vec<_>, Vec<_>) = v.unzip();
     let (low, high) = range(columns, true);
     if high > 0.0 {
-        let y = Axis::decades(of.axes[0], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
-        let caption = format!("{} as the controller sees it: of its own estimate, not of the truth.", of.function);
+        let y = Axis::decades(lyapunov.axes[0], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let caption = format!("{}, computed by the controller from the estimate.", lyapunov.function);
         figures.push((over_time("V over time, logarithmic", time, &y, &lines), caption));
     }
     for (body, [fell, bound]) in &traces.falls {
         let (low, high) = range([bound], true);
-        let y = Axis::decades(of.axes[1], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
-        let lines =
-            [Line::of("o d0", "measured, tick to tick", fell, tick_s), Line::of("k d1", "bound", bound, tick_s)];
+        let y = Axis::decades(lyapunov.axes[1], (low.max(LYAPUNOV_FLOOR), high.max(LYAPUNOV_FLOOR)));
+        let lines = [
+            Line::over_time("o d0", "measured, tick to tick", fell, tick_s),
+            Line::over_time("k d1", "bound", bound, tick_s),
+        ];
         let caption = format!(
-            "How fast V of {body} fell, and {} that it may not fall slower than: the certificate holds where the measured \
-             line is not below. Drawn as long as V is more than rounding; where it rose, at the foot.",
-            of.bound
+            "Decay rate of V of {body}, and its lower limit, {}: the certificate holds where the measured rate is at least \
+             the limit. Drawn while V exceeds rounding errors. Where V rose, the rate is drawn at the bottom.",
+            lyapunov.bound
         );
-        figures.push((over_time("rate of fall of V and its bound", time, &y, &lines), caption));
+        figures.push((over_time("decay rate of V and its bound", time, &y, &lines), caption));
     }
     figures
 }
 
-/// How late every role sent, over time.
+/// Builds the section with the lateness of every role over time.
 pub fn lateness(source: &Source, traces: &Traces, time: &Axis) -> Section {
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
-    let told = |row: &&super::traces::RoleTrace| row.lateness_us.iter().next().is_some();
+    let has_values = |row: &&super::traces::RoleTrace| row.lateness_us.iter().next().is_some();
     let rows: Vec<(String, &Columns<Extremes>)> =
-        traces.roles.iter().filter(told).map(|row| (row.role.clone(), &row.lateness_us)).collect();
+        traces.roles.iter().filter(has_values).map(|row| (row.role.clone(), &row.lateness_us)).collect();
     let early = traces.roles.iter().filter(|row| row.early.0 > 0).map(|row| {
         let (samples, us) = row.early;
-        let text =
-            format!("The stamps of {samples} samples of {} lie up to {us:.1} µs before their ticks were due", row.role);
-        Block::Text(text + ": its clock is another, and they are not drawn.")
+        Block::Text(format!(
+            "{samples} samples of {} have stamps up to {us:.1} µs before their due time, so the role has another clock. \
+             They are not drawn.",
+            row.role
+        ))
     });
     let early: Vec<Block> = early.collect();
     if rows.is_empty() {
-        let text = "This clock has no due times, so nothing was late; a run in real time shows a strip here.";
+        let text = "Lateness exists only with clock = \"realtime\": other clocks have no due times.";
         let blocks = if early.is_empty() { vec![Block::Text(text.to_owned())] } else { early };
         return Section { id: "lateness", title: "Lateness over time", blocks };
     }
     let shade = |extremes: &Extremes| (!extremes.is_empty()).then(|| extremes.max.max(1.0).log10() / SHADE_DECADES);
     let picture = strip("lateness of every role over time", time, &rows, tick_s, shade);
-    let caption = "From when a tick was due until the role's sample of it was handed to its link: the latest in each column. \
-                   Nothing is drawn where there is no sample.";
+    let caption = "Time from the due time of a tick until the role sent its sample: the largest value in each column. Columns \
+                   without samples are blank.";
     let scale = (0..SHADES).map(|index| {
         let from = |index: usize| 10_f64.powf(SHADE_DECADES * index as f64 / SHADES as f64);
         if index + 1 == SHADES {

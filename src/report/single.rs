@@ -1,4 +1,4 @@
-//! The page of one run: what is shown, in which order.
+//! The page of one run: its sections and their order.
 
 use super::axis::Axis;
 use super::chart::{Marks, marks};
@@ -10,7 +10,7 @@ use super::source::Source;
 use super::traces::{Traces, trace};
 use super::{percentiles, pictures, tables};
 
-/// Draws up a report, with the fields that are asked for by name.
+/// Builds the page of a run, with the fields named by `shown`.
 pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     let mut remarks = source.missing.clone();
     let traces = match (&source.recording, &source.scenario) {
@@ -18,7 +18,7 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
         _ => None,
     };
     if let Some(damage) = source.recording.as_ref().and_then(|recording| recording.damage()) {
-        remarks.push(format!("the recording is damaged, and shown as far as it goes: {damage}"));
+        remarks.push(format!("the recording is damaged, and the page shows only its readable part: {damage}"));
     }
     if let Some(missing) = source.recording.as_ref().and_then(|recording| recording.incomplete()) {
         remarks.push(format!("the recording is not complete: {missing}"));
@@ -43,7 +43,7 @@ pub fn model(source: &Source, shown: &[String]) -> Result<Model, ReportError> {
     sections.push(tables::machine(source));
     sections.retain(|section| !section.blocks.is_empty());
     let (title, subtitle) = headings(source);
-    let unjudged = ("not judged: there is no summary".to_owned(), None);
+    let unjudged = ("not judged: no summary".to_owned(), None);
     let verdict = source.summary.as_ref().map_or(unjudged, |summary| (summary.verdict.clone(), summary.accepted));
     Ok(Model { title, run: source.run(), subtitle, verdict, remarks, marks, sections })
 }
@@ -61,7 +61,7 @@ fn headings(source: &Source) -> (String, String) {
         return (String::new(), String::new());
     };
     let about = format!(
-        "{}, {} Hz; recording begun {}; corotate {} ({})",
+        "{}, {} Hz; recording started {}; corotate {} ({})",
         info.clock,
         1e9 / info.period_ns as f64,
         info.started_utc,
@@ -71,7 +71,7 @@ fn headings(source: &Source) -> (String, String) {
     (info.scenario_name.clone(), about)
 }
 
-/// The time axis of all pictures, and what is marked on it.
+/// Returns the time axis of all charts and its marks.
 fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
     let last = traces.and_then(|traces| traces.ticks).map_or(1, |(_, last)| last.max(1));
@@ -79,8 +79,8 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     let faults = tables::faults(source).into_iter().filter(|fault| fault.from_tick <= last);
     let span = |fault: tables::FaultRow| {
         let to = fault.from_tick.saturating_add(fault.ticks).min(last);
-        let what = format!("{} {}", fault.kind, fault.role);
-        (fault.from_tick as f64 * tick_s, to as f64 * tick_s, fault.number, what)
+        let label = format!("{} {}", fault.kind, fault.role);
+        (fault.from_tick as f64 * tick_s, to as f64 * tick_s, fault.number, label)
     };
     let incidents = source.summary.iter().flat_map(|summary| &summary.incidents);
     let (missing, _) = traces.map_or_else(Default::default, Traces::missing);
@@ -97,7 +97,7 @@ fn times(source: &Source, traces: Option<&Traces>) -> (Axis, Marks) {
     (time, marks)
 }
 
-/// Spans that touch each other as one: what is marked twice is no darker.
+/// Merges overlapping and adjacent spans, so that bands do not add up to a darker one.
 fn merged(mut spans: Vec<(u64, u64)>) -> Vec<(u64, u64)> {
     spans.sort_unstable();
     spans.dedup_by(|next, last| {

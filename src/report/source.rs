@@ -1,6 +1,6 @@
-//! What a report is made of: a run's directory, or a recording alone. What is there is read, what is not is remembered.
+//! The input of a report: a run's directory, or a recording alone. Notes the parts that are missing.
 //!
-//! Must not guess: a file that is there and cannot be read is an error.
+//! Must not guess: a file that exists but cannot be read is an error.
 
 use super::error::ReportError;
 use super::percentiles::{Curve, read_curve};
@@ -13,14 +13,14 @@ use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
-/// Everything that was found.
+/// The files of a run.
 #[derive(Debug)]
 pub struct Source {
     pub summary: Option<Summary>,
     pub scenario: Option<Scenario>,
     pub recording: Option<Recording>,
     pub curves: Vec<Curve>,
-    /// What is missing, and how to get it.
+    /// A remark for each missing part: what is missing, and how to get it.
     pub missing: Vec<String>,
 }
 
@@ -36,8 +36,8 @@ impl Source {
 
     fn recording(path: &Path) -> Result<Self, ReportError> {
         let recording = Recording::open(path)?;
-        let missing = "verdict, books and latencies are not in a recording: they are in summary.json and latency/ of \
-                       the run's directory; give that to `corotate report`";
+        let missing = "verdict, counters and latencies are missing: a recording does not contain them; give the run's \
+                       directory, with summary.json and latency/, to `corotate report`";
         Ok(Self {
             summary: None,
             scenario: Some(recording.scenario()?),
@@ -57,7 +57,7 @@ impl Source {
         let refused = |reason| ReportError::Summary { path: at(SUMMARY), reason };
         let summary = summary.map(|text| Summary::parse(&text)).transpose().map_err(refused)?;
         if summary.is_none() {
-            missing.push("there is no summary.json: the run did not come to its end, or not yet".to_owned());
+            missing.push("summary.json is missing: the run was aborted, or is still running".to_owned());
         }
         let scenario = match (text(&at(SCENARIO))?, &recording) {
             (Some(text), _) => Some(Scenario::parse(&text, &at(SCENARIO).display().to_string(), &[])?),
@@ -66,8 +66,8 @@ impl Source {
         };
         if recording.is_none() {
             missing.push(
-                "motion, errors over time, V and lateness over time need the samples, which were not recorded: \
-                 `corotate run FILE --record` keeps them, in run.mcap"
+                "charts over time are missing: the samples were not recorded; `corotate run FILE --record` writes them \
+                 to run.mcap"
                     .to_owned(),
             );
         }
@@ -75,43 +75,43 @@ impl Source {
         if curves.is_empty() {
             let clock = scenario.as_ref().map(|scenario| scenario.clock);
             let reason = match clock {
-                Some(ClockKind::InProcess) => " (a run in one thread measures none)",
-                Some(ClockKind::Lockstep) => " (a run in lockstep measures none: it does not look at the time)",
-                Some(ClockKind::Realtime) | None => "",
+                Some(ClockKind::InProcess) => "a run with clock = \"in-process\" measures none",
+                Some(ClockKind::Lockstep) => "a run with clock = \"lockstep\" measures none",
+                Some(ClockKind::Realtime) | None => "there is no latency/ in the directory",
             };
-            missing.push(format!("there are no latencies: there is no latency/ in the directory{reason}"));
+            missing.push(format!("latencies are missing: {reason}"));
         }
         let found = Self { summary, scenario, recording, curves, missing };
         found.require_one_run(path)?;
         Ok(found)
     }
 
-    /// What is joined must be of one run.
+    /// Checks that all files belong to the same run.
     fn require_one_run(&self, directory: &Path) -> Result<(), ReportError> {
-        let of = |name: &str, run: Option<RunId>| (directory.join(name), run);
+        let file = |name: &str, run: Option<RunId>| (directory.join(name), run);
         let mut files: Vec<(PathBuf, Option<RunId>)> = Vec::new();
-        files.extend(self.summary.as_ref().map(|summary| of(SUMMARY, summary.run)));
-        files.extend(self.recording.as_ref().map(|recording| of(RECORDING, recording.info().run)));
-        // Without a file of its own the scenario is the recording's, which has no name in it.
+        files.extend(self.summary.as_ref().map(|summary| file(SUMMARY, summary.run)));
+        files.extend(self.recording.as_ref().map(|recording| file(RECORDING, recording.info().run)));
+        // Without scenario.toml the scenario comes from the recording, and has no run identifier.
         let scenario = self.scenario.as_ref().filter(|_| directory.join(SCENARIO).exists());
-        files.extend(scenario.map(|scenario| of(SCENARIO, scenario.run)));
-        let curve = |curve: &Curve| of(&format!("{LATENCY}/{}.{}.hgrm", curve.role, curve.stage), curve.run);
+        files.extend(scenario.map(|scenario| file(SCENARIO, scenario.run)));
+        let curve = |curve: &Curve| file(&format!("{LATENCY}/{}.{}.hgrm", curve.role, curve.stage), curve.run);
         files.extend(self.curves.iter().map(curve));
-        let Some((first, others)) = files.split_first() else { return Ok(()) };
-        match others.iter().find(|other| other.1 != first.1) {
+        let Some((first, rest)) = files.split_first() else { return Ok(()) };
+        match rest.iter().find(|file| file.1 != first.1) {
             Some(second) => Err(ReportError::TwoRuns { files: Box::new([first.clone(), second.clone()]) }),
             None => Ok(()),
         }
     }
 
-    /// The run that all of it is of.
+    /// The identifier of the run.
     pub fn run(&self) -> Option<RunId> {
         let recorded = self.recording.as_ref().and_then(|recording| recording.info().run);
         self.summary.as_ref().map_or(recorded, |summary| summary.run)
     }
 }
 
-/// The content of a file; none if there is no such file.
+/// Reads a file; returns `None` if it does not exist.
 fn text(path: &Path) -> Result<Option<String>, ReportError> {
     match files::open(path).and_then(io::read_to_string) {
         Ok(text) => Ok(Some(text)),
@@ -120,7 +120,7 @@ fn text(path: &Path) -> Result<Option<String>, ReportError> {
     }
 }
 
-/// All `<role>.<stage>.hgrm` of a directory, in the order of the summary.
+/// Reads all `<role>.<stage>.hgrm` of a directory, in the order of the summary.
 fn curves(directory: &Path, summary: Option<&Summary>) -> Result<Vec<Curve>, ReportError> {
     let failed = |source| ReportError::Read { path: directory.to_owned(), source };
     let entries = match fs::read_dir(directory) {
@@ -140,7 +140,7 @@ fn curves(directory: &Path, summary: Option<&Summary>) -> Result<Vec<Curve>, Rep
         }
     }
     let stages = summary.map_or(&[][..], |summary| &summary.latencies);
-    let place = |curve: &Curve| stages.iter().position(|told| told.role == curve.role && told.stage == curve.stage);
+    let place = |curve: &Curve| stages.iter().position(|stage| stage.role == curve.role && stage.stage == curve.stage);
     curves.sort_by_cached_key(|curve| (place(curve).unwrap_or(usize::MAX), curve.role.clone(), curve.stage.clone()));
     Ok(curves)
 }

@@ -1,4 +1,4 @@
-//! The tables of a report: what a run's summary, or the end of a recording, says in numbers and words.
+//! The tables of a report, from the summary of a run or the end of a recording.
 
 use super::model::{Block, Section};
 use super::source::Source;
@@ -9,10 +9,10 @@ use crate::launch::{Criterion, Incident, LinkCounters, StageFigures, State, exac
 use crate::rig::{ConditionReport, Figure};
 use crate::telemetry::{MachineInfo, Percentiles, Ticks};
 
-/// A scripted fault as it stands in the scenario.
+/// An injected fault of the scenario.
 #[derive(Debug)]
 pub struct FaultRow {
-    /// Its number on the time axes.
+    /// The number on the time axes.
     pub number: usize,
     pub kind: String,
     pub role: String,
@@ -20,7 +20,7 @@ pub struct FaultRow {
     pub ticks: u64,
 }
 
-/// The scripted faults in the order of time.
+/// Returns the injected faults in the order of time.
 pub fn faults(source: &Source) -> Vec<FaultRow> {
     let table = source.scenario.as_ref().and_then(|scenario| scenario.resolved.get("fault"));
     let tables = table.and_then(toml::Value::as_array).into_iter().flatten();
@@ -41,11 +41,16 @@ pub fn faults(source: &Source) -> Vec<FaultRow> {
     rows
 }
 
-/// A number in few digits; the verdict's are told in full.
+/// Formats a number in at most eight characters or with five digits.
 fn number(value: Option<f64>) -> String {
     let short = |value: f64| Some(format!("{value}")).filter(|text| text.len() <= 8);
     let finite = value.filter(|value| value.is_finite());
     finite.map_or("–".to_owned(), |value| short(value).unwrap_or_else(|| format!("{value:.4e}")))
+}
+
+/// Formats a count; a dash if it is unknown.
+fn count(count: Option<u64>) -> String {
+    count.map_or("–".to_owned(), |count| count.to_string())
 }
 
 fn strings(cells: &[&dyn ToString]) -> Vec<String> {
@@ -60,12 +65,12 @@ fn held(holds: Option<bool>) -> &'static str {
     }
 }
 
-/// Verdict, criteria, and what a reader must know of the scenario.
+/// Builds the section with the criteria and the notes of the scenario.
 pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     if let Some(summary) = &source.summary {
         let row = |criterion: &Criterion| {
-            let value = criterion.value.map_or("not finite, or not measured".to_owned(), short);
+            let value = criterion.value.map_or("infinite or not measured".to_owned(), short);
             let default = criterion.default.then(|| "default".to_owned());
             let about: Vec<String> =
                 [default, criterion.role.clone(), criterion.reason.as_ref().map(ToString::to_string)]
@@ -78,31 +83,31 @@ pub fn verdict(source: &Source, traces: Option<&Traces>) -> Section {
         };
         let rows: Vec<_> = summary.criteria.iter().map(row).collect();
         if rows.is_empty() {
-            blocks.push(Block::Text("The scenario has no criteria: nothing is judged.".to_owned()));
+            blocks.push(Block::Text("The run is not judged: the scenario has no criteria.".to_owned()));
         } else {
             let head = vec!["criterion of [accept]", "value", "limit", "verdict"];
             blocks.push(Block::table("", head, rows));
         }
         blocks.extend(summary.notes.iter().map(|note| Block::Text(format!("Note: {note}."))));
         if summary.signal != 0 {
-            blocks.push(Block::Text(format!("The run was ended by signal {} before its last tick.", summary.signal)));
+            blocks.push(Block::Text(format!("Signal {} ended the run before its last tick.", summary.signal)));
         }
         if summary.score.faulted_ticks > 0 {
-            let text = format!("A body met the end of its model: {} ticks are lost.", summary.score.faulted_ticks);
+            let text = format!("A body left the range of its model: {} ticks are lost.", summary.score.faulted_ticks);
             blocks.push(Block::Text(text));
         }
         let (scored, unscored) = (summary.score.scored_ticks, summary.score.unscored_ticks);
         blocks.push(Block::Text(format!("{scored} of {} ticks scored.", scored + unscored)));
     } else {
-        blocks.push(Block::Text("Nobody has judged this run: there is no summary.".to_owned()));
+        blocks.push(Block::Text("The run is not judged: there is no summary.".to_owned()));
     }
     if let Some(traces) = traces.filter(|traces| traces.ticks.is_none()) {
-        blocks.push(Block::Text(format!("The recording has no sample of any of {} bodies.", traces.bodies.len())));
+        blocks.push(Block::Text(format!("The recording has no samples of the {} bodies.", traces.bodies.len())));
     }
     Section { id: "verdict", title: "Verdict", blocks }
 }
 
-/// What the estimate said that it lacked, and from when to when.
+/// Returns the table of degraded statuses that the estimate reported, with their times.
 fn unseen(traces: &Traces, tick_s: f64) -> Block {
     let row = |name: &&'static str| {
         let (spans, ticks) = traces.unseen_spans(name);
@@ -110,12 +115,11 @@ fn unseen(traces: &Traces, tick_s: f64) -> Block {
         let seconds = |tick: u64| digits(tick as f64 * tick_s);
         strings(&[name, &ticks, &spans.len(), &seconds(from), &seconds(to)])
     };
-    let head = vec!["status", "ticks", "bands", "first from, s", "last until, s"];
-    let caption = "What the estimate lacked".to_owned();
-    Block::table(&caption, head, traces.unseen.keys().map(row).collect())
+    let head = vec!["status", "ticks", "intervals", "first from, s", "last until, s"];
+    Block::table("Degraded estimate", head, traces.unseen.keys().map(row).collect())
 }
 
-/// What went wrong, and what was made to.
+/// Builds the section with injected faults, incidents, missing samples and the watchdog.
 pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let mut blocks = Vec::new();
     let tick_s = source.scenario.as_ref().map_or(0.0, |scenario| scenario.tick_s());
@@ -123,52 +127,50 @@ pub fn events(source: &Source, traces: Option<&Traces>) -> Section {
     let row =
         |fault: &FaultRow| strings(&[&fault.number, &seconds(fault.from_tick), &fault.ticks, &fault.kind, &fault.role]);
     let rows: Vec<_> = faults(source).iter().map(row).collect();
-    let fault = if rows.is_empty() { "" } else { "a band with a number is a scripted fault, " };
-    let lacking = if traces.is_some_and(|traces| !traces.unseen.is_empty()) {
-        "a grey band is where the estimate lacked something, "
-    } else {
-        ""
-    };
+    let fault = if rows.is_empty() { "" } else { "numbered band: injected fault; " };
+    let degraded =
+        if traces.is_some_and(|traces| !traces.unseen.is_empty()) { "grey band: degraded estimate; " } else { "" };
     blocks.push(Block::Text(format!(
-        "On every time axis: {fault}{lacking}a dashed line with a flag is an incident, a bar at the foot ticks of which some \
-         role sent no sample."
+        "Marks in charts over time: {fault}{degraded}dashed line with a flag: incident; bar at the bottom: a role sent no \
+         sample."
     )));
     let head = vec!["number", "from, s", "ticks", "fault", "role"];
-    blocks.extend((!rows.is_empty()).then(|| Block::table("Scripted faults", head, rows)));
+    blocks.extend((!rows.is_empty()).then(|| Block::table("Injected faults", head, rows)));
     blocks.extend(traces.map(|traces| unseen(traces, tick_s)));
     let incidents = source.summary.as_ref().map_or(&[][..], |summary| &summary.incidents);
     let time = |seconds: Option<f64>| seconds.map_or("–".to_owned(), digits);
     let row = |incident: &Incident| {
         let cause = match incident.last_words.as_str() {
             "" => incident.cause.clone(),
-            words => format!("{}; it said: {words}", incident.cause),
+            words => format!("{}; last output: {words}", incident.cause),
         };
         let (outage, recovery) = (time(incident.outage_s), time(incident.recovery_s));
         strings(&[&seconds(incident.tick), &incident.role, &cause, &incident.action.name(), &outage, &recovery])
     };
     let rows: Vec<_> = incidents.iter().map(row).collect();
-    let head = vec!["at, s", "role", "cause", "what was done", "back after, s", "recovered after, s"];
+    let head = vec!["at, s", "role", "cause", "action", "outage, s", "recovery, s"];
     blocks.extend((!rows.is_empty()).then(|| Block::table("Incidents", head, rows)));
     if let Some(traces) = traces {
         let (_, ticks) = traces.missing();
-        blocks.push(Block::Text(format!("Ticks of which a role sent no sample, all roles together: {ticks}.")));
+        blocks.push(Block::Text(format!("Missing samples, all roles: {ticks}.")));
     }
     if let Some(watchdog) = source.summary.as_ref().and_then(|summary| summary.watchdog.as_ref()) {
-        let row = |one: &crate::telemetry::WatchedReport| {
-            let first = one.first_tick.map_or("–".to_owned(), seconds);
-            strings(&[&one.quantity, &number(Some(one.max)), &number(one.largest), &one.judged, &one.breaches, &first])
+        let row = |watched: &crate::telemetry::WatchedReport| {
+            let first = watched.first_tick.map_or("–".to_owned(), seconds);
+            let [bound, largest] = [Some(watched.max), watched.largest].map(number);
+            strings(&[&watched.quantity, &bound, &largest, &watched.judged, &watched.breaches, &first])
         };
         let rows = watchdog.watched.iter().map(row).collect();
-        let head = vec!["watched", "bound", "largest", "judged", "beyond", "first at, s"];
+        let head = vec!["quantity", "bound", "largest", "ticks checked", "ticks beyond", "first at, s"];
         blocks.push(Block::table("Watchdog", head, rows));
         if let Some(tick) = watchdog.latched_at_tick {
             blocks.push(Block::Text(format!("The safe command was latched at {} s.", seconds(tick))));
         }
     }
-    Section { id: "events", title: "What went wrong", blocks }
+    Section { id: "events", title: "Events", blocks }
 }
 
-/// The figures of every stage.
+/// Returns the table of latency percentiles of every stage.
 pub fn latencies(source: &Source) -> Block {
     let row = |stage: &StageFigures| {
         let mut row = strings(&[&stage.role, &stage.stage]);
@@ -180,7 +182,7 @@ pub fn latencies(source: &Source) -> Block {
     Block::table("", head, rows)
 }
 
-/// Count, missed, 50 %, 99 %, 99.9 % and the largest of a stage; dashes where the stamps are not of one clock.
+/// Formats count, missed, 50 %, 99 %, 99.9 % and maximum of a stage; dashes if its stamps have different clocks.
 pub fn figures_cells(figures: &Percentiles) -> [String; 6] {
     let us = |value: f64| if value.is_nan() { "–".to_owned() } else { format!("{value:.2}") };
     let Percentiles { count, missed, p50_us, p99_us, p999_us, max_us, .. } = *figures;
@@ -191,14 +193,14 @@ fn ticks_row((role, ticks): (&String, &Ticks)) -> Vec<String> {
     strings(&[role, &ticks.elapsed, &ticks.executed, &ticks.missed, &ticks.starved, &ticks.safe, &ticks.stalled])
 }
 
-/// The counters of roles and links.
+/// Builds the section with the counters of roles, links, hosts and the recording.
 pub fn books(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let roles = ["role", "elapsed", "executed", "missed", "starved", "safe", "stalled"];
     if let Some(books) = source.summary.as_ref().map(|summary| &summary.books) {
         let balance = if books.balanced { "The counters balance." } else { "THE COUNTERS DO NOT BALANCE." };
         let scripted = !faults(source).is_empty() || books.injected_faults > 0;
-        let acted = format!("; scripted faults acted {} times", books.injected_faults);
+        let acted = format!("; injected faults acted {} times", books.injected_faults);
         blocks.push(Block::Text(format!(
             "{balance} Missed or starved: {} ticks; rejected: {} samples{}{}.",
             books.missed_ticks,
@@ -209,21 +211,20 @@ pub fn books(source: &Source) -> Section {
         blocks.extend(books.problems.iter().map(|problem| Block::Text(problem.clone())));
         if !books.unbooked.is_empty() {
             let unbooked = books.unbooked.join(", ");
-            blocks.push(Block::Text(format!("No books of {unbooked}: its signals are counted by their readers.")));
+            blocks.push(Block::Text(format!("No counters from {unbooked}: readers count the samples.")));
         }
         let rows = books.roles.iter().map(ticks_row).collect();
         blocks.push(Block::table("Ticks", roles.to_vec(), rows));
         let row = |link: &LinkCounters| {
-            let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
-            let void = format!("{}, {}", told(link.void.0), link.void.1);
+            let void = format!("{}, {}", count(link.void.0), link.void.1);
             strings(&[
                 &link.service,
                 &link.reader,
-                &told(link.published),
+                &count(link.published),
                 &link.received,
                 &link.gaps,
                 &void,
-                &told(link.unread),
+                &count(link.unread),
                 &link.stale,
                 &format!("{}{}", link.rejected, reasons(&link.rejected_by)),
             ])
@@ -235,7 +236,7 @@ pub fn books(source: &Source) -> Section {
             "published",
             "received",
             "gaps",
-            "void sent, received",
+            "no-sample markers sent, received",
             "unread",
             "stale",
             "rejected",
@@ -259,36 +260,39 @@ pub fn books(source: &Source) -> Section {
     Section { id: "books", title: "Accounting", blocks }
 }
 
-/// What was recorded.
-/// The part of each host, and every link between them, if there were several.
+/// Returns the tables of hosts and of the links between them, if the run had several hosts.
 fn hosts(source: &Source) -> Vec<Block> {
     let Some(hosts) = source.summary.as_ref().and_then(|summary| summary.hosts.as_ref()) else { return Vec::new() };
     let clock = |host: &HostReport| {
         let Some(clock) = &host.clock else {
-            return strings(&[&host.host, &"the run's", &"–", &"–", &"–", &"–"]);
+            return strings(&[&host.host, &"reference", &"–", &"–", &"–", &"–"]);
         };
         let short = |value: f64| format!("{value:.1}");
         let [error, largest] = [clock.error_max_us, clock.largest_correction_us].map(short);
         strings(&[&host.host, &clock.source, &error, &short(clock.drift_ppm), &short(clock.round_trip_us), &largest])
     };
-    let head = vec!["host", "clock", "known to, us", "drift, ppm", "there and back, us", "largest correction, us"];
+    let head = vec!["host", "clock", "error bound, µs", "drift, ppm", "round trip, µs", "largest correction, µs"];
     let mut blocks = vec![Block::table("Hosts", head, hosts.hosts.iter().map(clock).collect())];
     let silences = hosts.hosts.iter().flat_map(|host| host.silences.iter().map(move |silence| (host, silence)));
     blocks.extend(silences.map(|(host, silence)| {
-        let Silence { of, tick, seconds, healed } = silence;
-        let end = if *healed { ", then heard again" } else { "" };
-        Block::Text(format!("From tick {tick} on {} heard nothing of {of} for {seconds:.2} s{end}.", host.host))
+        let Silence { of: sender, tick, seconds, healed } = silence;
+        let end = if *healed { "; then the link recovered" } else { "" };
+        Block::Text(format!(
+            "From tick {tick} on, {} received nothing from {sender} for {seconds:.2} s{end}.",
+            host.host
+        ))
     }));
     let row = |link: &LinkEnd| {
-        let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
-        let us = |of: fn(&Percentiles) -> f64| {
-            link.one_way.filter(Percentiles::are_shown).map_or("–".to_owned(), |way| format!("{:.0}", of(&way)))
+        let us = |percentile: fn(&Percentiles) -> f64| {
+            link.one_way
+                .filter(Percentiles::are_shown)
+                .map_or("–".to_owned(), |way| format!("{:.0}", percentile(&way)))
         };
         let way = format!("{} to {}", link.from, link.to);
         let [p50, p99] = [us(|way| way.p50_us), us(|way| way.p99_us)];
-        strings(&[&link.service, &way, &told(link.sent), &told(link.received), &link.lost, &link.stale, &p50, &p99])
+        strings(&[&link.service, &way, &count(link.sent), &count(link.received), &link.lost, &link.stale, &p50, &p99])
     };
-    let head = vec!["signal", "between hosts", "sent", "received", "lost", "stale", "one way p50, us", "p99, us"];
+    let head = vec!["signal", "between hosts", "sent", "received", "lost", "stale", "one way 50 %, µs", "99 %, µs"];
     blocks.push(Block::table("Links between hosts", head, hosts.links.iter().map(row).collect()));
     blocks
 }
@@ -305,18 +309,17 @@ fn recorded(source: &Source) -> Vec<Block> {
     }
     if let Some(end) = source.recording.as_ref().and_then(|recording| recording.info().end.as_ref()) {
         let row = |signal: &crate::record::SignalReport| {
-            let told = |count: Option<u64>| count.map_or("–".to_owned(), |count| count.to_string());
-            let (published, lost) = (told(signal.published), told(signal.lost));
+            let (published, lost) = (count(signal.published), count(signal.lost));
             strings(&[&signal.service, &signal.recorded, &signal.void, &signal.extra, &published, &lost])
         };
         let rows = end.signals.iter().map(row).collect();
-        let head = vec!["signal", "recorded", "void", "extra", "published", "lost"];
+        let head = vec!["signal", "recorded", "no-sample markers", "extra", "published", "lost"];
         blocks.push(Block::table("Recording", head, rows));
     }
     blocks
 }
 
-/// What is proven, and the bounds it rests on.
+/// Builds the section with the certificates and the limits of the guards.
 pub fn certificate(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let Some(summary) = &source.summary else {
@@ -329,58 +332,57 @@ pub fn certificate(source: &Source) -> Section {
             strings(&[&condition.name, &value, &required, &verdict])
         };
         let continuous = certificate.continuous_rate_per_s.map_or(String::new(), |rate| {
-            format!("; the error of the continuous law falls at least as exp(−{} t)", digits(rate))
+            format!("; with the continuous law the error decays at least as fast as exp(−{} t)", digits(rate))
         });
         let caption = format!("{}{continuous}", certificate.body);
         let rows: Vec<_> = certificate.conditions.iter().map(row).collect();
         blocks.push(match rows.is_empty() {
-            true => Block::Text(format!("{caption}: its rig proves nothing of the law in continuous time.")),
+            true => Block::Text(format!("{caption}: the rig has no proof for the continuous law.")),
             false => Block::table(&caption, vec!["condition", "value", "required", ""], rows),
         });
-        blocks.push(Block::Text(told_of_loop(certificate)));
-        // Why no rate is claimed is told already.
-        let others = certificate.warnings.iter().filter(|warning| certificate.reason.as_ref() != Some(*warning));
-        blocks.extend(others.map(|warning| Block::Text(format!("Warning: {warning}."))));
+        blocks.push(Block::Text(loop_claim(certificate)));
+        // The text above contains the reason that no rate is claimed.
+        let warnings = certificate.warnings.iter().filter(|warning| certificate.reason.as_ref() != Some(*warning));
+        blocks.extend(warnings.map(|warning| Block::Text(format!("Warning: {warning}."))));
     }
     if let Some(score) = &summary.score.certificate {
         let (held, broken, judged) = (score.held, score.broken, score.held + score.broken);
-        let told = match broken {
-            0 => format!("held at all of {judged} steps"),
-            _ => format!("was broken at {broken} of {judged} steps and held at {held}"),
+        let result = match broken {
+            0 => format!("holds at all {judged} checked steps"),
+            _ => format!("fails at {broken} of {judged} checked steps and holds at {held}"),
         };
-        blocks.push(Block::Text(format!("The bound on dV/dt {told}; {} could not be judged.", score.unjudged)));
+        blocks.push(Block::Text(format!("The bound on dV/dt {result}; {} steps were not checked.", score.unjudged)));
     }
     let rows: Vec<_> = summary.limits.iter().map(|limit| vec![limit.name.clone(), number(Some(limit.value))]).collect();
-    let caption = "What samples are held against".to_owned();
-    blocks.extend((!rows.is_empty()).then(|| Block::table(&caption, vec!["limit", "value"], rows)));
+    blocks.extend((!rows.is_empty()).then(|| Block::table("Limits of the guards", vec!["limit", "value"], rows)));
     Section { id: "certificate", title: "Certificate", blocks }
 }
 
-/// What is claimed of the loop that ran.
-fn told_of_loop(certificate: &Claim) -> String {
+/// Describes the claims about the sampled loop.
+fn loop_claim(certificate: &Claim) -> String {
     let rate = match (certificate.loop_rate_text(), &certificate.reason) {
-        (Some(rate), _) => format!("once it is small, the error falls as exp(−{rate} t)"),
+        (Some(rate), _) => format!("a small error decays as exp(−{rate} t)"),
         (None, reason) => format!("no rate is claimed: {}", reason.as_deref().unwrap_or("none was computed")),
     };
     let floor = |floor: &Figure| format!("{} {}", floor.name, number(Some(floor.value)));
     let floors: Vec<String> = certificate.floors.iter().map(floor).collect();
-    let floors = if floors.is_empty() { String::new() } else { format!(" Floors to expect: {}.", floors.join(", ")) };
+    let floors = if floors.is_empty() { String::new() } else { format!(" Expected floors: {}.", floors.join(", ")) };
     let over =
         certificate.over_s.map_or(String::new(), |over_s| format!(", computed over the first {} s", digits(over_s)));
     let reach = |reach: &Reach| match reach.after_s {
-        Some(after_s) => format!("{} ≤ {} after {} s at that rate", reach.metric, digits(reach.limit), digits(after_s)),
+        Some(after_s) => format!("{} ≤ {} after {} s at this rate", reach.metric, digits(reach.limit), digits(after_s)),
         None => format!("{} ≤ {} is below the floor", reach.metric, digits(reach.limit)),
     };
-    let reaches: String = certificate.reaches.iter().map(|one| format!(" From the start, {}.", reach(one))).collect();
-    format!("The sampled loop of {}: {rate}{over}.{floors}{reaches}", certificate.body)
+    let reaches: String =
+        certificate.reaches.iter().map(|limit| format!(" From the initial error: {}.", reach(limit))).collect();
+    format!("Sampled loop of {}: {rate}{over}.{floors}{reaches}", certificate.body)
 }
 
-/// Where it ran, with which privileges, and the scenario.
+/// Builds the section with the machine, the privileges and the scenario.
 pub fn machine(source: &Source) -> Section {
     let mut blocks = Vec::new();
     let info = source.recording.as_ref().map(|recording| recording.info());
-    let told = |text: &String| serde_json::from_str::<MachineInfo>(text).ok();
-    let recorded = info.and_then(|info| told(&info.host));
+    let recorded = info.and_then(|info| serde_json::from_str::<MachineInfo>(&info.host).ok());
     if let Some(host) = source.summary.as_ref().map(|summary| &summary.host).or(recorded.as_ref()) {
         blocks.push(Block::Text(format!("{}: {}, {} cores, {}.", host.name, host.cpu, host.cores, host.kernel)));
     }
@@ -394,9 +396,9 @@ pub fn machine(source: &Source) -> Section {
     };
     let rows: Vec<_> = of_run.chain(of_file).map(row).collect();
     if rows.is_empty() {
-        blocks.push(Block::Text("No privileges were asked for.".to_owned()));
+        blocks.push(Block::Text("No privileges were requested.".to_owned()));
     } else {
-        let head = vec!["role", "privilege", "asked for", "", "reason"];
+        let head = vec!["role", "privilege", "requested", "result", "reason"];
         blocks.push(Block::table("Privileges", head, rows));
     }
     if let Some(run) = source.run() {
@@ -407,7 +409,7 @@ pub fn machine(source: &Source) -> Section {
         blocks.push(Block::Text(text));
     }
     if let Some(scenario) = &source.scenario {
-        blocks.push(Block::Details("The scenario as resolved".to_owned(), scenario.to_toml()));
+        blocks.push(Block::Details("Resolved scenario".to_owned(), scenario.to_toml()));
     }
     Section { id: "machine", title: "Machine and privileges", blocks }
 }

@@ -1,7 +1,7 @@
-//! One pass over a recording: every signal that a picture shows, in columns, and the metrics as the launcher scores them.
+//! Reads a recording once: the signals of all charts in columns, and the metrics as the launcher scores them.
 //!
-//! Nothing grows with the length of the run. What no role would have used (late, second and broken samples, and what a guard
-//! does not believe) is left out here too. Must not know pictures.
+//! Memory does not grow with the length of the run. Ignores the samples that roles ignore: late, repeated and broken ones,
+//! and those that a guard rejects. Must not know charts.
 
 use super::columns::{Columns, Corners, Count, Extremes};
 use crate::bus::Signal;
@@ -14,96 +14,96 @@ use crate::score::lyapunov_floor;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// So many ticks behind the newest, a tick is scored with the samples that it has.
+/// The number of ticks behind the newest after which a tick is scored with the samples that it has.
 const WINDOW_TICKS: u64 = 2048;
-/// So many bodies have traces of their own; all are scored.
+/// The largest number of driven bodies with traces; all bodies are scored.
 pub const BODIES_SHOWN: usize = 4;
 
-/// What a recording shows.
+/// The traces of a recording.
 #[derive(Debug, Default)]
 pub struct Traces {
-    /// First and last tick of which there is a sample.
+    /// The first and last tick with a sample.
     pub ticks: Option<(u64, u64)>,
     /// The names of the bodies.
     pub bodies: Vec<String>,
-    /// Values by body, signal, field and element. All bodies of a fleet have one.
+    /// Values by body, signal, field and element. The bodies of a fleet share a trace.
     pub values: BTreeMap<Key, Columns<Extremes>>,
     /// Paths by body and by the title of the plane.
     pub paths: BTreeMap<(String, &'static str), Columns<Corners>>,
-    /// Each metric over time.
+    /// The metrics over time.
     pub metrics: Vec<MetricTrace>,
-    /// V's measured rate of fall, and what its bound promises, by body, as long as V is more than rounding.
+    /// The measured decay rate of V and its bound, by body, while V exceeds rounding errors.
     pub falls: BTreeMap<String, [Columns<Extremes>; 2]>,
-    /// By role, in the order of a tick: its samples, and how late each was sent, µs; nothing where there was no time.
+    /// The samples and lateness of the roles, in the order of a tick.
     pub roles: Vec<RoleTrace>,
-    /// Ticks at which every sample of the metrics was there.
+    /// The number of ticks with all samples that the metrics need.
     pub scored_ticks: u64,
-    /// At how many ticks an estimate said by which status that something was not seen.
+    /// The number of ticks at which the estimate reported a degraded status, by status.
     pub unseen: BTreeMap<&'static str, Columns<Count>>,
 }
 
-/// The statuses of an estimate that lacks something.
+/// The status bits of a degraded estimate.
 const UNSEEN: u64 = status::UNOBSERVABLE | status::UNUSABLE | status::AXIS_LOST | status::DEGRADED;
 
 /// Body, signal, field, element.
 pub type Key = (String, &'static str, String, usize);
 
-/// A role's samples.
+/// The samples of a role.
 #[derive(Debug, Default)]
 pub struct RoleTrace {
     pub role: String,
     service: String,
     pub samples: Columns<Count>,
     pub lateness_us: Columns<Extremes>,
-    /// Samples that were sent before their tick was due, by their stamps, and by how much at the most, µs.
+    /// The number of samples with stamps before their due time, and the largest difference, µs.
     pub early: (u64, f64),
 }
 
-/// One metric.
+/// A metric over time.
 #[derive(Debug)]
 pub struct MetricTrace {
     pub name: &'static str,
     pub values: Columns<Extremes>,
     pub last: f64,
     last_tick: u64,
-    /// The largest from `accept.settled_by_s` on.
+    /// The largest value from `accept.settled_by_s` on.
     pub settled_max: Option<f64>,
 }
 
-/// Goes through a recording.
+/// Reads the traces of a recording.
 ///
 /// # Errors
-/// [`RecordError`], if its samples have another layout, too.
+/// [`RecordError`], also if the layouts of its samples differ from the scenario's.
 pub fn trace(recording: &Recording, scenario: &Scenario) -> Result<Traces, RecordError> {
     recording.check_layouts(scenario)?;
     Tracer::new(scenario, recording).run(recording)
 }
 
-/// A recorded signal while its samples pass.
+/// A recorded signal while its samples are read.
 struct SignalTrace {
-    /// The signal; none if the scenario has none of this name and length.
+    /// The signal; `None` if the scenario has no signal of this name and length.
     kind: Option<Signal>,
     guard: Option<Box<dyn WordGuard>>,
     body: usize,
     role: Option<usize>,
     last: Option<u64>,
-    /// The word of the status, if there is one.
+    /// The index of the status word, if the samples have one.
     status: Option<usize>,
-    /// The fields that are shown, with a trace for each element.
+    /// The traced fields.
     fields: Vec<Field>,
 }
 
 struct Field {
     offset: usize,
     count: usize,
-    /// Elements of one component: one for each body.
+    /// The elements per component: one for each body of a fleet.
     bodies: usize,
-    /// Where the word is whose bits tell which elements are measured, if they can be missing.
+    /// The offset of the word whose bits mark the measured elements, if elements can be missing.
     valid: Option<usize>,
     traces: Vec<(Key, Columns<Extremes>)>,
 }
 
-/// A tick of which not everything has come: the truths of all bodies and the estimate.
+/// The truths of all bodies and the estimate of a tick that is still incomplete.
 struct Pending {
     truths: Vec<Option<Vec<u64>>>,
     estimate: Option<Vec<u64>>,
@@ -119,7 +119,7 @@ struct Tracer {
     signals: Vec<SignalTrace>,
     pending: BTreeMap<u64, Pending>,
     newest: u64,
-    /// V and the bound on its rate by body, at its last command.
+    /// The tick, V and the bound on its rate at the last command, by body.
     before: BTreeMap<usize, (u64, f64, f64)>,
     metrics: Vec<f64>,
     planes: Vec<Plane>,
@@ -204,14 +204,15 @@ impl Tracer {
         }
     }
 
-    /// Whether a sample can be of a tick: one that was due in real time, and elsewhere the next. A broken stamp can not.
+    /// Returns true if the tick of a sample is possible: in real time it was due, else it is the next one. Detects broken
+    /// stamps.
     fn possible(&self, signal: usize, tick: u64, received_ns: u64) -> bool {
         let next = self.signals[signal].last.is_none_or(|last| last.checked_add(1) == Some(tick));
         let due = received_ns.saturating_sub(self.epoch_ns) / self.period_ns;
         tick <= self.last_tick && if self.epoch_ns > 0 { tick <= due.saturating_add(1) } else { next }
     }
 
-    /// Keeps what the metrics need; returns true if the sample would be used.
+    /// Stores the sample if a metric needs it; returns true if its guard accepts it.
     fn accepted(&mut self, index: usize, tick: u64, sample: &[u8]) -> bool {
         let signal = &mut self.signals[index];
         let (body, kind) = (signal.body, signal.kind);
@@ -238,7 +239,7 @@ impl Tracer {
         true
     }
 
-    /// Counts the ticks at which the status of an estimate tells that it lacks something.
+    /// Counts the degraded status bits of an estimate.
     fn unseen(&mut self, tick: u64, status: u64) {
         for (name, _) in status::NAMES.into_iter().filter(|(_, bit)| status & UNSEEN & bit != 0) {
             self.traces.unseen.entry(name).or_default().at(tick).0 += 1;
@@ -273,7 +274,7 @@ impl Tracer {
         let settled = tick as f64 * self.tick_s >= self.settled_by_s;
         for (metric, &value) in self.traces.metrics.iter_mut().zip(&self.metrics).filter(|(_, value)| !value.is_nan()) {
             metric.values.at(tick).take(value);
-            // A tick of which not all has come is scored after later ones.
+            // An incomplete tick may be scored after later ones.
             if tick >= metric.last_tick {
                 (metric.last, metric.last_tick) = (value, tick);
             }
@@ -283,7 +284,7 @@ impl Tracer {
         }
     }
 
-    /// How fast V fell from the last command to this one, and how fast it had to.
+    /// Adds the decay rate of V from the last command to this one, and its bound.
     fn fall(&mut self, body: usize, tick: u64, command: &[u64]) {
         let Some((v, bound)) = self.rig.lyapunov_words(command) else { return };
         let name = &self.traces.bodies[body];
@@ -297,7 +298,7 @@ impl Tracer {
         }
     }
 
-    /// The paths of a body, or of an estimate, in the planes that are shown.
+    /// Adds a point to the paths of a body or an estimate in all planes.
     fn path(&mut self, body: usize, tick: u64, sample: &[u8], index: usize) {
         let owner = match self.signals[index].kind {
             Some(Signal::Estimate) => "observer".to_owned(),
@@ -321,7 +322,7 @@ impl SignalTrace {
         let body = rig.bodies().iter().position(|body| body.name == info.body);
         let fleet = body.and_then(|body| rig.bodies()[body].fleet);
         let signals = [Signal::Truth, Signal::Measurement, Signal::Estimate, Signal::Command];
-        // A file may hold anything: a signal that the scenario does not have, or has otherwise, is not shown.
+        // A signal that the scenario does not have, or that has another length, is not traced.
         let fits = |signal: &Signal| {
             let length = body.and_then(|body| rig.length(body, *signal));
             info.signal == signal.name() && length.is_some_and(|words| 8 * words == info.layout.size())
@@ -332,7 +333,7 @@ impl SignalTrace {
         let shown = kind.is_some() && body <= BODIES_SHOWN;
         let columns = info.layout.columns.iter().skip(Stamp::FIELDS.len());
         let columns = columns.filter(|column| shown && column.kind == FieldKind::F64);
-        // The first field has the components that sensors may lack.
+        // Only elements of the first field can be missing in a measurement.
         let named = |name: &str| info.layout.columns.iter().find(|column| column.name == name);
         let valid = named("valid").filter(|_| kind == Some(Signal::Measurement));
         let name = kind.map_or("", Signal::name);
@@ -346,7 +347,7 @@ impl SignalTrace {
     }
 }
 
-/// The place of the role whose samples these are; none for the truth, and beside the first signal of a role.
+/// Returns the index of the role that sends a signal; `None` for the truth, and for all but the first signal of a role.
 fn role(info: &SignalInfo, traces: &mut Traces) -> Option<usize> {
     if info.signal == "truth" || info.role.is_empty() {
         return None;
@@ -392,26 +393,26 @@ fn whole_name((body, signal, field, _): &Key) -> String {
 }
 
 impl Traces {
-    /// An element of a field.
+    /// Returns the trace of an element of a field.
     pub fn get(&self, body: &str, signal: &'static str, field: &str, element: usize) -> Option<&Columns<Extremes>> {
         self.values.get(&(body.to_owned(), signal, field.to_owned(), element))
     }
 
-    /// The elements of a field that is asked for by name, as `leader/estimate.omega_rad_s` or, one of them,
+    /// Returns the elements of a field, such as `leader/estimate.omega_rad_s`, or one element, such as
     /// `leader/estimate.omega_rad_s[2]`.
     pub fn named<'a>(&'a self, name: &'a str) -> impl Iterator<Item = (&'a Key, &'a Columns<Extremes>)> {
-        let asked = move |key: &Key| whole_name(key) == name || format!("{}[{}]", whole_name(key), key.3) == name;
-        self.values.iter().filter(move |(key, _)| asked(key))
+        let matches = move |key: &Key| whole_name(key) == name || format!("{}[{}]", whole_name(key), key.3) == name;
+        self.values.iter().filter(move |(key, _)| matches(key))
     }
 
-    /// The names of all fields.
+    /// Returns the names of all fields.
     pub fn names(&self) -> String {
         let mut names: Vec<String> = self.values.keys().map(whole_name).collect();
         names.dedup();
         names.join(", ")
     }
 
-    /// From when to when a status said that something was not seen, in ticks, and at how many.
+    /// Returns the intervals of a degraded status, in ticks, and the number of ticks in them.
     pub fn unseen_spans(&self, name: &str) -> (Vec<(u64, u64)>, u64) {
         let (mut spans, mut total) = (Vec::<(u64, u64)>::new(), 0);
         let columns =
@@ -426,17 +427,17 @@ impl Traces {
         (spans, total)
     }
 
-    /// From when to when some role has fewer samples than ticks, in ticks; and how many ticks those are, over all roles.
+    /// Returns the intervals in which a role has fewer samples than ticks, and the number of missing samples of all roles.
     pub fn missing(&self) -> (Vec<(u64, u64)>, u64) {
         let Some((first, last)) = self.ticks else { return (Vec::new(), 0) };
         let (mut spans, mut total) = (Vec::new(), 0);
         for role in &self.roles {
             let (stride, mut next) = (role.samples.stride(), first);
             let counted = role.samples.iter().map(|(tick, count)| (tick, count.0));
-            // A role that fell silent has no columns any more.
-            let silent = |tick: u64| (tick, 0);
+            // After the last sample of a role there are no columns.
+            let empty = |tick: u64| (tick, 0);
             let beyond = role.samples.iter().last().map_or(first, |(tick, _)| tick + stride);
-            let beyond = (beyond..=last).step_by(stride.max(last / 512).max(1) as usize).map(silent);
+            let beyond = (beyond..=last).step_by(stride.max(last / 512).max(1) as usize).map(empty);
             let all: Vec<(u64, u64)> = counted.chain(beyond).collect();
             for (index, (tick, count)) in all.iter().enumerate() {
                 let end = all.get(index + 1).map_or(last + 1, |(tick, _)| *tick).min(last + 1);
