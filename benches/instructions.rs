@@ -1,9 +1,10 @@
-//! Instructions per estimate-and-control step, and per tick of a run in one thread, counted by callgrind: a regression shows
-//! however noisy the machine is.
+//! Instructions per estimate-and-control step and per tick of a run in one thread, counted by callgrind: detects
+//! regressions on noisy machines too.
 //!
-//! `cargo bench --features hooks,foxglove,parquet,hosts --bench instructions` (the features of the tests: others inline
-//! differently) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` writes it anew. Needs
-//! valgrind. The figures are those of one compiler, see `compiler` in the file: by another one they are shown and not judged.
+//! `cargo bench --features hooks,foxglove,parquet,hosts --bench instructions` (the features of the tests: others
+//! change inlining) compares with `benches/instructions.json` and fails beyond its tolerance; `-- --save` updates the
+//! file. Needs valgrind. The figures belong to one compiler, see `compiler` in the file: with another one they are
+//! shown and not compared.
 
 #[path = "contest/product.rs"]
 #[allow(dead_code, reason = "the contest uses all of it")]
@@ -19,15 +20,15 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 use std::sync::atomic::AtomicUsize;
 
-/// Passes over a second of samples in the two runs whose difference counts: everything else is in both.
+/// The passes over a second of samples in the two runs; only the difference between the runs counts.
 const PASSES: [u64; 2] = [1, 51];
 const STEPS_PER_PASS: u64 = product::SAMPLES as u64;
 /// A tick of `rigid-pair` through all roles in one thread: hashes, guards, counters and score included.
 const TICK: &str = "in-process tick";
-/// How many more instructions than were kept are a regression, %.
+/// The tolerated increase of the instructions, %.
 const TOLERANCE_PERCENT: f64 = 5.0;
 
-/// What is kept.
+/// The stored figures.
 #[derive(Debug, Serialize, Deserialize)]
 struct Kept {
     compiler: String,
@@ -41,7 +42,7 @@ fn main() -> ExitCode {
         ["--repeat", kind, passes] => passes.parse().map(|n| repeat(kind, n)).map_err(|error| error.to_string()),
         ["--save"] => save(),
         [] => compare(),
-        _ => Err("give nothing, or --save".to_owned()),
+        _ => Err("give no argument, or --save".to_owned()),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -61,8 +62,7 @@ fn repeat(kind: &str, passes: u64) {
     // At 1 kHz a pass is a second.
     let overrides = ["clock=in-process", "accept={}", &format!("duration_s={passes}")].map(str::to_owned);
     let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &overrides).expect("shipped scenarios are valid");
-    run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {}))
-        .expect("a run in one thread needs nothing that could fail");
+    run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).expect("a run in one thread does not fail");
 }
 
 fn path() -> PathBuf {
@@ -73,14 +73,14 @@ fn count_all() -> Result<BTreeMap<String, f64>, String> {
     KINDS.map(|(kind, ..)| kind).into_iter().chain([TICK]).map(|kind| Ok((kind.to_owned(), per_step(kind)?))).collect()
 }
 
-/// Instructions per step of a kind, to a tenth.
+/// Returns the instructions per step of a kind, to a tenth.
 fn per_step(kind: &str) -> Result<f64, String> {
     let [few, many] = PASSES.map(|passes| collected(kind, passes));
     let exact = (many? as f64 - few? as f64) / ((PASSES[1] - PASSES[0]) * STEPS_PER_PASS) as f64;
     Ok((exact * 10.0).round() / 10.0)
 }
 
-/// Instructions of a whole process.
+/// Returns the instructions of a whole process.
 fn collected(kind: &str, passes: u64) -> Result<u64, String> {
     let program = std::env::current_exe().map_err(|error| error.to_string())?;
     let done = Command::new("valgrind")
@@ -88,7 +88,7 @@ fn collected(kind: &str, passes: u64) -> Result<u64, String> {
         .arg(program)
         .args(["--repeat", kind, &passes.to_string()])
         .output()
-        .map_err(|error| format!("there is no valgrind ({error}); install it (Debian: apt install valgrind)"))?;
+        .map_err(|error| format!("valgrind is missing ({error}); install it (Debian: apt install valgrind)"))?;
     let text = String::from_utf8_lossy(&done.stderr);
     let count = text.lines().find_map(|line| line.split_once("Collected :")?.1.trim().parse().ok());
     count.filter(|_| done.status.success()).ok_or_else(|| format!("valgrind failed: {}", text.trim()))
@@ -108,12 +108,15 @@ fn save() -> Result<(), String> {
 }
 
 fn compare() -> Result<(), String> {
-    let text = std::fs::read_to_string(path()).map_err(|error| format!("{error}; make it with -- --save"))?;
+    let text = std::fs::read_to_string(path()).map_err(|error| format!("{error}; create it with -- --save"))?;
     let kept: Kept = serde_json::from_str(&text).map_err(|error| error.to_string())?;
     let same = kept.compiler == compiler();
     if !same {
         let kept = &kept.compiler;
-        eprintln!("SKIPPED: the instruction counts because the kept figures are of {kept}, and this is {}", compiler());
+        eprintln!(
+            "SKIPPED: the instruction counts, because the stored figures are of {kept}, and this is {}",
+            compiler()
+        );
     }
     let mut worse = Vec::new();
     println!("{:>14} {:>10} {:>10} {:>8}", "instructions", "kept", "now", "change");
@@ -121,7 +124,7 @@ fn compare() -> Result<(), String> {
         let before = kept.instructions_per_step.get(kind).copied().unwrap_or(f64::NAN);
         let change = 100.0 * (now / before - 1.0);
         println!("{kind:>14} {before:>10.1} {now:>10.1} {change:>+7.2}%");
-        // What was never kept is no number, and not within.
+        // A figure without a stored one is NaN, and not within the tolerance.
         let within = change <= kept.tolerance_percent;
         if !within {
             worse.push(kind.clone());
@@ -129,6 +132,6 @@ fn compare() -> Result<(), String> {
     }
     match worse.is_empty() || !same {
         true => Ok(()),
-        false => Err(format!("more than {} % above what was kept: {}", kept.tolerance_percent, worse.join(", "))),
+        false => Err(format!("more than {} % above the stored figures: {}", kept.tolerance_percent, worse.join(", "))),
     }
 }

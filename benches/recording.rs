@@ -1,7 +1,9 @@
-//! Whether recording a real-time run moves its latencies: runs with and without, in turn, on this machine.
+//! The effect of recording on the latencies of a real-time run: runs with and without a recorder, in turn, on this
+//! machine.
 //!
-//! `cargo bench --bench recording [-- PAIRS SECONDS]`. Per role and stage the median over the runs of their p50, p99 and p99.9,
-//! with the smallest and the largest: what recording costs is to be seen beside what runs differ by anyway.
+//! `cargo bench --bench recording [-- PAIRS SECONDS]` prints, per role and stage, the median over the runs of their
+//! p50, p99 and p99.9 with the smallest and the largest value, so that the cost of recording can be compared with the
+//! variation between runs.
 
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -15,7 +17,7 @@ fn main() {
     let pairs = numbers.first().copied().unwrap_or(5);
     let seconds = numbers.get(1).copied().unwrap_or(10).to_string();
     let directory = tempfile::tempdir().unwrap();
-    // Role and stage, then off and on, then the percentiles, then the runs.
+    // Role and stage, then without and with, then the percentiles, then the runs.
     let mut figures: BTreeMap<(String, String), [[Vec<f64>; 3]; 2]> = BTreeMap::new();
     let mut missed = [0, 0];
     for pair in 0..pairs {
@@ -43,7 +45,7 @@ fn main() {
     }
 }
 
-/// One real-time run of the shipped scenario; its summary.
+/// Runs the shipped scenario in real time and returns its summary.
 fn run(directory: &Path, seconds: &str, record: bool) -> Value {
     let mut command = Command::new(env!("CARGO_BIN_EXE_corotate"));
     command.args(["run", "--clock", "realtime", "--duration", seconds, "--set", "accept={}", "--json", "--out", "out"]);
@@ -58,6 +60,6 @@ fn words(values: &mut [f64]) -> String {
     match &*values {
         [] => "-".to_owned(),
         [first, .., last] => format!("{:.1} ({first:.1} to {last:.1})", values[values.len() / 2]),
-        [one] => format!("{one:.1}"),
+        [value] => format!("{value:.1}"),
     }
 }

@@ -1,4 +1,4 @@
-//! Puts the memory map where the linker script looks for it.
+//! Copies the memory map to the linker script's search path.
 
 fn main() {
     let out = std::path::PathBuf::from(std::env::var_os("OUT_DIR").expect("cargo sets it"));

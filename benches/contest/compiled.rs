@@ -1,6 +1,6 @@
-//! C code that is compiled for this machine when it is needed, and loaded: the hand-written step.
+//! C code that is compiled for this machine at run time and loaded: the hand-written step.
 //!
-//! Must not fail a run: where there is no compiler, the row says so.
+//! A missing compiler must not fail the benchmark: the row reports it.
 
 use libloading::Library;
 use std::fs;
@@ -11,16 +11,16 @@ pub struct Compiled {
     library: Library,
 }
 
-/// What a benchmark should have.
+/// The flags of a benchmark for this machine.
 pub const NATIVE: &[&str] = &["-O3", "-march=native"];
-/// The same for any machine of this kind, as the product is compiled, and with every operation rounded as it is there.
+/// The flags for any machine of this kind, like those of the product, with every operation rounded as in the product.
 pub const PORTABLE: &[&str] = &["-O3", "-ffp-contract=off"];
 
 impl Compiled {
     /// Compiles and loads C source.
     ///
     /// # Errors
-    /// Why that is not possible, in words.
+    /// The reason why that is not possible.
     #[allow(unsafe_code)]
     pub fn new(source: &str, flags: &[&str]) -> Result<Self, String> {
         let directory = tempfile::tempdir()
@@ -34,28 +34,28 @@ impl Compiled {
             .arg(&output)
             .arg(&input)
             .arg("-lm");
-        let done = compiler
-            .output()
-            .map_err(|error| format!("there is no C compiler `cc` ({error}); install one (Debian: apt install gcc)"))?;
+        let done = compiler.output().map_err(|error| {
+            format!("the C compiler `cc` is missing ({error}); install one (Debian: apt install gcc)")
+        })?;
         if !done.status.success() {
             return Err(format!("cc failed: {}", String::from_utf8_lossy(&done.stderr).trim()));
         }
-        // SAFETY: our own source, which has no code that runs when it is loaded.
+        // SAFETY: the source is our own and runs no code when it is loaded.
         let library =
             unsafe { Library::new(&output) }.map_err(|error| format!("cannot load {}: {error}", output.display()))?;
         Ok(Self { library })
     }
 
-    /// The function of this name.
+    /// Returns the function of this name.
     ///
     /// # Safety
-    /// It must have the type `F`, which is a function pointer, and must not be called once this is dropped.
+    /// The function must have the type `F`, a function pointer, and must not be called after this library is dropped.
     ///
     /// # Errors
-    /// That there is none.
+    /// The library has no such function.
     #[allow(unsafe_code)]
     pub unsafe fn function<F: Copy>(&self, name: &str) -> Result<F, String> {
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let symbol = unsafe { self.library.get::<F>(name.as_bytes()) };
         symbol.map(|symbol| *symbol).map_err(|error| error.to_string())
     }

@@ -1,10 +1,10 @@
-//! The textbook's extended Kalman filter of a free body's three rates, two of them measured: what the filters of this
-//! project are measured against. No part of the library.
+//! The textbook's extended Kalman filter of a free body's three rates, two of them measured: the reference of this
+//! project's filters. Not part of the library.
 
 use corotate::model::{euler, rk4_step};
 use nalgebra::{Matrix3, Vector3};
 
-/// Linearised about its own estimate, as the textbook has it; that is why it may diverge.
+/// An extended Kalman filter linearised about its own estimate, as in the textbook, so that it may diverge.
 pub struct Ekf {
     coefficients: Vector3<f64>,
     axis: usize,
@@ -12,14 +12,14 @@ pub struct Ekf {
     sensor_variance: f64,
     /// Density of the white noise that drives the hidden component, (rad/s)²/s.
     density: f64,
-    /// Its estimate of the angular velocity, rad/s.
+    /// The estimate of the angular velocity, rad/s.
     pub state: Vector3<f64>,
-    /// How far it trusts that, (rad/s)².
+    /// The covariance of the estimate, (rad/s)².
     pub covariance: Matrix3<f64>,
 }
 
 impl Ekf {
-    /// Starts at the first measurement with the guess in place of the hidden component `axis` (1 to 3).
+    /// Creates a filter at the first measurement with the guess in place of the hidden component `axis` (1 to 3).
     pub fn new(
         coefficients: &Vector3<f64>,
         axis: usize,
@@ -34,7 +34,7 @@ impl Ekf {
         Self { coefficients: *coefficients, axis, sensor_variance, density, state, covariance }
     }
 
-    /// A step of `h` seconds and the measurement at its end.
+    /// Takes a step of `h` seconds with the measurement at its end.
     pub fn step(&mut self, h: f64, measured: &Vector3<f64>) {
         let (a, x) = (self.coefficients, self.state);
         #[rustfmt::skip]

@@ -1,8 +1,9 @@
-//! The product beside others that do the same: its step beside straight-line C, an extended Kalman filter and the bare copy of the
-//! samples; the law of its fleets beside a copy of the same bytes.
+//! The product compared with other implementations: its step with straight-line C, an extended Kalman filter and the
+//! bare copy of the samples; the law of its fleets with a copy of the same bytes.
 //!
-//! `cargo bench --bench contest [-- OPTIONS]`, with the options of `corotate bench`, which measures the rest. C code is compiled when
-//! it runs. Must not be part of the library, nor keep anything that the library needs.
+//! Run `cargo bench --bench contest [-- OPTIONS]`, with the options of `corotate bench`, which measures everything
+//! else. C code is compiled at run time. This benchmark must not be part of the library, nor contain code that the
+//! library needs.
 
 pub mod compiled;
 pub mod ekf;
@@ -18,20 +19,20 @@ use corotate::bench::{Row, Target, row, target};
 use corotate::config::SHIPPED;
 use std::process::ExitCode;
 
-/// What the step is to be.
+/// The targets of the step.
 const STEP: &[Target] = &[
     target("first order", Some("first order in C"), Median, AtMost(1.05)),
     target("first order", None, Median, AtMost(15.0)),
     target("first order by an EKF", Some("first order"), Median, AtLeast(3.0)),
     target("second order", Some("first order"), Median, AtMost(1.3)),
 ];
-/// What the law of a fleet is to be.
+/// The targets of the law of a fleet.
 const FLEET: &[Target] = &[
     target("law, N = 1000", Some("copy, N = 1000"), Median, AtMost(1.3)),
     target("law, N = 1000", None, Median, AtMost(0.7)),
 ];
 
-/// Every row.
+/// All rows.
 pub const ROWS: &[Row] = &[
     row("step", "estimate-and-control step: samples in, command out", STEP, step::measure),
     row("fleet", "the law of N followers in one controller's step, per follower", FLEET, fleet::measure),

@@ -1,5 +1,5 @@
-//! The product's estimate-and-control step on a second of a shipped scenario's measurements, called through a pointer once per
-//! sample. Clocks are read before and after all of them, never within.
+//! The product's estimate-and-control step on a second of a shipped scenario's measurements, called through a pointer
+//! once per sample. The clock is read before and after all of them, never in between.
 
 use corotate::config::SHIPPED;
 use corotate::rig::{Command, Estimate, Measurement, Rig};
@@ -10,9 +10,9 @@ use corotate::with_shipped_rig;
 use std::hint::black_box;
 use std::time::Instant;
 
-/// Samples of one pass: a second of them.
+/// The number of samples in a pass: one second.
 pub const SAMPLES: usize = 1000;
-/// The four steps that are held against C: name, the shipped scenario, and what is changed in it.
+/// The four steps that are compared with C: name, shipped scenario, and overrides.
 pub const KINDS: [(&str, &str, &[&str]); 4] = [
     ("first order", "rigid-pair", &[]),
     (
@@ -24,15 +24,16 @@ pub const KINDS: [(&str, &str, &[&str]); 4] = [
     ("orbit", "orbit-hold", &[]),
 ];
 
-/// A shipped scenario with what is changed in it.
+/// Returns a shipped scenario with overrides.
 pub fn scenario(name: &str, overrides: &[&str]) -> Scenario {
     let (_, text) = SHIPPED.iter().find(|(known, _)| *known == name).expect("the scenario ships");
-    // What is judged at the end of a run is of no concern here, and some overrides would leave nothing to judge.
+    // The criteria at the end of a run are not used here, and some overrides would leave them without data.
     let overrides: Vec<String> = overrides.iter().chain(&["accept={}"]).map(|text| (*text).to_owned()).collect();
     Scenario::parse(text, "bench", &overrides).expect("shipped scenarios are valid")
 }
 
-/// A second of the observed body's measurements, and those of the first driven body: the same one where none is.
+/// Returns a second of the observed body's measurements with those of the first driven body, or with themselves if no
+/// body is driven.
 pub fn measurements<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<[Measurement<R>; 2]> {
     let mut bodies = [rig.body(0), rig.body(driven(rig).unwrap_or(0))];
     let tick = |tick: usize| {
@@ -47,12 +48,12 @@ pub fn measurements<R: Rig>(rig: &R, scenario: &Scenario) -> Vec<[Measurement<R>
     (0..SAMPLES).map(tick).collect()
 }
 
-/// The first driven body, if there is one.
+/// Returns the first driven body, if there is one.
 pub fn driven<R: Rig>(rig: &R) -> Option<usize> {
     rig.bodies().iter().position(|body| body.driven)
 }
 
-/// Nanoseconds per step of a pass.
+/// Returns the nanoseconds per step of a pass.
 pub fn timed(pass: impl FnOnce()) -> f64 {
     let began = Instant::now();
     pass();
@@ -61,7 +62,7 @@ pub fn timed(pass: impl FnOnce()) -> f64 {
 
 type StepOf<R> = fn(&mut Ours<R>, &Measurement<R>, &Measurement<R>, &mut Estimate<R>, &mut Command<R>);
 
-/// The product's step on one rig.
+/// The product's step for one rig.
 pub struct Ours<R: Rig> {
     observer: Observer<R::Estimator>,
     controller: Option<Controller<R::Law>>,
@@ -75,7 +76,7 @@ impl<R: Rig> Ours<R> {
         }
     }
 
-    /// Samples in, command out; without a driven body, the estimate.
+    /// Computes the command from the samples; without a driven body, the estimate.
     #[inline(never)]
     pub fn step(
         &mut self,
@@ -102,7 +103,8 @@ impl<R: Rig> Ours<R> {
     }
 }
 
-/// A pass over the samples by the product's step, begun anew every time; tells nanoseconds per step.
+/// Returns a pass over the samples by the product's step, restarted every time. A pass returns its nanoseconds per
+/// step.
 pub fn pass(scenario: &Scenario) -> Box<dyn FnMut() -> f64 + '_> {
     with_shipped_rig!(scenario.rig, rig => {
         let samples = measurements(rig, scenario);

@@ -1,15 +1,15 @@
-/* The estimate-and-control step as one would write it by hand in C: straight-line code for the ordinary tick, everything
- * that is constant computed once. What the product's step is measured against; no part of the product.
+/* The estimate-and-control step written by hand in C: straight-line code for the ordinary tick, with all constants computed
+ * once. The reference for the product's step; not part of the product.
  *
- * Same samples in, same samples out, same checks: finite, complete, the next tick, enough signal. Whatever is not the
- * ordinary tick is detected and refused with 0 here, where the product goes on; nothing else is left out. */
+ * Same samples in, same samples out, same checks: finite, complete, the next tick, enough signal. Any other
+ * tick is detected and refused with 0, where the product continues; nothing else is left out. */
 
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
 #define EXPORT __attribute__((visibility("default")))
-/* Packing neighbouring scalars costs more here than it saves: what one step stores singly the next would load in pairs. */
+/* Packing neighbouring scalars costs more than it saves here: a step would load in pairs what the last one stored singly. */
 #if defined(__GNUC__) && !defined(__clang__)
 #define STEP EXPORT __attribute__((optimize("no-tree-slp-vectorize")))
 #else
@@ -41,21 +41,21 @@ static inline double smaller(double x, double y) { return x < y ? x : y; }
 
 struct hidden_parameters {
     double inertia[3], gain[3];
-    double decay, bandwidth; /* one of them; the other is 0 */
+    double decay, bandwidth; /* one of the two; the other is 0 */
     double guess, floor, acceleration_max, rate_bound, tick;
 };
 
 struct hidden {
     double a1, a2, a3, gain1, gain2, gain3, limit;
-    /* What the estimate says of the body, in its order: coefficients, closure, ratios, excitation. */
+    /* The constant part of the estimate, in its order: coefficients, closure, ratios, excitation. */
     double body[7];
     /* The relation, in x = om i and y = a1 j with om = sqrt(-a1 a2): products of constants. */
     double om, scale, product, bend, floor_square, turn_limit;
     double h, h6, h2, hh12, moment[4];
-    /* Filters: what is left of the error; or the two gains. */
+    /* The filters: the remaining part of the error, or the two gains. */
     double left, gain_potential, gain_unknown;
     double slope1, slope2, slope3, hidden_slope;
-    /* Memory: of the last sample, and of the filter. */
+    /* The state: the last sample, and the filter. */
     double x, y, square, drift, turning, u1, u2, u3, w, residual;
     uint64_t tick;
     int started, second, judged;
@@ -96,7 +96,7 @@ EXPORT void hidden_start(struct hidden *s, const struct hidden_parameters *p) {
     s->w = p->guess;
 }
 
-/* atan2: the turn of one tick is small; below 0.03 the series is exact to a rounding. */
+/* atan2 for the small rotation of one tick; below 0.03 the series is exact to a rounding. */
 static inline double turn(double cross, double dot) {
     double t = cross / dot;
     if (RARE(!(fabs(t) < 0.03 && dot > 0)))
@@ -191,7 +191,7 @@ EXPORT uint64_t identifier_size(void) { return sizeof(struct identifier); }
 
 EXPORT void identifier_start(struct identifier *s, const struct identifier_parameters *p) {
     memset(s, 0, sizeof *s);
-    memcpy(s->matrix, p->decay, sizeof s->matrix); /* by rows */
+    memcpy(s->matrix, p->decay, sizeof s->matrix); /* row by row */
     for (int column = 0; column < 3; column++) {
         double sum = 0;
         for (int row = 0; row < 3; row++)
@@ -202,7 +202,7 @@ EXPORT void identifier_start(struct identifier *s, const struct identifier_param
     s->h = p->tick;
 }
 
-/* v := e^(A weight) v by its series on the vector: a matrix times a vector per degree, halved where the norm asks for it. */
+/* v := e^(A weight) v by its series on the vector: a matrix times a vector per degree, halved if the norm is too large. */
 static inline void decay(const struct identifier *s, double weight, double v[3]) {
     double norm = s->norm * weight;
     int pieces = 1, degree = 6;
@@ -264,7 +264,7 @@ static struct piece part_of(const struct path *p, double begin, double end) {
     return between(p, from, middle, to, end - begin);
 }
 
-/* How often the control points change their sign. */
+/* Counts the sign changes of the control points. */
 static inline int changes(const struct path *p, int axis) {
     double b0 = p->b[0][axis], b1 = p->b[1][axis], b2 = p->b[2][axis], b3 = p->b[3][axis];
     if (__builtin_expect((b0 > 0 && b1 > 0 && b2 > 0 && b3 > 0) || (b0 < 0 && b1 < 0 && b2 < 0 && b3 < 0), 1))
@@ -307,7 +307,7 @@ static double zero_of(const struct path *p, int axis) {
     return 0.5 * (low + high);
 }
 
-/* Learns from one step; the bits of what stood against it. */
+/* Updates the estimate with one step; returns the status bits that explain an unused step. */
 static uint64_t learn(struct identifier *s, const double to[3]) {
     struct path p;
     double v0[3], v1[3], third = s->h * (1.0 / 3), middle[3];
@@ -372,7 +372,7 @@ EXPORT int identifier_step(struct identifier *s, const struct rate_measurement *
     memcpy(s->last, w, sizeof s->last);
     memcpy(s->torque, u, sizeof s->torque);
 
-    /* The moments that fit: of three cross products the longest. */
+    /* The best-fitting moments: the longest of three cross products. */
     const double *a = s->a;
     double forms[3][3] = { { 1 - a[1], 1 + a[0], 1 + a[0] * a[1] },
                            { 1 + a[1] * a[2], 1 - a[2], 1 + a[1] },
@@ -401,7 +401,7 @@ EXPORT int identifier_step(struct identifier *s, const struct rate_measurement *
     return 1;
 }
 
-/* ---- The velocity of a body in orbit, and the law that takes it to a circle. ---- */
+/* ---- The velocity of a body in orbit, and the law that steers it to a circle. ---- */
 
 struct orbit_parameters { double mu, decay[2], guess[2], target, gains[3], thrust_max, tick; };
 

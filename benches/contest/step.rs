@@ -1,7 +1,9 @@
-//! The estimate-and-control step beside the same law in C, an extended Kalman filter, and the bare copy of the samples.
+//! The estimate-and-control step, compared with the same law in C, an extended Kalman filter, and the bare copy of
+//! the samples.
 //!
-//! Every contestant is called through a pointer, once per sample, on the same second of measurements, and hands over whole
-//! samples. Clocks are read before and after a second of them, never within. Must not know what a step computes.
+//! Every contestant is called through a pointer, once per sample, on the same second of measurements, and writes
+//! complete samples. The clock is read before and after that second, never in between. This file must not depend on
+//! the contents of a step.
 
 use super::compiled::{Compiled, NATIVE, PORTABLE};
 use super::ekf::Ekf;
@@ -24,12 +26,12 @@ use std::hint::black_box;
 
 /// The hand-written step.
 const REFERENCE: &str = include_str!("reference.c");
-/// What stands for the noise of the sensors where a filter is told of it: standard deviation, rad/s, and density of the
-/// hidden component's disturbance, (rad/s)²/s.
+/// The assumed noise of the sensors for filters that use it: standard deviation, rad/s, and density of the hidden
+/// component's disturbance, (rad/s)²/s.
 const DEVIATION: f64 = 2e-3;
 const DENSITY: f64 = 1e-8;
 
-/// One who takes part: a name, the floor, and a pass over all samples that tells how long it took, ns per step.
+/// A contestant: its name, its floor, and a pass over all samples that returns the nanoseconds per step.
 struct Contestant<'a> {
     name: String,
     floor: Option<String>,
@@ -52,17 +54,17 @@ struct InC<'a> {
     parameters: Vec<f64>,
     start: unsafe extern "C" fn(*mut f64, *const f64),
     step: StepInC,
-    /// The functions live as long as the library is loaded.
+    /// The functions, valid while the library is loaded.
     _library: &'a Compiled,
 }
 
 type StepInC = unsafe extern "C" fn(*mut f64, *const u8, *const u8, *mut u8, *mut u8) -> i32;
 
 impl<'a> InC<'a> {
-    /// The functions of one kind.
+    /// Loads the functions of one kind.
     #[allow(unsafe_code)]
     fn new(library: &'a Compiled, prefix: &str, parameters: Vec<f64>) -> Result<Self, String> {
-        // SAFETY: the names and types of reference.c; the library lives at least as long as this.
+        // SAFETY: the names and types are those of reference.c, and the library outlives the functions.
         let (size, start, step) = unsafe {
             (
                 library.function::<unsafe extern "C" fn() -> u64>(&format!("{prefix}_size"))?,
@@ -70,19 +72,19 @@ impl<'a> InC<'a> {
                 library.function::<StepInC>(&format!("{prefix}_step"))?,
             )
         };
-        // SAFETY: it takes nothing and gives the size of its state.
+        // SAFETY: the function takes no arguments and returns the size of its state.
         let words = unsafe { size() }.div_ceil(8) as usize;
         Ok(Self { state: vec![0.0; words], parameters, start, step, _library: library })
     }
 
-    /// Begins anew at the guess.
+    /// Restarts at the guess.
     #[allow(unsafe_code)]
     fn restart(&mut self) {
-        // SAFETY: the state has the size that C asked for, the parameters are in the order of its struct.
+        // SAFETY: the state has the size that C requires, and the parameters are in the order of its struct.
         unsafe { (self.start)(self.state.as_mut_ptr(), self.parameters.as_ptr()) }
     }
 
-    /// One step; whether it was an ordinary one.
+    /// Takes one step; returns true if it was an ordinary one.
     #[allow(unsafe_code)]
     #[inline]
     fn step<R: Rig>(
@@ -95,7 +97,7 @@ impl<'a> InC<'a> {
         let (observed, own) = (bytemuck::bytes_of(observed).as_ptr(), bytemuck::bytes_of(own).as_ptr());
         let estimate = bytemuck::bytes_of_mut(estimate).as_mut_ptr();
         let command = bytemuck::bytes_of_mut(command).as_mut_ptr();
-        // SAFETY: samples of the layout that C declares, plain words in declared order, which `sample!` asserts.
+        // SAFETY: the samples have the layout that C declares: plain words in declared order, as `sample!` asserts.
         unsafe { (self.step)(self.state.as_mut_ptr(), observed, own, estimate, command) != 0 }
     }
 
@@ -114,7 +116,7 @@ impl<'a> InC<'a> {
     }
 }
 
-/// The parameters of a kind's C code, from the resolved scenario, in the order of its struct.
+/// Returns the parameters of a kind's C code from the resolved scenario, in the order of its struct.
 fn parameters(kind: &str, scenario: &Scenario) -> (&'static str, Vec<f64>) {
     let table: toml::Table = scenario.to_toml().parse().expect("a resolved scenario is TOML");
     let tick_s = scenario.tick_s();
@@ -153,7 +155,7 @@ fn parameters(kind: &str, scenario: &Scenario) -> (&'static str, Vec<f64>) {
     }
 }
 
-/// Every number at a path of a table; rows of a matrix one after the other.
+/// Returns every number at a path of a table, matrices row by row.
 fn numbers(table: &toml::Table, path: &str) -> Vec<f64> {
     fn flat(value: &toml::Value, into: &mut Vec<f64>) {
         match value {
@@ -171,21 +173,21 @@ fn numbers(table: &toml::Table, path: &str) -> Vec<f64> {
     values
 }
 
-/// How far the C code is from the product on the same samples.
+/// The agreement of the C code with the product on the same samples.
 #[derive(Debug)]
 pub struct Agreement {
-    /// The step.
+    /// The kind of step.
     pub kind: &'static str,
     /// The largest difference of any number in an estimate or command, over the larger of 1 and its value.
     pub largest: f64,
-    /// Whether every word that is no number was the same: status, valid bits, stamps.
+    /// True if all integer words were equal: status, valid bits, stamps.
     pub words: bool,
 }
 
-/// Holds the C code against the product, sample by sample.
+/// Compares the C code with the product, sample by sample.
 ///
 /// # Errors
-/// Why there is no C code, in words.
+/// The reason why the C code is missing.
 pub fn agreements(library: &Result<Compiled, String>) -> Result<Vec<Agreement>, String> {
     let library = library.as_ref().map_err(Clone::clone)?;
     KINDS.iter().map(|(kind, name, overrides)| agreement(library, kind, &scenario(name, overrides))).collect()
@@ -231,7 +233,7 @@ impl Agreement {
                     FieldKind::F64 => {
                         let (ours, theirs) = (f64::from_bits(ours[index]), f64::from_bits(theirs[index]));
                         let difference = (ours - theirs).abs() / ours.abs().max(1.0);
-                        // Also where either is no number.
+                        // Covers NaN too.
                         self.largest = if difference <= self.largest { self.largest } else { difference };
                     }
                 }
@@ -240,12 +242,12 @@ impl Agreement {
     }
 }
 
-/// The C code, compiled in one way.
+/// Compiles the C code with these flags.
 pub fn library(flags: &[&str]) -> Result<Compiled, String> {
     Compiled::new(REFERENCE, flags)
 }
 
-/// The same job by a textbook's filter: measured rates in, command of the same law out.
+/// Returns the same step with the textbook's filter: measured rates in, command of the same law out.
 fn by_ekf(scenario: &Scenario) -> Option<Contestant<'_>> {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
@@ -284,7 +286,7 @@ fn ekf_step(
     controller.step(estimate, own, command);
 }
 
-/// The samples in and out and nothing else: what any step takes.
+/// Returns a copy of the samples in and out: the floor of every step.
 fn bare_copy(scenario: &Scenario) -> Option<Contestant<'_>> {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>()?;
     let samples = measurements(rig, scenario);
@@ -313,7 +315,7 @@ fn copy_samples(
     (command.acceleration_rad_s2, command.lyapunov_rad2_s2) = (own.omega_rad_s, own.applied_rad_s2[0]);
 }
 
-/// A kind's step, ours and in C.
+/// Returns a kind's step, ours and in C.
 fn kind<'a>(
     kind: &'static str,
     scenario: &'a Scenario,
@@ -339,7 +341,7 @@ fn pass_in_c<R: Rig>(_: &R, in_c: &mut InC<'_>, samples: &[[Measurement<R>; 2]])
     in_c.pass::<R>(samples)
 }
 
-/// What the receiving ends check before any of it: the observed body's measurement, and a driven body's.
+/// Returns the guards that check the measurements of the observed and a driven body before a step.
 fn guards<'a>(name: &str, scenario: &'a Scenario) -> Option<Contestant<'a>> {
     with_shipped_rig!(scenario.rig, rig => {
         let driven = driven(rig)?;
@@ -357,7 +359,7 @@ fn guards<'a>(name: &str, scenario: &'a Scenario) -> Option<Contestant<'a>> {
     })
 }
 
-/// The filters alone, relation included, on noisy samples of every conic.
+/// Returns the filters alone, with their relation, on noisy samples of every conic.
 fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<Contestant<'a>> {
     let start = Vector1::new(guess);
     let relation_filters = [
@@ -392,7 +394,7 @@ fn filters<'a>(recording: &'a Recording, name: &'static str, guess: f64) -> Vec<
     by_relation.chain(whole_body_filters(recording, name, guess)).collect()
 }
 
-/// The filters of the whole state: ours, and the textbook's.
+/// Returns the filters of the whole state: ours and the textbook's.
 fn whole_body_filters<'a>(recording: &'a Recording, name: &str, guess: f64) -> [Contestant<'a>; 2] {
     let noise = RateNoise { sensor_deviation_rad_s: recording.sensors(), density: DENSITY, guess_deviation_rad_s: 1.0 };
     let guarded = move || {
@@ -443,7 +445,7 @@ pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchErro
     let mut contestants: Vec<Contestant<'_>> =
         kinds.iter().flat_map(|(name, scenario)| kind(name, scenario, &libraries, board)).collect();
     contestants.extend(by_ekf(first).into_iter().chain(bare_copy(first)));
-    // Samples in, command out, for every shipped scenario that has commands.
+    // Samples in, command out, for every shipped scenario with commands.
     let with_law = shipped.iter().filter(|(_, scenario)| scenario.rig.bodies().iter().any(|body| body.driven));
     contestants
         .extend(with_law.clone().map(|(name, scenario)| Contestant::new(format!("step of {name}"), pass(scenario))));
@@ -453,12 +455,12 @@ pub fn measure(bench: &mut Bench<'_>, board: &mut Board) -> Result<(), BenchErro
     take_turns(bench, board, &mut contestants)
 }
 
-/// Everyone in turn, round after round.
+/// Runs all contestants in turn, round after round.
 fn take_turns(bench: &mut Bench<'_>, board: &mut Board, contestants: &mut [Contestant<'_>]) -> Result<(), BenchError> {
     let (rounds, passes) = (bench.size(41, 3), bench.size(20, 2));
     for round in 0..=rounds {
         bench.next(&format!("step: round {round} of {rounds}"))?;
-        // In the leader's place, or whatever else the machine does would be measured too.
+        // In the leader's place, so that other work of the machine is not measured too.
         let values = bench.in_the_leaders_place(board, |_| {
             let mean = |contestant: &mut Contestant<'_>| {
                 let total: f64 = (0..passes).map(|_| (contestant.pass)()).sum();

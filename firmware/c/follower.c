@@ -1,7 +1,7 @@
 /* The follower of config/rigid-pair.toml as a device: written from docs/serial-protocol.md, without the library.
  *
- * A Cortex-M7 (or M4F) of QEMU's mps2 boards, without an operating system and without an allocator. What stands between the
- * lines "board" and "end of board" is all that another board changes. Must not trust a byte that comes over the line. */
+ * For a Cortex-M7 (or M4F) of QEMU's mps2 boards, without an operating system and without an allocator. Another board needs
+ * other code between the lines "board" and "end of board" only. Every received byte must be checked. */
 
 #include <math.h>
 #include <stdbool.h>
@@ -12,7 +12,7 @@
 
 #define REGISTER(address) (*(volatile uint32_t *)(address))
 #define UART_DATA REGISTER(0x40004000)
-#define UART_STATE REGISTER(0x40004004) /* bit 0: cannot send now; bit 1: a byte has come */
+#define UART_STATE REGISTER(0x40004004) /* bit 0: transmitter full; bit 1: byte received */
 #define UART_CONTROL REGISTER(0x40004008)
 #define UART_INTERRUPTS REGISTER(0x4000400c)
 #define UART_DIVISOR REGISTER(0x40004010)
@@ -29,16 +29,16 @@ static void on_systick(void) { milliseconds++; }
 static void on_byte(void) { UART_INTERRUPTS = 3; }
 static void board_start(void) {
     UART_DIVISOR = CLOCK_HZ / BAUD;
-    UART_CONTROL = 11, INTERRUPTS_ON = 1; /* send, receive, interrupt 0 when a byte has come */
+    UART_CONTROL = 11, INTERRUPTS_ON = 1; /* send, receive, interrupt 0 on a received byte */
     SYSTICK_RELOAD = CLOCK_HZ / 1000 - 1;
     SYSTICK_CURRENT = 0;
     SYSTICK_CONTROL = 7;
 }
 
 static bool board_read(uint8_t *byte) {
-    bool there = UART_STATE & 2;
-    if (there) *byte = (uint8_t)UART_DATA;
-    return there;
+    bool received = UART_STATE & 2;
+    if (received) *byte = (uint8_t)UART_DATA;
+    return received;
 }
 
 static void board_write(const uint8_t *bytes, size_t count) {
@@ -48,7 +48,8 @@ static void board_write(const uint8_t *bytes, size_t count) {
     }
 }
 
-/* Sleeps until a byte or a millisecond has come. What comes between the look and the sleep ends the sleep. */
+/* Sleeps until a byte is received or a millisecond has passed. A byte received between the check and the sleep ends the
+ * sleep. */
 static void board_wait(void) {
     __asm__ volatile("cpsid i");
     if (!(UART_STATE & 2)) __asm__ volatile("wfi");
@@ -81,7 +82,7 @@ static uint32_t crc32(const uint8_t *bytes, size_t count) {
     return ~crc;
 }
 
-/* What is read from a payload. After a field that is not there, nothing is. */
+/* The position in a payload. After a missing field all further fields are missing. */
 struct reader {
     const uint8_t *at, *end;
     bool ok;
@@ -103,7 +104,7 @@ static uint64_t read_varint(struct reader *from, unsigned bits) {
 
 static bool read_bool(struct reader *from) { return read_varint(from, 1) == 1; }
 
-/* A text, or bytes: the length; `*at` is where they begin. */
+/* Reads a text or bytes: returns the length and sets `*at` to the first byte. */
 static size_t read_bytes(struct reader *from, const uint8_t **at) {
     uint64_t length = read_varint(from, 32);
     *at = from->at;
@@ -178,7 +179,7 @@ static struct {
     uint64_t missing, timeout;
 } body;
 
-/* Euler's equations with the acceleration held. */
+/* Computes Euler's equations with the held acceleration. */
 static void slope(const double w[3], double out[3]) {
     for (int i = 0; i < 3; i++) {
         int j = (i + 1) % 3, k = (i + 2) % 3;
@@ -186,7 +187,7 @@ static void slope(const double w[3], double out[3]) {
     }
 }
 
-/* One period by the classical Runge-Kutta method, in two steps: its error is below a rounding at 1 kHz. */
+/* Moves the body over one period by the classical Runge-Kutta method, in two steps: the error is below rounding at 1 kHz. */
 static void move(void) {
     enum { STEPS = 2 };
     const double h = body.step_s / STEPS;
@@ -221,14 +222,14 @@ static uint64_t ticks_until_safe(void) {
 static struct {
     bool known, realtime, manual_rearm, begun;
     uint64_t number, period_ns, last_tick;
-    uint64_t next, heard_ns;              /* meaningful once begun */
-    bool answered;                        /* whether the last executed tick can be told again */
+    uint64_t next, executed_ns;           /* valid once begun */
+    bool answered;                        /* true if the answer of the last executed tick can be repeated */
     uint64_t tick;
     enum event event;
     uint8_t outputs[MEASUREMENT_BYTES + TRUTH_BYTES];
 } run;
 
-static void live_through(uint64_t ticks) {
+static void catch_up(uint64_t ticks) {
     enum { MOST = 100000 }; /* after a longer absence the body's clock jumps */
     for (uint64_t i = 0; i < ticks && i < MOST; i++) {
         missing_command();
@@ -300,7 +301,7 @@ static void answer(uint32_t echo) {
     put_varint(echo);
     put_varint(run.tick);
     put_byte((uint8_t)run.event);
-    put_varint(3); /* both are there */
+    put_varint(3); /* both samples are present */
     put_varint(sizeof run.outputs);
     put_bytes(run.outputs, sizeof run.outputs);
     send();
@@ -316,22 +317,22 @@ static void on_tick(struct reader *from, uint32_t sequence) {
     if (run.answered && tick == run.tick) return answer(sequence);
     uint64_t next = run.begun ? run.next : tick;
     if (tick < next || tick > run.last_tick || present > 1 || length != present * COMMAND_BYTES) return;
-    live_through(tick - next);
+    catch_up(tick - next);
     run.event = take_command(tick, present ? bytes : NULL);
     measure();
     run.tick = tick, run.next = tick + 1;
     run.begun = run.answered = true;
-    run.heard_ns = board_ns();
+    run.executed_ns = board_ns();
     answer(sequence);
     move();
 }
 
-/* Where no byte arrives any more, the body goes safe by its own clock. */
+/* Applies the safe command by the device's own clock if no ticks arrive. */
 static void elapse(void) {
     uint64_t left = ticks_until_safe();
     if (!run.known || !run.begun || !run.realtime || !left) return;
-    if (board_ns() - run.heard_ns < left * run.period_ns + run.period_ns / 2) return;
-    live_through(left);
+    if (board_ns() - run.executed_ns < left * run.period_ns + run.period_ns / 2) return;
+    catch_up(left);
     run.next += left;
 }
 
@@ -347,7 +348,7 @@ static void on_payload(const uint8_t *bytes, size_t length) {
     if (kind == STOP && from.at == from.end && run.known) go_safe();
 }
 
-/* Decodes a block in place and looks whether it is whole. */
+/* Decodes a block in place and handles its payload if the CRC is valid. */
 static void on_block(uint8_t *block, size_t length) {
     size_t from = 0, to = 0;
     while (from < length) {
@@ -381,7 +382,7 @@ int main(void) {
     }
 }
 
-/* ---- start: the vectors, and memory as C expects it ------------------------------------------------------------------ */
+/* ---- start: the vectors, and the memory for C ------------------------------------------------------------------------ */
 
 extern uint32_t stack_top, bss_begin, bss_end;
 

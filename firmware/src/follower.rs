@@ -1,4 +1,4 @@
-//! The follower, simulated: where a real one would read its gyros and set its torquers.
+//! The follower, simulated; a real one would read its gyros and set its torquers here.
 
 use crate::pair;
 use corotate::model::RigidBody;
@@ -7,9 +7,9 @@ use corotate::sample::{RateCommand, RateMeasurement, RateTruth};
 use corotate::serial::{DevicePlant, Hello};
 use nalgebra::Vector3;
 
-/// What the device is called: kind and version.
+/// The name of the device: kind and version.
 pub const NAME: &str = "follower 1";
-/// All three gyros are there.
+/// The valid bits of all three gyros.
 const ALL_VALID: u64 = 0b111;
 
 /// A rigid body with three gyros and three torquers.
@@ -19,8 +19,8 @@ pub struct Follower {
     torque: Vector3<f64>,
 }
 
-/// The follower at its initial state, if that is what the host asks for.
-pub fn seat(hello: &Hello<'_>) -> Option<DevicePlant<Follower>> {
+/// Returns the follower at its initial state, if the host asks for it.
+pub fn make_role(hello: &Hello<'_>) -> Option<DevicePlant<Follower>> {
     let body = RigidBody::new(&pair::inertia()?);
     let follower = Follower { body, rate: pair::FOLLOWER_RATE_RAD_S.into(), torque: Vector3::zeros() };
     (hello.role == "follower").then(|| DevicePlant::new(follower, hello))

@@ -1,6 +1,6 @@
-//! What is left to do where nothing is: nothing. The host finds the device silent.
+//! The reaction to a panic: the device stops, and the host detects its silence.
 
-/// Stands still for ever.
+/// Stops for ever.
 pub fn halt() -> ! {
     loop {
         cortex_m::asm::nop();

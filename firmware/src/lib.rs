@@ -1,6 +1,6 @@
-//! A device of the serial protocol on a Cortex-M: the board, the roles that it may have, and the loop's numbers.
+//! A device of the serial protocol on a Cortex-M: the board, its possible roles, and the parameters of the loop.
 //!
-//! Nothing here allocates. Must not need more of a board than [`board`] gives.
+//! This crate does not allocate, and must use only the functions of [`board`].
 
 #![no_std]
 

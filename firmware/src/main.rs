@@ -1,6 +1,6 @@
-//! A device without an operating system: bytes in, frames out, and a look at the clock, for ever.
+//! A device without an operating system: receives bytes, sends frames and checks the clock, for ever.
 //!
-//! The flight computer of `config/rigid-pair.toml`, or with the feature `follower` its follower. Allocates nothing.
+//! The flight computer of `config/rigid-pair.toml`, or its follower with the feature `follower`. Does not allocate.
 
 #![no_std]
 #![no_main]
@@ -16,10 +16,10 @@ use cortex_m_rt::entry;
 
 #[entry]
 fn main() -> ! {
-    // Taken once, here: it is there.
+    // Succeeds: this is the only call.
     let Some(core) = cortex_m::Peripherals::take() else { halt() };
     let mut board = Board::start(core);
-    let mut device = Device::new(role::NAME, role::seat);
+    let mut device = Device::new(role::NAME, role::make_role);
     loop {
         board.wait();
         let now_ns = board.now_ns();

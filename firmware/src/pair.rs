@@ -1,4 +1,5 @@
-//! `config/rigid-pair.toml` as firmware has it: the numbers of that file, and the roles of the library made of them.
+//! The loop of `config/rigid-pair.toml` for firmware: the parameters of that file, and the library's roles created
+//! from them.
 
 use corotate::control::{Certificate, Synchronizer};
 use corotate::model::{Inertia, RigidBody};
@@ -7,25 +8,25 @@ use corotate::rate::{HiddenObserver, RateLaw, RateLawDesign};
 use nalgebra::{Vector1, Vector3};
 
 const INERTIA_KG_M2: [f64; 3] = [1.0, 2.0, 2.5];
-/// The leader's: the certificate's bound follows from it.
+/// The leader's initial rate, rad/s, which determines the certificate's bound.
 pub const LEADER_RATE_RAD_S: [f64; 3] = [0.6, -0.4, 0.8];
-/// The follower's.
+/// The follower's initial rate, rad/s.
 pub const FOLLOWER_RATE_RAD_S: [f64; 3] = [-0.3, 0.5, 0.2];
-/// The component that has no gyro, 0 to 2.
+/// The component without a gyro, 0 to 2.
 const HIDDEN: usize = 2;
 const DECAY_RATE_PER_S: f64 = 6.0;
 const GUESS_RAD_S: f64 = 0.0;
 const FLOOR_RAD_S: f64 = 1e-6;
 const GAIN_PER_S: [f64; 3] = [4.0; 3];
-/// As `corotate check rigid-pair` says: no larger acceleration is asked for.
+/// The limit printed by `corotate check rigid-pair`.
 const ACCELERATION_MAX_RAD_S2: f64 = 115.333_456_311_831_88;
 
-/// The body, leader and follower alike.
+/// Returns the inertia of leader and follower.
 pub fn inertia() -> Option<Inertia> {
     Inertia::new(INERTIA_KG_M2).ok()
 }
 
-/// The observer of the leader at its initial guess.
+/// Returns the observer of the leader at its initial guess.
 pub fn observer() -> Option<HiddenObserver> {
     let coefficients = inertia()?.coefficients();
     let relation = HiddenRate::new(&coefficients, HIDDEN + 1, FLOOR_RAD_S).ok()?;
@@ -33,7 +34,7 @@ pub fn observer() -> Option<HiddenObserver> {
     Some(HiddenObserver::new(relation, coefficients, Filter::First(filter)))
 }
 
-/// The law of the follower, for this period in seconds.
+/// Returns the law of the follower for the period `tick_s`.
 pub fn law(tick_s: f64) -> Option<RateLaw> {
     let (inertia, gain) = (inertia()?, Vector3::from(GAIN_PER_S));
     let bound = inertia.rate_bound_rad_s(&LEADER_RATE_RAD_S.into());

@@ -1,4 +1,4 @@
-//! Any text as a scenario: refused with reasons, or resolved to one that resolves to itself.
+//! Any text as a scenario: it is refused with reasons, or resolved to a scenario that resolves to itself.
 #![no_main]
 
 use corotate::scenario::Scenario;
@@ -6,7 +6,7 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| match Scenario::parse(text, "fuzz.toml", &[]) {
     Ok(scenario) => {
-        let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
+        let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("a resolved scenario is valid");
         assert_eq!(again.resolved, scenario.resolved);
         let _ = (scenario.rig.certificates(), scenario.rig.notes());
     }

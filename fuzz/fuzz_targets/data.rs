@@ -1,5 +1,5 @@
-//! Any bytes as a log, as they are and below a good header: refused with a reason, or read in order, identified and estimated
-//! with numbers that are finite where they are claimed to be.
+//! Any bytes as a log, alone and after a valid header: the log is refused with a reason, or read in order, identified
+//! and estimated with finite results wherever they must be finite.
 #![no_main]
 
 use corotate::data::{Log, Options};
@@ -19,7 +19,7 @@ fn read(bytes: Vec<u8>, options: &Options) {
         (Motion::default(), Recursive::new(None, 0.1), RateSurvey::new(&coefficients, 3));
     let filter = FilterKind::First { decay_per_s: 5.0 };
     let setup = Setup { coefficients, axis: 3, damping_per_s: 0.1, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
-    let mut reconstruction = Reconstruction::new(&setup).expect("it can be observed");
+    let mut reconstruction = Reconstruction::new(&setup).expect("the axis is observable");
     let mut last_s = f64::NEG_INFINITY;
     for entry in log.by_ref() {
         let Ok(entry) = entry else { break };

@@ -1,4 +1,5 @@
-//! Any `[[fault]]` tables in a shipped scenario: refused with reasons, or run to the end with finite commands and estimates.
+//! Any `[[fault]]` tables in a shipped scenario: they are refused with reasons, or run to the end with finite
+//! commands and estimates.
 #![no_main]
 
 use arbitrary::Arbitrary;
@@ -23,7 +24,7 @@ const KINDS: [&str; 12] = [
     "stall",
     "kill",
 ];
-const ROLES: [&str; 5] = ["leader", "follower", "observer", "controller", "nobody"];
+const ROLES: [&str; 5] = ["leader", "follower", "observer", "controller", "unknown"];
 const FIELDS: [&str; 7] =
     ["omega_rad_s", "applied_rad_s2", "acceleration_rad_s2", "closure", "valid", "status", "radius_du"];
 
@@ -43,23 +44,23 @@ struct Table {
     stall_ms: Option<f64>,
 }
 
-fn one<'a>(of: &[&'a str], index: u8) -> &'a str {
-    of[usize::from(index) % of.len()]
+fn pick<'a>(names: &[&'a str], index: u8) -> &'a str {
+    names[usize::from(index) % names.len()]
 }
 
 impl Table {
     fn to_toml(&self) -> String {
         let mut text = format!(
             "[[fault]]\nkind = \"{}\"\nrole = \"{}\"\nfrom_tick = {}\n",
-            one(&KINDS, self.kind),
-            one(&ROLES, self.role),
+            pick(&KINDS, self.kind),
+            pick(&ROLES, self.role),
             self.from_tick
         );
         let number = |value: f64| toml::Value::Float(value).to_string();
         let entries = [
             ("ticks", self.ticks.map(|ticks| ticks.to_string())),
             ("probability", self.probability.map(number)),
-            ("field", self.field.map(|field| format!("\"{}\"", one(&FIELDS, field)))),
+            ("field", self.field.map(|field| format!("\"{}\"", pick(&FIELDS, field)))),
             ("component", self.component.map(|component| (component % 8).to_string())),
             ("value", self.value.map(number)),
             ("bit", self.bit.map(|bit| bit.to_string())),
@@ -81,11 +82,11 @@ fuzz_target!(|tables: Vec<Table>| {
     let short = ["clock=in-process", "duration_s=0.1", "accept={}"].map(str::to_owned);
     match Scenario::parse(&text, "fault.toml", &short) {
         Ok(scenario) => {
-            let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
-            // As text: what is not a number is unequal to itself.
+            let again = Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("a resolved scenario is valid");
+            // Compared as text, because NaN is unequal to itself.
             assert_eq!(format!("{:?}", again.faults), format!("{:?}", scenario.faults));
-            let outcome = run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {}))
-                .expect("a run in one thread comes to its end");
+            let outcome =
+                run(&scenario, &mut Launch::new(&AtomicUsize::new(0), &mut |_| {})).expect("a run in one thread ends");
             assert!(outcome.reports.len() == 4 && outcome.problems.is_empty(), "{:?}", outcome.problems);
         }
         Err(error) => assert!(!error.to_string().is_empty()),

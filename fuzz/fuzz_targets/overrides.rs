@@ -1,4 +1,4 @@
-//! Any lines as `--set` arguments of a shipped scenario; the first byte says which.
+//! Any lines as `--set` arguments of a shipped scenario; the first byte selects it.
 #![no_main]
 
 use corotate::config::SHIPPED;
@@ -10,7 +10,7 @@ fuzz_target!(|input: (u8, &str)| {
     let arguments: Vec<String> = input.1.lines().map(str::to_owned).collect();
     match Scenario::parse(text, name, &arguments) {
         Ok(scenario) => {
-            Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("what was resolved resolves");
+            Scenario::parse(&scenario.to_toml(), "again.toml", &[]).expect("a resolved scenario is valid");
         }
         Err(error) => assert!(!error.to_string().is_empty()),
     }

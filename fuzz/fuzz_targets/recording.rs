@@ -1,5 +1,5 @@
-//! Any bytes as a recording; and as samples and metadata of a whole one, whose checksums are right, which no random bytes
-//! would be. Whatever can be opened can be exported, compared with itself and replayed.
+//! Any bytes as a recording, and as samples and metadata of a complete one with valid checksums, which random bytes
+//! never have. A recording that opens can be exported, compared with itself and replayed.
 #![no_main]
 
 use corotate::config::SHIPPED;
@@ -17,7 +17,7 @@ thread_local! {
     static BENCH: OnceCell<Bench> = const { OnceCell::new() };
 }
 
-/// A whole recording, and where the damaged ones are written.
+/// A complete recording, and the directory of the damaged ones.
 struct Bench {
     directory: tempfile::TempDir,
     whole: Vec<u8>,
@@ -27,17 +27,17 @@ impl Bench {
     fn new() -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let short = ["clock=in-process", "duration_s=0.02", "accept={}"].map(str::to_owned);
-        let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).expect("it is shipped");
+        let scenario = Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).expect("a shipped scenario is valid");
         let path = directory.path().join("whole.mcap");
         run(&scenario, &mut Launch { record: Some(path.clone()), ..Launch::new(&AtomicUsize::new(0), &mut |_| {}) })
-            .expect("it runs");
-        Self { whole: std::fs::read(path).expect("it was recorded"), directory }
+            .expect("the scenario runs");
+        Self { whole: std::fs::read(path).expect("the recording exists"), directory }
     }
 
-    /// The whole recording with other bytes in its samples and metadata, written again.
+    /// Returns the complete recording with other bytes in its samples and metadata.
     fn rewritten(&self, changes: &[(u16, &[u8])]) -> Vec<u8> {
         let mut file = std::io::Cursor::new(Vec::new());
-        let mut writer = mcap::Writer::new(&mut file).expect("memory takes it");
+        let mut writer = mcap::Writer::new(&mut file).expect("writing to memory succeeds");
         let mut changes = changes.iter().peekable();
         let mut change = |number: u16, bytes: &mut Vec<u8>| {
             while let Some((_, raw)) = changes.next_if(|(at, _)| at % 256 == number) {
@@ -48,24 +48,27 @@ impl Bench {
                 }
             }
         };
-        for (number, message) in mcap::MessageStream::new(&self.whole).expect("it is whole").enumerate() {
-            let mut message = message.expect("it is whole");
+        for (number, message) in mcap::MessageStream::new(&self.whole).expect("the recording is complete").enumerate() {
+            let mut message = message.expect("the recording is complete");
             let mut data = message.data.to_vec();
             change(number as u16, &mut data);
             message.data = data.into();
-            writer.write(&message).expect("memory takes it");
+            writer.write(&message).expect("writing to memory succeeds");
         }
-        let summary = mcap::Summary::read(&self.whole).expect("it is whole").expect("it has one");
+        let summary = mcap::Summary::read(&self.whole).expect("the recording is complete").expect("it has a summary");
         for index in &summary.metadata_indexes {
-            let Metadata { name, metadata } = mcap::read::metadata(&self.whole, index).expect("it is whole");
+            let Metadata { name, metadata } =
+                mcap::read::metadata(&self.whole, index).expect("the recording is complete");
             let metadata = metadata.into_iter().map(|(key, value)| {
                 let mut bytes = value.into_bytes();
                 change(255, &mut bytes);
                 (key, String::from_utf8_lossy(&bytes).into_owned())
             });
-            writer.write_metadata(&Metadata { name, metadata: metadata.collect() }).expect("memory takes it");
+            writer
+                .write_metadata(&Metadata { name, metadata: metadata.collect() })
+                .expect("writing to memory succeeds");
         }
-        writer.finish().expect("memory takes it");
+        writer.finish().expect("writing to memory succeeds");
         drop(writer);
         file.into_inner()
     }
@@ -92,7 +95,7 @@ fuzz_target!(|input: (u8, &[u8], Vec<(u16, &[u8])>)| {
         let bytes = match input.0 % 4 {
             0 => input.1.to_vec(),
             1 => {
-                // The whole file, cut off somewhere, or with bytes changed.
+                // The complete recording, truncated or with changed bytes.
                 let mut bytes = bench.whole.clone();
                 for (at, raw) in &input.2 {
                     let at = usize::from(*at) % bytes.len();
@@ -104,7 +107,7 @@ fuzz_target!(|input: (u8, &[u8], Vec<(u16, &[u8])>)| {
             _ => bench.rewritten(&input.2),
         };
         let path = bench.directory.path().join("fuzzed.mcap");
-        std::fs::write(&path, bytes).expect("there is room");
+        std::fs::write(&path, bytes).expect("the disk has space");
         bench.read(&path);
     });
 });

@@ -1,4 +1,4 @@
-//! Any bytes as the samples of a loop's signals: whatever a role reads, what it says is finite.
+//! Any bytes as samples of a loop's signals: the outputs of every role stay finite.
 #![no_main]
 
 use corotate::bus::memory::MemoryBus;
@@ -16,7 +16,8 @@ thread_local! {
     static PAIR: OnceCell<Scenario> = const { OnceCell::new() };
 }
 
-/// Sends raw words as a sample. A first byte below 192 keeps the stamp what it should be, so that more than stamps is met.
+/// Sends raw words as a sample. With a first byte below 192 the stamp is valid, so that the fuzzer reaches more than
+/// the stamp checks.
 fn send<S: Sample>(writer: &mut impl Write<S>, tick: u64, raw: &[u8]) {
     let Some((honest, raw)) = raw.split_first() else { return };
     let mut sample = S::default();
@@ -29,9 +30,9 @@ fn send<S: Sample>(writer: &mut impl Write<S>, tick: u64, raw: &[u8]) {
     writer.send(|out| *out = sample).unwrap();
 }
 
-fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
+fn run_loop(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
     let bus = MemoryBus::new(depths(scenario));
-    let of = |body: &str, signal| topic(scenario, body, signal);
+    let topic_of = |body: &str, signal| topic(scenario, body, signal);
     let role = |role: RoleId| -> ReadyNode {
         let ledger = private_ledger(scenario, role);
         let mut node = build(scenario, role, &bus, &ledger).unwrap();
@@ -39,11 +40,13 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
         node
     };
     let mut nodes = [role(RoleId::Observer), role(RoleId::Controller), role(RoleId::Plant(1))];
-    let mut measurement = bus.writer::<RateMeasurement>(&of("leader", Signal::Measurement), 1).unwrap();
-    let mut estimate = bus.writer::<RateEstimate>(&of("leader", Signal::Estimate), 1).unwrap();
-    let mut command = bus.writer::<RateCommand>(&of("follower", Signal::Command), 1).unwrap();
-    let mut estimates = Input::<_, RateEstimate>::watch(&bus, &of("leader", Signal::Estimate), Reader::Role).unwrap();
-    let mut commands = Input::<_, RateCommand>::watch(&bus, &of("follower", Signal::Command), Reader::Role).unwrap();
+    let mut measurement = bus.writer::<RateMeasurement>(&topic_of("leader", Signal::Measurement), 1).unwrap();
+    let mut estimate = bus.writer::<RateEstimate>(&topic_of("leader", Signal::Estimate), 1).unwrap();
+    let mut command = bus.writer::<RateCommand>(&topic_of("follower", Signal::Command), 1).unwrap();
+    let mut estimates =
+        Input::<_, RateEstimate>::watch(&bus, &topic_of("leader", Signal::Estimate), Reader::Role).unwrap();
+    let mut commands =
+        Input::<_, RateCommand>::watch(&bus, &topic_of("follower", Signal::Command), Reader::Role).unwrap();
     for (index, (which, raw)) in pieces.iter().enumerate() {
         let (tick, foreign) = (index as u64 / 4, which % 4);
         match foreign {
@@ -57,14 +60,20 @@ fn loop_of(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
                 node.finish_tick().unwrap();
             }
         }
-        // Only what the roles themselves say: a foreign estimate or command may be anything.
+        // Checks the roles' own outputs only: a foreign estimate or command may have any value.
         while estimates.advance().unwrap() {
-            let said = estimates.sample().filter(|_| foreign != 1);
-            assert!(said.is_none_or(|said| said.omega_rad_s.iter().all(|value| value.is_finite())), "{said:?}");
+            let estimate = estimates.sample().filter(|_| foreign != 1);
+            assert!(
+                estimate.is_none_or(|sample| sample.omega_rad_s.iter().all(|value| value.is_finite())),
+                "{estimate:?}"
+            );
         }
         while commands.advance().unwrap() {
-            let said = commands.sample().filter(|_| foreign != 2);
-            assert!(said.is_none_or(|said| said.acceleration_rad_s2.iter().all(|value| value.is_finite())), "{said:?}");
+            let command = commands.sample().filter(|_| foreign != 2);
+            assert!(
+                command.is_none_or(|sample| sample.acceleration_rad_s2.iter().all(|value| value.is_finite())),
+                "{command:?}"
+            );
         }
     }
 }
@@ -73,6 +82,6 @@ fuzz_target!(|pieces: Vec<(u8, &[u8])>| {
     PAIR.with(|pair| {
         let short = ["clock=in-process", "duration_s=1", "accept={}"].map(str::to_owned);
         let scenario = pair.get_or_init(|| Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &short).unwrap());
-        loop_of(scenario, &pieces);
+        run_loop(scenario, &pieces);
     });
 });

@@ -1,4 +1,4 @@
-//! Any bytes from a seat that another program has: its health, the schedule of a launcher that is none, its report.
+//! Any bytes from an external role or launcher: its health, its schedule, its report.
 #![no_main]
 
 use corotate::bus::memory::MemoryBus;
@@ -26,23 +26,23 @@ fn fill(sample: &mut impl Message, raw: &[u8]) {
 
 fn samples(scenario: &Scenario, pieces: &[(bool, &[u8])]) {
     let bus = MemoryBus::new(depths(scenario));
-    let of_run = topic(scenario, "run", Signal::Schedule);
-    let mut words = bus.writer::<Schedule>(&of_run, 1).expect("a writer");
+    let schedule_topic = topic(scenario, "run", Signal::Schedule);
+    let mut schedules = bus.writer::<Schedule>(&schedule_topic, 1).expect("a writer");
     let terminated = AtomicBool::new(false);
-    let reader = bus.reader(&of_run, Reader::Role).expect("a reader");
+    let reader = bus.reader(&schedule_topic, Reader::Role).expect("a reader");
     let mut control = Control::<MemoryBus>::new(&bus, reader, Vec::new(), 0, &terminated);
     let mut line = RoleLine::new("follower");
     for (number, (health, raw)) in pieces.iter().enumerate() {
         if *health {
-            let mut said = Health::default();
-            fill(&mut said, raw);
-            line.state = RoleState::from_number(said.state);
-            line.rate.push(number as f64, said.executed);
+            let mut sample = Health::default();
+            fill(&mut sample, raw);
+            line.state = RoleState::from_number(sample.state);
+            line.rate.push(number as f64, sample.executed);
             assert!(line.rate.per_s().is_none_or(f64::is_finite));
         } else {
-            words.send(|schedule| fill(schedule, raw)).expect("memory takes it");
-            let known = control.schedule().expect("memory gives it").phase <= 2;
-            assert_eq!(control.stopped().expect("memory gives it"), !known);
+            schedules.send(|schedule| fill(schedule, raw)).expect("writing to memory succeeds");
+            let known = control.schedule().expect("reading from memory succeeds").phase <= 2;
+            assert_eq!(control.stopped().expect("reading from memory succeeds"), !known);
         }
     }
 }
@@ -56,13 +56,14 @@ fn report(bytes: &[u8]) {
     let empty = "{\"file\":\"\",\"complete\":true,\"whole\":true,\"problem\":null,\"messages\":0,\"bytes\":0,\
                  \"signals\":[{\"service\":\"s\",\"recorded\":1,\"void\":0,\"extra\":0,\"published\":null,\"lost\":null,\
                  \"last_tick\":0,\"gaps\":[],\"more_gaps\":0}]}";
-    let mut recording: RecordingReport = serde_json::from_str(empty).expect("a report of ours");
+    let mut recording: RecordingReport = serde_json::from_str(empty).expect("an empty report is valid");
     recording.reconcile(&[report], &|_| 0);
 }
 
 fuzz_target!(|input: (Vec<(bool, &[u8])>, &[u8])| {
     PAIR.with(|pair| {
-        let scenario = pair.get_or_init(|| Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &[]).expect("it is shipped"));
+        let scenario =
+            pair.get_or_init(|| Scenario::parse(SHIPPED[0].1, SHIPPED[0].0, &[]).expect("a shipped scenario is valid"));
         samples(scenario, &input.0);
     });
     report(input.1);

@@ -1,4 +1,4 @@
-//! Any bytes on the line, to both ends: as they are, and as the payloads of good frames, which no random bytes would be.
+//! Any bytes on the line to both ends, as they are and as the payloads of valid frames, which random bytes never are.
 #![no_main]
 
 use corotate::config::SHIPPED;
@@ -14,8 +14,8 @@ thread_local! {
 
 fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
     let rig = scenario.rig.downcast_ref::<RigidBodyRig>().expect("the first shipped scenario is of rigid bodies");
-    let seat = |hello: &Hello<'_>| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello));
-    let mut device = Device::new("fuzz", seat);
+    let make_role = |hello: &Hello<'_>| Some(DeviceFlightComputer::new(rig.estimator(), [rig.law(1)], hello));
+    let mut device = Device::new("fuzz", make_role);
     let mut outputs = [0; 32];
     (outputs[0], outputs[1]) = (64, 56);
     let mut host = HostSession::new(Terms { run: 1, period_ns: Some(1_000_000), outputs, required: 1 });
@@ -29,11 +29,11 @@ fn feed(scenario: &Scenario, pieces: &[&[u8]], framed: bool) {
         decode(bytes, |message| {
             let _ = message;
         });
-        // What the device says to that, its host hears too.
-        let mut said = Vec::new();
-        device.receive(bytes, now_ns, |frame| said.extend_from_slice(frame));
+        // The host receives the bytes and the device's answers to them.
+        let mut answers = Vec::new();
+        device.receive(bytes, now_ns, |frame| answers.extend_from_slice(frame));
         device.elapse(now_ns);
-        for &byte in bytes.iter().chain(&said) {
+        for &byte in bytes.iter().chain(&answers) {
             let _ = host.push(byte, now_ns);
         }
         host.request(index as u64, Samples::default(), now_ns);

@@ -1,5 +1,5 @@
-//! The contest of `benches/contest` measures what it says, and who takes part computes the same.
-//! No figure is judged here: a smoke run on a loaded machine measures nothing.
+//! The contest of `benches/contest` runs, and its contestants compute the same results. No figure is checked: a smoke
+//! run on a loaded machine measures nothing.
 
 use crate::contestants::ROWS;
 use crate::contestants::compiled::NATIVE;
@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicUsize;
 use std::time::SystemTime;
 
 #[test]
-fn the_step_and_the_fleet_stand_beside_all_their_floors() {
+fn the_step_and_the_fleet_are_compared_with_all_their_floors() {
     let mut bench = Bench {
         rows: ROWS.to_vec(),
         quick: true,
@@ -35,7 +35,7 @@ fn the_step_and_the_fleet_stand_beside_all_their_floors() {
     for figure in &results.figures {
         assert!(figure.rounds.len() == 3 && figure.rounds.iter().all(|round| *round > 0.0), "{figure:?}");
     }
-    // Everything that has a target was measured, and none is judged by a smoke run.
+    // Every target has its measurement; a smoke run checks none.
     assert_eq!(results.targets.len(), 6);
     assert!(
         results.targets.iter().all(|target| target.value.is_some() && target.met.is_none()),

@@ -1,5 +1,5 @@
-//! A gyro axis fails in flight: the estimate does not jump, the follower stays, the axis may come back, and an axis that
-//! fails too early is flagged and bounded.
+//! A gyro axis fails in flight: the estimate does not jump, the follower stays synchronised, the axis may return, and
+//! an axis that fails too early is flagged and bounded.
 
 use crate::common::shipped;
 use corotate::bus::memory::MemoryBus;
@@ -9,7 +9,7 @@ use corotate::sample::{RateEstimate, RateTruth, status};
 use corotate::scenario::Scenario;
 use corotate::scenario::build;
 
-/// What is known of one tick.
+/// The samples of one tick.
 struct Row {
     leader: [f64; 3],
     follower: [f64; 3],
@@ -70,7 +70,7 @@ fn rows(overrides: &[&str]) -> Vec<Row> {
 }
 
 #[test]
-fn nothing_jumps_when_the_axis_goes_and_when_it_comes_back() {
+fn the_estimate_is_continuous_when_an_axis_fails_and_returns() {
     let rows = rows(&[]);
     let (gone, back) = (20_000, 30_000);
     assert!(rows[gone - 1].has(status::LEARNING) && !rows[gone - 1].has(status::AXIS_LOST));
@@ -85,7 +85,7 @@ fn nothing_jumps_when_the_axis_goes_and_when_it_comes_back() {
 }
 
 #[test]
-fn any_axis_may_fail_and_for_good() {
+fn any_axis_may_fail_permanently() {
     for axis in 1..=3 {
         let outage = format!("leader.outage=[{{axis={axis}, from_s=20.0}}]");
         let rows = rows(&[&outage]);
@@ -101,7 +101,7 @@ fn an_axis_that_fails_before_the_inertia_is_known_is_flagged_and_bounded() {
         let rows = rows(&["duration_s=30", &format!("leader.outage=[{{axis={axis}, from_s={from_s:?}}}]")]);
         let lost = (from_s * 1000.0) as usize;
         assert!(rows[lost..].iter().all(|row| row.has(status::AXIS_LOST | status::DEGRADED)), "{from_s} {axis}");
-        assert!(rows[lost..].iter().all(|row| row.estimate.valid.count_ones() == 2), "not to be trusted");
+        assert!(rows[lost..].iter().all(|row| row.estimate.valid.count_ones() == 2), "the lost component is not valid");
         let worst = rows[lost..].iter().map(Row::estimate_error).fold(0.0, f64::max);
         let away = rows[lost..].iter().map(Row::sync_error).fold(0.0, f64::max);
         println!("axis {axis} lost at {from_s} s: estimate off by {worst:.2}, follower by {away:.2} rad/s");
@@ -111,7 +111,7 @@ fn an_axis_that_fails_before_the_inertia_is_known_is_flagged_and_bounded() {
 }
 
 #[test]
-fn an_axis_that_comes_back_mends_what_was_degraded() {
+fn a_returning_axis_ends_the_degradation() {
     let rows = rows(&["leader.outage=[{axis=3, from_s=0.3, until_s=2.0}]", "duration_s=20"]);
     assert!(rows[1000].has(status::DEGRADED) && !rows[2001].has(status::DEGRADED));
     let end = rows.last().unwrap();
@@ -119,7 +119,7 @@ fn an_axis_that_comes_back_mends_what_was_degraded() {
 }
 
 #[test]
-fn two_lost_axes_hold_the_estimate_and_say_so() {
+fn two_lost_axes_hold_and_flag_the_estimate() {
     let both = "leader.outage=[{axis=3, from_s=20.0, until_s=20.5}, {axis=2, from_s=20.2, until_s=20.3}]";
     let rows = rows(&[both, "duration_s=30"]);
     assert!(rows[20_200..20_300].iter().all(|row| row.has(status::UNUSABLE)));

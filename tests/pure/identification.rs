@@ -1,7 +1,7 @@
-//! Holds the identification of inertia to its word: floor, decay against excitation, changes of sign, torque, missed ticks,
-//! and that a motion which tells nothing moves nothing.
+//! Checks the identification of inertia: error floor, decay with excitation, changes of sign, torque, missed ticks,
+//! and motions without information, which must not change the estimate.
 //!
-//! Every run is the pure part of the crate with measurements exact to rounding.
+//! Every run uses only the pure part of the library, with measurements exact to rounding.
 
 use crate::common::cases;
 use corotate::model::{Inertia, RigidBody};
@@ -12,23 +12,23 @@ use nalgebra::{Matrix3, Rotation3, Vector1, Vector3};
 use proptest::prelude::*;
 use std::iter::repeat_n;
 
-/// Below this mean of |ω1 ω2 ω3| a step does not excite, (rad/s)³.
+/// The mean of |ω1 ω2 ω3| below which a step does not excite, (rad/s)³.
 const FLOOR_RAD3_S3: f64 = 1e-9;
 
-/// Below this a component is at rest, rad/s.
+/// The rate below which a component is at rest, rad/s.
 const FLOOR_RAD_S: f64 = 1e-6;
 
-/// Two bodies and a flat plate, tumbling: every one changes the sign of ω1 ω2 ω3 dozens of times in [`RUN_S`].
+/// Two bodies and a flat plate, tumbling: each changes the sign of ω1 ω2 ω3 dozens of times in [`RUN_S`].
 const EXAMPLES: [([f64; 3], [f64; 3]); 3] =
     [([1.0, 2.0, 2.5], [1.2, -0.8, 1.6]), ([2.5, 1.2, 2.0], [0.9, 1.4, -0.7]), ([1.0, 2.0, 3.0], [1.2, -0.8, 1.6])];
 
-/// How long the examples run, s.
+/// The duration of the examples, s.
 const RUN_S: f64 = 100.0;
 
 /// The designed −λ of the identifier, s²/rad³.
 const DECAY: f64 = 3.0;
 
-/// A motion as sampled.
+/// A sampled motion.
 struct Motion {
     coefficients: Vector3<f64>,
     torque: Vector3<f64>,
@@ -60,13 +60,13 @@ impl Motion {
         Self::new(moments, start.into(), Vector3::zeros(), tick_s, repeat_n(1, ticks))
     }
 
-    /// Every step as the relation gets it.
+    /// Returns every step as the relation receives it.
     fn samples(&self) -> impl Iterator<Item = (RateSample, RateSample, f64)> {
         let sample = |rate_rad_s| RateSample { rate_rad_s, torque_rad_s2: self.torque };
         self.rates.windows(2).zip(&self.steps).map(move |(ends, step)| (sample(ends[0]), sample(ends[1]), *step))
     }
 
-    /// How many steps change the sign of ω1 ω2 ω3.
+    /// Returns the number of steps that change the sign of ω1 ω2 ω3.
     fn flips(&self) -> usize {
         self.rates.windows(2).filter(|ends| ends[0].product() * ends[1].product() < 0.0).count()
     }
@@ -94,20 +94,20 @@ impl Motion {
     }
 }
 
-/// What became of an estimate.
+/// The result of an identification.
 #[derive(Default)]
 struct Identified {
     estimate: Vector3<f64>,
     /// a − â at every sample.
     errors: Vec<Vector3<f64>>,
-    /// ∫|ω1 ω2 ω3|dt at every sample, as far as it was used, rad³/s².
+    /// The excitation ∫|ω1 ω2 ω3|dt of the used steps at every sample, rad³/s².
     excitation: Vec<f64>,
     unexcited: usize,
     ambiguous: usize,
 }
 
 impl Identified {
-    /// The greatest error once the excitation has brought the initial one below rounding.
+    /// Returns the largest error after the excitation has reduced the initial one below rounding.
     fn floor(&self, decay: f64) -> f64 {
         let settled: Vec<f64> = self
             .errors
@@ -121,14 +121,14 @@ impl Identified {
     }
 }
 
-/// The length of a vector. What is not a number exceeds every bound.
+/// Returns the length of a vector; a NaN exceeds every bound.
 fn size(error: &Vector3<f64>) -> f64 {
     let norm = error.norm();
     if norm.is_nan() { f64::INFINITY } else { norm }
 }
 
 #[test]
-fn dozens_of_changes_of_sign_leave_the_floor_where_rounding_puts_it() {
+fn changes_of_sign_leave_the_error_floor_at_rounding() {
     for (moments, start) in EXAMPLES {
         for (tick_s, bound) in [(1e-2, 1e-8), (1e-3, 1e-9)] {
             let motion = Motion::free(moments, start, tick_s, RUN_S);
@@ -151,14 +151,14 @@ fn dozens_of_changes_of_sign_leave_the_floor_where_rounding_puts_it() {
     }
 }
 
-/// ∫|ω1 ω2 ω3|dt of a motion, over steps so short that changes of sign do not matter.
+/// Returns ∫|ω1 ω2 ω3|dt of a motion, with steps so short that changes of sign do not matter.
 fn true_excitation(moments: [f64; 3], start: [f64; 3], duration_s: f64) -> f64 {
     let motion = Motion::free(moments, start, 1e-4, duration_s);
     motion.rates.windows(2).map(|ends| 0.5e-4 * (ends[0].product().abs() + ends[1].product().abs())).sum()
 }
 
 #[test]
-fn the_reported_excitation_is_the_true_one_but_for_steps_left_out() {
+fn the_reported_excitation_is_the_true_one_except_for_unused_steps() {
     for (moments, start) in EXAMPLES {
         let run = Motion::free(moments, start, 1e-2, 20.0).identify_diagonal(DECAY, Vector3::zeros());
         let reported = run.excitation[run.excitation.len() - 1];
@@ -168,7 +168,7 @@ fn the_reported_excitation_is_the_true_one_but_for_steps_left_out() {
     }
 }
 
-/// The slope of ln|error| over the excitation by least squares, while the error is between the magnitudes given.
+/// Returns the slope of ln|error| over the excitation by least squares, while the error is within `between`.
 fn fitted_decay(run: &Identified, component: usize, between: std::ops::Range<f64>) -> f64 {
     let points: Vec<(f64, f64)> = run
         .excitation
@@ -194,8 +194,8 @@ fn each_error_decays_with_the_excitation_at_its_own_rate() {
         for tick_s in [1e-2, 1e-3] {
             let run =
                 Motion::free(moments, start, tick_s, 50.0).identify(InvariantFilter::new(rates, Vector3::zeros()));
-            // While the estimate is wrong by δ the weight of a step is by about h²δ, which is where a fast component ends
-            // until the slowest has settled.
+            // While the estimate is wrong by δ, the weight of a step is wrong by about h²δ, which limits a fast
+            // component until the slowest has settled.
             let clean = 10.0 * tick_s * tick_s;
             let slopes: [f64; 3] = std::array::from_fn(|component| fitted_decay(&run, component, clean..1.0));
             println!("I {moments:?}, tick {tick_s} s: decay {slopes:.6?} for {:?}", rates.as_slice());
@@ -206,7 +206,7 @@ fn each_error_decays_with_the_excitation_at_its_own_rate() {
     }
 }
 
-/// e^{𝒜W}δ in 100 000 Runge-Kutta steps: knows nothing of the crate's exponential.
+/// Computes e^{𝒜W}δ in 100 000 Runge-Kutta steps, independently of the library's exponential.
 fn decayed(matrix: &Matrix3<f64>, weight: f64, mut error: Vector3<f64>) -> Vector3<f64> {
     let h = weight / 1e5;
     for _ in 0..100_000 {
@@ -219,7 +219,7 @@ fn decayed(matrix: &Matrix3<f64>, weight: f64, mut error: Vector3<f64>) -> Vecto
     error
 }
 
-/// Turning, defective, and far from normal, none of them with a zero in it.
+/// Returns a rotating, a defective and a far from normal matrix, none of them with a zero element.
 fn matrices() -> [Matrix3<f64>; 3] {
     let turn = Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
     [
@@ -231,7 +231,7 @@ fn matrices() -> [Matrix3<f64>; 3] {
 }
 
 #[test]
-fn a_general_matrix_moves_the_error_as_its_exponential_does() {
+fn a_general_matrix_reduces_the_error_by_its_exponential() {
     let (moments, start) = EXAMPLES[0];
     for matrix in matrices() {
         let hurwitz = Hurwitz::new(matrix).unwrap();
@@ -263,7 +263,7 @@ fn a_general_matrix_reaches_the_same_floor() {
 }
 
 #[test]
-fn a_matrix_that_lets_an_error_live_is_refused_with_its_eigenvalues() {
+fn a_matrix_without_decay_is_refused_with_its_eigenvalues() {
     let matrix = Matrix3::new(-1.0, 0.0, 0.0, 0.0, 0.5, 2.0, 0.0, -2.0, 0.5);
     let refusal = Hurwitz::new(matrix).unwrap_err();
     assert!(matches!(refusal, HurwitzError::NotHurwitz { .. }));
@@ -272,7 +272,7 @@ fn a_matrix_that_lets_an_error_live_is_refused_with_its_eigenvalues() {
 }
 
 #[test]
-fn every_guess_leads_to_the_truth() {
+fn every_guess_converges_to_the_truth() {
     let (moments, start) = EXAMPLES[0];
     let motion = Motion::free(moments, start, 1e-2, RUN_S);
     for guess in [[0.0; 3], [1.0, -1.0, 1.0], [-0.9, -0.9, 0.9], [5.0, 5.0, -5.0], [1e3, -1e4, 1e2]] {
@@ -284,9 +284,9 @@ fn every_guess_leads_to_the_truth() {
 }
 
 #[test]
-fn missed_ticks_are_only_longer_steps() {
+fn missed_ticks_only_lengthen_a_step() {
     for (moments, start) in EXAMPLES {
-        // Mostly every tick, now and then up to 40 of them in one step.
+        // Every tick for most steps, sometimes up to 40 in one step.
         let gaps = (0..20_000_u32).map(|k| match k % 50 {
             0 => 40,
             n if n % 7 == 0 => n % 5 + 1,
@@ -300,12 +300,12 @@ fn missed_ticks_are_only_longer_steps() {
             motion.flips(),
             run.ambiguous
         );
-        // Of the size that a tick as long as the longest step would give, see the order below.
+        // The error is that of a tick as long as the longest step, see the order below.
         assert!(floor < 5e-6, "{floor:e}");
     }
 }
 
-/// The error of one step is of the fifth order and stands for one time constant, that is for 1/h steps.
+/// The error of one step is of fifth order and accumulates over one time constant, that is over 1/h steps.
 #[test]
 fn the_settled_error_is_of_fourth_order_in_the_tick() {
     for (moments, start) in EXAMPLES {
@@ -322,7 +322,7 @@ fn the_settled_error_is_of_fourth_order_in_the_tick() {
 }
 
 #[test]
-fn a_known_torque_does_not_move_the_floor() {
+fn a_known_torque_does_not_raise_the_error_floor() {
     for (moments, start) in EXAMPLES {
         for (tick_s, bound) in [(1e-2, 1e-7), (1e-3, 1e-9)] {
             let torque = Vector3::new(0.02, -0.015, 0.01);
@@ -336,7 +336,7 @@ fn a_known_torque_does_not_move_the_floor() {
 }
 
 #[test]
-fn a_motion_that_does_not_excite_an_axis_is_flagged_and_moves_nothing() {
+fn an_unexciting_motion_is_flagged_and_does_not_change_the_estimate() {
     let guess = Vector3::new(0.3, -0.2, 0.1);
     for start in [[0.0, 0.7, 0.0], [0.0, 0.0, -0.9], [0.7, 0.0, 0.0], [0.0; 3]] {
         let motion = Motion::free([1.0, 2.0, 2.5], start, 1e-2, 5.0);
@@ -347,7 +347,7 @@ fn a_motion_that_does_not_excite_an_axis_is_flagged_and_moves_nothing() {
     }
 }
 
-/// Normally distributed numbers of variance 1 (sums of twelve uniform ones), the same at every run.
+/// Returns normally distributed numbers of variance 1 (sums of twelve uniform ones), the same in every run.
 fn noise() -> impl FnMut() -> f64 {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     move || {
@@ -359,10 +359,10 @@ fn noise() -> impl FnMut() -> f64 {
     }
 }
 
-/// Where a component passes through zero, noise changes its sign back and forth. That must not throw the estimate off by
-/// more than noise does anywhere: the filter passes it through at the gain λ ω_i.
+/// Noise makes the sign of a component flicker while it passes through zero. This must not disturb the estimate by
+/// more than noise does elsewhere: the filter passes it with the gain λ ω_i.
 #[test]
-fn flickering_signs_of_noisy_components_do_not_throw_the_estimate_off() {
+fn flickering_signs_of_noisy_components_do_not_disturb_the_estimate() {
     let (sigma, decay) = (1e-3, 0.3);
     let mut noise = noise();
     for (moments, start) in EXAMPLES {
@@ -382,16 +382,17 @@ fn flickering_signs_of_noisy_components_do_not_throw_the_estimate_off() {
     }
 }
 
-/// A body with two equal moments and its spin: a3 = 0 is as identifiable as any other coefficient.
+/// A body with two equal moments and a spin: a3 = 0 is as identifiable as any other coefficient.
 #[test]
-fn the_general_relation_serves_an_axisymmetric_body_too() {
+fn the_general_relation_identifies_an_axisymmetric_body_too() {
     let motion = Motion::free([1.0, 1.0, 1.6], [1.2, -0.8, 1.1], 1e-3, RUN_S);
     let floor = motion.identify_diagonal(DECAY, Vector3::repeat(0.4)).floor(DECAY);
     println!("axisymmetric body: floor {floor:.2e}, {} flips", motion.flips());
     assert!(floor <= 1e-9, "{floor:e}");
 }
 
-/// The greatest error of the axisymmetric estimate at or after a spin of 40/λ, and the fitted decay per radian of spin.
+/// Returns the largest error of the axisymmetric estimate after a spin of 40/λ, and the fitted decay per radian of
+/// spin.
 fn identify_axisymmetric(motion: &Motion, axis: usize, decay: f64, guess: f64, a: f64) -> (f64, f64) {
     let relation = Axisymmetric::new(axis, FLOOR_RAD_S).unwrap();
     let mut filter = InvariantFilter::new(Vector1::new(decay), Vector1::new(guess));
@@ -441,7 +442,7 @@ fn a_body_that_does_not_spin_about_its_axis_of_symmetry_is_refused() {
     }
 }
 
-/// Moments with no negative mass behind them.
+/// Generates the moments of a physically possible body.
 fn body() -> impl Strategy<Value = [f64; 3]> {
     prop::array::uniform3(0.05..1.0_f64).prop_map(|[x, y, z]| [y + z, z + x, x + y])
 }
@@ -453,9 +454,9 @@ fn vector(bound: f64) -> impl Strategy<Value = Vector3<f64>> {
 proptest! {
     #![proptest_config(cases(96))]
 
-    /// From the truth, no motion, torque or missed tick leads away by more than the disturbance of a step admits.
+    /// From the truth, no motion, torque or missed tick leads away by more than the error of a step permits.
     #[test]
-    fn the_truth_is_kept(
+    fn a_true_estimate_stays_true(
         moments in body(), start in vector(1.5), torque in vector(0.05), gaps in prop::collection::vec(1..=5_u32, 400)
     ) {
         let motion = Motion::new(moments, start, torque, 2e-3, gaps);
@@ -464,7 +465,7 @@ proptest! {
         prop_assert!(worst < 1e-7, "{worst:e} with {} flips", motion.flips());
     }
 
-    /// The error never grows but by what a step is wrong, whatever the guess among bodies.
+    /// The error never grows by more than the error of a step, for any physically possible guess.
     #[test]
     fn the_error_of_every_coefficient_contracts(
         moments in body(), start in vector(1.5), guess in vector(1.0), gaps in prop::collection::vec(1..=5_u32, 400)
@@ -477,17 +478,17 @@ proptest! {
         prop_assert!(off < 1e-3 * size(&run.errors[0]) + 1e-7, "{off:e} with {} flips", motion.flips());
     }
 
-    /// The signs of two components together are only a turn of the axes.
+    /// Changing the signs of two components rotates the axes and nothing else.
     #[test]
-    fn turning_the_axes_by_a_half_changes_no_bit(moments in body(), start in vector(1.5), guess in vector(1.0)) {
+    fn rotating_the_axes_by_half_a_turn_changes_no_bit(moments in body(), start in vector(1.5), guess in vector(1.0)) {
         let motion = Motion::free(moments, start.into(), 1e-2, 4.0);
         let turned = Motion::free(moments, [-start.x, start.y, -start.z], 1e-2, 4.0);
-        let [one, other] = [&motion, &turned].map(|motion| motion.identify_diagonal(DECAY, guess));
-        prop_assert!(one.errors == other.errors, "differ with {} flips", motion.flips());
+        let [original, rotated] = [&motion, &turned].map(|motion| motion.identify_diagonal(DECAY, guess));
+        prop_assert!(original.errors == rotated.errors, "differ with {} flips", motion.flips());
     }
 
     #[test]
-    fn ratios_undo_the_coefficients(moments in body()) {
+    fn ratios_invert_the_coefficients(moments in body()) {
         let ratios = InertiaRatios::new(&Inertia::new(moments).unwrap().coefficients()).unwrap();
         let wrong = (ratios.second * moments[0] - moments[1]).abs() + (ratios.third * moments[0] - moments[2]).abs();
         prop_assert!(wrong < 1e-13 && ratios.closure.abs() < 1e-14, "{ratios:?}");
@@ -496,13 +497,13 @@ proptest! {
     /// e^{𝒜(V+W)} = e^{𝒜V} e^{𝒜W}, and nothing grows in the long run.
     #[test]
     fn powers_of_a_decay_multiply(
-        elements in prop::array::uniform9(-3.0..3.0_f64), one in 0.0..2.0_f64, other in 0.0..2.0_f64
+        elements in prop::array::uniform9(-3.0..3.0_f64), first in 0.0..2.0_f64, second in 0.0..2.0_f64
     ) {
         let matrix = Matrix3::from_column_slice(&elements) - Matrix3::identity() * 3.0;
         match Hurwitz::new(matrix) {
             Ok(hurwitz) => {
-                let difference = hurwitz.exp(one + other) - hurwitz.exp(one) * hurwitz.exp(other);
-                let scale = hurwitz.exp(one).norm() * hurwitz.exp(other).norm();
+                let difference = hurwitz.exp(first + second) - hurwitz.exp(first) * hurwitz.exp(second);
+                let scale = hurwitz.exp(first).norm() * hurwitz.exp(second).norm();
                 prop_assert!(difference.norm() <= 1e-13 * scale, "{difference}");
                 let late = hurwitz.exp(800.0 / -hurwitz.abscissa()).norm();
                 prop_assert!(late < 1e-200, "{late:e}");
@@ -512,12 +513,12 @@ proptest! {
                 prop_assert!((trace - matrix.trace()).abs() < 1e-12, "{eigenvalues}");
                 prop_assert!(eigenvalues.0.iter().any(|value| value.re >= -tolerance), "{eigenvalues}");
             }
-            Err(other) => prop_assert!(false, "{other}"),
+            Err(error) => prop_assert!(false, "{error}"),
         }
     }
 
     #[test]
-    fn an_axisymmetric_step_tells_its_coefficient(
+    fn an_axisymmetric_step_yields_its_coefficient(
         axis in 1..=3_usize, axial in 0.05..1.95_f64, start in vector(2.0), step in 1e-3..0.5_f64
     ) {
         let mut moments = [1.0; 3];

@@ -1,7 +1,7 @@
-//! Holds the mathematics to its word: Euler's equations against independent reference trajectories, the observer's floor,
-//! decay and order against what its derivation promises, and for random bodies the properties that no example can show.
+//! Checks the mathematics: Euler's equations against independent reference trajectories, the observer's floor, decay
+//! and order against its derivation, and general properties with random bodies.
 //!
-//! Every run here is the pure part of the crate: no clock, no processes, the measurements exact to rounding.
+//! Every run uses only the pure part of the library: no clock, no processes, measurements exact to rounding.
 
 use crate::common::cases;
 use corotate::control::{Certificate, Condition};
@@ -11,16 +11,16 @@ use nalgebra::{Vector1, Vector3};
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
-/// Below this the measured components count as carrying no information, rad/s; no motion here comes near it.
+/// The level below which measured components carry no information, rad/s; no motion here comes near it.
 const BLIND_RAD_S: f64 = 1e-6;
 
 /// The designed −λ of the examples, 1/s.
 const DECAY_PER_S: f64 = 5.0;
 
-/// From here on e^{λt} is below the rounding of the estimate, s.
+/// The time after which e^{λt} is below the rounding of the estimate, s.
 const SETTLED_S: f64 = 8.0;
 
-/// A body and its initial rates for every conic; the hidden axis is 3. Named as the conic prints itself.
+/// A body and its initial rates for every conic; the hidden axis is 3. The names are those that the conic prints.
 const EXAMPLES: [(&str, [f64; 3], [f64; 3]); 4] = [
     ("Elliptic", [1.0, 2.0, 3.0], [0.6, -0.4, 0.8]),
     ("Hyperbolic", [1.0, 3.0, 2.0], [0.9, 0.3, 0.8]),
@@ -28,7 +28,7 @@ const EXAMPLES: [(&str, [f64; 3], [f64; 3]); 4] = [
     ("ParabolicSecond", [1.5, 2.0, 2.0], [0.4, 0.5, 0.7]),
 ];
 
-/// A body's motion as its sensors sample it.
+/// A body's motion as sampled by its sensors.
 struct Motion {
     coefficients: Vector3<f64>,
     torque: Vector3<f64>,
@@ -77,7 +77,8 @@ impl Motion {
         }))
     }
 
-    /// ω_k − ω̂_k at each sample for the hidden axis k, from an initial guess. No step may count as unobservable.
+    /// Returns ω_k − ω̂_k at each sample for the hidden axis k, from an initial guess. No step may count as
+    /// unobservable.
     fn errors(&self, axis: usize, decay_per_s: f64, guess: f64) -> Vec<f64> {
         let relation = self.relation(axis);
         let mut filter = InvariantFilter::new(Vector1::new(decay_per_s), Vector1::new(guess));
@@ -93,19 +94,20 @@ impl Motion {
         errors
     }
 
-    /// What the observer gets to see: a not-a-number in the hidden component would poison everything that reads it.
+    /// Returns the observer's input. The hidden component is NaN, so that any use of it would show.
     fn sample(&self, mut rate: Vector3<f64>, axis: usize) -> RateSample {
         rate[axis - 1] = f64::NAN;
         RateSample { rate_rad_s: rate, torque_rad_s2: self.torque }
     }
 
-    /// The greatest error at or after a time.
+    /// Returns the largest error at or after a time.
     fn worst_after(&self, time_s: f64, errors: &[f64]) -> f64 {
         let late = self.times().zip(errors).filter(|(time, _)| *time >= time_s);
         greatest(late.map(|(_, error)| error.abs()))
     }
 
-    /// The greatest |∂φ/∂ω_i| + |∂φ/∂ω_j| along the motion, s: what the relation makes of a disturbed measurement.
+    /// Returns the largest |∂φ/∂ω_i| + |∂φ/∂ω_j| along the motion, s: the sensitivity of the relation to measurement
+    /// errors.
     fn sensitivity(&self, axis: usize) -> f64 {
         let conic = self.relation(axis).conic();
         let (i, j) = (axis % 3, (axis + 1) % 3);
@@ -115,7 +117,7 @@ impl Motion {
             let (wi, wj) = (rate[i].abs(), rate[j].abs());
             match conic {
                 Conic::Elliptic { omega } => ai * (wi + wj) / ((omega * wi).powi(2) + (ai * wj).powi(2)),
-                // The greater of |z₊| and |z₋| is the sum of the magnitudes.
+                // The larger of |z₊| and |z₋| is the sum of the magnitudes.
                 Conic::Hyperbolic { omega } => (omega + ai) / (omega * (omega * wi + ai * wj)),
                 Conic::ParabolicFirst => quotient(ai, wi, wj),
                 Conic::ParabolicSecond => quotient(aj, wj, wi),
@@ -124,12 +126,12 @@ impl Motion {
         greatest(self.rates.iter().map(at))
     }
 
-    /// The greatest component of the angular velocity along the motion, rad/s.
+    /// Returns the largest component of the angular velocity along the motion, rad/s.
     fn fastest(&self) -> f64 {
         greatest(self.rates.iter().map(|rate| rate.amax()))
     }
 
-    /// What the error may at most be apart from the decaying initial one.
+    /// Returns the bound on the error apart from the decaying initial one.
     ///
     /// With M = max |ω_i|, α = max |a_i|, U = max |u_i| and ν = αM + U/M the components obey |ω̇| ≤ Mν, the n-th
     /// derivative of the drift is at most αM²(n+1)!νⁿ, and three things disturb a step of length h:
@@ -140,8 +142,8 @@ impl Motion {
     /// - rounding, of the measurements and of the body's own integration (steps of a few milliradians): a few ulps of M
     ///   each, |∇φ| times that in φ, taken as all of one sign.
     ///
-    /// A steady disturbance d of the drift ends as d/(1 − e^{λh}) + d/2, one of Δφ as d/h. The remainders of higher order
-    /// and the bounds' own slack are left to a factor of two.
+    /// A constant disturbance d of the drift results in d/(1 − e^{λh}) + d/2, one of Δφ in d/h. A factor of two
+    /// covers the remainders of higher order and the slack of the bounds.
     fn floor(&self, axis: usize, decay_per_s: f64) -> f64 {
         let (longest, shortest) =
             self.steps.iter().fold((0.0_f64, f64::INFINITY), |(most, least), &h| (most.max(h), least.min(h)));
@@ -157,19 +159,19 @@ impl Motion {
         2.0 * (drift + driven + rounding)
     }
 
-    /// Whether the measured components stay away from the set where they tell nothing: a relative disturbance of them
-    /// must not end up in φ more than a hundredfold.
+    /// Returns true if the measured components stay away from the unobservable set: a relative disturbance of them
+    /// must not be amplified in φ more than a hundredfold.
     fn well_conditioned(&self, axis: usize) -> bool {
         self.fastest() * self.sensitivity(axis) < 100.0
     }
 }
 
-/// The greatest of non-negative numbers. What is not a number exceeds every bound.
+/// Returns the largest of non-negative numbers; a NaN exceeds every bound.
 fn greatest(numbers: impl Iterator<Item = f64>) -> f64 {
     numbers.map(|number| if number.is_nan() { f64::INFINITY } else { number }).fold(0.0, f64::max)
 }
 
-/// The slope of ln|error| over time by least squares, from the errors between the two magnitudes given.
+/// Returns the slope of ln|error| over time by least squares, for errors within `between`.
 fn fitted_decay(motion: &Motion, errors: &[f64], between: std::ops::Range<f64>) -> f64 {
     let points: Vec<(f64, f64)> = motion
         .times()
@@ -186,7 +188,7 @@ fn fitted_decay(motion: &Motion, errors: &[f64], between: std::ops::Range<f64>) 
     product / square
 }
 
-/// A reference trajectory: the instants, s, and the angular velocities at them, rad/s.
+/// Returns a reference trajectory: the instants, s, and the angular velocities at them, rad/s.
 fn reference(name: &str) -> Vec<(f64, Vector3<f64>)> {
     let path = format!("{}{name}.csv", concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/"));
     let text = std::fs::read_to_string(path).unwrap();
@@ -197,7 +199,7 @@ fn reference(name: &str) -> Vec<(f64, Vector3<f64>)> {
     text.lines().skip(1).map(row).collect()
 }
 
-/// Moments and initial rates are those of `FREE` in the script that made the data.
+/// Moments and initial rates are those of `FREE` in the script that created the data.
 #[test]
 fn free_motion_follows_the_reference_trajectories() {
     for (name, moments) in [
@@ -249,15 +251,15 @@ fn the_decay_is_the_designed_one() {
     }
 }
 
-/// Fourth, although one step is good to the fifth. With K = ġ/ω_k, over one step of length h,
+/// The order is four, although the error of one step is of fifth order. With K = ġ/ω_k, over one step of length h,
 ///
 /// - the cubic Hermite polynomial of the drift g integrates to h⁵g⁗/720 of the true ∫g;
 /// - its end slopes K ω_k use ω_k from a linear drift, wrong by ∓h³g″/24 at the two ends, which adds h⁵K g″/144;
 /// - ω_k at the start, from ∫ω_k = Δφ, is wrong by half as much, and of that only 1 − e^{λh} is let in.
 ///
-/// Δφ itself is exact. The drift's error stands uncorrected for 1/|λ|, that is for 1/(|λ|h) steps, and costs one order:
-/// the error obeys ε̇ = λε + h⁴(g⁗/720 + K g″/144) + O(h⁵). A tick that is long against 1/|λ| would hide that and show
-/// the fifth order; hence the slow λ.
+/// Δφ itself is exact. The drift's error acts uncorrected for 1/|λ|, that is for 1/(|λ|h) steps, which costs one
+/// order: the error obeys ε̇ = λε + h⁴(g⁗/720 + K g″/144) + O(h⁵). A tick that is long against 1/|λ| would hide that
+/// and show the fifth order; hence the slow λ.
 #[test]
 fn the_error_is_of_fourth_order_in_the_tick() {
     let ticks_s = [0.4, 0.2, 0.1, 0.05];
@@ -265,7 +267,8 @@ fn the_error_is_of_fourth_order_in_the_tick() {
         let rms = ticks_s.map(|tick_s| {
             let motion = Motion::free(moments, start, tick_s, 80.0);
             let errors = motion.errors(3, 0.5, start[2]);
-            // At the instants that all ticks share, or the orders would compare different phases of the motion.
+            // At the instants that all ticks share; otherwise the orders would compare different phases of the
+            // motion.
             let shared = errors.iter().step_by((ticks_s[0] / tick_s).round() as usize).skip(25);
             (shared.clone().map(|error| error * error).sum::<f64>() / shared.count() as f64).sqrt()
         });
@@ -277,7 +280,7 @@ fn the_error_is_of_fourth_order_in_the_tick() {
     }
 }
 
-/// How often neighbours in a sequence differ in a property.
+/// Returns the number of changes of a property between neighbours in a sequence.
 fn changes<T: PartialEq>(sequence: impl Iterator<Item = T> + Clone) -> usize {
     sequence.clone().zip(sequence.skip(1)).filter(|(before, after)| before != after).count()
 }
@@ -302,7 +305,7 @@ fn neither_a_branch_cut_nor_a_change_of_sign_disturbs_the_estimate() {
     }
 }
 
-/// A random body, what is hidden of it, and its observer.
+/// A random body, its hidden component, and its observer.
 #[derive(Debug, Clone)]
 struct Case {
     moments: [f64; 3],
@@ -313,7 +316,7 @@ struct Case {
     guess: f64,
 }
 
-/// Moments of inertia with the given second moments of the mass along the axes: physical as long as no mass is negative.
+/// Returns the moments of inertia for the second moments of mass along the axes: possible if no mass is negative.
 fn moments_of(spread: [f64; 3]) -> [f64; 3] {
     [spread[1] + spread[2], spread[2] + spread[0], spread[0] + spread[1]]
 }
@@ -322,8 +325,8 @@ fn vector(bound: f64) -> impl Strategy<Value = Vector3<f64>> {
     prop::array::uniform3(-bound..bound).prop_map(Vector3::from)
 }
 
-/// Every fourth body is exactly axisymmetric, so that the parabolas occur too. The others stay away from symmetry, where
-/// Ω vanishes and nothing is seen well.
+/// Generates bodies of which a quarter is exactly axisymmetric, so that the parabolas occur too. The others stay away
+/// from symmetry, where Ω vanishes and the accuracy is low.
 fn body() -> impl Strategy<Value = [f64; 3]> {
     let spread = prop::array::uniform3(0.02..1.0_f64);
     let body = (spread, prop::option::weighted(0.25, 0..3_usize)).prop_map(|(mut spread, twin)| {
@@ -355,23 +358,23 @@ impl Case {
         Motion::new(self.moments, self.start, torque, self.tick_s, ticks_per_sample)
     }
 
-    /// A sample at every tick, until the initial error must have vanished or enough has been seen.
+    /// Returns a sample at every tick, until the initial error must have vanished or enough is sampled.
     fn every_tick(&self) -> impl Iterator<Item = u32> + use<> {
         let ticks = 30.0 / (self.decay_per_s * self.tick_s);
         std::iter::repeat_n(1, (ticks as usize).min(1000))
     }
 
-    /// The error must be e^{λt} times the initial one, sign included, but for the floor: as a bound from above and,
-    /// while far above the floor, from below.
+    /// Checks that the error is e^{λt} times the initial one, including its sign, up to the floor: as an upper bound
+    /// and, while far above the floor, as a lower bound.
     fn check_contraction(&self, motion: &Motion) -> Result<(), TestCaseError> {
         prop_assume!(motion.well_conditioned(self.axis));
         let floor = motion.floor(self.axis, self.decay_per_s);
-        // A bound that allows everything would prove nothing.
+        // A bound that permits everything would prove nothing.
         prop_assume!(floor < 1e-4);
         let errors = motion.errors(self.axis, self.decay_per_s, self.guess);
         for (time, error) in motion.times().zip(&errors) {
             let decayed = errors[0] * (-self.decay_per_s * time).exp();
-            // The second term is for the rounding of a thousand products and of the time itself.
+            // The second term covers the rounding of a thousand products and of the time itself.
             let allowed = floor + 1e-10 * decayed.abs();
             prop_assert!((error - decayed).abs() <= allowed, "{error:e} for {decayed:e} ± {allowed:e} at {time} s");
         }
@@ -388,18 +391,18 @@ proptest! {
     }
 
     #[test]
-    fn a_known_torque_changes_nothing_in_the_contraction(case in case(), torque in vector(0.2)) {
+    fn a_known_torque_does_not_change_the_contraction(case in case(), torque in vector(0.2)) {
         case.check_contraction(&case.motion(torque, case.every_tick()))?;
     }
 
     #[test]
-    fn missed_ticks_are_only_longer_steps(case in case(), gaps in prop::collection::vec(1..=7_u32, 200)) {
+    fn missed_ticks_only_lengthen_a_step(case in case(), gaps in prop::collection::vec(1..=7_u32, 200)) {
         case.check_contraction(&case.motion(Vector3::zeros(), gaps))?;
     }
 
-    /// To the last bit: the three axes go through the same arithmetic.
+    /// Exact to the last bit, because the three axes use the same arithmetic.
     #[test]
-    fn the_names_of_the_axes_do_not_matter(case in case(), torque in vector(0.2)) {
+    fn the_numbering_of_the_axes_does_not_matter(case in case(), torque in vector(0.2)) {
         let turned = Case {
             moments: [case.moments[2], case.moments[0], case.moments[1]],
             axis: case.axis % 3 + 1,
@@ -414,12 +417,12 @@ proptest! {
     }
 }
 
-/// A positive number of any order of magnitude from 1e-9 to 1e3.
+/// Generates a positive number of any order of magnitude from 1e-9 to 1e3.
 fn margin() -> impl Strategy<Value = f64> {
     (-9.0..3.0_f64).prop_map(|log10| 10.0_f64.powf(log10))
 }
 
-/// What is added to a triple to make it no body's.
+/// Generates invalid additions to a moment.
 fn flaw() -> impl Strategy<Value = f64> {
     prop_oneof![Just(0.0), Just(-0.0), Just(-1.0), Just(f64::NAN), Just(f64::INFINITY), Just(f64::NEG_INFINITY)]
 }
@@ -427,8 +430,8 @@ fn flaw() -> impl Strategy<Value = f64> {
 proptest! {
     #![proptest_config(cases(3000))]
 
-    /// With |k_i| > |a_i| M the exact bound M²a_i²/(4|k_i|) + |k_k|/4 is below M|a_i|/4 + |k_k|/4: the paper asks at
-    /// least twice of what is needed.
+    /// With |k_i| > |a_i| M the exact bound M²a_i²/(4|k_i|) + |k_k|/4 is below M|a_i|/4 + |k_k|/4: the paper requires
+    /// at least twice the necessary rate.
     #[test]
     fn the_paper_s_condition_implies_the_exact_one(
         moments in body(), axis in 1..=3_usize, bound in margin(), over in prop::array::uniform3(margin()), last in margin()
@@ -441,15 +444,15 @@ proptest! {
         gain[k] = over[2];
         let decay = (gain[k] / 2.0 + (a[i].abs() + a[j].abs()) * bound) * (1.0 + last);
         let certificate = Certificate::new(&a, axis, &gain, decay, bound, 1e-3, 1);
-        prop_assert!(certificate.paper.iter().all(Condition::holds), "the case is not what it should be: {certificate:?}");
+        prop_assert!(certificate.paper.iter().all(Condition::holds), "the case must meet the paper's condition: {certificate:?}");
         prop_assert!(certificate.exact.holds(), "{certificate:?}");
         prop_assert!(certificate.exact.required <= certificate.paper[2].required / 2.0 * (1.0 + 1e-9), "{certificate:?}");
     }
 
-    /// Judged by the mass that would have to be there: the moments are physical if no second moment of the mass along an
-    /// axis is negative and at most one of them is zero.
+    /// The criterion is the required mass: the moments are possible if no second moment of mass along an axis is
+    /// negative and at most one is zero.
     #[test]
-    fn inertia_is_what_some_distribution_of_mass_has(
+    fn an_inertia_is_accepted_if_some_distribution_of_mass_has_it(
         spread in prop::array::uniform3(prop_oneof![1 => Just(0.0), 6 => 1e-6..1.0_f64, 1 => -1.0..-1e-6_f64]),
         scale in margin(),
     ) {
@@ -468,7 +471,7 @@ proptest! {
     }
 
     #[test]
-    fn inertia_has_no_moment_that_is_not_a_positive_number(moments in body(), axis in 1..=3_usize, flaw in flaw()) {
+    fn a_moment_that_is_not_positive_and_finite_is_refused(moments in body(), axis in 1..=3_usize, flaw in flaw()) {
         let mut moments = moments;
         moments[axis - 1] = flaw;
         let refusal = Inertia::new(moments);

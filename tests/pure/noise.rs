@@ -1,4 +1,4 @@
-//! What the filters make of noisy measurements, against the textbook's extended Kalman filter on the same data.
+//! The filters on noisy measurements, compared with the textbook's extended Kalman filter on the same data.
 //!
 //! `cargo test --release --test all noise:: -- --nocapture` prints every figure.
 
@@ -10,12 +10,12 @@ use corotate::observe::{
 use nalgebra::Vector1;
 use std::f64::consts::FRAC_1_SQRT_2;
 
-/// After this time the filters' transients are over, s; the recordings are twice as long.
+/// The time after which the filters' transients are over, s; the recordings are twice as long.
 const SETTLED_S: f64 = 20.0;
 
 const ELLIPTIC: &Case = &CASES[0];
 
-/// The guess of the hidden component unless a test is about guesses: off by this much, rad/s.
+/// The error of the initial guess of the hidden component, except in tests of the guess, rad/s.
 const GUESS_ERROR: f64 = 0.1;
 
 fn first(rate: f64, guess: f64) -> Filter<1> {
@@ -30,7 +30,7 @@ fn kalman(density: f64, guess: f64, deviation: f64) -> Filter<1> {
     Filter::Kalman(KalmanFilter::new(Vector1::new(density), Vector1::new(guess), Vector1::new(deviation)))
 }
 
-/// ω_k − ω̂_k at each sample by a filter on the invariant relation.
+/// Returns ω_k − ω̂_k at each sample for a filter on the invariant relation.
 fn by_relation(recording: &Recording, mut filter: Filter<1>) -> Vec<f64> {
     let relation = recording.relation();
     let mut errors = vec![recording.truth[0].z - filter.estimate().x];
@@ -50,7 +50,7 @@ fn by_relation(recording: &Recording, mut filter: Filter<1>) -> Vec<f64> {
     errors
 }
 
-/// ω_k − ω̂_k at each sample by the extended Kalman filter.
+/// Returns ω_k − ω̂_k at each sample for the extended Kalman filter.
 fn by_ekf(recording: &Recording, density: f64, [guess, deviation]: [f64; 2]) -> Vec<f64> {
     let noise = [recording.deviation, density];
     let mut peer = Ekf::new(&recording.coefficients, 3, noise, &recording.measured[0], [guess, deviation]);
@@ -61,7 +61,7 @@ fn by_ekf(recording: &Recording, density: f64, [guess, deviation]: [f64; 2]) -> 
     std::iter::once(recording.truth[0].z - guess).chain(errors).collect()
 }
 
-/// ω_k − ω̂_k at each sample by the guarded Kalman filter of the whole state.
+/// Returns ω_k − ω̂_k at each sample for the guarded Kalman filter of the whole state.
 fn by_guarded(recording: &Recording, density: f64, [guess, deviation]: [f64; 2]) -> Vec<f64> {
     let mut filter = guarded(recording, density, 1e-6, [guess, deviation]);
     let errors = (1..recording.truth.len()).map(|index| {
@@ -76,7 +76,7 @@ fn guarded(recording: &Recording, density: f64, floor: f64, [guess, deviation]: 
     GuardedKalman::new(&recording.coefficients, 3, floor, noise, &recording.sample(0), guess).unwrap()
 }
 
-/// Root mean square of what lies after the settling time. Not a number counts as infinite.
+/// Returns the root mean square after the settling time; infinite for a NaN.
 fn rms(recording: &Recording, errors: &[f64]) -> f64 {
     let late = &errors[(SETTLED_S / recording.tick_s) as usize..];
     let mean = late.iter().map(|error| error * error).sum::<f64>() / late.len() as f64;
@@ -87,7 +87,7 @@ fn row(values: &[f64]) -> String {
     values.iter().map(|value| format!("{value:9.2e}")).collect::<Vec<_>>().join(" ")
 }
 
-/// Root mean square over several recordings.
+/// Returns the root mean square over several recordings.
 fn pooled(values: &[f64]) -> f64 {
     (values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64).sqrt()
 }
@@ -97,7 +97,7 @@ fn record(case: &Case, tick_s: f64, deviation: f64, seed: u64) -> Recording {
 }
 
 #[test]
-fn noise_passes_as_the_theory_says() {
+fn noise_passes_as_predicted_by_theory() {
     let recordings = [1, 2, 3].map(|seed| record(ELLIPTIC, 1e-3, 2e-3, seed));
     let guess = ELLIPTIC.start[2] + GUESS_ERROR;
     let all = |run: &dyn Fn(&Recording) -> Vec<f64>| {
@@ -108,11 +108,11 @@ fn noise_passes_as_the_theory_says() {
     let within = |name: &str, range: [f64; 2], run: &dyn Fn(&Recording) -> Vec<f64>| {
         print!("{name:28}");
         let value = pooled(&all(run));
-        // The range is of two seeds; three others may lie a fifth beside it.
+        // The range is that of two seeds; three others may differ from it by a fifth.
         assert!(value > range[0] / 1.2 && value < range[1] * 1.2, "{name}: {value:e}");
     };
     within("first order, 5/s", [1.4e-2, 1.4e-2], &|data| by_relation(data, first(5.0, guess)));
-    // From the truth: a wrong guess would still be felt after 20 s at this rate.
+    // Started at the truth: a wrong guess would still have an effect after 20 s at this rate.
     within("first order, 0.2/s", [5.6e-4, 5.6e-4], &|data| by_relation(data, first(0.2, ELLIPTIC.start[2])));
     within("second order, 0.7 rad/s", [4.2e-5, 4.8e-5], &|data| by_relation(data, second(0.7, guess)));
     within("second order, 2 rad/s", [1.4e-4, 1.6e-4], &|data| by_relation(data, second(2.0, guess)));
@@ -126,7 +126,8 @@ fn noise_passes_as_the_theory_says() {
     }
 }
 
-/// Pooled rms of the extended, the guarded and the relation's Kalman filter on the same recordings, rad/s.
+/// Returns the pooled rms of the extended, the guarded and the relation's Kalman filter on the same recordings,
+/// rad/s.
 fn compare(case: &Case, recordings: &[Recording], density: f64) -> [f64; 3] {
     let start = [case.start[2] + GUESS_ERROR, 1.0];
     let pool = |run: &dyn Fn(&Recording) -> Vec<f64>| {
@@ -162,7 +163,7 @@ fn the_guarded_kalman_filter_equals_the_extended_one_at_every_noise() {
     assert!(worse.is_empty(), "{worse:#?}");
 }
 
-/// The time after which the error stays below a bound, s; infinite if it does not.
+/// Returns the time after which the error stays below a bound, s; infinite if it does not.
 fn settling_s(recording: &Recording, errors: &[f64], bound: f64) -> f64 {
     match errors.iter().rposition(|error| error.is_nan() || error.abs() > bound) {
         Some(last) if last + 1 == errors.len() => f64::INFINITY,
@@ -219,7 +220,8 @@ fn without_noise_the_floor_is_that_of_rounding() {
     }
 }
 
-/// Every filter on the samples of the given indices only.
+/// Returns the errors of every filter on the samples with the given indices only, and the number of unobservable
+/// steps.
 fn sparse(recording: &Recording, indices: &[usize], floor: f64) -> (Vec<[f64; 5]>, usize) {
     let guess = recording.truth[0].z + GUESS_ERROR;
     let relation = HiddenRate::new(&recording.coefficients, 3, floor).unwrap().with_noise(&recording.sensors());
@@ -243,7 +245,7 @@ fn sparse(recording: &Recording, indices: &[usize], floor: f64) -> (Vec<[f64; 5]
     (errors, unseen)
 }
 
-/// Root mean square of every filter's errors over the last half.
+/// Returns the root mean square of every filter's errors over the last half.
 fn late_rms(errors: &[[f64; 5]]) -> [f64; 5] {
     let late = &errors[errors.len() / 2..];
     std::array::from_fn(|filter| {
@@ -252,10 +254,10 @@ fn late_rms(errors: &[[f64; 5]]) -> [f64; 5] {
 }
 
 #[test]
-fn missed_ticks_are_only_longer_steps() {
+fn missed_ticks_only_lengthen_a_step() {
     for case in &CASES {
         let recording = record(case, 1e-3, 1e-3, 5);
-        // One to forty-seven ticks from sample to sample, and a silence of half a second.
+        // One to forty-seven ticks from sample to sample, and a gap of half a second.
         let gaps = (0_usize..).map(|k| if k == 700 { 500 } else { 1 + (k * k * 31) % 47 });
         let indices: Vec<_> = gaps
             .scan(0, |at, gap| {
@@ -268,14 +270,14 @@ fn missed_ticks_are_only_longer_steps() {
         let (missed, whole) =
             (late_rms(&sparse(&recording, &indices, 1e-6).0), late_rms(&sparse(&recording, &every, 1e-6).0));
         println!("{:16} {} of all samples {}", case.name, row(&missed), row(&whole));
-        // A 24th of the samples: white noise passes up to √24 times as strongly through filters of one bandwidth.
+        // One of 24 samples: filters of one bandwidth pass up to √24 times as much white noise.
         assert!((1..5).all(|filter| missed[filter] < 12.0 * whole[filter]), "{}", case.name);
     }
 }
 
 #[test]
-fn blind_gaps_are_bridged_by_the_model() {
-    // Only on a hyperbola do the measured components come nearer to what cannot be observed, and go again.
+fn the_model_bridges_unobservable_gaps() {
+    // Only on a hyperbola do the measured components come near the unobservable set and leave it again.
     let case = &CASES[1];
     for floor in [0.5, 0.6, 0.8] {
         let recording = record(case, 1e-2, 1e-3, 5);

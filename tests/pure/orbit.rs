@@ -1,5 +1,5 @@
-//! Holds the third paper's system to its word: the motion against an independent reference, the observer's floor, decay and
-//! order, the loop with and without a measured velocity, the clocks against each other, faults, and what is refused.
+//! Checks the third paper's system: the motion against an independent reference, the observer's floor, decay and
+//! order, the loop with and without a measured velocity, the clocks against each other, faults, and invalid input.
 
 use crate::common::{Bench, WITHOUT_TICK_LIMITS, cases, reference, shipped};
 use corotate::bus::memory::MemoryBus;
@@ -25,7 +25,7 @@ fn field() -> CentralField {
     CentralField::new(1.0, 0.05, 20.0).unwrap()
 }
 
-/// A motion as its position sensors sample it: the states, one more than there are steps, and the steps, s.
+/// A motion as sampled by its position sensors: the states, one more than there are steps, and the steps, s.
 struct Motion {
     states: Vec<OrbitState>,
     steps: Vec<f64>,
@@ -58,7 +58,7 @@ impl Motion {
         std::iter::once(0.0).chain(sums).collect()
     }
 
-    /// The error of (vx, vy) at each sample, from a guess in polar components.
+    /// Returns the error of (vx, vy) at each sample, from a guess in polar components.
     fn errors(&self, decay: Vector2<f64>, guess: Vector2<f64>) -> Vec<Vector2<f64>> {
         let relation = OrbitVelocity::new(field().mu());
         let velocity = |x: &OrbitState| to_inertial(x.theta, &Vector2::new(x.vr, x.vtheta));
@@ -99,7 +99,7 @@ fn a_settled_estimate_is_the_true_velocity() {
 }
 
 #[test]
-fn the_decay_is_the_designed_one_on_either_axis() {
+fn each_axis_has_the_designed_decay() {
     for (axis, decay) in [(0, DECAY_PER_S), (1, 2.5)] {
         let motion = Motion::free(1e-3, 4.0);
         let errors = motion.errors(Vector2::new(DECAY_PER_S, 2.5), Vector2::new(-0.4, 0.1));
@@ -127,7 +127,7 @@ fn the_error_is_of_fourth_order_in_the_tick() {
     let ticks_s = [0.2, 0.1, 0.05, 0.025];
     let rms = ticks_s.map(|tick_s| {
         let errors = Motion::free(tick_s, 60.0).errors(Vector2::repeat(0.5), Vector2::new(START.vr, START.vtheta));
-        // At the instants that all ticks share, and with a slow L, or the fifth order of one step would show.
+        // At the instants that all ticks share, and with a slow L; otherwise the fifth order of one step would show.
         let shared = errors.iter().step_by((ticks_s[0] / tick_s).round() as usize).skip(100);
         (shared.clone().map(Vector2::norm_squared).sum::<f64>() / shared.count() as f64).sqrt()
     });
@@ -137,7 +137,7 @@ fn the_error_is_of_fourth_order_in_the_tick() {
     assert!((orders[2] - 4.0).abs() < 0.1, "{orders:?}");
 }
 
-/// A shipped scenario in this thread: per tick the truths of all bodies and the estimate.
+/// Runs a shipped scenario in this thread and returns the truths of all bodies and the estimate per tick.
 fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> {
     let overrides: Vec<String> = overrides.iter().map(|text| (*text).to_owned()).collect();
     let scenario = &Scenario::load(&shipped(name), &overrides).unwrap();
@@ -173,7 +173,7 @@ fn run(name: &str, overrides: &[&str]) -> Vec<(Vec<OrbitTruth>, OrbitEstimate)> 
     rows
 }
 
-/// The paper's comparison: the law with the velocity measured, and with the velocity estimated.
+/// The paper's comparison: the law with the measured and with the estimated velocity.
 #[test]
 fn with_and_without_a_measured_velocity_the_target_orbit_is_reached() {
     let full = run("orbit-hold", &["controller.feedback=full-state"]);
@@ -187,12 +187,12 @@ fn with_and_without_a_measured_velocity_the_target_orbit_is_reached() {
     let apart = |tick: usize| (full[tick].0[0].radius_du - observed[tick].0[0].radius_du).abs();
     let farthest = (0..full.len()).map(apart).fold(0.0, f64::max);
     println!("the two are at most {farthest:.3} du apart in radius");
-    assert!(farthest > 1e-2, "a law that has to wait for its observer moves differently");
+    assert!(farthest > 1e-2, "the law with an estimate moves differently at first");
 }
 
-/// Against the paper's own observer (15), (16) and a plant in Cartesian coordinates, in another language.
+/// The reference is the paper's own observer (15), (16) and a plant in Cartesian coordinates, in another language.
 #[test]
-fn the_closed_loop_is_the_reference_s() {
+fn the_closed_loop_follows_the_reference() {
     let expected = reference("let_orbit_hold_100hz.csv");
     let rows = run("orbit-hold", &["tick_hz=100", "duration_s=10", "accept={}"]);
     assert_eq!(rows.len(), expected.len());
@@ -210,7 +210,7 @@ fn the_closed_loop_is_the_reference_s() {
 }
 
 #[test]
-fn the_closed_loop_s_estimate_decays_as_designed() {
+fn the_estimate_in_the_closed_loop_decays_as_designed() {
     let rows = run("orbit-hold", &["duration_s=4", "accept={}"]);
     let error = |tick: usize| {
         let (truth, estimate) = (&rows[tick].0[0], &rows[tick].1);
@@ -223,7 +223,7 @@ fn the_closed_loop_s_estimate_decays_as_designed() {
 }
 
 #[test]
-fn thrust_keeps_to_its_limit_and_needs_none_at_the_end() {
+fn thrust_is_limited_and_vanishes_at_the_end() {
     let rows = run("orbit-hold", &["duration_s=25"]);
     let thrust = |row: &(Vec<OrbitTruth>, OrbitEstimate)| Vector2::from(row.0[0].applied_du_s2).amax();
     assert!(rows.iter().all(|row| thrust(row) <= 0.5) && rows.iter().any(|row| thrust(row) == 0.5));
@@ -231,7 +231,7 @@ fn thrust_keeps_to_its_limit_and_needs_none_at_the_end() {
 }
 
 #[test]
-fn a_follower_moves_as_its_leader_does_at_another_angle() {
+fn a_follower_moves_like_its_leader_at_another_angle() {
     for predict in ["controller.predict=true", "controller.predict=false"] {
         let rows = run("orbit-rendezvous", &[predict, "duration_s=25"]);
         let difference = |row: &(Vec<OrbitTruth>, OrbitEstimate)| {
@@ -243,8 +243,8 @@ fn a_follower_moves_as_its_leader_does_at_another_angle() {
         let before = difference(&rows[rows.len() - 3000]).2;
         println!("{predict}: {radius:.1e} du, {velocity:.1e} du/s, phase offset {angle:.6} rad");
         assert!(radius.abs() < 1e-8 && velocity < 1e-8 && (angle - before).abs() < 1e-7, "{radius} {velocity}");
-        assert!(angle.abs() > 0.1, "an offset was there and none is taken out");
-        // The leader's orbit is an ellipse: it really moves in and out, and nothing acts on it.
+        assert!(angle.abs() > 0.1, "the initial offset of the angle stays");
+        // The leader's orbit is an ellipse: its radius varies, and no thrust acts on it.
         let radii = rows.iter().map(|row| row.0[0].radius_du);
         assert!(radii.clone().fold(0.0, f64::max) - radii.fold(9.0, f64::min) > 0.2);
         assert!(rows.iter().all(|row| row.0[0].applied_du_s2 == [0.0; 2]));
@@ -252,7 +252,7 @@ fn a_follower_moves_as_its_leader_does_at_another_angle() {
 }
 
 #[test]
-fn processes_publish_the_bits_of_the_thread() {
+fn processes_publish_the_bits_of_one_thread() {
     for (scenario, set) in [
         ("orbit-hold", "controller.predict=false"),
         ("orbit-hold", "controller.predict=true"),
@@ -263,16 +263,16 @@ fn processes_publish_the_bits_of_the_thread() {
         let run = |clock: &str| {
             bench.summary(scenario, &["--clock", clock, "--duration", "5", "--set", "accept={}", "--set", set])
         };
-        let (one, many) = (run("in-process"), run("lockstep"));
-        assert_eq!(one["state"]["hash"], many["state"]["hash"], "{scenario} {set}");
-        assert_eq!((&many["books"]["balanced"], &many["last_tick"]), (&true.into(), &5000.into()));
-        let links = many["books"]["links"].as_array().unwrap();
+        let (in_process, lockstep) = (run("in-process"), run("lockstep"));
+        assert_eq!(in_process["state"]["hash"], lockstep["state"]["hash"], "{scenario} {set}");
+        assert_eq!((&lockstep["books"]["balanced"], &lockstep["last_tick"]), (&true.into(), &5000.into()));
+        let links = lockstep["books"]["links"].as_array().unwrap();
         assert!(links.iter().all(|link| !link["service"].as_str().unwrap().ends_with("/truth")), "{links:?}");
         bench.assert_clean(&[]);
     }
 }
 
-/// Both rigs in real time, with what they are accepted by; the machine may be slow, the result may not suffer.
+/// Both rigs in real time meet their criteria; a slow machine may miss ticks, but must not degrade the result.
 #[test]
 fn the_shipped_scenarios_are_accepted_in_real_time() {
     for scenario in ["orbit-hold", "orbit-rendezvous"] {
@@ -285,13 +285,13 @@ fn the_shipped_scenarios_are_accepted_in_real_time() {
 }
 
 #[test]
-fn full_state_feedback_is_noted_wherever_the_scenario_is_told() {
+fn full_state_feedback_is_noted_in_every_output() {
     let bench = Bench::new();
     let note = "spacecraft measures its own velocity";
     let set = ["--set", "controller.feedback=full-state"];
     let short = ["--clock", "in-process", "--duration", "1", "--set", "accept={}"];
-    let told = bench.summary("orbit-hold", &[&set[..], &short, &["--out", "out"]].concat());
-    assert!(told["notes"][0].as_str().unwrap().contains(note), "{told:#}");
+    let summary = bench.summary("orbit-hold", &[&set[..], &short, &["--out", "out"]].concat());
+    assert!(summary["notes"][0].as_str().unwrap().contains(note), "{summary:#}");
     let resolved = std::fs::read_to_string(bench.path("out/scenario.toml")).unwrap();
     assert!(resolved.contains("feedback = \"full-state\""), "{resolved}");
     let file = bench.path("orbit-hold.toml");
@@ -311,7 +311,7 @@ fn a_body_that_hits_or_leaves_fails_the_run() {
         let bench = Bench::new();
         let file = shipped(scenario);
         for clock in ["in-process", "lockstep"] {
-            // Without any criterion of the scenario's own.
+            // Without the scenario's own criteria.
             let common = ["--clock", clock, "--duration", "1", "--set", "accept={}", "--json", "--out", clock];
             let run = [&["run", file.to_str().unwrap(), "--set", set[0], "--set", set[1]], &common[..]].concat();
             let done = bench.run(&run);
@@ -325,14 +325,14 @@ fn a_body_that_hits_or_leaves_fails_the_run() {
         }
         let hashes = |clock: &str| std::fs::read_to_string(bench.path(&format!("{clock}/hashes.txt"))).unwrap();
         // The first line names the run.
-        let (one, many) = (hashes("in-process"), hashes("lockstep"));
-        assert!(one.lines().count() > 2 && one.lines().skip(1).eq(many.lines().skip(1)));
+        let (in_process, lockstep) = (hashes("in-process"), hashes("lockstep"));
+        assert!(in_process.lines().count() > 2 && in_process.lines().skip(1).eq(lockstep.lines().skip(1)));
         bench.assert_clean(&[]);
     }
 }
 
 #[test]
-fn what_makes_no_sense_is_refused_with_key_and_remedy() {
+fn invalid_values_are_refused_with_key_and_remedy() {
     let bench = Bench::new();
     let hold = [
         ("spacecraft.initial_radius_du=0.0", "spacecraft.initial_radius_du: 0 du is not between"),
@@ -376,12 +376,12 @@ fn what_makes_no_sense_is_refused_with_key_and_remedy() {
         assert_eq!(done.code, Some(2), "{set}: {done:?}");
         assert!(done.stderr.contains(reason), "{set}: {}", done.stderr);
     }
-    // A hyperbolic start is a start like any other.
+    // A hyperbolic start is valid too.
     let set = "spacecraft.initial_velocity_du_s=[0.5, 1.6]";
     assert_eq!(bench.run(&["check", shipped("orbit-hold").to_str().unwrap(), "--set", set]).code, Some(0));
 }
 
-/// An orbit that keeps between 0.5 and 5 du, anywhere on it.
+/// Generates a state on an orbit that stays between 0.5 and 5 du.
 fn orbit() -> impl Strategy<Value = OrbitState> {
     let start = (0.6..2.0_f64, -0.4..0.4_f64, -9.0..9.0_f64, 0.7..1.2_f64, any::<bool>());
     start
@@ -399,7 +399,7 @@ fn vector(bound: f64) -> impl Strategy<Value = Vector2<f64>> {
     prop::array::uniform2(-bound..bound).prop_map(Vector2::from)
 }
 
-/// What may go wrong with a number.
+/// Generates any number, including invalid ones.
 fn anything() -> impl Strategy<Value = f64> {
     prop_oneof![any::<f64>(), -1e3..1e3_f64, Just(0.0)]
 }
@@ -422,8 +422,8 @@ proptest! {
         prop_assert!((Vector4::from(whole) - Vector4::from(parts)).amax() < 1e-11);
     }
 
-    /// With r ≥ 0.5 the acceleration's fourth derivative stays below 2e4 in these units, so 2 ms ticks leave less than 1e-9;
-    /// the gaps of up to five ticks make that 1e-7.
+    /// With r ≥ 0.5 the acceleration's fourth derivative stays below 2e4 in these units, so 2 ms ticks leave less
+    /// than 1e-9; the gaps of up to five ticks make that 1e-7.
     #[test]
     fn the_error_contracts_as_designed_under_thrust_and_missed_ticks(
         start in orbit(), thrust in vector(0.05), guess in vector(2.0), decay in prop::array::uniform2(0.5..10.0_f64),
@@ -440,7 +440,7 @@ proptest! {
     }
 
     #[test]
-    fn axes_turn_back_and_forth(theta in -100.0..100.0_f64, v in vector(10.0)) {
+    fn conversions_between_axes_are_inverse(theta in -100.0..100.0_f64, v in vector(10.0)) {
         prop_assert!((to_polar(theta, &to_inertial(theta, &v)) - v).amax() < 1e-14);
         prop_assert!((to_inertial(theta, &v).norm() - v.norm()).abs() < 1e-14);
     }
@@ -449,9 +449,9 @@ proptest! {
 proptest! {
     #![proptest_config(cases(2000))]
 
-    /// Whatever state and thrust: a state within the field or a fault with the last good one, and finite in any case.
+    /// Any state and thrust yield a state within the field, or a fault with the last valid one; both are finite.
     #[test]
-    fn no_state_is_ever_not_a_number(
+    fn a_state_is_always_finite(
         r in 0.06..19.0_f64, v in prop::array::uniform2(-50.0..50.0_f64), thrust in prop::array::uniform2(anything()),
         dt_s in 0.0..0.1_f64
     ) {
@@ -461,7 +461,7 @@ proptest! {
     }
 
     #[test]
-    fn no_command_is_beyond_the_limit_or_not_a_number(
+    fn a_command_is_always_finite_and_within_the_limit(
         leader in prop::array::uniform4(anything()), body in prop::array::uniform4(anything()), predict in any::<bool>()
     ) {
         let gains = OrbitGains { radius_per_s2: 1.0, radial_per_s: 1.8, transverse_per_s: 1.0 };
@@ -472,7 +472,7 @@ proptest! {
         }
     }
 
-    /// ë_r = −k_r e_r − k_v ė_r and ė_θ = −k_θ e_θ, whatever the two orbits are.
+    /// ë_r = −k_r e_r − k_v ė_r and ė_θ = −k_θ e_θ for any two orbits.
     #[test]
     fn the_law_makes_the_error_linear(leader in orbit(), body in orbit(), gain in prop::array::uniform3(0.1..3.0_f64)) {
         let [radius_per_s2, radial_per_s, transverse_per_s] = gain;

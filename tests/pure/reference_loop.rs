@@ -9,10 +9,10 @@ use corotate::scenario::Scenario;
 use corotate::scenario::build;
 use serde_json::Value;
 
-/// What the columns of `let_pair*.csv` may differ by.
+/// The tolerance of the columns of `let_pair*.csv`.
 const TOLERANCE: f64 = 1e-9;
 
-/// Overrides that turn a shipped scenario into the case of a reference file.
+/// Returns the overrides that turn a shipped scenario into the case of a reference file.
 fn case(file: &str) -> (&'static str, Vec<String>) {
     let (scenario, decay, gain) = match file {
         "let_pair_100hz.csv" => ("rigid-pair", "5.0", "[2.0, 2.0, 2.0]"),
@@ -28,7 +28,7 @@ fn case(file: &str) -> (&'static str, Vec<String>) {
     (scenario, overrides.into())
 }
 
-/// Runs a scenario in this thread and gives, per tick, ω, p, ω̂3 and u as the reference does.
+/// Runs a scenario in this thread and returns ω, p, ω̂3 and u per tick, like the reference.
 fn columns(scenario: &Scenario) -> Vec<Vec<f64>> {
     let bus = MemoryBus::new(depths(scenario));
     let mut nodes: Vec<_> = RoleId::all(scenario)
@@ -77,16 +77,16 @@ fn agrees_with(file: &str) {
 }
 
 #[test]
-fn the_loop_is_the_reference_s_with_an_elliptic_leader() {
+fn the_loop_follows_the_reference_with_an_elliptic_leader() {
     agrees_with("let_pair_100hz.csv");
 }
 
 #[test]
-fn the_loop_is_the_reference_s_with_a_hyperbolic_leader() {
+fn the_loop_follows_the_reference_with_a_hyperbolic_leader() {
     agrees_with("let_pair_hyperbolic_100hz.csv");
 }
 
-/// Lockstep processes publish the very bits of the in-process run, so they reproduce the reference too.
+/// Lockstep processes publish the bits of the in-process run, so they reproduce the reference too.
 #[test]
 fn lockstep_processes_reproduce_the_reference_bit_by_bit() {
     for file in ["let_pair_100hz.csv", "let_pair_hyperbolic_100hz.csv"] {
@@ -94,9 +94,9 @@ fn lockstep_processes_reproduce_the_reference_bit_by_bit() {
         let set: Vec<&str> = overrides.iter().flat_map(|argument| ["--set", argument]).collect();
         let bench = Bench::new();
         let run = |clock: &str| bench.summary(scenario, &[&set[..], &["--clock", clock]].concat());
-        let (one, many) = (run("in-process"), run("lockstep"));
-        assert_eq!(one["state"]["hash"], many["state"]["hash"], "{file}");
-        assert_eq!(one["last_tick"], 1000);
+        let (in_process, lockstep) = (run("in-process"), run("lockstep"));
+        assert_eq!(in_process["state"]["hash"], lockstep["state"]["hash"], "{file}");
+        assert_eq!(in_process["last_tick"], 1000);
     }
 }
 
@@ -107,7 +107,8 @@ fn checkpoints(bench: &Bench, directory: &str) -> Vec<(u64, String)> {
     text.lines().skip(1).map(entry).collect()
 }
 
-/// Of a long run not every tick has a hash, but the last one has, and `clean_ticks` are all of an undisturbed run's.
+/// In a long run not every tick has a hash, but the last one has one; `clean_ticks` are all ticks of an undisturbed
+/// run.
 #[test]
 fn a_long_run_has_the_hash_of_its_last_tick() {
     let bench = Bench::new();
@@ -126,7 +127,8 @@ fn a_long_run_has_the_hash_of_its_last_tick() {
     }
 }
 
-/// Real time gives the bits of the in-process run for every tick before the first disturbed one, which the summary names.
+/// In real time every tick before the first disturbed one has the bits of the in-process run; the summary names that
+/// tick.
 #[test]
 fn realtime_gives_the_same_bits_up_to_the_first_missed_tick() {
     for scenario in ["rigid-pair", "rigid-pair-hyperbolic", "rigid-trio"] {
@@ -148,9 +150,9 @@ fn realtime_gives_the_same_bits_up_to_the_first_missed_tick() {
     }
 }
 
-/// A difference in any published value changes the hash: the comparison above can fail.
+/// A difference in any published value changes the hash, so the comparison above can fail.
 #[test]
-fn the_hash_tells_runs_apart_that_differ_in_the_last_bit() {
+fn runs_that_differ_in_the_last_bit_have_different_hashes() {
     let bench = Bench::new();
     let hash = |rate: f64| -> Value {
         let set = format!("follower.0.initial_rate_rad_s=[{rate:?}, 0.5, 0.2]");

@@ -1,7 +1,7 @@
-//! How many instructions a step takes, for a machine on which one instruction takes one nanosecond (`-icount shift=0`), and how
-//! much stack the flight computer.
+//! Counts the instructions of a step on a machine where one instruction takes one nanosecond (`-icount shift=0`), and
+//! the stack used by the flight computer.
 //!
-//! Prints a line per figure to the UART. The loop is that of `config/rigid-pair.toml`, its bodies simulated here too.
+//! Prints one figure per line to the UART. The loop is that of `config/rigid-pair.toml`, with simulated bodies.
 
 #![no_std]
 #![no_main]
@@ -18,13 +18,13 @@ use cortex_m::peripheral::SYST;
 use cortex_m_rt::entry;
 use nalgebra::Vector3;
 
-/// The period h, s, and how many ticks are measured: the first few are no usual ones.
+/// The period h, s, the number of ticks, and the number of initial ticks that are not measured.
 const TICK_S: f64 = 0.001;
 const TICKS: u64 = 1100;
 const FIRST: u64 = 100;
-/// Instructions per count of the clock: at 25 MHz and one instruction per nanosecond.
+/// The number of instructions per count of the clock: at 25 MHz and one instruction per nanosecond.
 const PER_COUNT: u32 = 40;
-/// The clock counts down from here, without an interrupt: no step takes so long.
+/// The initial value of the clock, which counts down without an interrupt; no step takes that long.
 const RELOAD: u32 = 0x00ff_ffff;
 
 struct Text<'a>(&'a mut Board);
@@ -36,7 +36,7 @@ impl Write for Text<'_> {
     }
 }
 
-/// The instructions of many steps, in counts of the clock.
+/// The instructions of all measured steps, in counts of the clock.
 #[derive(Default)]
 struct Counted(u32);
 
@@ -49,7 +49,7 @@ impl Counted {
         made
     }
 
-    /// Instructions per step, beyond those that measuring takes.
+    /// Returns the instructions per step, less those of the measurement itself.
     fn mean(&self, measuring: &Self) -> u32 {
         self.0.saturating_sub(measuring.0) * PER_COUNT / (TICKS - FIRST) as u32
     }
@@ -64,27 +64,27 @@ fn measurement(tick: u64, rate: &Vector3<f64>, applied: &Vector3<f64>, valid: u6
 }
 
 const MEASUREMENT: usize = 64;
-/// Of the stack, bytes are marked that the device may reach.
+/// The marked bytes of the stack, more than the device uses.
 const MARKED: usize = 64 << 10;
 const MARK: u32 = 0x5ac3_3ca5;
-/// Left alone below the caller's frame.
+/// The bytes below the caller's frame that are not marked.
 const MARGIN: usize = 256;
 
-/// Marks the stack below the caller's frame.
+/// Marks the stack below the caller's frame and returns its lowest marked address.
 #[inline(never)]
 fn mark() -> usize {
     let here = cortex_m::register::msp::read() as usize - MARGIN;
     for address in (here - MARKED..here).step_by(4) {
-        // SAFETY: below the stack pointer nothing is in use, and no interrupt comes.
+        // SAFETY: memory below the stack pointer is unused, and no interrupt occurs.
         unsafe { (address as *mut u32).write_volatile(MARK) };
     }
     here
 }
 
-/// How many bytes of the stack were used below `top` since it was marked from `here` on.
+/// Returns the number of bytes used below `top` since the stack was marked from `here` on.
 fn used(top: usize, here: usize) -> usize {
     let mut address = here - MARKED;
-    // SAFETY: memory of the stack, which is only read.
+    // SAFETY: memory of the stack, only read.
     while address < here && unsafe { (address as *const u32).read_volatile() } == MARK {
         address += 4;
     }
@@ -97,10 +97,10 @@ fn frame<'a>(message: Message<'_>, room: &'a mut [u8; MAX_FRAME]) -> Option<&'a 
     encode(payload, room).ok()
 }
 
-/// The flight computer behind its line: from the first byte of a request to the last of the answer.
+/// Measures the flight computer behind its line, from the first byte of a request to the last of the answer.
 #[inline(never)]
 fn exchange() -> Option<u32> {
-    let mut device = Device::new(flight::NAME, flight::seat);
+    let mut device = Device::new(flight::NAME, flight::make_role);
     let (mut room, mut counted, mut measuring) = ([0; MAX_FRAME], Counted::default(), Counted::default());
     let hello = Hello {
         run: 1,
@@ -152,7 +152,7 @@ fn run(board: &mut Board) -> Option<()> {
     for (name, counted) in [("observer", observing), ("controller", controlling), ("body", moving)] {
         writeln!(Text(board), "{name} {}", counted.mean(&measuring)).ok()?;
     }
-    // The loop that was counted is one that works: after 1.1 s the bodies have come nearer.
+    // The measured loop must work: after 1.1 s the error has decreased.
     writeln!(Text(board), "error_micro_rad_s {}", (error * 1e6) as u32).ok()
 }
 
@@ -160,7 +160,7 @@ fn run(board: &mut Board) -> Option<()> {
 fn main() -> ! {
     let Some(core) = cortex_m::Peripherals::take() else { halt::halt() };
     let mut board = Board::start(core);
-    // SAFETY: this program has the clock for itself from here on.
+    // SAFETY: only this code uses the clock from here on.
     let mut core = unsafe { cortex_m::Peripherals::steal() };
     core.SYST.disable_interrupt();
     core.SYST.set_reload(RELOAD);

@@ -1,6 +1,6 @@
-//! What the memory model allows: the orders in which a reader may see the stores of a writer (loom), for what processes hand
-//! over to each other in shared memory. The code is the library's own, with loom's atomics in the place of the processor's.
-//! A run fails, too, if it explores so few orders that it could not tell.
+//! Model checks (loom) of the data that processes exchange in shared memory: all orders in which a reader may see the
+//! stores of a writer. The code is the library's own, with loom's atomics instead of the processor's. A check also
+//! fails if it explores too few orders to be meaningful.
 
 #![cfg(test)]
 
@@ -18,24 +18,25 @@ fn words(count: usize) -> Arc<Vec<AtomicU64>> {
     Arc::new((0..count).map(|_| AtomicU64::new(0)).collect())
 }
 
-/// Lets a reader race a writer in every order; `read` tells whether it has got something, which must happen in some.
+/// Runs a reader against a writer in every order. `read` returns true if it found data, which must happen in some
+/// orders.
 fn race(write: fn(&[AtomicU64], &[AtomicU64]), read: fn(&[AtomicU64], &[AtomicU64]) -> bool) {
     let counts = std::sync::Arc::new([(); 2].map(|()| AtomicUsize::new(0)));
-    let told = counts.clone();
+    let outcomes = counts.clone();
     loom::model(move || {
-        let (one, other) = (words(1), words(4));
-        let (written, also) = (one.clone(), other.clone());
-        let writer = loom::thread::spawn(move || write(&written, &also));
-        let got = read(&one, &other);
+        let (word, copies) = (words(1), words(4));
+        let (written_word, written_copies) = (word.clone(), copies.clone());
+        let writer = loom::thread::spawn(move || write(&written_word, &written_copies));
+        let got = read(&word, &copies);
         writer.join().unwrap();
-        told[usize::from(got)].fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        outcomes[usize::from(got)].fetch_add(1, std::sync::atomic::Ordering::Relaxed);
     });
     let [nothing, something] = [0, 1].map(|got| counts[got].load(std::sync::atomic::Ordering::Relaxed));
-    println!("{nothing} orders in which the reader gets nothing, {something} in which it gets something");
+    println!("{nothing} orders in which the reader finds nothing, {something} in which it finds data");
     assert!(nothing > 10 && something > 10, "{nothing} {something}");
 }
 
-/// Whoever reads a record while it is replaced, twice so that its own copy is written again, gets one whole.
+/// A reader gets a whole record while it is replaced, twice so that the reader's own copy is overwritten.
 #[test]
 fn a_record_is_read_whole() {
     let write: fn(&[AtomicU64], &[AtomicU64]) = |commits, copies| {
@@ -54,9 +55,9 @@ fn a_record_is_read_whole() {
     });
 }
 
-/// Whoever looks for a number finds its words, or nothing.
+/// A reader finds all words of a number, or nothing.
 #[test]
-fn what_is_kept_is_found_whole() {
+fn stored_words_are_found_whole() {
     let write: fn(&[AtomicU64], &[AtomicU64]) = |_, place| {
         for number in 0..2 {
             handover::keep(&place[..3], number, [10 + number; 2].into_iter());
