@@ -44,9 +44,9 @@ fn run_loop(scenario: &Scenario, pieces: &[(u8, &[u8])]) {
     let mut estimate = bus.writer::<RateEstimate>(&topic_of("leader", Signal::Estimate), 1).unwrap();
     let mut command = bus.writer::<RateCommand>(&topic_of("follower", Signal::Command), 1).unwrap();
     let mut estimates =
-        Input::<_, RateEstimate>::watch(&bus, &topic_of("leader", Signal::Estimate), Reader::Role).unwrap();
+        Input::<_, RateEstimate>::open(&bus, &topic_of("leader", Signal::Estimate), Reader::Role).unwrap();
     let mut commands =
-        Input::<_, RateCommand>::watch(&bus, &topic_of("follower", Signal::Command), Reader::Role).unwrap();
+        Input::<_, RateCommand>::open(&bus, &topic_of("follower", Signal::Command), Reader::Role).unwrap();
     for (index, (which, raw)) in pieces.iter().enumerate() {
         let (tick, foreign) = (index as u64 / 4, which % 4);
         match foreign {

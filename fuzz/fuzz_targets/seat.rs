@@ -5,7 +5,7 @@ use corotate::bus::memory::MemoryBus;
 use corotate::bus::{Bus, Reader, Signal, Write};
 use corotate::config::SHIPPED;
 use corotate::record::RecordingReport;
-use corotate::runtime::{Control, depths, topic};
+use corotate::runtime::{LauncherLink, depths, topic};
 use corotate::sample::{Health, Message, RoleState, Schedule};
 use corotate::scenario::Scenario;
 use corotate::telemetry::RoleReport;
@@ -30,7 +30,7 @@ fn samples(scenario: &Scenario, pieces: &[(bool, &[u8])]) {
     let mut schedules = bus.writer::<Schedule>(&schedule_topic, 1).expect("a writer");
     let terminated = AtomicBool::new(false);
     let reader = bus.reader(&schedule_topic, Reader::Role).expect("a reader");
-    let mut control = Control::<MemoryBus>::new(&bus, reader, Vec::new(), 0, &terminated);
+    let mut control = LauncherLink::<MemoryBus>::new(&bus, reader, Vec::new(), 0, &terminated);
     let mut line = RoleLine::new("follower");
     for (number, (health, raw)) in pieces.iter().enumerate() {
         if *health {
