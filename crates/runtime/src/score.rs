@@ -409,11 +409,11 @@ impl<R: Rig, B: Bus> RigScorer<R, B> {
     /// Whether no sample of the next tick can still come.
     fn settled(&mut self) -> Result<bool, BusError> {
         let next = self.scoring.next_tick;
-        let mut settled = self.estimate.seek(next)? != Seek::NotYet;
+        let mut waiting = self.estimate.seek(next)? == Seek::NotYet;
         for truth in &mut self.truths {
-            settled &= truth.seek(next)? != Seek::NotYet;
+            waiting = waiting || truth.seek(next)? == Seek::NotYet;
         }
-        Ok(settled)
+        Ok(!waiting)
     }
 
     fn score_tick(&mut self) {

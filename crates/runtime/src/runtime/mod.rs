@@ -54,6 +54,8 @@ use crate::sample::FleetTruth;
 const WINDOW_TICKS: std::ops::RangeInclusive<u64> = 2..=64;
 /// Upper bound on the fleet samples that wait for one reader, bytes, unless the window's minimum needs more.
 const WAITING_BYTES: usize = 1 << 20;
+/// Samples of one signal, of all bodies together, that may wait for one reader in lockstep. A larger backlog leaves a core's caches.
+const WAITING_SAMPLES: u64 = 512;
 /// The same bound for the scorer of a real-time run, bytes: the scorer reads rarely.
 const SCORED_BYTES: usize = 1 << 22;
 
@@ -66,7 +68,7 @@ fn longest_sample(scenario: &Settings) -> Option<usize> {
 /// Returns the number of ticks that the fastest plant may run ahead of the slowest consumer in lockstep.
 pub fn window_ticks(scenario: &Settings) -> u64 {
     let fits = longest_sample(scenario).map_or(u64::MAX, |bytes| (WAITING_BYTES / 2 / bytes) as u64);
-    fits.clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
+    fits.min(WAITING_SAMPLES / scenario.bodies.len() as u64).clamp(*WINDOW_TICKS.start(), *WINDOW_TICKS.end())
 }
 
 /// Returns the queue depths of a scenario's links.

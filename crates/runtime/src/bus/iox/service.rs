@@ -25,6 +25,9 @@ const MAX_BORROWED: usize = 2;
 /// How long the transport waits for what somebody else has begun to make: longer than any machine keeps a maker from going
 /// on, because a connection that was given up is not tried again. The wait for a maker that is dead is ended by the janitor.
 const CREATION_TIMEOUT: Duration = Duration::from_secs(10);
+/// Connections to dead writers that a reader keeps until it has read what they sent. A signal has one writer at a time, and a reader
+/// looks at every one of these places each time it finds no new sample.
+const EXPIRED_CONNECTIONS: usize = 8;
 /// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
 pub const VERSION: &str = "0.10.0";
 /// An upper bound on what the transport puts before a sample, bytes.
@@ -145,6 +148,7 @@ pub(super) fn config(root: &std::path::Path, domain: &Domain) -> Result<Config, 
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     config.global.creation_timeout = CREATION_TIMEOUT;
+    config.defaults.publish_subscribe.subscriber_expired_connection_buffer = EXPIRED_CONNECTIONS;
     Ok(config)
 }
 
