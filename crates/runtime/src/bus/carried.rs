@@ -1,35 +1,35 @@
-//! What links carry: samples of one body, whose size is known to the compiler, and those of fleets, whose length is not.
+//! The samples that links carry: those of one body, whose size is known at compile time, and those of fleets, whose
+//! length is not.
 //!
-//! Whoever is generic over this serves both by the same code, and pays for neither what the other needs. Must not know how
-//! a bus carries anything.
+//! Generic code serves both kinds without cost for the simpler one. Must not know how a bus carries samples.
 
 use super::{Bus, BusError, Read, Reader, Topic, Write};
 use crate::sample::{Field, FleetLayout, FleetSample, Message, Sample};
 use std::borrow::{Borrow, BorrowMut};
 use std::marker::PhantomData;
 
-/// A kind of sample that links carry. `bodies` is how many bodies a signal tells of: 1, or a fleet's number.
+/// A kind of sample that links carry. `bodies` is the number of bodies in a sample, 1 except for fleets.
 pub trait Carried: Message + 'static {
-    /// One of one's own.
+    /// An owned sample.
     type Owned: BorrowMut<Self>;
-    /// The writing end of its links.
+    /// The writing end of a link.
     type Writer<B: Bus>: Write<Self>;
-    /// The reading end of its links.
+    /// The reading end of a link.
     type Reader<B: Bus>: Read<Self>;
 
-    /// Name and version of the layout.
+    /// Returns name and version of the layout.
     fn type_name() -> &'static str;
-    /// The type name with a hash of the fields.
+    /// Returns the type name with a hash of the fields.
     fn layout() -> &'static str;
-    /// The fields after the stamp, in order.
+    /// Returns the fields after the stamp, in order.
     fn fields(bodies: usize) -> Vec<Field>;
-    /// One of all zeros.
+    /// Returns a sample of zeros.
     fn blank(bodies: usize) -> Self::Owned;
-    /// How long one is, words.
+    /// Returns the length of a sample, words.
     fn length(bodies: usize) -> usize;
-    /// Becomes as another one.
+    /// Copies another sample into this one.
     fn assign(&mut self, from: &Self);
-    /// Opens a signal for writing, in this life of the writer.
+    /// Opens a signal for writing, for this generation of the writer.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -119,7 +119,7 @@ impl<L: FleetLayout> Carried for FleetSample<L> {
     }
 }
 
-/// A fleet's sample of one's own.
+/// An owned sample of a fleet.
 #[derive(Debug)]
 pub struct FleetBuffer<L> {
     words: Box<[u64]>,
@@ -127,18 +127,18 @@ pub struct FleetBuffer<L> {
 }
 
 impl<L: FleetLayout> FleetBuffer<L> {
-    /// A sample of all zeros for so many bodies.
+    /// Creates a sample of zeros for `bodies` bodies.
     pub fn new(bodies: usize) -> Self {
         Self { words: vec![0; FleetSample::<L>::length(bodies)].into(), layout: PhantomData }
     }
 
-    /// The sample.
+    /// Returns the sample.
     #[inline]
     pub fn sample(&self) -> &FleetSample<L> {
         FleetSample::over(&self.words)
     }
 
-    /// The sample, to be written.
+    /// Returns the sample for writing.
     #[inline]
     pub fn sample_mut(&mut self) -> &mut FleetSample<L> {
         FleetSample::over_mut(&mut self.words)

@@ -1,14 +1,14 @@
-//! A run's domain: the directories and the name prefix under which everything it shares lives, so that two runs never meet
-//! and no other user gets in.
+//! The domain of a run: the directories and the name prefix of everything that the run shares. Two runs never meet in
+//! it, and no other user can enter.
 //!
-//! The domain's directory is private, and all that is believed is in it. What is mapped lies in shared memory: our own files
-//! in a directory there that is private too, and `shared` in the domain's directory leads to it; the transport's beside it,
-//! under a prefix that nobody knows before the first of them is made.
+//! The domain's directory is private, and only its content is trusted. Mapped files lie in shared memory: our own in a
+//! private directory there, to which the link `shared` in the domain's directory leads; the transport's beside it,
+//! under a prefix that stays unknown until its first file exists.
 //!
-//! Knows files and locks, and of the transport only which of its files it would leave open to everybody. The lock says whether
-//! the run is alive; the kernel lets go of it when the launcher dies, however it dies. The launcher locks its directory in shared
-//! memory too: that lock is seen where the domain's directory is not, as from outside a container. Must not touch a domain whose
-//! lock is held, nor what another user has put beside it.
+//! Knows files and locks, and which file the transport would leave writable for all users. A held lock means that the
+//! run is alive; the kernel releases it when the launcher dies. The launcher also locks its directory in shared memory,
+//! because that lock is visible where the domain's directory is not, for example outside a container. Must not touch a
+//! domain whose lock is held, nor files of other users.
 
 use crate::files::{self, PrivacyError, require_private, user, user_name};
 use crate::system::{random_bits, remedy};
@@ -20,62 +20,62 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, symlink};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-/// Where the transport's shared memory appears as files.
+/// The directory of the transport's shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
-/// What the names of a domain's files in [`SHARED_MEMORY`] begin with, before its id.
+/// The prefix of a domain's file names in [`SHARED_MEMORY`], before its ID.
 const PREFIX: &str = "corotate_";
-/// What the transport's paths may not exceed, less what it appends: the directory of a node, and a file's name with the prefix.
+/// Longest allowed path of a domain: the transport appends a node's directory and a file name with the prefix.
 const MAX_ROOT_LENGTH: usize = 112;
-/// Letters of an identifier: 128 random bits, so that nobody guesses one.
+/// Length of a domain ID in hexadecimal digits: 128 random bits, so that it is unguessable.
 const ID_LENGTH: usize = 32;
-/// The file of iceoryx2 0.10 that it makes writable for everybody, its count of nodes, by the end of its name: the SHA-1 of
-/// the count's type is in it. Made here, closed, it is taken as it is.
+/// Name of the file in which iceoryx2 0.10 counts its nodes, with the SHA-1 of the count's type. The transport would
+/// create it writable for all users; a private one that exists is used instead.
 const NODE_COUNT: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
-/// What is in it at first: the version 0.10.0 as 64 bits in the machine's order, then the count.
+/// Initial content of that file: version 0.10.0 as 64 bits in native order, then the count.
 const NO_NODES: [u64; 2] = [10 << 16, 0];
-/// So often a domain is given up in which another user has put something before us.
+/// Number of domains that are tried if another user has created a file of the domain first.
 const DOMAINS_MAX: u32 = 3;
-/// The link in a domain's directory to that of its own files in shared memory.
+/// The link in a domain's directory to its own directory in shared memory.
 const OWN_SHARED: &str = "shared";
-/// The link in a domain's own shared memory to its directory.
+/// The link in a domain's directory in shared memory to the domain's directory.
 const OWN_ROOT: &str = "root";
-/// The age from which files in shared memory that are in no locked directory count as left: a launcher makes its
-/// directory some microseconds after its first file.
+/// Age from which files in shared memory without a locked directory count as abandoned. A launcher creates its
+/// directory microseconds after its first file.
 const BEGUN: Duration = Duration::from_secs(60);
-/// How often something is tried again that another process, or a signal, has come in the way of.
+/// Number of attempts when another process or a signal interferes.
 const ATTEMPTS: u32 = 100;
 
-/// A domain that this process uses.
+/// A domain in use by this process.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Domain {
     root: PathBuf,
 }
 
-/// A domain that this process owns; it is removed with everything in it when this is dropped.
+/// A domain owned by this process. Dropping it removes the domain with its content.
 #[derive(Debug)]
 pub struct OwnedDomain {
     domain: Domain,
     _lock: File,
-    /// The lock of its directory in shared memory.
+    /// The lock on its directory in shared memory.
     _shared: Option<File>,
 }
 
-/// Why a domain could not be made or joined.
+/// A domain could not be created, joined or found.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum DomainError {
-    /// A directory is not this user's alone.
+    /// A directory is not private to this user.
     #[error(transparent)]
     #[strum(transparent)]
     Privacy(#[from] PrivacyError),
-    /// Another user made what is the domain's to make, again and again.
-    #[error("{} was there before this run could make it, in {DOMAINS_MAX} domains one after the other; remove it, or have its owner stopped", path.display())]
+    /// Another user repeatedly created a file of the domain first.
+    #[error("{} exists already: another user created it first, in {DOMAINS_MAX} domains in succession; remove it, or stop that user's program", path.display())]
     #[strum(serialize = "domain-taken")]
     Taken {
-        /// What he made.
+        /// The file of the other user.
         path: PathBuf,
     },
-    /// An identifier that can be guessed is none.
+    /// Domain identifiers must be unguessable.
     #[error("the system gives no random numbers: {source}; a sandbox may forbid getrandom: allow it")]
     #[strum(serialize = "no-random-numbers")]
     Random {
@@ -86,12 +86,12 @@ pub enum DomainError {
     #[error("cannot make {}: {source}; {}", path.display(), remedy_at(path, source))]
     #[strum(serialize = "cannot-create")]
     Create {
-        /// What could not be made.
+        /// The path.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },
-    /// A domain cannot be locked, so nobody could tell whether its run is alive.
+    /// A domain cannot be locked, so other processes could not tell whether its run is alive.
     #[error("cannot lock {}: {source}; {}, or set XDG_RUNTIME_DIR to a directory of a local file system", path.display(), remedy(source))]
     #[strum(serialize = "cannot-lock")]
     Lock {
@@ -100,14 +100,14 @@ pub enum DomainError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Every name that was tried was taken, or taken away.
-    #[error("cannot make a domain in {} in {ATTEMPTS} attempts; end whatever removes files there", path.display())]
+    /// Every attempt to create a domain met another process.
+    #[error("cannot make a domain in {} in {ATTEMPTS} attempts; stop the program that removes files there", path.display())]
     #[strum(serialize = "domain-contended")]
     Contended {
         /// The directory of all domains.
         path: PathBuf,
     },
-    /// There is too little shared memory. Found out later it would kill whoever touches the missing page.
+    /// Too little shared memory. Later a missing page would kill the process that touches it.
     #[error("/dev/shm has {} KiB free and the run may take {}; free some, or mount it larger", free >> 10, needed >> 10)]
     #[strum(serialize = "no-shared-memory")]
     NoRoom {
@@ -116,14 +116,14 @@ pub enum DomainError {
         /// Bytes that a run may take.
         needed: u64,
     },
-    /// There are too few inodes. Found out later, files are left half made, and others wait for them.
+    /// Too few inodes. Later this would leave half-made files that other processes wait for.
     #[error("{} has room for {free} more files and the run may make {needed}; remove some, or mount it with more inodes (mount -o remount,nr_inodes=...)", path.display())]
     NoInodes {
         /// The directory.
         path: PathBuf,
-        /// Files that may yet be made.
+        /// Number of files that can still be created.
         free: u64,
-        /// Files that a run may make.
+        /// Number of files that a run may create.
         needed: u64,
     },
     /// The directory's path is too long for the transport's files.
@@ -133,10 +133,10 @@ pub enum DomainError {
         /// The path.
         path: PathBuf,
     },
-    /// No run is under way.
+    /// No run is in progress.
     #[error("no run of this user is under way; start one with `corotate run`, or name its domain's directory")]
     NoRun,
-    /// The directory has the results of a run that is over.
+    /// The path names the results of a run that is over.
     #[error("{} has the results of a run that is over; `corotate report {}` shows it", path.display(), path.display())]
     #[strum(serialize = "run-over")]
     Over {
@@ -151,7 +151,7 @@ pub enum DomainError {
     },
 }
 
-/// Returns the remedy for an error at a path of a domain, which lies in shared memory or in the directory of all domains.
+/// Returns the remedy for an error at a path in shared memory or in the directory of all domains.
 fn remedy_at(path: &Path, error: &io::Error) -> String {
     if !path.starts_with(SHARED_MEMORY) {
         return format!("{}, or set XDG_RUNTIME_DIR to another directory", remedy(error));
@@ -165,7 +165,7 @@ fn remedy_at(path: &Path, error: &io::Error) -> String {
     }
 }
 
-/// The directory that is to hold this user's domains.
+/// Returns the directory for this user's domains.
 fn base() -> PathBuf {
     match std::env::var_os("XDG_RUNTIME_DIR").filter(|directory| !directory.is_empty()) {
         Some(directory) => PathBuf::from(directory).join("corotate"),
@@ -173,10 +173,10 @@ fn base() -> PathBuf {
     }
 }
 
-/// The same, if it is there, without links.
+/// Returns that directory without symbolic links, if it exists.
 ///
 /// # Errors
-/// [`PrivacyError`]: there may be anything in it.
+/// [`PrivacyError`]: its content must not be trusted.
 pub fn private_base() -> Result<Option<PathBuf>, PrivacyError> {
     match require_private(&base()) {
         Err(PrivacyError::System { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -185,8 +185,7 @@ pub fn private_base() -> Result<Option<PathBuf>, PrivacyError> {
 }
 
 impl OwnedDomain {
-    /// Makes a new domain with room for `bytes` of shared memory, after removing those that dead runs of this user left
-    /// behind.
+    /// Creates a domain with room for `bytes` of shared memory, after removing the domains of this user's dead runs.
     ///
     /// # Errors
     /// [`DomainError`].
@@ -196,7 +195,7 @@ impl OwnedDomain {
         require_room(bytes as u64)?;
         let mut taken = 1;
         for _ in 0..ATTEMPTS {
-            // Within the loop: another run that ends may remove the directory as long as it is empty.
+            // Inside the loop: a run that ends may remove the directory while it is empty.
             let base = base();
             DirBuilder::new().recursive(true).mode(0o700).create(&base).map_err(|error| create(&base, error))?;
             let Some(base) = private_base()? else { continue };
@@ -204,9 +203,9 @@ impl OwnedDomain {
             if root.as_os_str().len() > MAX_ROOT_LENGTH {
                 return Err(DomainError::TooLong { path: root });
             }
-            // The lock comes first: a domain without a lock that is held counts as dead.
+            // The lock comes first: a domain without a held lock counts as dead.
             let Some(lock) = lock(&lock_path(&root), LockMode::New)? else { continue };
-            // Removed again if it cannot be completed.
+            // Dropped, and so removed, if the domain cannot be completed.
             let mut owned = Self { domain: Domain { root }, _lock: lock, _shared: None };
             let root = owned.domain.root();
             DirBuilder::new().mode(0o700).create(root).map_err(|error| create(root, error))?;
@@ -221,7 +220,7 @@ impl OwnedDomain {
         Err(DomainError::Contended { path: base() })
     }
 
-    /// The domain, to be used.
+    /// Returns the domain.
     pub fn domain(&self) -> &Domain {
         &self.domain
     }
@@ -234,7 +233,7 @@ impl Drop for OwnedDomain {
 }
 
 impl Domain {
-    /// The domain at a directory that a launcher of this user made.
+    /// Joins the domain in a directory that a launcher of this user created.
     ///
     /// # Errors
     /// [`DomainError::NotADomain`], [`DomainError::Privacy`].
@@ -247,9 +246,9 @@ impl Domain {
         }
     }
 
-    /// Makes what is the domain's in shared memory before anybody else does. The first file there tells the transport's prefix,
-    /// so it is the only one of its files that has a name which can be known beforehand. Gives the lock of the domain's own directory
-    /// there; `None` where the file system has no locks.
+    /// Creates the domain's files in shared memory before another user can. The first file reveals the transport's
+    /// prefix, so it is the only one whose name is predictable. Returns the lock on the domain's directory in shared
+    /// memory; `None` if the file system has no locks.
     fn make_shared(&self) -> Result<Option<File>, DomainError> {
         let failed = |path: &Path, source: io::Error| match source.kind() {
             io::ErrorKind::AlreadyExists => DomainError::Taken { path: path.to_owned() },
@@ -263,7 +262,7 @@ impl Domain {
         let link = self.root.join(OWN_SHARED);
         symlink(&shared, &link).map_err(|error| failed(&link, error))?;
         DirBuilder::new().mode(0o700).create(&shared).map_err(|error| failed(&shared, error))?;
-        // Before it is locked it may be taken for left over, and be removed.
+        // Until it is locked, another process may remove it as abandoned.
         let taken = || DomainError::Taken { path: shared.clone() };
         let directory = open_directory(&shared).map_err(|_| taken())?;
         let lock = match files::lock(&directory, &shared) {
@@ -277,40 +276,40 @@ impl Domain {
         Ok(lock)
     }
 
-    /// Its directory, open to this user alone.
+    /// Returns the domain's directory, which is private to this user.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Whether its run has not been cleared away yet. What cannot be looked at is there.
+    /// Returns true until the domain has been removed. A domain that cannot be examined counts as existing.
     pub fn exists(&self) -> bool {
         lock_path(&self.root).try_exists().unwrap_or(true)
     }
 
-    /// Removes what a process that left late has made anew in a domain that is gone.
+    /// Removes files that a late process has created in a domain that is already removed.
     pub fn remove_if_over(&self) {
         if !self.exists() {
             self.remove();
         }
     }
 
-    /// What the names of all its files in shared memory begin with.
+    /// Returns the prefix of all its file names in shared memory.
     fn name_stem(&self) -> String {
         format!("{PREFIX}{}", self.root.file_name().unwrap_or_default().to_string_lossy())
     }
 
-    /// What the names of the transport's files in shared memory begin with.
+    /// Returns the prefix of the transport's file names in shared memory.
     pub fn prefix(&self) -> String {
         self.name_stem() + "_"
     }
 
-    /// Where a file of ours lies in shared memory that goes with the domain.
+    /// Returns the path of one of our files in the domain's shared memory.
     pub fn shared(&self, name: &str) -> PathBuf {
         self.root.join(OWN_SHARED).join(name)
     }
 
-    /// What is the domain's in shared memory: the transport's files, and the directory of our own. What another user has put
-    /// there under such a name is not.
+    /// Returns the domain's entries in shared memory: the transport's files and our own directory. Entries of other
+    /// users with such names are left out.
     pub fn shared_memory_files(&self) -> impl Iterator<Item = PathBuf> {
         let (stem, user) = (self.name_stem(), user());
         let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
@@ -320,7 +319,7 @@ impl Domain {
             .map(|entry| entry.path())
     }
 
-    /// Checks that whatever this process has mapped of the domain is its user's, so that no other can shorten it.
+    /// Checks that every mapped file of the domain belongs to this user, so that no other user can shorten it.
     ///
     /// # Errors
     /// [`PrivacyError::Foreign`].
@@ -328,7 +327,7 @@ impl Domain {
         let begins = format!("{SHARED_MEMORY}/{}", self.prefix());
         let maps = fs::read_to_string("/proc/self/maps").unwrap_or_default();
         for path in maps.lines().filter_map(|line| line.find(&begins).map(|at| Path::new(&line[at..]))) {
-            // What is gone cannot be looked at by its name, and went while it was ours: nobody else can remove it.
+            // A file that has vanished was ours: no other user can remove it.
             if let Ok(file) = fs::symlink_metadata(path)
                 && file.uid() != user()
             {
@@ -338,28 +337,28 @@ impl Domain {
         Ok(())
     }
 
-    /// Removes what is the domain's in shared memory.
+    /// Removes the domain's files in shared memory.
     fn remove_shared(&self) {
         self.shared_memory_files().for_each(|path| {
             let _ = fs::remove_file(&path).or_else(|_| fs::remove_dir_all(path));
         });
     }
 
-    /// Removes every trace of the domain. What is gone already is no error.
+    /// Removes every file of the domain. Vanished files are no error.
     fn remove(&self) {
         self.remove_shared();
         let _ = fs::remove_dir_all(&self.root);
-        // What could not be removed stays marked, for the next run of this user.
+        // If something could not be removed, the lock file stays as a mark for this user's next run.
         let gone = matches!(self.root.try_exists(), Ok(false));
         if gone && self.shared_memory_files().next().is_none() {
             let _ = fs::remove_file(lock_path(&self.root));
         }
-        // The directory of all domains goes with the last; it is not empty while another run lives.
+        // Removes the directory of all domains with the last domain; it is not empty while another run exists.
         let _ = self.root.parent().map(fs::remove_dir);
     }
 }
 
-/// Removes the domains of this user whose launcher is dead, and tells which.
+/// Removes the domains of this user's dead runs and returns them.
 ///
 /// # Errors
 /// [`PrivacyError`].
@@ -367,19 +366,19 @@ pub fn remove_dead_domains() -> Result<Vec<Domain>, PrivacyError> {
     Ok(private_base()?.map_or(Vec::new(), |base| remove_dead(&base)))
 }
 
-/// Files of a dead run in shared memory whose domain directory is gone, as that of a container.
+/// Files of dead runs in shared memory without a domain directory, for example of a container.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct AbandonedFiles {
-    /// Runs.
+    /// Number of runs.
     pub runs: usize,
-    /// Files of theirs.
+    /// Number of files.
     pub files: usize,
-    /// Their size, bytes.
+    /// Size of the files, bytes.
     pub bytes: u64,
 }
 
-/// Finds what dead runs of this user have left in shared memory while the directories of their domains are gone, and removes it if
-/// `clean` says so.
+/// Finds the files of this user's dead runs in shared memory whose domain directories are gone; removes them if `clean`
+/// is true.
 pub fn scan_abandoned(clean: bool) -> AbandonedFiles {
     let mut ids: Vec<String> = entries(Path::new(SHARED_MEMORY)).filter_map(|path| id_of(&path)).collect();
     ids.sort();
@@ -387,7 +386,7 @@ pub fn scan_abandoned(clean: bool) -> AbandonedFiles {
     let mut all = AbandonedFiles::default();
     for id in ids {
         let domain = Domain { root: base().join(id) };
-        // Held until all is removed: a launcher that is only beginning does not get these locks, and begins anew.
+        // Held until the removal is complete: a launcher that is starting does not get these locks and retries.
         let Some(_locks) = domain.lock_abandoned() else { continue };
         for path in domain.shared_memory_files() {
             let within = entries(&path).chain([path]).filter_map(|path| fs::symlink_metadata(path).ok());
@@ -404,7 +403,7 @@ pub fn scan_abandoned(clean: bool) -> AbandonedFiles {
     all
 }
 
-/// The domain that a path in shared memory belongs to, by its name.
+/// Returns the domain ID in the name of a path in shared memory.
 fn id_of(path: &Path) -> Option<String> {
     let (id, rest) = path.file_name()?.to_str()?.strip_prefix(PREFIX)?.split_at_checked(ID_LENGTH)?;
     (is_id(OsStr::new(id)) && rest.starts_with(['_', '-'])).then(|| id.to_owned())
@@ -414,17 +413,17 @@ fn entries(directory: &Path) -> impl Iterator<Item = PathBuf> + use<> {
     fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path())
 }
 
-/// Opens a directory that is no link.
+/// Opens a directory that is not a symbolic link.
 fn open_directory(path: &Path) -> io::Result<File> {
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::NONBLOCK;
     OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)
 }
 
 impl Domain {
-    /// The locks of a domain whose launcher is dead and whose directory is gone; `None` if either may be there.
+    /// Returns the locks of a domain whose launcher is dead and whose directory is gone; `None` if either may exist.
     ///
-    /// The launcher locks the directory in shared memory, and every role its record there. Such a lock is seen from every PID
-    /// namespace, and the kernel releases it when its holder dies.
+    /// The launcher locks the directory in shared memory, and every role its ledger there. Such a lock is visible from
+    /// every PID namespace, and the kernel releases it when its holder dies.
     fn lock_abandoned(&self) -> Option<Vec<File>> {
         let is_there = |root: &Path| !matches!(lock_path(root).try_exists(), Ok(false));
         if is_there(&self.root) {
@@ -438,7 +437,7 @@ impl Domain {
             }
             match fs::read_link(path.join(OWN_ROOT)) {
                 Ok(root) if is_there(&root) => return None,
-                // An older launcher holds no lock before its roles do.
+                // An older launcher holds no lock until its roles do.
                 Err(_) if !about.modified().ok()?.elapsed().is_ok_and(|age| age > BEGUN) => return None,
                 _ => {}
             }
@@ -463,18 +462,18 @@ impl Domain {
     }
 }
 
-/// A domain that was found, of a run or of what is left of one.
+/// A domain of a living or dead run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FoundDomain {
-    /// Its directory.
+    /// The domain's directory.
     pub root: PathBuf,
-    /// Whether its launcher is alive.
+    /// True if the launcher is alive.
     pub alive: bool,
-    /// When it was made, as far as the file system tells.
+    /// Creation time, if the file system provides it.
     pub made: Option<SystemTime>,
 }
 
-/// The domains of this user, the newest first.
+/// Returns the domains of this user, newest first.
 ///
 /// # Errors
 /// [`DomainError::Privacy`].
@@ -485,7 +484,7 @@ pub fn domains() -> Result<Vec<FoundDomain>, DomainError> {
 fn find_domains(base: &Path) -> Vec<FoundDomain> {
     let find = |path: PathBuf| {
         let made = fs::metadata(&path).and_then(|lock| lock.modified()).ok();
-        // Whoever holds the lock is alive; one that is ours now was nobody's, and is let go of at once.
+        // A held lock means that the launcher is alive. A lock taken here was free, and is released at once.
         let alive = !matches!(lock(&path, LockMode::Existing), Ok(Some(_)));
         FoundDomain { root: path.with_extension(""), alive, made }
     };
@@ -494,7 +493,7 @@ fn find_domains(base: &Path) -> Vec<FoundDomain> {
     found
 }
 
-/// The lock files of all domains. What is not a regular file is no lock, and neither is a file of another name.
+/// Returns the lock files of all domains: regular files with a matching name.
 fn locks(base: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = fs::read_dir(base).into_iter().flatten().flatten();
     let regular = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()));
@@ -504,21 +503,21 @@ fn locks(base: &Path) -> impl Iterator<Item = PathBuf> {
 }
 
 fn require_room(needed: u64) -> Result<(), DomainError> {
-    // A system that does not tell how much is left is not refused for it.
+    // If the system does not report free space, the run is not refused.
     let free = statvfs(SHARED_MEMORY).map_or(u64::MAX, |room| room.f_bavail.saturating_mul(room.f_frsize));
     if free < needed { Err(DomainError::NoRoom { free, needed }) } else { Ok(()) }
 }
 
-/// Checks that so many files can be made in shared memory, and as many beside the domains.
+/// Checks that this number of files can be created in shared memory and in the directory of all domains.
 ///
 /// # Errors
 /// [`DomainError::NoInodes`].
 pub fn require_files(needed: u64) -> Result<(), DomainError> {
     let base = base();
-    // The directory of all domains may not be there yet.
+    // The directory of all domains may not exist yet.
     let existing = base.ancestors().find(|path| path.is_dir()).unwrap_or(Path::new("/"));
     for path in [Path::new(SHARED_MEMORY), existing] {
-        // A system that does not tell how many there are, or makes them as it needs them, is not refused for it.
+        // If the file system does not report inodes or creates them on demand, the run is not refused.
         let free = statvfs(path).ok().filter(|room| room.f_files > 0).map_or(u64::MAX, |room| room.f_favail);
         if free < needed {
             return Err(DomainError::NoInodes { path: path.to_owned(), free, needed });
@@ -539,8 +538,8 @@ fn remove_dead(base: &Path) -> Vec<Domain> {
     removed
 }
 
-/// Domains that are gone and were made anew by somebody who joined too late, and was killed: a launcher makes the lock before
-/// the directory, and removes it after.
+/// Returns removed domains that a late process has created again before it was killed: a launcher creates the lock
+/// before the directory and removes it after.
 fn recreated(base: &Path) -> impl Iterator<Item = Domain> {
     let entries = fs::read_dir(base).into_iter().flatten().flatten();
     let named = entries.map(|entry| entry.path()).filter(|root| root.file_name().is_some_and(is_id));
@@ -555,14 +554,14 @@ fn lock_path(root: &Path) -> PathBuf {
     root.with_extension("lock")
 }
 
-/// Whether a lock is to be made or taken over.
+/// Creation of a lock file, or use of an existing one.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum LockMode {
     New,
     Existing,
 }
 
-/// Takes a lock file; `None` if another process holds it, made it, or took it away meanwhile.
+/// Locks a lock file; `None` if another process holds, created or removed it.
 fn lock(path: &Path, lock: LockMode) -> Result<Option<File>, DomainError> {
     let mut options = OpenOptions::new();
     options.write(true).create_new(lock == LockMode::New).mode(0o600);
@@ -594,7 +593,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_domain_is_private_and_goes_without_a_trace() {
+    fn a_domain_is_private_and_is_removed_completely() {
         let owned = OwnedDomain::create(0).unwrap();
         let domain = owned.domain().clone();
         assert_eq!(fs::metadata(domain.root()).unwrap().mode() & 0o777, 0o700);
@@ -610,9 +609,9 @@ mod tests {
         assert!(matches!(Domain::join(domain.root()), Err(DomainError::NotADomain { .. })));
     }
 
-    /// As the shared memory of a container that was killed with the base directory: nothing but files, and locks that are released.
+    /// As after a killed container whose base directory is gone: only files and released locks remain.
     #[test]
-    fn what_a_dead_run_left_in_shared_memory_is_found_without_its_directory() {
+    fn abandoned_files_in_shared_memory_are_found_without_a_domain_directory() {
         let elsewhere = tempfile::tempdir().unwrap();
         let domain = Domain { root: elsewhere.path().join(random_id().unwrap()) };
         let left = || domain.shared_memory_files().count();
@@ -637,7 +636,7 @@ mod tests {
         assert_eq!(left(), 2);
         scan_abandoned(true);
         assert_eq!(left(), 0);
-        // Without its directory a file may be a launcher's that is only beginning.
+        // Without a directory in shared memory the file may belong to a starting launcher.
         let young = Path::new(SHARED_MEMORY).join(format!("{}x", domain.prefix()));
         fs::write(&young, b"x").unwrap();
         assert!(domain.lock_abandoned().is_none());
@@ -648,7 +647,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_regular_file_is_no_lock() {
+    fn only_regular_files_are_locks() {
         let base = tempfile::tempdir().unwrap();
         let at = |name: &str| base.path().join(format!("{name:0>ID_LENGTH$}.lock"));
         rustix::fs::mkfifoat(rustix::fs::CWD, at("1"), rustix::fs::Mode::RWXU).unwrap();
@@ -663,24 +662,24 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_are_removed_and_the_living_are_not() {
+    fn only_domains_of_dead_runs_are_removed() {
         let base = tempfile::tempdir().unwrap();
         let at = |name: &str| base.path().join(format!("{name:0>ID_LENGTH$}"));
-        let (dead, living, remade, other) = (at("dead"), at("1"), at("2"), base.path().join("other"));
-        [&remade, &other].into_iter().for_each(|root| fs::create_dir(root).unwrap());
+        let (dead, living, recreated, unrelated) = (at("dead"), at("1"), at("2"), base.path().join("unrelated"));
+        [&recreated, &unrelated].into_iter().for_each(|root| fs::create_dir(root).unwrap());
         let mut held = None;
         for root in [&dead, &living] {
             fs::create_dir(root).unwrap();
             held = lock(&lock_path(root), LockMode::New).unwrap();
         }
         let alive = |root: &PathBuf| {
-            find_domains(base.path()).into_iter().find(|found| found.root == *root).map(|one| one.alive)
+            find_domains(base.path()).into_iter().find(|found| found.root == *root).map(|found| found.alive)
         };
         assert_eq!((alive(&dead), alive(&living)), (Some(false), Some(true)));
         remove_dead(base.path());
         assert_eq!((alive(&dead), alive(&living)), (None, Some(true)));
         assert!(!dead.exists() && !lock_path(&dead).exists());
         assert!(living.exists() && held.is_some());
-        assert!(!remade.exists() && other.exists());
+        assert!(!recreated.exists() && unrelated.exists());
     }
 }

@@ -1,7 +1,7 @@
-//! The bus over shared memory; beside `raw.rs` only this file and its parts know iceoryx2.
+//! The bus over shared memory. Only this file, its parts and `raw.rs` know iceoryx2.
 //!
-//! Publish-subscribe with overflow: a slow or dead reader never holds a writer up. What a reader must not lose is bounded
-//! by the loop itself (lockstep), not by a writer that waits.
+//! Publish-subscribe with overflow: a slow or dead reader never delays a writer. Lockstep bounds the number of waiting
+//! samples by its window, not by a waiting writer.
 
 mod cause;
 mod fleet;
@@ -34,11 +34,11 @@ use std::io;
 use std::rc::Rc;
 use std::time::Duration;
 
-/// For so long an opening tries again where no other limit is given, ns.
+/// Default time limit of an opening, ns.
 const OPENING_NS: u64 = 10_000_000_000;
 
 impl IoxBus {
-    /// Enters a domain as `name`.
+    /// Enters a domain under this name.
     ///
     /// # Errors
     /// [`BusError::Domain`].
@@ -46,7 +46,7 @@ impl IoxBus {
         Self::with_notifiers(domain, name, depths, Notifiers::open(domain), true)
     }
 
-    /// The same for one who only looks: of the signals nothing is made, and one that nobody has opened is an error.
+    /// Enters a domain without creating signals: opening a signal that does not exist is an error.
     ///
     /// # Errors
     /// [`BusError::Domain`].
@@ -68,12 +68,12 @@ impl IoxBus {
         Ok(Self { node, notifiers, depths, creates, domain: domain.clone(), opening_ns: OPENING_NS })
     }
 
-    /// The same, with another limit on how long an opening may take.
+    /// Sets the time limit of an opening.
     pub fn with_opening_limit(self, limit: Duration) -> Self {
         Self { opening_ns: limit.as_nanos() as u64, ..self }
     }
 
-    /// Whether a signal has a fast lane: where only the newest sample counts.
+    /// Returns true if a signal has a latest-value channel: only the newest sample counts.
     fn has_latest_channel(&self, topic: &Topic) -> bool {
         let for_roles = matches!(topic.signal, Signal::Measurement | Signal::Estimate | Signal::Command);
         for_roles && self.depths.role == 1
@@ -87,7 +87,7 @@ impl IoxBus {
             } else {
                 builder.open().map_err(OpenFailure::from)
             };
-            opened.map_err(|refusal| self.explain(refusal, topic, S::LAYOUT))
+            opened.map_err(|failure| self.explain(failure, topic, S::LAYOUT))
         })
     }
 
@@ -103,7 +103,7 @@ impl IoxBus {
             } else {
                 builder.open().map_err(OpenFailure::from)
             };
-            opened.map_err(|refusal| self.explain(refusal, topic, L::LAYOUT))
+            opened.map_err(|failure| self.explain(failure, topic, L::LAYOUT))
         })
     }
 
@@ -127,14 +127,14 @@ impl IoxBus {
     }
 }
 
-/// Puts away what processes of a domain left behind when they died, so that others can take their places. For the janitor
-/// alone: it may take long, or for ever where somebody stands still.
+/// Removes the remains of a domain's dead processes. For the janitor only: it may block for a long time, or forever
+/// while a process is stopped.
 pub fn clear_dead(domain: &Domain) -> Result<(), BusError> {
     set_log_level(LogLevel::Fatal);
     let failed = |reason| BusError::Domain { domain: domain.root().display().to_string(), reason };
     let clear = |node: NodeState<Ipc>| {
         if let NodeState::Dead(dead) = node {
-            // What cannot be put away now is so the next time.
+            // A failure is repeated at the next call.
             let _ = dead.try_remove_stale_resources();
         }
         CallbackProgression::Continue
@@ -182,7 +182,7 @@ impl Bus for IoxBus {
             let builder = service.subscriber_builder().buffer_size(depth);
             connections.check(builder.set_degradation_handler(connections.failure_handler()).create()?)
         })?;
-        // Who reads every sample has no use for the latest.
+        // A reader of every sample does not need the latest-value channel.
         let latest_channel = match reader {
             Reader::Role if self.has_latest_channel(topic) => LatestChannel::Wanted { generation: 1 },
             _ => LatestChannel::None,
@@ -234,18 +234,18 @@ mod tests {
         IoxBus::enter(domain.domain(), "test", Depths { role: 1, scorer: 8, history: 0 }).unwrap()
     }
 
-    /// What iceoryx2 would leave open to everybody it takes as the domain has made it.
+    /// iceoryx2 uses the private file of the domain instead of creating one for all users.
     #[test]
-    fn the_transport_makes_nothing_that_is_open_to_others() {
+    fn the_transport_creates_only_private_files() {
         let domain = OwnedDomain::create(0).unwrap();
         let shared = || domain.domain().shared_memory_files().map(|path| (path.metadata().unwrap(), path));
         let before: Vec<_> = shared().map(|(_, path)| path).collect();
         let first = enter(domain.domain().root(), domain.domain(), "first").unwrap();
-        assert_eq!(shared().map(|(_, path)| path).collect::<Vec<_>>(), before, "a node alone makes no file");
+        assert_eq!(shared().map(|(_, path)| path).collect::<Vec<_>>(), before, "a node alone creates no file");
         let count = before.iter().find(|path| path.to_string_lossy().contains("_node.")).unwrap();
         let count = || std::fs::read(count).unwrap()[8];
         let (counted, _second) = (count(), enter(domain.domain().root(), domain.domain(), "second").unwrap());
-        assert_eq!((counted, count()), (1, 2), "it counts in the file that was there");
+        assert_eq!((counted, count()), (1, 2), "it counts in the existing file");
         let bus = bus(&domain);
         let _ends =
             (bus.writer::<RateCommand>(&topic(), 1).unwrap(), bus.reader::<RateCommand>(&topic(), Reader::Role));
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_dead_left_is_not_put_away_by_whoever_comes() {
+    fn a_new_process_does_not_clean_up_after_dead_ones() {
         let domain = OwnedDomain::create(0).unwrap();
         let config = config(domain.domain().root(), domain.domain()).unwrap();
         assert!(!config.global.node.cleanup_dead_nodes_on_creation);
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_connected_gets_what_a_writer_sent_that_is_gone() {
+    fn a_connected_reader_gets_the_samples_of_an_ended_writer() {
         let domain = OwnedDomain::create(0).unwrap();
         let (ours, theirs) = (bus(&domain), bus(&domain));
         let [mut connected, mut other] = [0, 1].map(|_| theirs.reader::<RateTruth>(&topic(), Reader::Scorer).unwrap());
@@ -304,7 +304,7 @@ mod tests {
             received += 1;
         }
         assert_eq!(received, 5);
-        // Why a recorder connects before the ticks run.
+        // Therefore a recorder connects before the ticks run.
         assert!(!other.advance().unwrap());
     }
 
@@ -319,21 +319,21 @@ mod tests {
     }
 
     crate::sample! {
-        /// As a program was built first.
+        /// The first version.
         Built = "test/Sample/v1" {
-            /// One.
+            /// A field.
             speed_rad_s: f64,
-            /// Another.
+            /// Another field.
             current_a: f64,
         }
     }
 
     crate::sample! {
-        /// `Ordered` with two fields swapped, under the same name.
+        /// The same name with two fields swapped.
         Swapped = "test/Sample/v1" {
-            /// Another.
+            /// Another field.
             current_a: f64,
-            /// One.
+            /// A field.
             speed_rad_s: f64,
         }
     }
@@ -354,7 +354,7 @@ mod tests {
         assert!(ours.reader::<Built>(&topic(), Reader::Role).is_ok());
     }
 
-    /// A foreign program is told this version: it must be the one that is linked.
+    /// Foreign programs receive this version, which must be the linked one.
     #[test]
     fn the_version_is_the_transport_s_own() {
         let domain = OwnedDomain::create(0).unwrap();
@@ -370,9 +370,9 @@ mod tests {
 
     #[test]
     fn two_domains_never_meet() {
-        let (one, other) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
-        let mut writer = bus(&one).writer::<RateTruth>(&topic(), 1).unwrap();
-        let mut reader = bus(&other).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
+        let (first, second) = (OwnedDomain::create(0).unwrap(), OwnedDomain::create(0).unwrap());
+        let mut writer = bus(&first).writer::<RateTruth>(&topic(), 1).unwrap();
+        let mut reader = bus(&second).reader::<RateTruth>(&topic(), Reader::Scorer).unwrap();
         reader.advance().unwrap();
         writer.send(|sample| sample.stamp.tick = 1).unwrap();
         assert!(!reader.advance().unwrap());

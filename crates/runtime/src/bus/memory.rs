@@ -1,4 +1,4 @@
-//! The bus within one thread: the same semantics as [`super::iox`], no shared memory, no files.
+//! The bus within one thread: the semantics of [`super::iox`] without shared memory or files.
 
 use super::{Bus, BusError, Depths, FleetBuffer, Read, Reader, Topic, Write};
 use crate::sample::{FleetLayout, FleetSample, Sample};
@@ -7,25 +7,25 @@ use std::cell::RefCell;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-/// One reader's waiting samples, the newest last; beyond the depth the oldest gives way.
+/// One reader's waiting samples, the newest last. At full depth the oldest is dropped.
 struct ReaderQueue<S> {
     samples: VecDeque<S>,
     depth: usize,
 }
 
 type Queue<S> = Rc<RefCell<ReaderQueue<S>>>;
-/// The queues of a signal's readers. One whose reader is gone goes to the next reader, with what waits in it: a role that
-/// is built anew takes its predecessor's place.
+/// The queues of a signal's readers. The next reader takes over the queue of a dropped one with its samples: a rebuilt
+/// role takes its predecessor's place.
 type Queues<S> = Rc<RefCell<Vec<Queue<S>>>>;
 
-/// A bus that lives in one thread.
+/// A bus within one thread.
 pub struct MemoryBus {
     depths: Depths,
     topics: RefCell<HashMap<String, Box<dyn Any>>>,
 }
 
 impl MemoryBus {
-    /// A bus without signals.
+    /// Creates a bus without signals.
     pub fn new(depths: Depths) -> Self {
         Self { depths, topics: RefCell::new(HashMap::new()) }
     }
@@ -37,7 +37,7 @@ impl MemoryBus {
         entry.downcast_ref::<Queues<T>>().cloned().ok_or_else(|| BusError::Open {
             service,
             end,
-            reason: format!("it carries another type than {type_name}"),
+            reason: format!("its samples are not of type {type_name}"),
         })
     }
 
@@ -89,7 +89,7 @@ impl Bus for MemoryBus {
     }
 }
 
-/// Hands a sample to every reader.
+/// Adds a sample to the queue of every reader.
 #[inline]
 fn push_to_all<T: Clone>(queues: &Queues<T>, sample: &T) {
     for queue in queues.borrow().iter() {
@@ -129,11 +129,11 @@ impl<S: Sample> Write<S> for MemoryWriter<S> {
     }
 }
 
-/// The writing end of a fleet's signal. Readers share what was written; a chunk that nobody reads any more is written again.
+/// The writing end of a fleet's signal. Readers share the written buffers; a buffer that no reader uses is reused.
 pub struct MemoryFleetWriter<L> {
     queues: Queues<Rc<FleetBuffer<L>>>,
     chunks: Vec<Rc<FleetBuffer<L>>>,
-    /// The chunk that was filled last.
+    /// Index of the buffer filled last.
     filled: usize,
     bodies: usize,
 }
@@ -242,7 +242,7 @@ mod tests {
         assert!(newest.advance().unwrap());
         assert_eq!(newest.current().unwrap().stamp.tick, 4);
         assert!(!newest.advance().unwrap());
-        assert_eq!(newest.current().unwrap().stamp.tick, 4, "the sample at hand stays");
+        assert_eq!(newest.current().unwrap().stamp.tick, 4, "the current sample stays");
         for tick in 0..5 {
             assert!(every.advance().unwrap());
             assert_eq!(every.current().unwrap().stamp.tick, tick);
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_is_opened_anew_finds_what_its_predecessor_left() {
+    fn a_new_reader_takes_over_the_queue_of_a_dropped_one() {
         let bus = MemoryBus::new(Depths { role: 4, scorer: 8, history: 0 });
         let open = || bus.reader::<RateCommand>(&topic(), Reader::Role).unwrap();
         let mut writer = bus.writer::<RateCommand>(&topic(), 1).unwrap();
@@ -263,7 +263,7 @@ mod tests {
         let mut second = open();
         assert!(second.advance().unwrap());
         assert_eq!(second.current().unwrap().stamp.tick, 1);
-        assert!(!open().advance().unwrap(), "a further reader begins with nothing");
+        assert!(!open().advance().unwrap(), "a second reader starts with an empty queue");
     }
 
     #[test]

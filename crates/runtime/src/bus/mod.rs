@@ -1,6 +1,7 @@
-//! Links between roles: one writer and some readers per signal, samples loaned, written in place and sent.
+//! Links between roles: one writer and several readers per signal. Samples are loaned, written in place and sent.
 //!
-//! Roles know these traits alone. [`iox`] is the only file that knows iceoryx2 (and `raw`, which measures it bare); [`memory`] is its twin within one thread.
+//! Roles use only these traits. [`iox`] implements them over iceoryx2, [`memory`] within one thread; `raw` measures
+//! bare iceoryx2.
 
 mod carried;
 pub mod domain;
@@ -20,7 +21,7 @@ pub use words::{AnyBus, EndOpeners, ReadWords, WordReader, WordWriter, WriteWord
 
 use crate::sample::{FleetLayout, FleetSample, Sample};
 
-/// Why a link failed. The run cannot go on without it.
+/// A link failed. The run cannot continue without it.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum BusError {
@@ -28,9 +29,9 @@ pub enum BusError {
     #[error("cannot enter the shared-memory domain {domain}: {reason}")]
     #[strum(serialize = "cannot-enter-domain")]
     Domain {
-        /// Where.
+        /// The domain's directory.
         domain: String,
-        /// Why, and what to do.
+        /// The reason, with a remedy.
         reason: String,
     },
     /// A signal could not be opened.
@@ -64,29 +65,29 @@ pub enum BusError {
     },
 }
 
-/// What reads a signal, and so how many samples may wait for it.
+/// The kind of a reader, which decides how many samples may wait for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reader {
     /// A role: the newest sample only in real time, all of them in lockstep.
     Role,
-    /// The scorer or the recorder, which look only now and then but want every sample.
+    /// The scorer or the recorder: reads rarely and wants every sample.
     Scorer,
 }
 
-/// How many samples may wait for each kind of reader.
+/// Queue depths for each kind of reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Depths {
     /// For [`Reader::Role`].
     pub role: usize,
     /// For [`Reader::Scorer`].
     pub scorer: usize,
-    /// For a reader that comes late: how many of the last samples it still gets. In lockstep, where nobody goes on without
-    /// its inputs, a role that is started anew would otherwise wait for ever for what its predecessor had been sent.
+    /// Number of past samples that a new reader gets. In lockstep a restarted role would otherwise wait forever for
+    /// samples that its predecessor received.
     pub history: usize,
 }
 
 impl Depths {
-    /// For this kind of reader.
+    /// Returns the depth for this kind of reader.
     pub fn for_reader(&self, reader: Reader) -> usize {
         match reader {
             Reader::Role => self.role,
@@ -95,12 +96,12 @@ impl Depths {
     }
 }
 
-/// Opens links.
+/// A factory of links.
 pub trait Bus {
-    /// Whether a reader that is opened anew may get samples again that its predecessor had.
+    /// True if a new reader may get samples that its predecessor received.
     const REPEATS: bool;
 
-    /// Whether the run that it belongs to is gone, with all that its signals lay in. Not for every tick: the system is asked.
+    /// Returns true if the run no longer exists. Makes a system call: not for every tick.
     fn is_gone(&self) -> bool {
         false
     }
@@ -114,7 +115,7 @@ pub trait Bus {
     /// The reading end of a fleet's signal.
     type FleetReader<L: FleetLayout>: Read<FleetSample<L>>;
 
-    /// Opens a signal for writing; there is one writer per signal. `generation` is the one that its stamps will have.
+    /// Opens a signal for writing, with one writer per signal. `generation` is the one of its stamps.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -124,12 +125,12 @@ pub trait Bus {
     /// # Errors
     /// [`BusError::Open`].
     fn reader<S: Sample>(&self, topic: &Topic, reader: Reader) -> Result<Self::Reader<S>, BusError>;
-    /// Opens the signal of a fleet of so many bodies for writing.
+    /// Opens the signal of a fleet of `bodies` bodies for writing.
     ///
     /// # Errors
     /// [`BusError::Open`].
     fn fleet_writer<L: FleetLayout>(&self, topic: &Topic, bodies: usize) -> Result<Self::FleetWriter<L>, BusError>;
-    /// Opens the signal of a fleet of so many bodies for reading.
+    /// Opens the signal of a fleet of `bodies` bodies for reading.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -143,12 +144,12 @@ pub trait Bus {
 
 /// The writing end of a link.
 pub trait Write<S: ?Sized> {
-    /// Fills the next sample in place; nobody sees it before it is delivered.
+    /// Fills the next sample in place. It is invisible to readers until it is delivered.
     ///
     /// # Errors
     /// [`BusError::Send`].
     fn fill(&mut self, fill: impl FnOnce(&mut S)) -> Result<(), BusError>;
-    /// Sends what was filled. Never waits for a reader.
+    /// Sends the filled sample. Never waits for a reader.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -162,7 +163,7 @@ pub trait Write<S: ?Sized> {
         self.fill(fill)?;
         self.deliver()
     }
-    /// Delivers, but where readers of the newest sample have a shorter way, only they see it at first;
+    /// Writes the filled sample to the latest-value channel only, if there is one, else delivers it.
     /// [`publish`](Self::publish) must follow.
     ///
     /// # Errors
@@ -170,59 +171,59 @@ pub trait Write<S: ?Sized> {
     fn write_latest(&mut self) -> Result<(), BusError> {
         self.deliver()
     }
-    /// Sends what was only shown, if anything was.
+    /// Publishes a sample that was only written to the latest-value channel.
     ///
     /// # Errors
     /// [`BusError::Send`].
     fn publish(&mut self) -> Result<(), BusError> {
         Ok(())
     }
-    /// Gets ready for the next [`send`](Self::send), so that it has less to do then.
+    /// Prepares the next sample, so that [`send`](Self::send) has less to do.
     ///
     /// # Errors
     /// [`BusError::Send`].
     fn prepare(&mut self) -> Result<(), BusError>;
-    /// Lets readers that have come later know of this end; [`send`](Self::send) does so too.
+    /// Connects to readers that came later; [`send`](Self::send) does so too.
     ///
     /// # Errors
     /// [`BusError::Send`].
     fn refresh(&mut self) -> Result<(), BusError>;
 }
 
-/// The process that has a writing end open.
+/// The process that has the writing end open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WriterProcess {
-    /// Its number, as it knows it itself: in a container another one than outside.
+    /// Process ID in the writer's own namespace, which may differ from that of a reader outside its container.
     pub pid: u32,
-    /// Tells it from every other process of that number.
+    /// Distinguishes the process from others with the same ID.
     pub unique: u128,
 }
 
 /// The reading end of a link.
 pub trait Read<S: ?Sized> {
-    /// Moves on to the next sample; false, and nothing changed, if there is none. Never waits.
+    /// Moves to the next sample. Returns false and changes nothing if no sample waits. Never waits.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn advance(&mut self) -> Result<bool, BusError>;
-    /// The sample at hand, in place; none before the first.
+    /// Returns the current sample in place; `None` before the first.
     fn current(&self) -> Option<&S>;
-    /// Whether somebody has the writing end open; one that was killed has until its remains are cleared. Within one thread it
-    /// is always open.
+    /// Returns true while the writing end is open. That of a killed process counts as open until its remains are
+    /// removed. Always true within one thread.
     fn has_writer(&self) -> bool {
         true
     }
-    /// The process that has the writing end open; none within one thread.
+    /// Returns the process that has the writing end open; `None` within one thread.
     fn writer(&self) -> Option<WriterProcess> {
         None
     }
-    /// Sleeps until there may be a next sample, at most until `until_ns` on the monotonic clock. Where nobody else could
-    /// bring one meanwhile it does not sleep.
+    /// Sleeps until a sample may have arrived, at most until `until_ns` on the monotonic clock. Within one thread it
+    /// returns at once.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
-    /// Connects to the writer that there is now, by the shortest way. Off the critical path. Who is connected gets what was sent
-    /// also when the writer is gone by then.
+    /// Connects to the current writer by the fastest path. Off the critical path. A connected reader also gets samples
+    /// of a writer that has ended since.
     fn refresh(&mut self);
 }

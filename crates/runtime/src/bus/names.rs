@@ -2,25 +2,25 @@
 
 use std::fmt;
 
-/// What is said about a body, or by a role.
+/// A kind of signal of a body or role.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Signal {
-    /// The state as it is. For recording and scoring only.
+    /// The true state, for recording and scoring only.
     Truth,
-    /// What the sensors report.
+    /// The sensor values.
     Measurement,
-    /// What the observer makes of it.
+    /// The observer's estimate.
     Estimate,
-    /// What the actuators are to apply.
+    /// The controller's command.
     Command,
-    /// How a role is doing.
+    /// The heartbeat of a role.
     Health,
-    /// What the launcher tells all roles.
+    /// The launcher's schedule for all roles.
     Schedule,
 }
 
 impl Signal {
-    /// Its part of the service's name.
+    /// Returns the last part of the service name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Truth => "truth",
@@ -33,7 +33,7 @@ impl Signal {
     }
 }
 
-/// One signal of one body or role of a scenario.
+/// A signal of one body or role of a scenario.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topic {
     /// The scenario's name.

@@ -1,7 +1,7 @@
-//! Futex notifiers: a reader that has nothing to do sleeps on the notifier of the signal it lacks, and its writer wakes it.
+//! Futex notifiers: an idle reader sleeps on the notifier of the signal it lacks, and the writer wakes it.
 //!
-//! A notifier is a futex in memory that the processes of a run share. It has no owner, so nobody's death can lock it. A writer
-//! that finds nobody asleep makes no system call. Must not carry anything: who is woken looks at the link.
+//! A notifier is a futex in the shared memory of a run. It has no owner, so no death can lock it. A writer makes no
+//! system call if no reader sleeps. Must not carry data: a woken reader polls its link.
 
 use super::Topic;
 use super::domain::Domain;
@@ -14,22 +14,22 @@ use std::rc::Rc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Notifiers of a run. Where there are more signals, some share one and wake each other's readers in vain.
+/// Number of notifiers of a run. With more signals some share a notifier and cause useless wakes.
 const NOTIFIERS: usize = 512;
-/// Notifiers are a cache line apart: one writer's notifications must not slow another down.
+/// Notifiers are a cache line apart, so that writers do not slow each other down.
 const STRIDE: usize = 16;
-/// Beside a notifier: whose it is.
+/// Word beside a notifier: hash of its signal.
 const OWNER: usize = 1;
-/// Set while somebody is asleep; the count of notifications is above it.
+/// Set while a reader sleeps; the bits above count notifications.
 const ASLEEP: u32 = 1;
 const NOTIFICATION: u32 = 2;
-/// A writer that has never notified is perhaps none of ours and never will: its reader looks again after so long, ns.
+/// Longest sleep if the writer has never notified, as foreign programs do, ns.
 const SILENT_NS: u64 = 50_000;
-/// One that has may have died before it notified: its reader looks again after so long, ns. Not after a tick: two that wake at
-/// one time are in each other's way.
+/// Longest sleep if the writer has notified, because it may have died since, ns. Longer than a tick, so that two
+/// readers do not wake together.
 const NOTIFIED_NS: u64 = 10_000_000;
 
-/// Bytes of shared memory for the notifiers of a run.
+/// Size of a run's notifiers in shared memory, bytes.
 pub const NOTIFIERS_BYTES: usize = NOTIFIERS * STRIDE * size_of::<u32>();
 
 /// The notifiers of a run.
@@ -39,7 +39,7 @@ pub struct Notifiers {
 }
 
 impl Notifiers {
-    /// Those of a domain.
+    /// Opens or creates the notifiers of a domain.
     ///
     /// # Errors
     /// The system's reason.
@@ -47,7 +47,7 @@ impl Notifiers {
         Self::over(SharedHalves::open(&domain.shared("notifiers"), NOTIFIERS * STRIDE)?)
     }
 
-    /// Those of a domain that has some already.
+    /// Opens the existing notifiers of a domain.
     ///
     /// # Errors
     /// The system's reason.
@@ -57,21 +57,21 @@ impl Notifiers {
 
     fn over(memory: SharedHalves) -> io::Result<Self> {
         if memory.halves().len() < NOTIFIERS * STRIDE {
-            return Err(io::Error::other("the notifiers of this run are another version's"));
+            return Err(io::Error::other("the notifiers of this run are of another version"));
         }
         Ok(Self { memory: Rc::new(memory) })
     }
 
-    /// The notifier of a signal.
+    /// Returns the notifier of a signal.
     pub fn notifier_for(&self, topic: &Topic) -> Notifier {
-        // XXH3 with seed 0 of the service's name: every build of this program must find the same.
+        // XXH3 with seed 0 of the service name: every build of this program must compute the same index.
         let hash = xxh3_64(topic.to_string().as_bytes());
         let (home, owner) = (hash as usize % NOTIFIERS, (hash >> 32) as u32 | 1);
         let index = (home..NOTIFIERS).chain(0..home).find(|index| self.claim(*index, owner)).unwrap_or(home);
         Notifier { memory: self.memory.clone(), index: index * STRIDE }
     }
 
-    /// Takes a notifier for a signal, unless it is another one's.
+    /// Claims a notifier for a signal; returns false if it belongs to another one.
     fn claim(&self, index: usize, owner: u32) -> bool {
         let present = self.memory.halves()[index * STRIDE + OWNER].compare_exchange(
             0,
@@ -96,7 +96,7 @@ impl Notifier {
         &self.memory.halves()[self.index]
     }
 
-    /// Wakes whoever sleeps. After the sample is there.
+    /// Wakes sleeping readers. Must follow the sample.
     #[inline]
     pub fn notify(&self) {
         if self.word().fetch_add(NOTIFICATION, Ordering::SeqCst) & ASLEEP != 0 {
@@ -107,23 +107,22 @@ impl Notifier {
     #[cold]
     fn wake(&self) {
         self.word().fetch_and(!ASLEEP, Ordering::SeqCst);
-        // A reader that is not woken looks again by itself.
+        // A reader that is not woken polls again by itself.
         let _ = futex::wake(self.word(), futex::Flags::empty(), i32::MAX as u32);
     }
 
-    /// Sleeps until it is notified, at most until `until_ns`, and not at all if `news` says that there is something. May end
-    /// early.
+    /// Sleeps until notified, at most until `until_ns`; returns at once if `news` is true. May end early.
     #[inline]
     pub fn sleep<E>(&self, until_ns: u64, news: impl FnOnce() -> Result<bool, E>) -> Result<(), E> {
         let seen = self.word().fetch_or(ASLEEP, Ordering::SeqCst) | ASLEEP;
-        // Looked at after the mark is set: what arrives from here on wakes.
+        // Checked after the mark is set: a sample that arrives from here on wakes the reader.
         if news()? {
             return Ok(());
         }
         let longest_ns = if seen >= NOTIFICATION { NOTIFIED_NS } else { SILENT_NS };
         let wait_ns = until_ns.saturating_sub(monotonic_ns()).min(longest_ns);
         let timeout = Timespec { tv_sec: 0, tv_nsec: wait_ns as _ };
-        // Rung, interrupted or over: the caller looks for itself.
+        // Notified, interrupted or timed out: the caller polls.
         let _ = futex::wait(self.word(), futex::Flags::empty(), seen, Some(&timeout));
         Ok(())
     }
@@ -143,14 +142,14 @@ mod tests {
     const FAR_NS: u64 = 10_000_000_000;
 
     #[test]
-    fn whoever_sleeps_is_woken_by_the_ring_and_not_by_the_clock() {
+    fn a_sleeping_reader_is_woken_by_a_notification() {
         let domain = OwnedDomain::create(0).unwrap();
         let (notifies, waits) = (domain.domain().clone(), domain.domain().clone());
-        let (said, heard) = std::sync::mpsc::channel();
-        let ringer = std::thread::spawn(move || {
+        let (stop, stopped) = std::sync::mpsc::channel();
+        let notifying = std::thread::spawn(move || {
             let notifier = Notifiers::open(&notifies).unwrap().notifier_for(&topic("b"));
             notifier.notify();
-            while heard.try_recv().is_err() {
+            while stopped.try_recv().is_err() {
                 notifier.notify();
                 std::thread::yield_now();
             }
@@ -159,13 +158,13 @@ mod tests {
         for _ in 0..200 {
             notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(false)).unwrap();
         }
-        said.send(()).unwrap();
-        ringer.join().unwrap();
+        stop.send(()).unwrap();
+        notifying.join().unwrap();
         assert!(notifier.word().load(Ordering::SeqCst) >= NOTIFICATION);
     }
 
     #[test]
-    fn nobody_sleeps_over_news_or_longer_than_told() {
+    fn a_sleep_ends_with_news_and_at_its_limit() {
         let domain = OwnedDomain::create(0).unwrap();
         let notifier = Notifiers::open(domain.domain()).unwrap().notifier_for(&topic("b"));
         notifier.sleep(monotonic_ns() + FAR_NS, || Ok::<_, Infallible>(true)).unwrap();
@@ -174,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn when_no_bell_is_left_signals_share() {
+    fn signals_share_notifiers_when_none_is_left() {
         let domain = OwnedDomain::create(0).unwrap();
         let notifiers = Notifiers::open(domain.domain()).unwrap();
         let indices: Vec<usize> =
@@ -183,18 +182,18 @@ mod tests {
     }
 
     #[test]
-    fn the_bells_of_a_signal_are_one_for_every_process() {
+    fn every_process_finds_the_same_notifier() {
         let domain = OwnedDomain::create(0).unwrap();
-        let (one, other) = (Notifiers::open(domain.domain()).unwrap(), Notifiers::open(domain.domain()).unwrap());
-        let indices: Vec<usize> = (0..400).map(|n| one.notifier_for(&topic(&n.to_string())).index).collect();
-        assert_eq!(indices, (0..400).map(|n| other.notifier_for(&topic(&n.to_string())).index).collect::<Vec<_>>());
+        let (first, second) = (Notifiers::open(domain.domain()).unwrap(), Notifiers::open(domain.domain()).unwrap());
+        let indices: Vec<usize> = (0..400).map(|n| first.notifier_for(&topic(&n.to_string())).index).collect();
+        assert_eq!(indices, (0..400).map(|n| second.notifier_for(&topic(&n.to_string())).index).collect::<Vec<_>>());
         let distinct: std::collections::HashSet<usize> = indices.iter().copied().collect();
-        assert_eq!(distinct.len(), indices.len(), "none is shared");
+        assert_eq!(distinct.len(), indices.len(), "notifiers are not shared");
     }
 
-    /// The hash is a contract between processes, which may have been built by different compilers.
+    /// The hash is a contract between processes that different compilers may have built.
     #[test]
-    fn a_signal_has_the_same_place_in_every_build() {
+    fn a_signal_has_the_same_index_in_every_build() {
         let domain = OwnedDomain::create(0).unwrap();
         let notifier = Notifiers::open(domain.domain()).unwrap().notifier_for(&topic("b"));
         // XXH3-64 of "corotate/s/b/estimate", by the reference implementation.

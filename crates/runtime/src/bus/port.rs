@@ -1,30 +1,30 @@
-//! A signal as data: its place, the layout of its samples, and what opens its ends without knowing their type.
+//! A signal as data: its topic, the layout of its samples, and functions that open its ends without knowing their type.
 
 use super::iox::Qos;
 use super::{AnyBus, BusError, Carried, Depths, EndOpeners, Reader, Topic, WordReader, WordWriter};
 use crate::sample::Field;
 
-/// One signal as it travels: where, and what its bytes mean.
+/// A signal with the layout of its samples.
 #[derive(Debug, Clone)]
 pub struct Port {
-    /// The signal and its service.
+    /// The topic, which names the service.
     pub topic: Topic,
     /// Name and version of the layout.
     pub type_name: &'static str,
-    /// The type name with a hash of the fields, by which services and devices know it.
+    /// The type name with a hash of the fields, which identifies services and device samples.
     pub layout: &'static str,
     /// The length of a sample, bytes.
     pub size: usize,
     /// The fields after the stamp, in order.
     pub fields: Vec<Field>,
-    /// Whether it tells of a fleet, and travels as a slice of words.
+    /// True for a fleet, whose samples are slices of words.
     pub fleet: bool,
     bodies: usize,
     ends: EndOpeners,
 }
 
 impl Port {
-    /// The signal of a kind of sample, of a single body or of a fleet of so many.
+    /// Creates the port of a kind of sample, for a single body or a fleet of this size.
     pub fn new<S: Carried + ?Sized>(topic: Topic, fleet: Option<usize>) -> Self {
         let bodies = fleet.unwrap_or(1);
         let size = S::length(bodies) * size_of::<u64>();
@@ -33,13 +33,13 @@ impl Port {
         Self { topic, type_name, layout, size, fields, fleet: fleet.is_some(), bodies, ends }
     }
 
-    /// What to ask of its service.
+    /// Returns the requirements on its service.
     pub fn qos(&self, depths: Depths) -> Qos {
         let signal = self.topic.signal;
         if self.fleet { Qos::for_fleet(signal, depths) } else { Qos::for_signal(signal, depths) }
     }
 
-    /// Opens it for reading, as words.
+    /// Opens the signal for reading as words.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -47,7 +47,7 @@ impl Port {
         self.ends.reader(bus.into(), &self.topic, self.bodies, reader)
     }
 
-    /// Opens it for writing, as words.
+    /// Opens the signal for writing as words.
     ///
     /// # Errors
     /// [`BusError::Open`].

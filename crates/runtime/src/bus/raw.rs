@@ -1,6 +1,6 @@
-//! Bare iceoryx2, as its own documentation has it: what the bus is measured beside. No part of the product.
+//! Bare iceoryx2 as in its documentation: the reference that the bus is measured against. Not part of the product.
 //!
-//! With `iox.rs` the only file that knows iceoryx2. Must not be better than a plain use of the library, nor worse.
+//! Like `iox.rs` it may know iceoryx2. Must be neither better nor worse than plain use of the library.
 
 use super::domain::Domain;
 use super::iox::enter;
@@ -15,20 +15,20 @@ use std::fmt::Debug;
 use std::rc::Rc;
 use std::time::Duration;
 
-/// A bare node, and the domain's directory, by which its paths are short enough for the sockets of bare events. It stays open
-/// until the last socket is removed.
+/// A bare node, and the domain's directory, which keeps paths short enough for the sockets of bare events. It stays
+/// open until the last socket is removed.
 pub struct RawNode(Node<Ipc>, Rc<Directory>);
 
-/// The bare publisher of samples of `WORDS` words.
+/// A bare publisher of samples of `WORDS` words.
 pub struct RawPublisher<const WORDS: usize>(Publisher<Ipc, [u64; WORDS], ()>);
-/// The bare subscriber to the newest of them.
+/// A bare subscriber to the newest sample.
 pub struct RawSubscriber<const WORDS: usize>(Subscriber<Ipc, [u64; WORDS], ()>);
-/// The end of a bare event that notifies.
+/// The notifying end of a bare event.
 pub struct RawNotifier(Notifier<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
-/// The end that waits.
+/// The waiting end of a bare event.
 pub struct RawListener(Listener<Ipc>, #[expect(dead_code, reason = "held open")] Rc<Directory>);
 
-/// What a service's builder says of an error.
+/// Wraps an error of a service builder.
 fn refused(service: &str, end: &'static str, reason: impl Debug) -> BusError {
     BusError::Open { service: service.to_owned(), end, reason: format!("{reason:?}") }
 }
@@ -55,7 +55,7 @@ impl RawNode {
         Ok(Self(node, Rc::new(root)))
     }
 
-    /// One publisher, and the newest sample only.
+    /// Opens a service with one publisher and queues for the newest sample only.
     fn publish_subscribe<const WORDS: usize>(
         &self,
         name: &str,
@@ -71,14 +71,14 @@ impl RawNode {
             .map_err(|error| refused(name, end, error))
     }
 
-    /// The writing end of publish-subscribe.
+    /// Opens the writing end of publish-subscribe.
     pub fn publisher<const WORDS: usize>(&self, name: &str) -> Result<RawPublisher<WORDS>, BusError> {
         let service = self.publish_subscribe(name, "publisher")?;
         let publisher = service.publisher_builder().create();
         publisher.map(RawPublisher).map_err(|error| refused(name, "publisher", error))
     }
 
-    /// The reading end of publish-subscribe.
+    /// Opens the reading end of publish-subscribe.
     pub fn subscriber<const WORDS: usize>(&self, name: &str) -> Result<RawSubscriber<WORDS>, BusError> {
         let service = self.publish_subscribe(name, "subscriber")?;
         let subscriber = service.subscriber_builder().buffer_size(1).create();
@@ -90,13 +90,13 @@ impl RawNode {
         self.0.service_builder(&name_of).event().open_or_create().map_err(|error| refused(name, end, error))
     }
 
-    /// The end of an event that notifies.
+    /// Opens the notifying end of an event.
     pub fn notifier(&self, name: &str) -> Result<RawNotifier, BusError> {
         let notifier = self.event(name, "notifier")?.notifier_builder().create();
         notifier.map(|end| RawNotifier(end, self.1.clone())).map_err(|error| refused(name, "notifier", error))
     }
 
-    /// The end of an event that waits.
+    /// Opens the waiting end of an event.
     pub fn listener(&self, name: &str) -> Result<RawListener, BusError> {
         let listener = self.event(name, "listener")?.listener_builder().create();
         listener.map(|end| RawListener(end, self.1.clone())).map_err(|error| refused(name, "listener", error))
@@ -104,7 +104,7 @@ impl RawNode {
 }
 
 impl<const WORDS: usize> RawPublisher<WORDS> {
-    /// Loans, writes in place, sends.
+    /// Loans a sample, writes it in place and sends it.
     #[inline]
     pub fn send(&mut self, words: &[u64]) -> Result<(), BusError> {
         let mut content = [0; WORDS];
@@ -115,7 +115,7 @@ impl<const WORDS: usize> RawPublisher<WORDS> {
 }
 
 impl<const WORDS: usize> RawSubscriber<WORDS> {
-    /// The newest sample, if there is one; read where it lies.
+    /// Reads the newest sample in place; `None` if no sample waits.
     #[inline]
     pub fn receive<T>(&mut self, read: impl FnOnce(&[u64]) -> T) -> Result<Option<T>, BusError> {
         let sample = self.0.receive().map_err(receive_failed)?;
@@ -124,7 +124,7 @@ impl<const WORDS: usize> RawSubscriber<WORDS> {
 }
 
 impl RawNotifier {
-    /// Rings.
+    /// Notifies the listener.
     #[inline]
     pub fn notify(&self) -> Result<(), BusError> {
         self.0.notify().map(|_| ()).map_err(send_failed)
@@ -132,7 +132,7 @@ impl RawNotifier {
 }
 
 impl RawListener {
-    /// Waits for the next notification, at most so long.
+    /// Waits for the next notification, at most for this time.
     #[inline]
     pub fn wait(&self, at_most: Duration) -> Result<(), BusError> {
         self.0.timed_wait(|_| (), at_most).map(|_| ()).map_err(receive_failed)

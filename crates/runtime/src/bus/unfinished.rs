@@ -1,7 +1,7 @@
-//! Unfinished files: what a process began to make for a run and will never finish.
+//! Unfinished files: created by a process that will never finish them.
 //!
-//! Whoever opens a file whose maker left it at size 0 waits for it, in iceoryx2 0.10 without any limit. Once the file is
-//! removed, the opener makes it itself. Must not remove what somebody alive is about to finish.
+//! iceoryx2 0.10 waits without limit for a file that its maker left at size 0. Once the file is removed, the waiting
+//! process creates it itself. Must not remove a file that a living process is about to finish.
 
 use super::domain::Domain;
 use std::fs::{self, Metadata};
@@ -10,28 +10,28 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-/// A file that is finished in time is so after some 20 µs. Nobody is looked for before so long: its maker may be in another
-/// PID namespace, where it is not seen.
+/// Minimum age before the maker is looked for: a living maker finishes within some 20 µs, and may be invisible in
+/// another PID namespace.
 const YOUNG: Duration = Duration::from_millis(20);
-/// The owner's right to read: the transport grants it to a file in shared memory last.
+/// Read permission of the owner: the transport sets it last on a file in shared memory.
 const READABLE: u32 = 0o400;
-/// The owner's right to write: the transport takes it from the description of a service last.
+/// Write permission of the owner: the transport removes it last from the description of a service.
 const WRITABLE: u32 = 0o200;
 
 impl Domain {
-    /// The files that somebody has begun and not finished.
+    /// Returns the unfinished files of the domain.
     pub fn unfinished(&self) -> Vec<PathBuf> {
         self.begun().into_iter().map(|(path, _)| path).collect()
     }
 
-    /// Removes unfinished files whose maker is gone, or has not finished them for `limit`. True if there are more.
+    /// Removes unfinished files whose maker is gone or has not finished them for `limit`; returns true if some remain.
     pub fn remove_unfinished(&self, limit: Duration) -> bool {
         let mut left = false;
         for (path, file) in self.begun() {
             let age = age(&file);
             let abandoned = || !is_open(&path, &file) && is_as_it_was(&path, &file);
             if age > limit || age > YOUNG && abandoned() {
-                // What is gone by now is no error, and what cannot be removed is another user's.
+                // A file that has vanished is no error; one that cannot be removed belongs to another user.
                 let _ = fs::remove_file(&path);
             } else {
                 left = true;
@@ -56,27 +56,27 @@ impl Domain {
     }
 }
 
-/// For how long a file has been as it is. A clock that was set back makes nothing older.
+/// Returns the time since a file changed; zero if the clock was set back.
 fn age(file: &Metadata) -> Duration {
     let changed = Duration::new(file.ctime().max(0) as u64, file.ctime_nsec() as u32);
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH + changed).unwrap_or_default()
 }
 
-/// Whether nobody has changed the file since: its maker may finish it and close it while processes are looked at.
+/// Returns true if the file has not changed: its maker may have finished it while processes were searched.
 fn is_as_it_was(path: &Path, file: &Metadata) -> bool {
     let state = |file: &Metadata| (file.ino(), file.ctime(), file.ctime_nsec());
     fs::symlink_metadata(path).is_ok_and(|now| state(&now) == state(file))
 }
 
-/// Whether a process has the file open. Its maker has, from its creation until it is finished.
+/// Returns true if a process has the file open. Its maker has it open until the file is finished.
 fn is_open(path: &Path, file: &Metadata) -> bool {
     let processes = fs::read_dir("/proc").into_iter().flatten().flatten().map(|entry| entry.path());
     processes.filter(|process| process.join("fd").is_dir()).any(|process| match fs::read_dir(process.join("fd")) {
-        // The name holds the domain's id, so it is nobody else's.
+        // The name contains the domain's ID, so it is unique.
         Ok(descriptors) => descriptors
             .flatten()
             .any(|descriptor| fs::read_link(descriptor.path()).is_ok_and(|open| open.file_name() == path.file_name())),
-        // One that hides its descriptors may be the maker if it is of the same user.
+        // A process of the same user that hides its descriptors may be the maker.
         Err(error) => {
             let user = fs::metadata(&process).map(|process| process.uid());
             error.kind() == io::ErrorKind::PermissionDenied && user.is_ok_and(|user| user == file.uid())
@@ -101,7 +101,7 @@ mod tests {
         OpenOptions::new().write(true).create_new(true).mode(WRITABLE).open(path).unwrap()
     }
 
-    /// Looks until nothing is left, or something is that lasts.
+    /// Removes files until none is left or the time is over.
     fn settle(domain: &Domain) {
         let end = std::time::Instant::now() + 3 * YOUNG;
         while domain.remove_unfinished(LIMIT) && std::time::Instant::now() < end {
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_will_finish_is_removed_and_nothing_else() {
+    fn only_abandoned_files_are_removed() {
         let owned = OwnedDomain::create(0).unwrap();
         let domain = owned.domain();
         let services = domain.root().join("services");
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn what_somebody_has_open_is_left_until_the_limit() {
+    fn an_open_file_stays_until_the_limit() {
         let owned = OwnedDomain::create(0).unwrap();
         let path = shared(owned.domain(), "held");
         let held = begin(&path);

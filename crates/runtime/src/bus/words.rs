@@ -1,14 +1,14 @@
-//! Ends of links whose samples are words, for those who pass samples on and know their layout as data alone: recorder, watcher,
-//! replay, the launcher's look at external roles.
+//! Link ends whose samples are words, for processes that pass samples on and know their layout only as data: recorder,
+//! watcher, replay, and the launcher's view of external roles.
 //!
-//! Must not know what a sample means. Roles open ends of their samples' own types, which are read without a call by a table.
+//! Must not know the meaning of samples. Roles use typed ends instead, which need no dynamic dispatch.
 
 use super::iox::IoxBus;
 use super::memory::MemoryBus;
 use super::{BusError, Carried, Read, Reader, Topic, Write, WriterProcess};
 use std::marker::PhantomData;
 
-/// A bus, whichever it is.
+/// A bus of either kind.
 #[derive(Clone, Copy)]
 pub enum AnyBus<'a> {
     /// Within this thread.
@@ -29,34 +29,34 @@ impl<'a> From<&'a IoxBus> for AnyBus<'a> {
     }
 }
 
-/// A reading end.
+/// A reading end of words.
 pub trait ReadWords {
-    /// The next sample, stamp first; none if none has come. Never waits.
+    /// Returns the next sample, stamp first; `None` if no sample waits. Never waits.
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn next(&mut self) -> Result<Option<&[u64]>, BusError>;
-    /// Whether somebody has the writing end open, as [`Read::has_writer`].
+    /// Returns true while the writing end is open, see [`Read::has_writer`].
     fn has_writer(&self) -> bool;
-    /// The process that has it open, as [`Read::writer`].
+    /// Returns the process that has the writing end open, see [`Read::writer`].
     fn writer(&self) -> Option<WriterProcess>;
-    /// Sleeps until there may be a next sample, at most until `until_ns`, as [`Read::sleep`].
+    /// Sleeps until a sample may have arrived, at most until `until_ns`, see [`Read::sleep`].
     ///
     /// # Errors
     /// [`BusError::Receive`].
     fn sleep(&mut self, until_ns: u64) -> Result<(), BusError>;
-    /// Connects to the writer that there is now, as [`Read::refresh`].
+    /// Connects to the current writer, see [`Read::refresh`].
     fn refresh(&mut self);
 }
 
-/// A writing end.
+/// A writing end of words.
 pub trait WriteWords {
-    /// Sends a sample, given as its bytes.
+    /// Sends a sample given as bytes.
     ///
     /// # Errors
     /// [`BusError::Send`].
     fn send(&mut self, bytes: &[u8]) -> Result<(), BusError>;
-    /// Lets a reader that has come later know of this end.
+    /// Connects to readers that came later.
     ///
     /// # Errors
     /// [`BusError::Send`].
@@ -68,7 +68,7 @@ pub type WordReader = Box<dyn ReadWords>;
 /// A writing end of any signal.
 pub type WordWriter = Box<dyn WriteWords>;
 
-/// Opens the ends of signals that carry one kind of sample.
+/// Functions that open the ends of a kind of sample.
 #[derive(Debug, Clone, Copy)]
 pub struct EndOpeners {
     read: fn(AnyBus<'_>, &Topic, usize, Reader) -> Result<WordReader, BusError>,
@@ -76,7 +76,7 @@ pub struct EndOpeners {
 }
 
 impl EndOpeners {
-    /// Those of a kind of sample.
+    /// Returns the functions for a kind of sample.
     pub fn for_sample<S: Carried + ?Sized>() -> Self {
         let read = |bus: AnyBus<'_>, topic: &Topic, bodies, reader| -> Result<WordReader, BusError> {
             Ok(match bus {
@@ -93,7 +93,7 @@ impl EndOpeners {
         Self { read, write }
     }
 
-    /// Opens a signal of so many bodies for reading.
+    /// Opens a signal of `bodies` bodies for reading.
     ///
     /// # Errors
     /// [`BusError::Open`].
@@ -107,7 +107,7 @@ impl EndOpeners {
         (self.read)(bus, topic, bodies, reader)
     }
 
-    /// Opens a signal of so many bodies for writing.
+    /// Opens a signal of `bodies` bodies for writing.
     ///
     /// # Errors
     /// [`BusError::Open`].

@@ -1,4 +1,4 @@
-//! A device in a role's seat: the process that serves it to the end of the run.
+//! A device in the place of a role: the process that serves it until the end of the run.
 
 use super::process::{
     RoleError, device_failure_path, failure_path, find_role, in_domain, join, require_process, take_ledger, write_whole,
@@ -15,14 +15,14 @@ use std::sync::atomic::AtomicBool;
 pub struct BridgeResult {
     /// The line's counters.
     pub counters: LineCounters,
-    /// When the device was absent.
+    /// The outages of the device.
     pub outages: Vec<Outage>,
-    /// Why the device was lost to the run, if it was: at the end, or in real time for longer than commands last.
+    /// Reason if the device was lost: at the end of the run, or in real time for longer than the command timeout.
     pub lost: Option<String>,
 }
 
-/// The seat's roles, in the order of a tick, if a device can have them: one that travels in samples of fixed size, or observer
-/// and controller together.
+/// Returns the roles in the order of a tick if a device can have them: one role whose samples have a fixed size, or
+/// observer and controller together.
 fn roles(scenario: &Settings, names: &[String]) -> Result<Vec<RoleId>, RoleError> {
     let mut roles = names.iter().map(|name| find_role(scenario, name)).collect::<Result<Vec<_>, _>>()?;
     roles.sort_by_key(|role| *role == RoleId::Controller);
@@ -42,36 +42,36 @@ fn roles(scenario: &Settings, names: &[String]) -> Result<Vec<RoleId>, RoleError
     Err(RoleError::NoDevice { roles: names.join(","), driven })
 }
 
-/// The file in a domain's directory with the name of the device that has a seat, for a bridge that is started again.
+/// Returns the file in a domain's directory with the device's name, for a bridge that is restarted.
 fn device_path(root: &Path, roles: &str) -> PathBuf {
     root.join(format!("{roles}.device"))
 }
 
-/// Puts a device into a role's seat and serves it to the end of the run. `welcomed` is told the device's name.
-/// Gives an account of it, if a run was served.
+/// Runs a device in place of its roles until the end of the run. Calls `welcomed` with the device's name; returns the
+/// result if a run was served.
 ///
 /// # Errors
 /// [`RoleError`].
 pub fn run_bridge(
-    seat: &DeviceConfig,
+    config: &DeviceConfig,
     terminated: &AtomicBool,
     welcomed: impl FnOnce(&str),
 ) -> Result<Option<BridgeResult>, RoleError> {
-    let (domain, scenario) = join(&seat.domain)?;
-    let roles = roles(&scenario, &seat.roles)?;
+    let (domain, scenario) = join(&config.domain)?;
+    let roles = roles(&scenario, &config.roles)?;
     roles.iter().try_for_each(|role| require_process(&scenario, *role))?;
-    // A bridge that is started again in the same run finds a device that knows it.
+    // A bridge that is restarted in the same run has the same run number.
     let run = xxhash_rust::xxh3::xxh3_64(domain.root().as_os_str().as_encoded_bytes());
-    let mut link = DeviceLink::open(seat, &scenario, &roles, run)?;
+    let mut link = DeviceLink::open(config, &scenario, &roles, run)?;
     let known = device_path(domain.root(), link.role());
     let before = std::fs::read_to_string(&known).ok();
     let Some(name) = link.greet(before, terminated)? else { return Ok(None) };
     welcomed(&format!("{name}{}", link.remark()));
     write_whole(&known, name.as_bytes()).map_err(|source| RoleError::Report { path: known.clone(), source })?;
-    let (last, others) = roles.split_last().expect("a seat has a role");
-    let others = others.iter().map(|other| Ok((*other, take_ledger(&domain, &scenario, *other)?)));
-    let others = others.collect::<Result<_, RoleError>>()?;
-    let (mut served, role_impl) = (None, RoleImpl::Device(*last, others, Box::new(link)));
+    let (last, companions) = roles.split_last().expect("a device has a role");
+    let companions = companions.iter().map(|role| Ok((*role, take_ledger(&domain, &scenario, *role)?)));
+    let companions = companions.collect::<Result<_, RoleError>>()?;
+    let (mut served, role_impl) = (None, RoleImpl::Device(*last, companions, Box::new(link)));
     let done = in_domain(&domain, &scenario, role_impl, terminated, |report| {
         if let Some(counters) = report.line {
             let lost = report.outages.iter().rev().find_map(|outage| lost(outage, &scenario));
@@ -79,7 +79,7 @@ pub fn run_bridge(
         }
     });
     if let Err(RoleError::Node(NodeError::Device(error))) = &done {
-        // For the launcher, which has no line to it. If the run is gone, the caller is told all the same.
+        // For the launcher, which has no other connection to this process. The caller gets the error in any case.
         for role in &roles {
             let path = if scenario.clock == ClockKind::Realtime { device_failure_path } else { failure_path };
             let _ = write_whole(&path(domain.root(), role.name(&scenario)), error.to_string().as_bytes());
@@ -88,7 +88,7 @@ pub fn run_bridge(
     done.map(|()| served)
 }
 
-/// Returns why an outage has cost the run its device, if it has.
+/// Returns the reason if an outage has cost the run its device.
 fn lost(outage: &Outage, scenario: &Settings) -> Option<String> {
     let timeout_s = scenario.command_timeout_ticks as f64 * scenario.tick_s();
     let Outage { tick, cause, .. } = outage;

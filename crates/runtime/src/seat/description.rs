@@ -1,6 +1,6 @@
-//! A role's seat as told to a program that is not ours: everything it needs to take it, in one JSON object.
+//! The seat description: all that a foreign program needs to take a role, as one JSON object.
 //!
-//! Must not hold anything that a foreign program would have to look up elsewhere, nor anything that is not so.
+//! Must be complete and must not contain anything untrue.
 
 use super::process::{RoleError, WARM_UP_PAUSE_NS, WARM_UP_SAMPLES, report_path, scenario_path};
 use crate::bus::domain::Domain;
@@ -17,15 +17,15 @@ use std::path::{Path, PathBuf};
 /// Layout version of the description.
 const SCHEMA: &str = "corotate/seat/v1";
 
-/// What a foreign program must know to take a role's seat.
+/// The description of a role for a foreign program.
 #[derive(Debug, Serialize)]
 pub struct SeatDescription {
     schema: &'static str,
     version: &'static str,
-    /// The role's name, and what kind of role it is.
+    /// The role's name, and its kind.
     role: String,
     kind: &'static str,
-    /// The body that a plant is; none for the other roles.
+    /// The body of a plant; null for other roles.
     body: Option<String>,
     scenario_name: String,
     clock: &'static str,
@@ -33,38 +33,38 @@ pub struct SeatDescription {
     period_ns: u64,
     /// The last tick; the first is 0.
     last_tick: u64,
-    /// How far a plant may run ahead of the credit in lockstep.
+    /// Number of ticks that a plant may run ahead of the credit in lockstep.
     window_ticks: u64,
-    /// From so many ticks after its measurement on a command acts.
+    /// Number of ticks from a measurement until its command acts.
     actuation_delay_ticks: u64,
     command_timeout_ticks: u64,
     rearm: &'static str,
     transport: Transport,
-    /// The loop's signals, in the order in which our own role opens them.
+    /// The loop's signals, in the order in which the built-in role opens them.
     writes: Vec<SignalDescription>,
     reads: Vec<SignalDescription>,
-    /// The role's word to the launcher, and the launcher's to it.
+    /// The role's heartbeat, and the launcher's schedule.
     health: SignalDescription,
     schedule: SignalDescription,
-    /// What the schedule's `phase` and health's `state` mean.
+    /// The values of the schedule's `phase` and of health's `state`.
     phases: BTreeMap<&'static str, u64>,
     states: BTreeMap<&'static str, u64>,
     /// The bits of every sample's `status`.
     status: BTreeMap<&'static str, u64>,
-    /// The bit of a sample's `generation` that makes it a void: its tick has no sample.
+    /// The bit of a sample's `generation` that makes it a no-sample marker.
     void_bit: u32,
     warm_up: WarmUp,
-    /// Where the role may leave its counters, and where this description lies while a run waits; none without a domain.
+    /// The file for the role's report; null without a domain.
     report: Option<PathBuf>,
-    /// The scenario as resolved: parameters and initial states of all bodies.
+    /// The resolved scenario: parameters and initial states of all bodies.
     scenario: toml::Table,
 }
 
-/// How to reach the shared memory. Without a domain only the version is known.
+/// Access to the shared memory. Without a domain only the version is known.
 #[derive(Debug, Serialize)]
 struct Transport {
     name: &'static str,
-    /// The version that every process of a run must have.
+    /// The version that every process of a run must use.
     version: &'static str,
     /// The run's directory.
     domain: Option<PathBuf>,
@@ -73,22 +73,22 @@ struct Transport {
     prefix: Option<String>,
 }
 
-/// One signal: its service, the layout of its samples, and what to ask of the service.
+/// A signal: its service, the layout of its samples, and the requirements on the service.
 #[derive(Debug, Serialize)]
 struct SignalDescription {
     signal: &'static str,
     service: String,
     /// The type by which the service is opened: a versioned name and the hash of the layout.
     type_name: &'static str,
-    /// That hash.
+    /// The hash of the layout.
     layout: &'static str,
-    /// Bytes.
+    /// Length of a sample, bytes.
     size: usize,
-    /// Whether it travels as a slice of words of 8 bytes, which the type name is of.
+    /// True if samples are slices of 8-byte words, whose type is the type name.
     slice: bool,
     fields: Vec<FieldDescription>,
     qos: Qos,
-    /// How many samples may wait for our own role; only where the role reads.
+    /// Queue depth of the built-in role; only for signals that the role reads.
     #[serde(skip_serializing_if = "Option::is_none")]
     buffer_size: Option<usize>,
 }
@@ -96,24 +96,24 @@ struct SignalDescription {
 #[derive(Debug, Serialize)]
 struct FieldDescription {
     name: &'static str,
-    /// Bytes from the start of the sample.
+    /// Offset from the start of the sample, bytes.
     offset: usize,
     kind: &'static str,
     count: usize,
 }
 
-/// How links are exercised before the first tick: so many samples of generation 0, so far apart.
+/// Exercise of the links before the first tick: number of samples of generation 0, and their interval.
 #[derive(Debug, Serialize)]
 struct WarmUp {
     samples: usize,
     pause_ns: u64,
 }
 
-/// Describes a role's seat; in the run of that domain, or in any.
+/// Describes a role, in the run of a domain or in general.
 pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>) -> SeatDescription {
     let (ports, depths) = (ports(scenario, role), depths(scenario));
     let written = |port: &Port| SignalDescription::new(port, depths, None);
-    // Where several commands may come before one is due, the newest is not enough.
+    // If several commands may arrive before one is due, the newest is not enough.
     let waits = |port: &Port| port.topic.signal == Signal::Command && scenario.actuation_delay_ticks > 1;
     let reader = |port: &Port| if waits(port) { Reader::Scorer } else { Reader::Role };
     let read = |port: &Port| SignalDescription::new(port, depths, Some(reader(port)));
@@ -152,13 +152,13 @@ pub fn describe_seat(scenario: &Scenario, role: RoleId, domain: Option<&Domain>)
 }
 
 impl SeatDescription {
-    /// The description as a text for people and programs.
+    /// Returns the description as indented JSON.
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("a description of plain values is JSON") + "\n"
     }
 }
 
-/// The domain at a directory, whose run must be one of this very scenario: all that is told of a seat depends on both.
+/// Joins the domain in a directory, whose run must use this scenario: the description depends on both.
 ///
 /// # Errors
 /// [`RoleError::Domain`], [`RoleError::Config`], [`RoleError::OtherScenario`].
@@ -171,7 +171,7 @@ pub fn join_run(scenario: &Scenario, root: &Path) -> Result<Domain, RoleError> {
     Ok(domain)
 }
 
-/// The file in a domain's directory that describes an external role's seat.
+/// Returns the file in a domain's directory that describes an external role.
 pub fn seat_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.seat.json"))
 }
@@ -229,7 +229,7 @@ mod tests {
         serde_json::from_str(&describe_seat(&scenario, role, domain).to_json()).unwrap()
     }
 
-    /// Whoever lays the fields out one after another gets the size, in every seat of every shipped scenario.
+    /// The fields of every signal of every shipped scenario fill its sample without gaps.
     #[test]
     fn the_fields_of_every_signal_fill_its_size() {
         let mut signals = 0;
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn a_follower_s_seat_says_where_and_what() {
+    fn a_follower_s_seat_describes_its_domain_and_signals() {
         let domain = OwnedDomain::create(0).unwrap();
         let seat = described(SHIPPED[0].1, "follower", Some(domain.domain()));
         assert_eq!(seat["kind"], "plant");
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_domain_nothing_is_made_up() {
+    fn fields_that_need_a_domain_are_null_without_one() {
         let seat = described(SHIPPED[0].1, "controller", None);
         assert!(seat["transport"]["prefix"].is_null() && seat["report"].is_null() && seat["body"].is_null());
     }

@@ -1,10 +1,10 @@
-//! A role's seat in a run: who takes it, in a process of its own, and what it must know.
+//! The role processes of a run, and the seat description for programs that take a role.
 //!
 //! | file | duty |
 //! |---|---|
 //! | `process` | a role of this program, or of a function, from its start to its report; the files of a domain |
 //! | `bridge` | a device in the place of a role |
-//! | `description` | what a program of somebody else's needs, as data |
+//! | `description` | the seat description for foreign programs |
 
 mod bridge;
 mod description;

@@ -1,6 +1,6 @@
-//! One role as a process: enter the domain, take privileges, open links, warm up, run, report.
+//! A role as a process: enters the domain, takes privileges, opens links, warms up, runs, reports.
 //!
-//! Must not start or end any other process; the launcher's schedule says when to go and when to stop.
+//! Must not start or end another process; the launcher's schedule starts and stops the role.
 
 use crate::bus::domain::{Domain, DomainError, domains};
 use crate::bus::iox::IoxBus;
@@ -24,21 +24,21 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-/// How often a role looks for the next phase before its ticks, ns.
+/// Interval at which a role polls the schedule before its ticks, ns.
 const LOOK_NS: u64 = 1_000_000;
-/// Samples that every link carries before the first tick.
+/// Number of warm-up samples on every link before the first tick.
 pub(super) const WARM_UP_SAMPLES: usize = 100;
-/// The pause between them, ns.
+/// Interval of warm-up samples, ns.
 pub(super) const WARM_UP_PAUSE_NS: u64 = 50_000;
-/// Wakes by which the machine's own lateness is measured before the first tick, and the time between them, ns.
+/// Number and interval (ns) of wakes that measure the machine's own lateness before the first tick.
 const BASELINE_WAKES: usize = 100;
 const BASELINE_PERIOD_NS: u64 = 300_000;
-/// The most that one look adds to the launcher's silence, ns.
+/// Upper bound on the launcher silence that one poll adds, ns.
 const LOOK_MAX_NS: u64 = 100_000_000;
-/// How long a role that is done waits for a launcher that says nothing, ns: longer than any machine keeps a launcher waiting.
+/// Time that a finished role waits for a silent launcher, ns: longer than a launcher is ever delayed.
 const LEAVE_NS: u64 = 120_000_000_000;
 
-/// Which role to take, where.
+/// A role and the domain of its run.
 #[derive(Debug, Clone)]
 pub struct RoleAddress {
     /// The domain's directory.
@@ -47,11 +47,11 @@ pub struct RoleAddress {
     pub role: String,
 }
 
-/// Why a role ended without a report.
+/// A role ended without a report.
 #[derive(Debug, thiserror::Error, strum::IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 pub enum RoleError {
-    /// The domain is none.
+    /// The directory is not a usable domain.
     #[error(transparent)]
     #[strum(transparent)]
     Domain(#[from] DomainError),
@@ -59,8 +59,8 @@ pub enum RoleError {
     #[error(transparent)]
     #[strum(serialize = "refused-scenario")]
     Config(#[from] ConfigError),
-    /// Only a part of the run is here.
-    #[error("the run in {} was launched on another host, and not all of its signals are here; look at it there", .0.display())]
+    /// Only a part of the run's signals exists on this host.
+    #[error("the run in {} was launched on another host, and only a part of its signals exists here; join it on that host", .0.display())]
     #[strum(serialize = "partial-run")]
     Part(PathBuf),
     /// The scenario has no such role.
@@ -68,41 +68,41 @@ pub enum RoleError {
     NoSuchRole {
         /// As given.
         role: String,
-        /// The roles there are.
+        /// The existing roles.
         known: String,
     },
-    /// The role is another process's too.
+    /// The role shares the process of another role.
     #[error(
-        "in this run the {role} is in the process of the {host} (launch.processes); start that, or give each a process of its own"
+        "in this run {role} runs in the process of {host} (launch.processes); start that one, or give each a process of its own"
     )]
     #[strum(serialize = "hosted-role")]
     Hosted {
         /// As given.
         role: String,
-        /// The role in whose process it is.
+        /// The role that the process is named after.
         host: String,
     },
-    /// The domain's run is one of another scenario.
-    #[error("the run in {} is not one of this scenario with these overrides; give its own file, {}", domain.display(), scenario.display())]
+    /// The run uses another scenario.
+    #[error("the run in {} uses another scenario or other overrides; give its scenario file, {}", domain.display(), scenario.display())]
     OtherScenario {
         /// The domain's directory.
         domain: PathBuf,
         /// The scenario of its run.
         scenario: PathBuf,
     },
-    /// No device could have this role.
+    /// A device cannot have these roles.
     #[error(
-        "a device can be one driven body (here: {driven}), the observer, the controller, or observer,controller, and none \
-         that serves a fleet; `{roles}` is none of these"
+        "a device cannot be `{roles}`; name one driven body (here: {driven}), observer, controller, or observer,controller, none of \
+         which may serve a fleet"
     )]
     #[strum(serialize = "no-device-role")]
     NoDevice {
         /// As given.
         roles: String,
-        /// The driven bodies that are no fleets.
+        /// The driven bodies that are not fleets.
         driven: String,
     },
-    /// There is no device for the seat.
+    /// The device failed or cannot take part.
     #[error(transparent)]
     #[strum(transparent)]
     Device(#[from] DeviceError),
@@ -110,36 +110,38 @@ pub enum RoleError {
     #[error(transparent)]
     #[strum(transparent)]
     Bus(#[from] BusError),
-    /// The role cannot go on.
+    /// The node cannot continue.
     #[error(transparent)]
     #[strum(transparent)]
     Node(#[from] NodeError),
-    /// The counters could not be opened.
+    /// The ledger could not be opened.
     #[error(transparent)]
     #[strum(transparent)]
     Ledger(#[from] LedgerError),
-    /// The launcher did not give the word in time.
-    #[error("no word from the launcher for {waited_s} s; is `corotate run` alive in this domain?")]
+    /// The launcher did not publish the awaited phase in time.
+    #[error("the launcher was silent for {waited_s} s; is `corotate run` alive in this domain?")]
     NoLauncher {
-        /// How long the role waited, s.
+        /// Waiting time, s.
         waited_s: f64,
     },
-    /// It serves a fleet.
-    #[error("{role} serves a fleet, which no function computes; give its bodies roles of their own")]
+    /// The role serves a fleet.
+    #[error("a function cannot compute {role}, which serves a fleet; give its bodies roles of their own")]
     #[strum(serialize = "fleet-role")]
     Fleet {
-        /// Its name.
+        /// The role's name.
         role: String,
     },
-    /// The run is gone, and its launcher never told this role to stop.
-    #[error("the run is gone: its launcher was killed; start it again")]
+    /// The run no longer exists, and its launcher sent no stop.
+    #[error("the run no longer exists: its launcher was killed; start it again")]
     #[strum(serialize = "run-gone")]
     Gone,
-    /// The launcher ended the run while this role was busy.
-    #[error("the run ended without this role, which did not stop when told to; the run's incidents say why it ended")]
+    /// The launcher ended the run without waiting for this role.
+    #[error(
+        "the run ended while this role still ran, because it did not stop in time; the run's incidents give the reason"
+    )]
     #[strum(serialize = "run-ended")]
     Late,
-    /// The run was launched on another host, and its time is not to be had.
+    /// The run was launched on another host, and its clock cannot be read.
     #[error("cannot read the clock of the run in {}: {source}; {}", path.display(), remedy(source))]
     #[strum(serialize = "no-run-clock")]
     Clock {
@@ -159,47 +161,47 @@ pub enum RoleError {
     },
 }
 
-/// The file in a domain that holds the scenario of its run.
+/// Returns the file in a domain with the scenario of its run.
 pub fn scenario_path(domain: &Domain) -> PathBuf {
     domain.root().join("scenario.toml")
 }
 
-/// The file in a domain's directory that a role leaves its report in.
+/// Returns the file in a domain's directory for a role's report.
 pub fn report_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.report.json"))
 }
 
-/// The file in a domain's directory that an external role leaves its last words in, if it has any.
+/// Returns the file in a domain's directory for the error that ended an external role.
 pub fn failure_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.words"))
 }
 
-/// The file in a domain's directory that a bridge in real time leaves its last words in: another one may take its seat, so they end
-/// nothing by themselves.
+/// Returns the file in a domain's directory for the error that ended a bridge in real time. That does not end the run,
+/// because another bridge may take over.
 pub fn device_failure_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.device.words"))
 }
 
-/// The file in a domain's directory that a role leaves its panic in, if it panicked.
+/// Returns the file in a domain's directory for a role's panic.
 pub fn panic_path(root: &Path, role: &str) -> PathBuf {
     root.join(format!("{role}.panic.json"))
 }
 
-/// The file in a domain's directory that says where the run's results will be: a path, and nothing else.
+/// Returns the file in a domain's directory with the path of the run's results.
 pub fn results_path(root: &Path) -> PathBuf {
     root.join("results")
 }
 
-/// The file of a run's results that is written once it is over.
+/// The file of a run's results that is written at the end.
 pub const SUMMARY: &str = "summary.json";
 
-/// The domain of a run that is under way: of the newest; or of the one whose results go to the directory that is given, or whose
-/// recording is the file that is given; or that directory itself.
+/// Returns the domain of a run in progress: the newest, or the one named by its directory, by its results directory, or
+/// by its recording.
 ///
 /// # Errors
 /// [`DomainError::NoRun`], [`DomainError::Over`], [`DomainError::NotADomain`], [`DomainError::Privacy`].
 pub fn find_run(given: Option<&Path>) -> Result<PathBuf, DomainError> {
-    // A domain that cannot be joined is told by the process that joins it.
+    // The process that joins the domain reports why it cannot be joined.
     if let Some(given) = given.filter(|given| !matches!(Domain::join(given), Err(DomainError::NotADomain { .. }))) {
         return Ok(given.to_owned());
     }
@@ -217,58 +219,58 @@ pub fn find_run(given: Option<&Path>) -> Result<PathBuf, DomainError> {
     }
 }
 
-/// Takes a role's seat in a run and serves it to the end. `terminated` is set by a signal that asks the process to end.
+/// Runs a role until the end of the run. `terminated` is set by a signal that asks the process to end.
 ///
 /// # Errors
 /// [`RoleError`].
-pub fn run_role(seat: &RoleAddress, terminated: &AtomicBool) -> Result<(), RoleError> {
-    let (domain, scenario) = join(&seat.domain)?;
-    let role = find_role(&scenario, &seat.role)?;
+pub fn run_role(address: &RoleAddress, terminated: &AtomicBool) -> Result<(), RoleError> {
+    let (domain, scenario) = join(&address.domain)?;
+    let role = find_role(&scenario, &address.role)?;
     require_process(&scenario, role)?;
-    panics::keep_in(panic_path(domain.root(), &seat.role));
-    let others = role.process_members(&scenario).into_iter().filter(|other| *other != role);
-    let others = others.map(|other| Ok((other, take_ledger(&domain, &scenario, other)?)));
-    let role_impl = RoleImpl::Role(role, others.collect::<Result<_, LedgerError>>()?);
+    panics::keep_in(panic_path(domain.root(), &address.role));
+    let companions = role.process_members(&scenario).into_iter().filter(|member| *member != role);
+    let companions = companions.map(|member| Ok((member, take_ledger(&domain, &scenario, member)?)));
+    let role_impl = RoleImpl::Role(role, companions.collect::<Result<_, LedgerError>>()?);
     in_domain(&domain, &scenario, role_impl, terminated, |_| {})
 }
 
-/// The same with a function that computes the role's samples. The process takes no privileges for it.
+/// Runs a role whose samples a function computes. The process takes no privileges.
 ///
 /// # Errors
 /// [`RoleError`]; [`RoleError::Fleet`] for a role that serves a fleet.
 pub fn run_function(
-    seat: &RoleAddress,
+    address: &RoleAddress,
     compute: Box<dyn RoleFunction>,
     terminated: &AtomicBool,
 ) -> Result<(), RoleError> {
-    let (domain, scenario) = join(&seat.domain)?;
-    let role = find_role(&scenario, &seat.role)?;
+    let (domain, scenario) = join(&address.domain)?;
+    let role = find_role(&scenario, &address.role)?;
     require_process(&scenario, role)?;
     let ports = ports(&scenario, role);
     if ports.reads.iter().chain(&ports.writes).any(|port| port.fleet) {
-        return Err(RoleError::Fleet { role: seat.role.clone() });
+        return Err(RoleError::Fleet { role: address.role.clone() });
     }
     let served = in_domain(&domain, &scenario, RoleImpl::Function(role, compute), terminated, |_| {});
     if let Err(RoleError::Node(NodeError::Computed { reason })) = &served {
-        // For the launcher, which has no line to it. If the run is gone, whoever called it is told all the same.
-        let _ = write_whole(&failure_path(domain.root(), &seat.role), reason.as_bytes());
+        // For the launcher, which has no other connection to this process. The caller gets the error in any case.
+        let _ = write_whole(&failure_path(domain.root(), &address.role), reason.as_bytes());
     }
     served
 }
 
-/// Refuses a role that has no process of its own.
+/// Refuses a role that shares the process of another role.
 pub(super) fn require_process(scenario: &Settings, role: RoleId) -> Result<(), RoleError> {
     let host = role.process_role(scenario);
     let name = |role: RoleId| role.name(scenario).to_owned();
     if host == role { Ok(()) } else { Err(RoleError::Hosted { role: name(role), host: name(host) }) }
 }
 
-/// The file with the correction of this host's clock, where the run was launched on another.
+/// Returns the file with the correction of this host's clock, in a run that was launched on another host.
 pub fn clock_path(domain: &Domain) -> PathBuf {
     domain.shared("clock")
 }
 
-/// The domain of a run with its scenario. The process has the time of that run from here on.
+/// Joins the domain in a directory and loads its scenario. From here on the process uses the clock of that run.
 pub fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let domain = Domain::join(directory)?;
     let path = clock_path(&domain);
@@ -277,10 +279,10 @@ pub fn join(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     Ok((domain, scenario))
 }
 
-/// The same for whoever wants to see the whole run.
+/// Joins a run whose signals must all exist on this host.
 pub fn join_complete(directory: &Path) -> Result<(Domain, Scenario), RoleError> {
     let (domain, scenario) = join(directory)?;
-    // Only hosts that joined a run have a clock to be corrected.
+    // Only hosts that joined a run have a clock correction.
     if clock_path(&domain).exists() {
         domain.remove_if_over();
         return Err(RoleError::Part(domain.root().to_owned()));
@@ -288,13 +290,13 @@ pub fn join_complete(directory: &Path) -> Result<(Domain, Scenario), RoleError> 
     Ok((domain, scenario))
 }
 
-/// The role of this name.
+/// Returns the role of this name.
 pub(super) fn find_role(scenario: &Settings, name: &str) -> Result<RoleId, RoleError> {
     RoleId::named(scenario, name)
         .ok_or_else(|| RoleError::NoSuchRole { role: name.to_owned(), known: scenario.roles().join(", ") })
 }
 
-/// Serves a seat in a domain to the end of the run, and leaves its report there; `reported` sees it too.
+/// Runs a role in a domain until the end of the run and writes its report; `reported` receives the report too.
 pub(super) fn in_domain(
     domain: &Domain,
     scenario: &Scenario,
@@ -303,16 +305,16 @@ pub(super) fn in_domain(
     mut reported: impl FnMut(&RoleReport),
 ) -> Result<(), RoleError> {
     let role = role_impl.role();
-    // Before any link is opened, so that the links' memory is locked as it is mapped.
+    // Before links are opened, so that their memory is locked when it is mapped.
     let realtime = scenario.clock == ClockKind::Realtime;
     request_short_slices();
-    // What computes in an interpreter has threads and memory of its own.
+    // A function in an interpreter has threads and memory of its own.
     let takes = realtime && !matches!(role_impl, RoleImpl::Function(..));
     let privileges = if takes { take_privileges(scenario, role) } else { Privileges::default() };
     let ledger = take_ledger(domain, scenario, role)?;
     let roles: Vec<&str> = role_impl.ledgers(&ledger).iter().map(|(role, _)| role.name(scenario)).collect();
     if roles.iter().any(|role| scenario.debug.iter().any(|name| name == role)) {
-        // Yama restricts debuggers to a process's parent; without it there is nothing to allow.
+        // Yama restricts debuggers to the parent process; without Yama this call fails and is not needed.
         let _ = rustix::process::set_ptracer(rustix::process::PTracer::Any);
     }
     hooks::enter(&roles, ledger.generation() + 1);
@@ -329,12 +331,12 @@ pub(super) fn in_domain(
     served
 }
 
-/// A role's ledger in a domain, to be read.
+/// Opens a role's ledger in a domain for reading.
 pub fn open_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::shared(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
 
-/// The same, to be written by this process alone.
+/// Opens a role's ledger in a domain as its only writer.
 pub(super) fn take_ledger(domain: &Domain, scenario: &Settings, role: RoleId) -> Result<Ledger, LedgerError> {
     Ledger::taken(&ledger_path(domain, scenario, role), ledger_words(scenario, role))
 }
@@ -350,29 +352,29 @@ fn write_report(domain: &Domain, report: &RoleReport) -> Result<(), RoleError> {
     write_whole(&path, &text).map_err(failed)
 }
 
-/// Writes a file so that nobody ever sees a part of it.
+/// Writes a file atomically: no reader sees a part of it.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let part = path.with_extension("part");
     files::write(&part, bytes)?;
     std::fs::rename(&part, path)
 }
 
-/// What a seat is served with.
+/// The environment of a role process.
 pub struct RoleEnvironment<'a, B> {
     /// The scenario.
     pub scenario: &'a Settings,
     /// The bus.
     pub bus: &'a B,
-    /// The counters, new or a predecessor's.
+    /// The ledger, new or of a predecessor.
     pub ledger: &'a Ledger,
-    /// Whether this process was asked to end.
+    /// Set when a signal asks the process to end.
     pub terminated: &'a AtomicBool,
-    /// What the caller has taken.
+    /// The privileges that the caller has taken.
     pub privileges: Privileges,
 }
 
-/// Serves a seat on a bus: the phases of a run, from open links to the report of each of its roles. `build` opens the links of
-/// the loop and builds the node.
+/// Runs a role through all phases, from opening its links to the report of each role of its process. `build` opens the
+/// loop's links and builds the node.
 ///
 /// # Errors
 /// [`RoleError`].
@@ -384,14 +386,14 @@ pub fn serve<B: Bus + 'static>(
 ) -> Result<(), RoleError> {
     let RoleEnvironment { scenario, bus, ledger, terminated, privileges } = service;
     let role_impl = role_impl.into();
-    let (role, books) = (role_impl.role(), role_impl.ledgers(ledger));
+    let (role, ledgers) = (role_impl.role(), role_impl.ledgers(ledger));
     let heartbeat = |(role, ledger): &(RoleId, Ledger)| {
         let (role, generation) = (*role, ledger.generation() + 1);
         let health = bus.writer(&topic(scenario, role.name(scenario), Signal::Health), generation)?;
         Ok(Heartbeat { role, health, generation })
     };
-    // Before the links of the loop: a role that has those open and not this one is judged by its samples alone.
-    let heartbeats = books.iter().map(heartbeat).collect::<Result<_, BusError>>()?;
+    // Before the links of the loop: a role without health signal is supervised by its samples only.
+    let heartbeats = ledgers.iter().map(heartbeat).collect::<Result<_, BusError>>()?;
     let mut node = build(role_impl)?;
     node.restore()?;
     let mut launcher = LauncherLink::<B>::new(
@@ -402,7 +404,7 @@ pub fn serve<B: Bus + 'static>(
         terminated,
     );
     let mut stages = Vec::new();
-    let leads = books.iter().any(|(role, _)| *role == RoleId::Plant(0));
+    let leads = ledgers.iter().any(|(role, _)| *role == RoleId::Plant(0));
     let ended = match begin(scenario, leads, &mut node, &mut launcher, &mut stages)? {
         Some(schedule) => drive(scenario, role, &mut node, &mut launcher, &schedule, &privileges)?,
         None => Ended::Stopped,
@@ -412,22 +414,22 @@ pub fn serve<B: Bus + 'static>(
         release_priority();
     }
     if bus.is_gone() {
-        let told = launcher.schedule().is_ok_and(|word| Phase::from_number(word.phase) == Phase::Stop);
-        return Err(if told { RoleError::Late } else { RoleError::Gone });
+        let stop_sent = launcher.schedule().is_ok_and(|schedule| Phase::from_number(schedule.phase) == Phase::Stop);
+        return Err(if stop_sent { RoleError::Late } else { RoleError::Gone });
     }
-    for (of, ledger) in &books {
-        // What was asked of the machine is the seat's own, and what was measured before the ticks the leader's.
-        let mut stages = if *of == RoleId::Plant(0) { std::mem::take(&mut stages) } else { Vec::new() };
-        let grants = if *of == role { privileges.grants.clone() } else { Vec::new() };
-        let node = node.member(*of).unwrap_or(&*node);
+    for (member, ledger) in &ledgers {
+        // Grants belong to the process's role; the baseline belongs to the leader.
+        let mut stages = if *member == RoleId::Plant(0) { std::mem::take(&mut stages) } else { Vec::new() };
+        let grants = if *member == role { privileges.grants.clone() } else { Vec::new() };
+        let node = node.member(*member).unwrap_or(&*node);
         stages.extend(node.stages());
         let (line, outages) = (node.line(), node.outages());
-        deliver(&RoleReport { line, outages, ..report(scenario, *of, ledger, stages, grants) })?;
+        deliver(&RoleReport { line, outages, ..report(scenario, *member, ledger, stages, grants) })?;
     }
-    // Samples may still wait to be read: the links stay open until everybody is done.
+    // Samples may still wait in queues: the links stay open until all readers are done.
     if ended == Ended::Finished {
-        let mut patience = LauncherTimeout::new(LEAVE_NS);
-        while patience.lasts(launcher.schedule()?.stamp.tick) && !launcher.stopped()? {
+        let mut timeout = LauncherTimeout::new(LEAVE_NS);
+        while timeout.lasts(launcher.schedule()?.stamp.tick) && !launcher.stopped()? {
             launcher.announce(RoleState::Done, &*node)?;
             node.refresh()?;
             sleep_until(monotonic_ns() + LOOK_NS);
@@ -436,32 +438,32 @@ pub fn serve<B: Bus + 'static>(
     Ok(())
 }
 
-/// How long a role waits for its launcher, which announces again and again while it lives. Time in which this process is
-/// stopped does not count.
+/// Limit on the launcher's silence. A living launcher publishes repeatedly. Time in which this process is stopped does
+/// not count.
 struct LauncherTimeout {
     limit_ns: u64,
     silent_ns: u64,
     looked_ns: u64,
-    heard: Option<u64>,
+    last_tick: Option<u64>,
 }
 
 impl LauncherTimeout {
     fn new(limit_ns: u64) -> Self {
-        Self { limit_ns, silent_ns: 0, looked_ns: monotonic_ns(), heard: None }
+        Self { limit_ns, silent_ns: 0, looked_ns: monotonic_ns(), last_tick: None }
     }
 
-    /// Returns true while the launcher's last word, by its number, is recent.
-    fn lasts(&mut self, word: u64) -> bool {
+    /// Returns true while the launcher's last schedule, known by its number, is recent.
+    fn lasts(&mut self, tick: u64) -> bool {
         let now_ns = monotonic_ns();
-        let news = self.heard.replace(word) != Some(word);
+        let news = self.last_tick.replace(tick) != Some(tick);
         self.silent_ns = if news { 0 } else { self.silent_ns + (now_ns - self.looked_ns).min(LOOK_MAX_NS) };
         self.looked_ns = now_ns;
         self.silent_ns < self.limit_ns
     }
 }
 
-/// From open links to the word to run. The links of a successor carry samples already. Whoever has the leader measures the
-/// machine. `None` if the run was stopped before.
+/// Runs the phases from open links to the run phase; `None` if the run is stopped before. Without warm-up for a
+/// successor, whose links already carry samples. The process of the leader measures the baseline.
 fn begin<B: Bus>(
     scenario: &Settings,
     leads: bool,
@@ -485,7 +487,7 @@ fn begin<B: Bus>(
     await_phase(scenario, node, launcher, RoleState::Ready, Phase::Run)
 }
 
-/// The machine's own lateness on this core at this priority: bare absolute sleeps, nothing else.
+/// Measures the machine's own lateness on this core at this priority, with bare absolute sleeps.
 fn baseline() -> Latency {
     let mut latency = Latency::default();
     let mut due_ns = monotonic_ns();
@@ -505,9 +507,9 @@ fn await_phase<B: Bus>(
     phase: Phase,
 ) -> Result<Option<Schedule>, RoleError> {
     let waited_s = 2.0 * scenario.startup_timeout_s;
-    let mut patience = LauncherTimeout::new((waited_s * 1e9) as u64);
+    let mut timeout = LauncherTimeout::new((waited_s * 1e9) as u64);
     let mut schedule = launcher.schedule()?;
-    while patience.lasts(schedule.stamp.tick) {
+    while timeout.lasts(schedule.stamp.tick) {
         launcher.announce(state, &**node)?;
         if launcher.stopped()? {
             return Ok(None);
@@ -521,9 +523,11 @@ fn await_phase<B: Bus>(
     Err(RoleError::NoLauncher { waited_s })
 }
 
-/// How a role with these privileges waits. Neither the lead nor the spin takes so much of a short period that others starve.
+/// Returns the waiting behaviour of a role with these privileges. Lead and spin are limited to a quarter of the period,
+/// so that other processes get time.
 fn wait_policy<'a>(scenario: &Settings, role: RoleId, privileges: &'a Privileges) -> WaitPolicy<'a> {
-    // A way between hosts may take its budget: one tick, less what comes after the cutoff, is there in any case.
+    // Samples between hosts may use their delay budget. One tick of it, less the time after the cutoff, is available
+    // anyway.
     let lag_ticks = scenario.lag_ticks(role.name(scenario)).saturating_sub(1);
     let Realtime { wake, wake_lead_us, spin_us, cutoff, .. } = scenario.realtime;
     let [lead_ns, spin_ns] = [wake_lead_us, spin_us].map(|us| ((us * 1e3) as u64).min(scenario.period_ns / 4));
@@ -544,7 +548,7 @@ fn drive<B: Bus>(
     privileges: &Privileges,
 ) -> Result<Ended, RoleError> {
     let grid = Grid { epoch_ns: schedule.epoch_ns, period_ns: scenario.period_ns };
-    // A successor begins with the next tick there is: in real time that of the grid, in lockstep the one left undone.
+    // A successor begins with the next tick of the grid in real time, with the first unexecuted tick in lockstep.
     let late = scenario.clock == ClockKind::Realtime && !launcher.first();
     let first_tick = if late { grid.next_at(monotonic_ns()) } else { node.next_tick() };
     node.start(grid, first_tick.min(scenario.last_tick + 1))?;

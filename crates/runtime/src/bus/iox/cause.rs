@@ -1,6 +1,6 @@
-//! The error of the system behind a failure of the transport, which iceoryx2 tells in its log alone.
+//! The system error behind a failure of iceoryx2, which reports it only in its log.
 //!
-//! Every message of that log is written right after the failed call, so the error is still at hand. Must not print.
+//! The log message follows the failed call directly, so the error code is still set. Must not print.
 
 use crate::system::remedy;
 use iceoryx2::prelude::{LogLevel, set_log_level, set_logger};
@@ -9,7 +9,7 @@ use std::cell::Cell;
 use std::fmt::Arguments;
 use std::io;
 
-/// Errors that iceoryx2 never meets in order: others are its way to look whether something is there, or locked.
+/// Errors that iceoryx2 never meets in normal operation. It uses others to test whether a file exists or is locked.
 const SERIOUS: [i32; 11] = [
     libc::ENOSPC,
     libc::EDQUOT,
@@ -26,7 +26,7 @@ const SERIOUS: [i32; 11] = [
 
 thread_local! {
     static LAST_SERIOUS: Cell<Option<i32>> = const { Cell::new(None) };
-    /// The last error of any kind, by which a word that tells nothing is made clearer.
+    /// The last error of any kind, which explains an uninformative message.
     static LAST_ANY: Cell<Option<i32>> = const { Cell::new(None) };
 }
 
@@ -42,30 +42,30 @@ impl Log for ErrorCapture {
     }
 }
 
-/// From now on the transport's failures are heard, and not printed: what matters comes back as an error.
+/// Captures the transport's errors from now on instead of printing them.
 pub fn capture_errors() {
     set_logger(&ErrorCapture);
     set_log_level(LogLevel::Debug);
 }
 
-/// Forgets what was heard. What is called next has causes of its own.
+/// Resets the captured errors before a call.
 pub fn reset() {
-    // The error at hand is forgotten too, by one that is no cause: a name that cannot be there.
+    // Replaces the current error code by that of a missing file, which is never reported as a cause.
     let _ = std::fs::metadata("");
     LAST_SERIOUS.set(None);
     LAST_ANY.set(None);
 }
 
-/// Why the transport failed: the error of the system behind it and what to do about it, else `otherwise`.
+/// Returns the captured system error with a remedy, else `otherwise`.
 pub fn reason(otherwise: impl FnOnce() -> String) -> String {
-    let told = |code| {
+    let describe = |code| {
         let error = io::Error::from_raw_os_error(code);
         format!("{error}; {}", remedy(&error))
     };
     let (serious, any) = (LAST_SERIOUS.take(), LAST_ANY.take());
-    serious.map(told).unwrap_or_else(|| {
+    serious.map(describe).unwrap_or_else(|| {
         let words = otherwise();
         let vague = ["Internal", "UnableTo", "Insufficient"].iter().any(|word| words.contains(word));
-        any.filter(|_| vague).map_or(words, told)
+        any.filter(|_| vague).map_or(words, describe)
     })
 }

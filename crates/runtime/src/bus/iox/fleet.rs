@@ -1,4 +1,4 @@
-//! The links of fleets over shared memory: slices of words, as long as the fleet's samples are.
+//! Links of fleets over shared memory: slices of words with the length of the fleet's samples.
 
 use super::cause;
 use super::opening::{Connections, IoxBus};
@@ -16,7 +16,7 @@ use iceoryx2::sample::Sample as Received;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-/// A word of a fleet's sample as iceoryx2 sees it: its type names the layout of the whole.
+/// A word of a fleet's sample for iceoryx2; its type names the layout of the whole sample.
 #[repr(transparent)]
 #[derive(Debug, TransparentWrapper)]
 #[transparent(u64)]
@@ -91,7 +91,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
         Ok(())
     }
 
-    /// Takes the next sample's memory and clears it, off the critical path.
+    /// Loans and clears the memory of the next sample, off the critical path.
     #[inline]
     fn prepare(&mut self) -> Result<(), BusError> {
         if self.loan.is_none() {
@@ -105,7 +105,7 @@ impl<L: FleetLayout> Write<FleetSample<L>> for IoxFleetWriter<L> {
     }
 }
 
-/// The reading end of a fleet's signal. A slice of another length is no sample of this fleet, and passed over.
+/// The reading end of a fleet's signal. Slices of another length are ignored.
 pub struct IoxFleetReader<L: FleetLayout> {
     service: Service<L>,
     subscriber: Subscriber<Ipc, [Word<L>], ()>,
@@ -182,7 +182,7 @@ impl<L: FleetLayout> Read<FleetSample<L>> for IoxFleetReader<L> {
     }
 
     fn refresh(&mut self) {
-        // What is wrong with the writer is told by the next look.
+        // The next poll reports an error of the writer.
         let _ = self.subscriber.update_connections();
     }
 }

@@ -1,9 +1,8 @@
-//! The fast lane beside a signal: its latest sample, and nothing else, on an iceoryx2 blackboard.
+//! The latest-value channel of a signal: its newest sample on an iceoryx2 blackboard.
 //!
-//! A reader that wants the newest sample only finds it here sooner than in its queue, and looks without touching a queue.
-//! Every sample still goes out by publish-subscribe, for those who want all of them and for programs that are not ours. A
-//! blackboard that its writer died on cannot be written again while anybody reads it, so each generation of a writer has
-//! one of its own.
+//! A reader of the newest sample finds it here earlier than in its queue, and polls without touching a queue. Every
+//! sample is also published, for readers of all samples and for foreign programs. A blackboard whose writer died cannot
+//! be written again while a reader uses it, so each generation of a writer has its own.
 
 use super::opening::OpenFailure;
 use super::service::{Ipc, MAX_NODES, MAX_READERS, Wire};
@@ -14,14 +13,14 @@ use iceoryx2::port::reader::{BlackboardValue, EntryHandle};
 use iceoryx2::port::writer::EntryHandleMut;
 use iceoryx2::prelude::*;
 
-/// A blackboard of ours has one entry.
+/// The only key of a blackboard.
 const KEY: u64 = 0;
 
 /// The writing end.
 pub struct LatestWriter<S: Sample>(EntryHandleMut<Ipc, u64, Wire<S>>);
 
 impl<S: Sample> LatestWriter<S> {
-    /// A new lane, of the writer's `generation`.
+    /// Creates the channel of the writer's `generation`.
     pub fn create(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Result<Self, OpenFailure> {
         let service = node
             .service_builder(&name(topic, generation).map_err(OpenFailure::never)?)
@@ -34,24 +33,24 @@ impl<S: Sample> LatestWriter<S> {
         writer.entry::<Wire<S>>(&KEY).map(Self).map_err(OpenFailure::never)
     }
 
-    /// Puts a sample there.
+    /// Writes a sample.
     #[inline]
     pub fn put(&self, sample: &S) {
         self.0.update_with_copy(Wire(*sample));
     }
 }
 
-/// The reading end, with the sample at hand.
+/// The reading end with its current sample.
 pub struct LatestReader<S: Sample> {
     entry: EntryHandle<Ipc, u64, Wire<S>>,
     value: BlackboardValue<Wire<S>>,
-    /// Nothing has been taken yet: also what was there before counts as news.
+    /// True until the first read: the initial content then counts as new.
     fresh: bool,
     generation: u64,
 }
 
 impl<S: Sample> LatestReader<S> {
-    /// The lane of a writer of `generation`; none if there is none, as where the writer is no program of ours.
+    /// Opens the channel of a writer of `generation`; `None` if it does not exist, as with a foreign writer.
     pub fn open(node: &Node<Ipc>, topic: &Topic, generation: u64) -> Option<Self> {
         let service = node.service_builder(&name(topic, generation).ok()?).blackboard_opener::<u64>().open().ok()?;
         let entry = service.reader_builder().create().ok()?.entry::<Wire<S>>(&KEY).ok()?;
@@ -59,18 +58,18 @@ impl<S: Sample> LatestReader<S> {
         Some(Self { entry, value, fresh: true, generation })
     }
 
-    /// The writer's generation.
+    /// Returns the writer's generation.
     pub fn generation(&self) -> u64 {
         self.generation
     }
 
-    /// Whether there may be another sample than the one at hand.
+    /// Returns true if a newer sample than the current one may exist.
     #[inline]
     pub fn has_news(&self) -> bool {
         self.fresh || !self.entry.is_up_to_date(&self.value)
     }
 
-    /// Takes the newest sample; false if that is at hand.
+    /// Reads the newest sample; returns false if that is the current one.
     #[inline]
     pub fn advance(&mut self) -> bool {
         let news = self.has_news();
@@ -81,7 +80,7 @@ impl<S: Sample> LatestReader<S> {
         news
     }
 
-    /// The sample at hand.
+    /// Returns the current sample.
     #[inline]
     pub fn sample(&self) -> &S {
         &self.value.0

@@ -1,6 +1,6 @@
-//! A node in a run's domain, what keeps an end of a signal from being opened there, and whether that may pass.
+//! Opens the ends of signals and repeats attempts that failed for a temporary reason.
 //!
-//! Must not wait longer than it is told to, nor clean up after anybody.
+//! Must not wait longer than its limit, nor clean up after other processes.
 
 use super::cause;
 use super::service::{Ipc, config};
@@ -25,9 +25,9 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A dead process holds its place until the janitor has put away what it left: for so long a successor asks again, ns.
+/// Time limit for the remains of a dead process to be removed by the janitor, ns.
 const VACATE_NS: u64 = 2_000_000_000;
-/// Between two attempts at an opening, ns.
+/// Pause between two attempts, ns.
 const RETRY_NS: u64 = 20_000_000;
 
 /// A node in a run's domain.
@@ -35,16 +35,16 @@ pub struct IoxBus {
     pub(super) node: Rc<Node<Ipc>>,
     pub(super) notifiers: Notifiers,
     pub(super) depths: Depths,
-    /// Whether a signal that nobody has opened yet is made.
+    /// True if missing signals are created.
     pub(super) creates: bool,
     pub(super) domain: Domain,
-    /// For how long an opening tries again, ns.
+    /// Time limit of an opening, ns.
     pub(super) opening_ns: u64,
 }
 
 impl IoxBus {
-    /// Opens something, again and again while what is in the way may pass. A signal to this process only breaks off an
-    /// attempt: what it asks for is done in order, by whoever looks for it.
+    /// Opens an end, and repeats the attempt while the failure may be temporary. A signal to this process only
+    /// interrupts an attempt; the caller handles the signal.
     pub(super) fn open<T>(
         &self,
         topic: &Topic,
@@ -54,29 +54,29 @@ impl IoxBus {
         let begun_ns = monotonic_ns();
         loop {
             cause::reset();
-            let refusal = match attempt() {
+            let failure = match attempt() {
                 Ok(opened) => {
                     let mapped = self.domain.require_own_mappings();
                     return mapped
                         .map(|()| opened)
                         .map_err(|error| self.failed_to_open(topic, end, OpenFailure::never(error)));
                 }
-                Err(refusal) => refusal,
+                Err(failure) => failure,
             };
-            let limit_ns = match refusal.retry {
+            let limit_ns = match failure.retry {
                 Retry::Never | Retry::NeverForOtherType => 0,
                 Retry::WhenFinished => self.opening_ns,
                 Retry::WhenVacated => VACATE_NS.min(self.opening_ns),
             };
             if monotonic_ns() - begun_ns >= limit_ns {
-                return Err(self.failed_to_open(topic, end, refusal));
+                return Err(self.failed_to_open(topic, end, failure));
             }
             sleep_until(monotonic_ns() + RETRY_NS);
         }
     }
 
-    fn failed_to_open(&self, topic: &Topic, end: &'static str, refusal: OpenFailure) -> BusError {
-        let OpenFailure { mut reason, retry } = refusal;
+    fn failed_to_open(&self, topic: &Topic, end: &'static str, failure: OpenFailure) -> BusError {
+        let OpenFailure { mut reason, retry } = failure;
         if retry == Retry::WhenFinished {
             let limit_s = self.opening_ns as f64 / 1e9;
             let unfinished =
@@ -90,10 +90,10 @@ impl IoxBus {
         BusError::Open { service: topic.to_string(), end, reason }
     }
 
-    /// Adds to a refusal what a signal's samples are in the run and in this program, if that is why.
-    pub(super) fn explain(&self, refusal: OpenFailure, topic: &Topic, ours: &str) -> OpenFailure {
-        if refusal.retry != Retry::NeverForOtherType {
-            return refusal;
+    /// Adds the sample types of the run and of this program to a failure caused by different types.
+    pub(super) fn explain(&self, failure: OpenFailure, topic: &Topic, ours: &str) -> OpenFailure {
+        if failure.retry != Retry::NeverForOtherType {
+            return failure;
         }
         let theirs = self.type_of(topic).unwrap_or_else(|| "another type".to_owned());
         let cause = if type_name_of(&theirs) == type_name_of(ours) {
@@ -105,10 +105,10 @@ impl IoxBus {
             "its samples are `{theirs}` in this run and `{ours}` in this program: {cause}; build all programs of the run from one \
              source, and raise the version in a type name whenever its fields change"
         );
-        OpenFailure { reason, ..refusal }
+        OpenFailure { reason, ..failure }
     }
 
-    /// The type of a signal's samples in this run, as far as it is known.
+    /// Returns the type of a signal's samples in this run, if known.
     fn type_of(&self, topic: &Topic) -> Option<String> {
         let name = topic.to_string().as_str().try_into().ok()?;
         let config = config(self.domain.root(), &self.domain).ok()?;
@@ -119,19 +119,19 @@ impl IoxBus {
     }
 }
 
-/// Whether what keeps something from being opened may pass.
+/// Condition under which an opening is repeated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Retry {
     Never,
-    /// Not at all: the signal carries another type.
+    /// Never: the signal carries another type.
     NeverForOtherType,
-    /// Once somebody else has finished what he makes, or this process the handling of a signal.
+    /// Another process finishes a file, or this process returns from a signal handler.
     WhenFinished,
-    /// Once the remains of a dead process are put away.
+    /// The janitor removes the remains of a dead process.
     WhenVacated,
 }
 
-/// Why something could not be opened.
+/// A failed opening.
 #[derive(Debug)]
 pub(super) struct OpenFailure {
     reason: String,
@@ -168,7 +168,7 @@ impl From<PublishSubscribeOpenOrCreateError> for OpenFailure {
         use PublishSubscribeCreateError as Create;
         use PublishSubscribeOpenOrCreateError as Error;
         match error {
-            // What is not there is made: it has not been for so long that somebody else was making it.
+            // A missing service is created. This error means that its creation by another process took too long.
             Error::PublishSubscribeOpenError(PublishSubscribeOpenError::DoesNotExist) => {
                 Self::new(error, Retry::WhenFinished)
             }
@@ -207,15 +207,14 @@ impl From<SubscriberCreateError> for OpenFailure {
     }
 }
 
-/// Whether an end that is being opened could be connected to every other end there is. The transport itself only logs it,
-/// and never tries again.
+/// Records whether a new end could connect to all existing ends. The transport only logs a failure and never retries.
 #[derive(Clone, Default)]
 pub(super) struct Connections {
     failed: Arc<AtomicBool>,
 }
 
 impl Connections {
-    /// What the transport is to call if it cannot connect.
+    /// Returns the handler that the transport calls if it cannot connect.
     pub(super) fn failure_handler(
         &self,
     ) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
@@ -226,12 +225,12 @@ impl Connections {
         }
     }
 
-    /// The end, if it is connected.
+    /// Returns the end if it is connected to all others.
     pub(super) fn check<T>(&self, end: T) -> Result<T, OpenFailure> {
         if self.failed.load(Ordering::Relaxed) {
             return Err(OpenFailure {
-                reason: "not connected to every process that has it open (is /dev/shm full?)".to_owned(),
-                // Whoever leaves, or dies, meanwhile is put away soon.
+                reason: "not connected to every process that uses the signal (is /dev/shm full?)".to_owned(),
+                // A process that leaves or dies meanwhile is removed soon.
                 retry: Retry::WhenVacated,
             });
         }
@@ -247,19 +246,19 @@ mod tests {
     use std::path::Path;
     use std::time::Duration;
 
-    /// Opens by attempts that are refused until so many have been made; returns how many were.
-    fn attempts(bus: &IoxBus, until: u32, refusal: impl Fn() -> OpenFailure) -> (u32, Result<(), BusError>) {
+    /// Opens with `until` failed attempts; returns the number of attempts and the result.
+    fn attempts(bus: &IoxBus, until: u32, failure: impl Fn() -> OpenFailure) -> (u32, Result<(), BusError>) {
         let mut made = 0;
         let attempt = || {
             made += 1;
-            if made > until { Ok(()) } else { Err(refusal()) }
+            if made > until { Ok(()) } else { Err(failure()) }
         };
         let opened = bus.open(&topic(), "reader", attempt);
         (made, opened)
     }
 
     #[test]
-    fn what_may_pass_is_tried_again_and_nothing_else() {
+    fn only_temporary_failures_are_retried() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let interrupted = || PublishSubscribeOpenOrCreateError::from(PublishSubscribeOpenError::Interrupt).into();
@@ -269,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn who_leaves_while_another_opens_costs_another_attempt() {
+    fn a_process_that_leaves_during_an_opening_causes_a_retry() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let gone = || {
@@ -281,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn an_opening_has_a_limit_and_names_the_file_that_it_waits_for() {
+    fn an_opening_has_a_limit_and_names_the_unfinished_file() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain).with_opening_limit(Duration::from_millis(50));
         let path = Path::new(SHARED_MEMORY).join(domain.domain().prefix() + "begun");

@@ -1,4 +1,4 @@
-//! How a service of the transport is made: its configuration, its size, and how a sample is seen by it.
+//! Properties of the transport's services: configuration, size, quality of service, sample types.
 
 use super::cause;
 use crate::bus::domain::Domain;
@@ -12,61 +12,61 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::fmt;
 use std::time::Duration;
 
-/// The most processes in one run: roles, launcher, recorders, watchers.
+/// Upper bound on the processes of a run: roles, launcher, recorders, watchers.
 pub(super) const MAX_NODES: usize = 128;
-/// The most readers of the launcher's schedule: every role.
+/// Upper bound on the readers of the schedule: every role.
 const MAX_SCHEDULE_READERS: usize = 128;
-/// The most readers of any other signal: roles, scorer, recorder, watchers.
+/// Upper bound on the readers of any other signal: roles, scorer, recorder, watchers.
 pub(super) const MAX_READERS: usize = 8;
-/// The most readers of a fleet's signals, of which every sample is large: role, scorer, recorder, a watcher.
+/// Upper bound on the readers of a fleet's signal, whose samples are large: role, scorer, recorder, one watcher.
 const MAX_FLEET_READERS: usize = 4;
-/// Samples that a reader holds at once: the one at hand, and the next while they are exchanged.
+/// Samples that a reader holds at once: the current one, and the next during the exchange.
 const MAX_BORROWED: usize = 2;
-/// How long the transport waits for what somebody else has begun to make: longer than any machine keeps a maker from going
-/// on, because a connection that was given up is not tried again. The wait for a maker that is dead is ended by the janitor.
+/// Time limit of the transport for a file that another process creates. Longer than any maker is delayed, because the
+/// transport never retries a connection. The janitor ends the wait for a dead maker.
 const CREATION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Connections to dead writers that a reader keeps until it has read what they sent. A signal has one writer at a time, and a reader
-/// looks at every one of these places each time it finds no new sample.
+/// Connections to ended writers that a reader keeps until it has read their samples. A signal has one writer at a time,
+/// and a reader checks every one of these connections whenever it finds no new sample.
 const EXPIRED_CONNECTIONS: usize = 8;
-/// The transport's version, which every process of a run must have: the layout in shared memory changes between them.
+/// The transport's version, which every process of a run must use, because the layout in shared memory depends on it.
 pub const VERSION: &str = "0.10.0";
-/// An upper bound on what the transport puts before a sample, bytes.
+/// Upper bound on the header of a sample, bytes.
 const HEADER_BYTES: usize = 64;
-/// An upper bound on what a signal takes besides its samples: queues, lists of members, rounding to pages; bytes.
+/// Upper bound on a signal's memory besides samples: queues, member lists, rounding to pages, bytes.
 const SIGNAL_BYTES: usize = 64 << 10;
 
 pub(in crate::bus) type Ipc = ipc::Service;
 
-/// An upper bound on the shared memory that one signal with samples of `size` bytes takes, bytes.
+/// Returns an upper bound on the shared memory of one signal with samples of `size` bytes, bytes.
 pub fn footprint(qos: &Qos, size: usize) -> usize {
     let waiting = qos.subscriber_max_buffer_size + qos.subscriber_max_borrowed_samples;
     (qos.max_subscribers * waiting + qos.history_size + 2) * (HEADER_BYTES + size) + SIGNAL_BYTES
 }
 
-/// What a run takes of shared memory besides its signals, bytes.
+/// Shared memory of a run besides its signals, bytes.
 pub const COMMON_BYTES: usize = NOTIFIERS_BYTES;
 
-/// What the opener of a signal's service asks for. Whoever comes first makes the service, so all ask for the same.
+/// Quality of service of a signal. The first opener creates the service, so all openers request the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 pub struct Qos {
-    /// One writer per signal.
+    /// Writers: one.
     pub max_publishers: usize,
-    /// The most readers.
+    /// Upper bound on the readers.
     pub max_subscribers: usize,
-    /// The most processes.
+    /// Upper bound on the processes.
     pub max_nodes: usize,
-    /// Samples for readers that come later.
+    /// Number of past samples for new readers.
     pub history_size: usize,
-    /// The most samples that may wait for one reader.
+    /// Upper bound on the samples that wait for one reader.
     pub subscriber_max_buffer_size: usize,
-    /// The most samples that one reader may hold.
+    /// Upper bound on the samples that one reader holds.
     pub subscriber_max_borrowed_samples: usize,
-    /// Whether the oldest waiting sample gives way to a new one.
+    /// True if a new sample replaces the oldest waiting one.
     pub enable_safe_overflow: bool,
 }
 
 impl Qos {
-    /// That of a signal on links of these depths.
+    /// Returns the quality of service of a signal on links of these depths.
     pub fn for_signal(signal: Signal, depths: Depths) -> Self {
         Self {
             max_publishers: 1,
@@ -79,18 +79,18 @@ impl Qos {
         }
     }
 
-    /// That of a fleet's signal.
+    /// Returns the quality of service of a fleet's signal.
     pub fn for_fleet(signal: Signal, depths: Depths) -> Self {
         Self { max_subscribers: MAX_FLEET_READERS, ..Self::for_signal(signal, depths) }
     }
 }
 
-/// How many samples of a signal may wait for a reader.
+/// Returns the queue depth of a reader of a signal.
 pub fn buffer_size(signal: Signal, reader: Reader, depths: Depths) -> usize {
     depths.for_reader(reader).min(deepest(signal, depths))
 }
 
-/// What roles say of themselves and hear from the launcher is said again and again.
+/// Returns the number of past samples for new readers. Health and schedule need none: they are published repeatedly.
 fn history(signal: Signal, depths: Depths) -> usize {
     match signal {
         Signal::Health | Signal::Schedule => 0,
@@ -98,7 +98,7 @@ fn history(signal: Signal, depths: Depths) -> usize {
     }
 }
 
-/// What is scored or recorded needs room for those who look only now and then.
+/// Returns the depth of the deepest queue. Scored and recorded signals are read rarely.
 fn deepest(signal: Signal, depths: Depths) -> usize {
     match signal {
         Signal::Truth | Signal::Measurement | Signal::Estimate | Signal::Command => depths.scorer.max(depths.role),
@@ -106,7 +106,7 @@ fn deepest(signal: Signal, depths: Depths) -> usize {
     }
 }
 
-/// A sample as iceoryx2 sees it.
+/// A sample for iceoryx2.
 #[repr(transparent)]
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wire<S>(pub(super) S);
@@ -120,12 +120,12 @@ unsafe impl<S: Sample> ZeroCopySend for Wire<S> {
     }
 }
 
-/// Whether a service has a writer. One that was killed is one until its remains are cleared.
+/// Returns true if a service has a writer. A killed writer counts until its remains are removed.
 pub(super) fn has_writer<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> bool {
     service.dynamic_config().number_of_publishers() > 0
 }
 
-/// The process that has a service's writing end open, dead or alive.
+/// Returns the process of a service's writer, dead or alive.
 pub(super) fn writer<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory<Ipc, P, ()>) -> Option<WriterProcess> {
     let mut found = None;
     service.dynamic_config().list_publishers(|details| {
@@ -136,14 +136,14 @@ pub(super) fn writer<P: fmt::Debug + IceoryxSend + ?Sized>(service: &PortFactory
     found
 }
 
-/// The transport's configuration by which a process enters a domain, whose directory is at `root`.
+/// Returns the configuration for a domain whose directory is at `root`.
 pub(super) fn config(root: &std::path::Path, domain: &Domain) -> Result<Config, String> {
     let mut config = Config::default();
     let root = root.to_string_lossy();
     let root = Path::new(root.as_bytes()).map_err(|error| format!("{error:?}"))?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(domain.prefix().as_bytes()).map_err(|error| format!("{error:?}"))?;
-    // The janitor alone puts away what the dead left: it may have to wait for somebody who stands still.
+    // Only the janitor cleans up after dead processes, because it may have to wait for a stopped process.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;

@@ -1,4 +1,4 @@
-//! The links of single bodies over shared memory: samples of one size, by a queue, and the newest by its lane too.
+//! Links of single bodies over shared memory: a queue of samples, and a latest-value channel.
 
 use super::cause;
 use super::latest::{LatestReader, LatestWriter};
@@ -20,20 +20,20 @@ pub struct IoxWriter<S: Sample> {
     pub(super) publisher: Publisher<Ipc, Wire<S>, ()>,
     pub(super) latest: Option<LatestWriter<S>>,
     pub(super) loan: Option<SampleMut<Ipc, Wire<S>, ()>>,
-    /// What was shown in the lane and is not sent.
+    /// A sample that is in the latest-value channel and not published.
     pub(super) unpublished: Option<SampleMut<Ipc, Wire<S>, ()>>,
     pub(super) notifier: Notifier,
     pub(super) topic: Topic,
 }
 
 impl<S: Sample> IoxWriter<S> {
-    /// The sample that was filled, and is in the lane if there is one.
+    /// Takes the filled sample and writes it to the latest-value channel, if any.
     #[inline]
     fn filled(&mut self) -> Option<SampleMut<Ipc, Wire<S>, ()>> {
         let sample = self.loan.take()?;
         if let Some(latest) = &self.latest {
             latest.put(&sample.payload().0);
-            // Whoever looks at the lane need not sleep until the queues are served.
+            // A reader of the channel need not wait for the queues.
             self.notifier.notify();
         }
         Some(sample)
@@ -88,7 +88,8 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
         self.unpublished.take().map_or(Ok(()), |sample| self.queue(sample))
     }
 
-    /// Takes the next sample's memory: iceoryx2's one small allocation per sample happens here, off the critical path.
+    /// Loans the memory of the next sample: the one small allocation of iceoryx2 per sample happens here, off the
+    /// critical path.
     #[inline]
     fn prepare(&mut self) -> Result<(), BusError> {
         if self.loan.is_none() {
@@ -102,7 +103,7 @@ impl<S: Sample> Write<S> for IoxWriter<S> {
     }
 }
 
-/// Looks at the fast lane between two at the queue, where nothing new is as a rule.
+/// Number of polls of the channel between two polls of the queue, which is usually empty.
 const LOOKS: u32 = 256;
 
 /// The reading end.
@@ -111,50 +112,50 @@ pub struct IoxReader<S: Sample> {
     pub(super) service: PortFactory<Ipc, Wire<S>, ()>,
     pub(super) subscriber: Subscriber<Ipc, Wire<S>, ()>,
     pub(super) latest_channel: LatestChannel<S>,
-    /// Looks at the lane that found nothing.
+    /// Number of polls of the channel without a new sample.
     pub(super) idle: u32,
     pub(super) current: Current<S>,
-    /// Generation and tick of the last two samples that the lane has had, the newer first.
+    /// Generation and tick of the last two samples from the channel, newer first.
     pub(super) channel_keys: [(u64, u64); 2],
-    /// Taken from the queue before a sleep, and not told of yet.
+    /// A sample taken from the queue before a sleep, not returned yet.
     pub(super) pending: Option<Received<Ipc, Wire<S>, ()>>,
-    /// Generation and tick of the last sample told of.
+    /// Generation and tick of the last returned sample.
     pub(super) newest: (u64, u64),
     pub(super) notifier: Notifier,
     pub(super) topic: Topic,
 }
 
-/// A reader's fast lane.
+/// A reader's latest-value channel.
 #[allow(clippy::large_enum_variant, reason = "there is one per reader, and it is looked at at every tick")]
 pub(super) enum LatestChannel<S: Sample> {
-    /// There is none.
+    /// The signal has no channel.
     None,
-    /// It is to be looked for: that of a writer of this generation.
+    /// The channel of a writer of this generation is not open yet.
     Wanted { generation: u64 },
-    /// It is there.
+    /// The channel is open.
     Open(LatestReader<S>),
 }
 
-/// What tells the samples of a signal apart, and orders them: generation and tick.
+/// Returns generation and tick, which identify and order the samples of a signal.
 #[inline]
 fn key(sample: &impl Sample) -> (u64, u64) {
     let stamp = sample.stamp();
     (stamp.generation & !NO_SAMPLE, stamp.tick)
 }
 
-/// No sample has this key.
+/// A key that no sample has.
 pub(super) const NO_KEY: (u64, u64) = (u64::MAX, u64::MAX);
 
-/// Returns true if a sample of this key in the queue is not news to a reader to which the lane has `shown` two.
+/// Returns true if a sample of this key in the queue was already read from the channel.
 ///
-/// A writer serves the lane before the queue, so the queue may still hold the sample before the one in the lane. Keys do not
-/// tell the order of the two: the one in the lane may be late by a scripted fault.
+/// A writer serves the channel before the queue, so the queue may hold the sample before the one in the channel. Keys
+/// do not decide their order: a scripted fault may have delayed the one in the channel.
 #[inline]
 fn is_overtaken<S: Sample>(channel: &LatestChannel<S>, channel_keys: &[(u64, u64); 2], key: (u64, u64)) -> bool {
     channel_keys.contains(&key) || matches!(channel, LatestChannel::Open(latest) if key <= self::key(latest.sample()))
 }
 
-/// Where the sample at hand is.
+/// The location of the current sample.
 pub(super) enum Current<S: Sample> {
     None,
     InLane,
@@ -167,7 +168,7 @@ impl<S: Sample> IoxReader<S> {
         BusError::Receive { service: self.topic.to_string(), reason }
     }
 
-    /// Takes the next sample from the queue that the lane has not had.
+    /// Takes the next sample from the queue that was not read from the channel.
     fn receive(&mut self) -> Result<bool, BusError> {
         let (received, key) = loop {
             let received = match self.pending.take() {
@@ -188,7 +189,7 @@ impl<S: Sample> IoxReader<S> {
             LatestChannel::Open(latest) if generation > latest.generation() => {
                 self.latest_channel = LatestChannel::Wanted { generation }
             }
-            // Warm-up tells nothing of its writer.
+            // A warm-up sample does not identify its writer.
             LatestChannel::Wanted { generation: wanted } if generation > 0 => *wanted = generation,
             _ => {}
         }
@@ -209,7 +210,7 @@ impl<S: Sample> Read<S> for IoxReader<S> {
                 self.channel_keys = [key, self.channel_keys[0]];
                 let before = std::mem::replace(&mut self.newest, key);
                 self.current = Current::InLane;
-                // The queue may have been faster, and the lane may take one sample for two.
+                // The queue may have been faster, and the channel may return one sample twice.
                 return Ok(self.newest != before);
             }
             self.idle = self.idle.wrapping_add(1);
@@ -246,7 +247,8 @@ impl<S: Sample> Read<S> for IoxReader<S> {
             });
         };
         notifier.sleep(until_ns, || {
-            // What the lane has had waits in the queue too. It is no news, and is taken out, or no sleep would last.
+            // Samples read from the channel also wait in the queue. They are discarded, otherwise every sleep would end
+            // at once.
             while !latest.has_news() && pending.is_none() {
                 match subscriber.receive() {
                     Ok(Some(sample)) => {
@@ -257,23 +259,23 @@ impl<S: Sample> Read<S> for IoxReader<S> {
                     Err(error) => return Err(failed(cause::reason(|| format!("{error:?}")))),
                 }
             }
-            // The next look goes to the queue, if nothing is in the lane.
+            // The next poll reads the queue if the channel has nothing new.
             *idle = u32::MAX;
             Ok(true)
         })
     }
 
     fn refresh(&mut self) {
-        // Or the first look at the queue, once the lane is open, would connect to its writer in the midst of the loop. What
-        // is wrong with it is told by that look.
+        // Otherwise the first poll of the queue after the channel is open would connect to the writer during a tick.
+        // That poll reports errors.
         let _ = self.subscriber.update_connections();
-        // Whoever looks once per tick would find a new writer of the signal only after so many ticks.
+        // A reader that polls once per tick would otherwise find a new writer only after many ticks.
         self.idle = u32::MAX;
         if let LatestChannel::Wanted { generation } = self.latest_channel {
             match LatestReader::open(&self.node, &self.topic, generation) {
                 Some(latest) => self.latest_channel = LatestChannel::Open(latest),
-                // Where there is none there will be none: a lane is made before its signal. But before the first sample it
-                // is not known whose to look for.
+                // A writer creates its channel before its signal, so a missing channel will stay missing. Before the
+                // first sample the writer's generation is unknown.
                 None if self.newest != (0, 0) => self.latest_channel = LatestChannel::None,
                 None => {}
             }
@@ -290,7 +292,7 @@ mod tests {
     use crate::clock::monotonic_ns;
     use crate::sample::RateCommand;
 
-    /// A signal with a fast lane, whose bus has links of the newest sample.
+    /// A signal with a latest-value channel.
     fn fast() -> Topic {
         Topic { signal: Signal::Command, ..topic() }
     }
@@ -299,9 +301,9 @@ mod tests {
         writer.send(|sample| (sample.stamp.tick, sample.stamp.generation) = (tick, generation)).unwrap();
     }
 
-    /// The queue still holds what the lane has given: that must not keep the reader awake.
+    /// The queue still holds the sample read from the channel. That must not end the sleep.
     #[test]
-    fn a_reader_of_the_lane_sleeps_at_once_when_there_is_nothing_new() {
+    fn a_reader_of_the_channel_sleeps_when_there_is_no_new_sample() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let mut writer = bus.writer::<RateCommand>(&fast(), 1).unwrap();
@@ -324,9 +326,9 @@ mod tests {
         }
     }
 
-    /// A writer that is interrupted between the lane and the queue: the queue holds what the lane has shown before.
+    /// The writer is interrupted between channel and queue: the queue holds a sample that the channel has delivered.
     #[test]
-    fn what_the_lane_has_shown_is_not_told_again_when_a_late_sample_follows() {
+    fn a_sample_from_the_channel_is_not_repeated_when_a_late_sample_follows() {
         for sleeps in [false, true] {
             let domain = OwnedDomain::create(0).unwrap();
             let bus = bus(&domain);
@@ -356,9 +358,9 @@ mod tests {
         }
     }
 
-    /// A reader that looks once per tick, and never sleeps on the signal.
+    /// A reader that polls once per tick and never sleeps on the signal.
     #[test]
-    fn a_successor_is_found_at_the_first_look_after_a_refresh() {
+    fn a_successor_is_found_at_the_first_poll_after_a_refresh() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
@@ -373,9 +375,9 @@ mod tests {
         }
     }
 
-    /// A successor of the writer has a lane of its own, which is looked for only later.
+    /// A successor of the writer has its own channel, which the reader opens later.
     #[test]
-    fn what_only_the_queue_has_ends_the_sleep_and_is_found_at_the_next_look() {
+    fn a_sample_only_in_the_queue_ends_the_sleep_and_is_read_next() {
         let domain = OwnedDomain::create(0).unwrap();
         let bus = bus(&domain);
         let mut reader = bus.reader::<RateCommand>(&fast(), Reader::Role).unwrap();
@@ -390,7 +392,7 @@ mod tests {
                 assert!(!reader.advance().unwrap(), "once");
             }
             reader.refresh();
-            assert!(!reader.advance().unwrap(), "what is in the channel now was in the queue");
+            assert!(!reader.advance().unwrap(), "the channel's sample was already read from the queue");
         }
     }
 }
