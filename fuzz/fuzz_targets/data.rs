@@ -4,7 +4,7 @@
 
 use corotate::data::{Log, Options};
 use corotate::estimate::{FilterKind, RateSurvey, Reconstruction, Setup};
-use corotate::identify::{Motion, Recursive, Sample, findings};
+use corotate::identify::{Motion, RecursiveIdentifier, Sample, findings};
 use corotate::model::Inertia;
 use libfuzzer_sys::fuzz_target;
 use std::io::Cursor;
@@ -16,7 +16,7 @@ fn read(bytes: Vec<u8>, options: &Options) {
     };
     let coefficients = Inertia::new([1.0, 2.0, 2.5]).expect("a body").coefficients();
     let (mut motion, mut recursive, mut survey) =
-        (Motion::default(), Recursive::new(None, 0.1), RateSurvey::new(&coefficients, 3));
+        (Motion::default(), RecursiveIdentifier::new(None, 0.1), RateSurvey::new(&coefficients, 3));
     let filter = FilterKind::First { decay_per_s: 5.0 };
     let setup = Setup { coefficients, axis: 3, damping_per_s: 0.1, filter, guess_rad_s: None, floor_rad_s: 1e-3 };
     let mut reconstruction = Reconstruction::new(&setup).expect("the axis is observable");

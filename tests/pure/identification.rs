@@ -6,7 +6,8 @@
 use crate::common::cases;
 use corotate::model::{Inertia, RigidBody};
 use corotate::observe::{
-    Axisymmetric, Hurwitz, HurwitzError, Identification, InertiaRatios, InertiaRelation, InvariantFilter, RateSample,
+    AxisymmetricRelation, Hurwitz, HurwitzError, Identification, InertiaRatios, InertiaRelation, InvariantFilter,
+    RateSample,
 };
 use nalgebra::{Matrix3, Rotation3, Vector1, Vector3};
 use proptest::prelude::*;
@@ -394,7 +395,7 @@ fn the_general_relation_identifies_an_axisymmetric_body_too() {
 /// Returns the largest error of the axisymmetric estimate after a spin of 40/λ, and the fitted decay per radian of
 /// spin.
 fn identify_axisymmetric(motion: &Motion, axis: usize, decay: f64, guess: f64, a: f64) -> (f64, f64) {
-    let relation = Axisymmetric::new(axis, FLOOR_RAD_S).unwrap();
+    let relation = AxisymmetricRelation::new(axis, FLOOR_RAD_S).unwrap();
     let mut filter = InvariantFilter::new(Vector1::new(decay), Vector1::new(guess));
     let (mut spun, mut floor, mut mid) = (0.0, 0.0_f64, None);
     for (from, to, step) in motion.samples() {
@@ -433,7 +434,7 @@ fn the_axisymmetric_coefficient_is_found_for_either_sign_of_the_spin() {
 
 #[test]
 fn a_body_that_does_not_spin_about_its_axis_of_symmetry_is_refused() {
-    let relation = Axisymmetric::new(3, FLOOR_RAD_S).unwrap();
+    let relation = AxisymmetricRelation::new(3, FLOOR_RAD_S).unwrap();
     for spin in [0.0, 1e-7, -1e-7] {
         let motion = Motion::free([1.0, 1.0, 1.6], [0.5, 0.4, spin], 1e-2, 1.0);
         for (from, to, step) in motion.samples() {
@@ -525,7 +526,7 @@ proptest! {
         moments[axis - 1] = axial;
         let motion = Motion::free(moments, start.into(), step, step);
         let (from, to, _) = motion.samples().next().unwrap();
-        if let Identification::Excited(increment) = Axisymmetric::new(axis, 1e-3).unwrap().observe(&from, &to, step) {
+        if let Identification::Excited(increment) = AxisymmetricRelation::new(axis, 1e-3).unwrap().observe(&from, &to, step) {
             let error = increment.potential.x - (1.0 - axial) * increment.weight;
             prop_assert!(error.abs() < 1e-12 , "{error:e}");
         } else {

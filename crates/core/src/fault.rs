@@ -85,19 +85,19 @@ pub struct ContentFault {
     /// The change.
     pub change: Change,
     /// The affected words.
-    pub words: Words,
+    pub words: WordRange,
 }
 
 /// Consecutive words of 8 bytes of a sample, counted from its start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Words {
+pub struct WordRange {
     /// The index of the first word.
     pub first: usize,
     /// The number of words, at least 1.
     pub count: usize,
 }
 
-impl Words {
+impl WordRange {
     /// Returns all words after the stamp of a sample of `size` bytes.
     pub fn content(size: usize) -> Self {
         Self { first: STAMP, count: size / WORD - STAMP }
@@ -176,12 +176,12 @@ impl Fault {
 
 /// Returns the words and the type of the field `name`. `fields` are those after the stamp; `tick` and `generation` of
 /// the stamp are found too.
-pub fn field(fields: &[Field], name: &str) -> Option<(Words, FieldKind)> {
+pub fn field(fields: &[Field], name: &str) -> Option<(WordRange, FieldKind)> {
     let stamp = [("tick", 0), ("generation", 1)].into_iter().find(|(known, _)| *known == name);
-    let of_stamp = stamp.map(|(_, first)| (Words { first, count: 1 }, FieldKind::U64));
+    let of_stamp = stamp.map(|(_, first)| (WordRange { first, count: 1 }, FieldKind::U64));
     let of_content = || {
         let field = fields.iter().find(|field| field.name == name)?;
-        Some((Words { first: field.offset / WORD, count: field.count }, field.kind))
+        Some((WordRange { first: field.offset / WORD, count: field.count }, field.kind))
     };
     of_stamp.or_else(of_content)
 }
@@ -210,7 +210,7 @@ mod tests {
     use super::*;
     use crate::sample::{RateMeasurement, Sample};
 
-    fn fault(change: Change, words: Words) -> Fault {
+    fn fault(change: Change, words: WordRange) -> Fault {
         let action = Action::Content(ContentFault { change, words });
         Fault { from_tick: 10, ticks: 3, occurrence: Occurrence::Independent(1.0), seed: seed(7, 0), action }
     }
@@ -231,13 +231,13 @@ mod tests {
         tampered
     }
 
-    fn omega() -> Words {
+    fn omega() -> WordRange {
         field(RateMeasurement::FIELDS, "omega_rad_s").unwrap().0
     }
 
     #[test]
     fn every_change_affects_only_its_words() {
-        let second = Words { first: omega().first + 1, count: 1 };
+        let second = WordRange { first: omega().first + 1, count: 1 };
         assert_eq!(tampered(&fault(Change::Freeze, second), 10).omega_rad_s, [0.1, 9.0, 0.3]);
         assert_eq!(tampered(&fault(Change::Set(5.0), second), 10).omega_rad_s, [0.1, 5.0, 0.3]);
         assert!(tampered(&fault(Change::Set(f64::NAN), omega()), 10).omega_rad_s.iter().all(|value| value.is_nan()));
@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn draws_depend_on_seed_and_tick_alone() {
-        let flip = fault(Change::Flip(None), Words::content(size_of::<RateMeasurement>()));
+        let flip = fault(Change::Flip(None), WordRange::content(size_of::<RateMeasurement>()));
         assert_eq!(tampered(&flip, 10), tampered(&flip, 10));
         let reseeded = Fault { seed: seed(8, 0), ..flip.clone() };
         let differ = |a: &Fault, b: &Fault| (0..64).filter(|tick| tampered(a, *tick) != tampered(b, *tick)).count();
@@ -271,12 +271,12 @@ mod tests {
 
     #[test]
     fn fields_of_content_and_stamp_are_found_by_name() {
-        assert_eq!(field(RateMeasurement::FIELDS, "tick"), Some((Words { first: 0, count: 1 }, FieldKind::U64)));
+        assert_eq!(field(RateMeasurement::FIELDS, "tick"), Some((WordRange { first: 0, count: 1 }, FieldKind::U64)));
         assert_eq!(
             field(RateMeasurement::FIELDS, "applied_rad_s2"),
-            Some((Words { first: 7, count: 3 }, FieldKind::F64))
+            Some((WordRange { first: 7, count: 3 }, FieldKind::F64))
         );
         assert_eq!(field(RateMeasurement::FIELDS, "sent_ns"), None);
-        assert_eq!(Words::content(size_of::<RateMeasurement>()), Words { first: 4, count: 8 });
+        assert_eq!(WordRange::content(size_of::<RateMeasurement>()), WordRange { first: 4, count: 8 });
     }
 }

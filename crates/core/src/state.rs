@@ -35,9 +35,9 @@ pub trait Words {
 
 /// A visitor that passes the numbers of a state on as [weights](Words::weight).
 #[derive(Debug)]
-pub struct Weights<'a, W>(pub &'a mut W);
+pub struct WeightWords<'a, W>(pub &'a mut W);
 
-impl<W: Words> Words for Weights<'_, W> {
+impl<W: Words> Words for WeightWords<'_, W> {
     #[inline]
     fn word(&mut self, value: &mut u64) {
         self.0.word(value);
@@ -51,9 +51,9 @@ impl<W: Words> Words for Weights<'_, W> {
 
 /// A visitor that counts words and changes nothing.
 #[derive(Debug, Default)]
-pub struct Count(pub usize);
+pub struct WordCount(pub usize);
 
-impl Words for Count {
+impl Words for WordCount {
     #[inline]
     fn word(&mut self, _value: &mut u64) {
         self.0 += 1;
@@ -68,16 +68,16 @@ impl Words for Count {
 /// assert_eq!(corotate::state::length(&mut state), 5);
 /// ```
 pub fn length(state: &mut impl Persist) -> usize {
-    let mut count = Count::default();
+    let mut count = WordCount::default();
     state.persist(&mut count);
     count.0
 }
 
 /// A visitor that restores a state from its words; missing words are zero.
 #[derive(Debug)]
-pub struct Restore<'a>(pub &'a [u64]);
+pub struct StoredWords<'a>(pub &'a [u64]);
 
-impl Words for Restore<'_> {
+impl Words for StoredWords<'_> {
     #[inline]
     fn word(&mut self, value: &mut u64) {
         let (first, rest) = self.0.split_first().unwrap_or((&0, &[]));
@@ -207,7 +207,7 @@ mod tests {
             state.persist(&mut store);
             assert_eq!(store.0.len(), length(&mut state), "the length does not depend on the values");
             let mut read: State = if state == full { empty } else { full };
-            read.persist(&mut Restore(&store.0));
+            read.persist(&mut StoredWords(&store.0));
             assert_eq!(read, state);
             assert_eq!(read.1[0].to_bits(), state.1[0].to_bits());
         }

@@ -11,7 +11,7 @@ pub const ACTUATION_DELAY_MAX: u64 = 64;
 /// The commands that a law has sent and that do not act yet at its next tick, for its prediction. `U` is the actuator
 /// input of a command.
 #[derive(Debug)]
-pub struct InFlight<U> {
+pub struct InFlightCommands<U> {
     /// The inputs, each with the tick after that of its measurement, or 0 if empty. The number of slots is a power of
     /// two, so that none is located by a division.
     sent: [(u64, U); ACTUATION_DELAY_MAX as usize],
@@ -20,7 +20,7 @@ pub struct InFlight<U> {
     count: u64,
 }
 
-impl<U: Default> InFlight<U> {
+impl<U: Default> InFlightCommands<U> {
     /// Creates an empty buffer for a law whose commands act `delay_ticks` after their measurement, at most
     /// [`ACTUATION_DELAY_MAX`].
     pub fn new(delay_ticks: u64, blank: impl Fn() -> U) -> Self {
@@ -31,7 +31,7 @@ impl<U: Default> InFlight<U> {
     }
 }
 
-impl<U> InFlight<U> {
+impl<U> InFlightCommands<U> {
     /// Returns true if a command acts from the next tick on, so that none is ever in flight.
     #[inline]
     pub fn is_empty(&self) -> bool {
@@ -77,7 +77,7 @@ impl<U> InFlight<U> {
     }
 }
 
-impl<U: Persist> Persist for InFlight<U> {
+impl<U: Persist> Persist for InFlightCommands<U> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.persist_by(words, U::persist);
     }
@@ -90,8 +90,8 @@ mod tests {
 
     #[test]
     fn the_inputs_until_the_next_command_are_known() {
-        let mut sent = InFlight::new(4, || 0.0);
-        let inputs = |sent: &InFlight<f64>, tick| {
+        let mut sent = InFlightCommands::new(4, || 0.0);
+        let inputs = |sent: &InFlightCommands<f64>, tick| {
             sent.after(tick).map(|input| input.copied().unwrap_or(-1.0)).collect::<Vec<_>>()
         };
         assert_eq!(inputs(&sent, 0), [-1.0; 3], "before the first command the acting input stays");
@@ -100,7 +100,7 @@ mod tests {
         }
         assert_eq!(inputs(&sent, 10), [-1.0, 8.0, 9.0], "the command of tick 7 was not sent");
         assert_eq!(inputs(&sent, 11), [8.0, 9.0, 9.0]);
-        let mut next = InFlight::new(1, || 0.0);
+        let mut next = InFlightCommands::new(1, || 0.0);
         assert!(next.is_empty() && next.sent(5).is_none() && inputs(&next, 5).is_empty());
     }
 }

@@ -12,7 +12,7 @@ mod watchdog;
 pub use adaptation::InertiaAdaptation;
 pub use certificate::{Certificate, Condition};
 pub use fleet::FleetLaw;
-pub use in_flight::{ACTUATION_DELAY_MAX, InFlight};
+pub use in_flight::{ACTUATION_DELAY_MAX, InFlightCommands};
 pub use orbit_certificate::OrbitCertificate;
 pub use orbit_hold::{OrbitGains, OrbitHold};
 pub use synchronizer::{Synchronizer, limited};

@@ -80,7 +80,7 @@ impl Watchdog {
 
     /// Checks a quantity that must stay constant, in any unit.
     #[inline]
-    pub fn constant(&mut self, quantity: usize, tick: u64, value: f64) {
+    pub fn check_constant(&mut self, quantity: usize, tick: u64, value: f64) {
         if self.watches(quantity, tick)
             && let Some(drift) = self.references[quantity].drift(value)
         {
@@ -90,7 +90,7 @@ impl Watchdog {
 
     /// Checks a quantity that must stay small.
     #[inline]
-    pub fn magnitude(&mut self, quantity: usize, tick: u64, value: f64) {
+    pub fn check_magnitude(&mut self, quantity: usize, tick: u64, value: f64) {
         if self.watches(quantity, tick) {
             self.check(quantity, tick, value.abs());
         }
@@ -177,7 +177,7 @@ mod tests {
     fn the_reference_is_the_median_of_the_first_values_from_its_tick_on() {
         let mut watchdog = watchdog(None);
         let invariants = |watchdog: &mut Watchdog, tick, values: [f64; 2]| {
-            values.iter().enumerate().for_each(|(quantity, value)| watchdog.constant(quantity, tick, *value));
+            values.iter().enumerate().for_each(|(quantity, value)| watchdog.check_constant(quantity, tick, *value));
         };
         (0..10).for_each(|tick| invariants(&mut watchdog, tick, [99.0, 99.0]));
         [2.0, 1e300, 2.0, 2.0, f64::NAN]
@@ -196,8 +196,8 @@ mod tests {
     fn nan_is_a_breach_and_an_unwatched_quantity_is_not_checked() {
         let mut watchdog = watchdog(None);
         for (tick, value) in [(9, 9.0), (10, 0.5), (11, -0.6), (12, f64::NAN), (13, f64::INFINITY)] {
-            watchdog.magnitude(2, tick, value);
-            watchdog.magnitude(3, tick, value);
+            watchdog.check_magnitude(2, tick, value);
+            watchdog.check_magnitude(3, tick, value);
         }
         let [_, _, innovation, lyapunov, ..] = *watchdog.breaches();
         assert_eq!((innovation.judged, innovation.count, innovation.first_tick), (4, 3, Some(11)));
@@ -210,11 +210,11 @@ mod tests {
     fn consecutive_breaches_latch_for_good() {
         let mut watchdog = watchdog(Some(3));
         for tick in [10, 11, 13, 14, 14, 14] {
-            watchdog.magnitude(2, tick, 1.0);
+            watchdog.check_magnitude(2, tick, 1.0);
         }
         assert_eq!(watchdog.latched_at(), None, "two consecutive ticks, whatever the number of breaches per tick");
-        watchdog.magnitude(2, 15, 1.0);
-        watchdog.magnitude(2, 16, 0.0);
+        watchdog.check_magnitude(2, 15, 1.0);
+        watchdog.check_magnitude(2, 16, 0.0);
         assert_eq!(watchdog.latched_at(), Some(15));
     }
 }

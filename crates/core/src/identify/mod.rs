@@ -25,7 +25,7 @@ pub use axes::AxesFit;
 pub use findings::{Finding, findings};
 pub use motion::{Motion, MotionSummary, Sample};
 pub(crate) use recursive::undamped;
-pub use recursive::{Recursive, RecursiveAxisymmetric, RecursiveFit};
+pub use recursive::{RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier};
 pub use tensor::TensorFit;
 
 use crate::model::{Inertia, InertiaError};

@@ -7,7 +7,8 @@
 
 use super::Sample;
 use crate::observe::{
-    Axisymmetric, AxisymmetricError, Filter, Identification, InertiaRelation, InvariantFilter, KalmanFilter, RateSample,
+    AxisymmetricError, AxisymmetricRelation, Filter, Identification, InertiaRelation, InvariantFilter, KalmanFilter,
+    RateSample,
 };
 use nalgebra::{SVector, Vector3};
 
@@ -34,12 +35,12 @@ pub struct RecursiveFit<const N: usize> {
 ///
 /// ```
 /// # extern crate corotate_core as corotate;
-/// use corotate::identify::{Recursive, Sample};
+/// use corotate::identify::{RecursiveIdentifier, Sample};
 /// use corotate::model::{Inertia, RigidBody};
 /// use corotate::nalgebra::Vector3;
 ///
 /// let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
-/// let (mut rate, mut identifier) = (Vector3::new(1.2, 0.8, 1.6), Recursive::new(None, 0.0));
+/// let (mut rate, mut identifier) = (Vector3::new(1.2, 0.8, 1.6), RecursiveIdentifier::new(None, 0.0));
 /// for tick in 0..30_000 {
 ///     identifier.push(&Sample { time_s: f64::from(tick) * 1e-3, rate_rad_s: rate });
 ///     rate = body.flow(&rate, &Vector3::zeros(), 1e-3);
@@ -47,14 +48,14 @@ pub struct RecursiveFit<const N: usize> {
 /// assert!((identifier.fit().coefficients - body.coefficients()).amax() < 1e-6);
 /// ```
 #[derive(Debug, Clone)]
-pub struct Recursive {
+pub struct RecursiveIdentifier {
     filter: Filter<3>,
     path: Path,
 }
 
 /// The identifier of the one coefficient of a body that is symmetric about a known axis.
 #[derive(Debug, Clone)]
-pub struct RecursiveAxisymmetric {
+pub struct RecursiveAxisymmetricIdentifier {
     axis: usize,
     filter: Filter<1>,
     path: Path,
@@ -141,7 +142,7 @@ pub(crate) fn undamped(interval_s: f64, damping_per_s: f64) -> (f64, f64) {
     (-libm::expm1(-turn) / damping_per_s, libm::exp(turn))
 }
 
-impl Recursive {
+impl RecursiveIdentifier {
     /// Creates an identifier whose error decays as e^{−rate·W}, or one that forgets nothing; `damping_per_s` is the
     /// result of least squares.
     pub fn new(rate: Option<f64>, damping_per_s: f64) -> Self {
@@ -169,20 +170,20 @@ impl Recursive {
     }
 }
 
-impl RecursiveAxisymmetric {
+impl RecursiveAxisymmetricIdentifier {
     /// Creates the identifier for a body that is symmetric about `axis`, 1 to 3; W is the angle of its spin, rad.
     ///
     /// # Errors
     /// [`AxisymmetricError`] if there is no such axis.
     pub fn new(axis: usize, rate: Option<f64>, damping_per_s: f64) -> Result<Self, AxisymmetricError> {
-        Axisymmetric::new(axis, 0.0)?;
+        AxisymmetricRelation::new(axis, 0.0)?;
         Ok(Self { axis, filter: filter(rate), path: Path::new(damping_per_s) })
     }
 
     /// Adds the next sample of a segment; its time is after that of the last one.
     pub fn push(&mut self, sample: &Sample) {
         let Some(([from, to], interval_s)) = self.path.step(sample) else { return };
-        let Ok(relation) = Axisymmetric::new(self.axis, FLOOR * self.path.fastest_rad_s) else { return };
+        let Ok(relation) = AxisymmetricRelation::new(self.axis, FLOOR * self.path.fastest_rad_s) else { return };
         let observed = relation.with_variance(Vector3::repeat(1.0)).observe(&from, &to, interval_s);
         self.path.apply(&mut self.filter, &observed);
     }
@@ -220,7 +221,7 @@ mod tests {
     fn a_damped_body_is_identified_like_a_free_one() {
         let expected = Inertia::new([1.0, 2.0, 2.5]).unwrap().coefficients();
         for (damping, rate) in [(0.0, None), (0.1, None), (0.1, Some(20.0))] {
-            let mut identifier = Recursive::new(rate, damping);
+            let mut identifier = RecursiveIdentifier::new(rate, damping);
             tumble([1.0, 2.0, 2.5], damping, |sample| identifier.push(sample));
             let fit = identifier.fit();
             assert!((fit.coefficients - expected).amax() < 1e-5, "{damping} {rate:?}: {fit:?}");
@@ -230,16 +231,16 @@ mod tests {
 
     #[test]
     fn an_axisymmetric_body_is_identified_by_one_coefficient() {
-        let mut identifier = RecursiveAxisymmetric::new(3, None, 0.05).unwrap();
+        let mut identifier = RecursiveAxisymmetricIdentifier::new(3, None, 0.05).unwrap();
         tumble([2.0, 2.0, 1.5], 0.05, |sample| identifier.push(sample));
         let fit = identifier.fit();
         assert!((1.0 - fit.coefficients.x - 0.75).abs() < 1e-9, "{fit:?}");
-        assert!(RecursiveAxisymmetric::new(4, None, 0.0).is_err());
+        assert!(RecursiveAxisymmetricIdentifier::new(4, None, 0.0).is_err());
     }
 
     #[test]
     fn a_new_segment_does_not_continue_the_last() {
-        let mut identifier = Recursive::new(None, 0.0);
+        let mut identifier = RecursiveIdentifier::new(None, 0.0);
         for start in [[1.2, 0.8, 1.6], [-0.5, 1.9, 0.4]] {
             let body = RigidBody::new(&Inertia::new([1.0, 2.0, 2.5]).unwrap());
             let mut rate = Vector3::from(start);

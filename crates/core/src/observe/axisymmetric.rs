@@ -39,7 +39,7 @@ impl From<&AxisymmetricError> for &'static str {
 /// The relation for a = (I_j − I_k)/I_i of a body that is symmetric about axis k: ρ = |ω_k|, rad/s, g = 0. Its
 /// filter's rate is per radian of spin. The ratio of the moments is I_k/I_i = 1 − a.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Axisymmetric {
+pub struct AxisymmetricRelation {
     axes: [usize; 3],
     floor_rad_s: f64,
     variance_rad2_s2: Vector3<f64>,
@@ -60,7 +60,7 @@ impl Spin {
     }
 }
 
-impl Axisymmetric {
+impl AxisymmetricRelation {
     /// Creates the relation for the symmetry axis `axis` (1 to 3; 3 in the paper) and noiseless sensors.
     ///
     /// A spin or a transverse component of at most `floor_rad_s` counts as not exciting; a floor below 1e-9 rad/s is
@@ -180,7 +180,7 @@ mod tests {
     ) -> Identification<1> {
         let [from, to] =
             [from, body.flow(&from, &torque, dt_s)].map(|rate_rad_s| RateSample { rate_rad_s, torque_rad_s2: torque });
-        Axisymmetric::new(axis, 1e-6).unwrap().observe(&from, &to, dt_s)
+        AxisymmetricRelation::new(axis, 1e-6).unwrap().observe(&from, &to, dt_s)
     }
 
     #[test]
@@ -217,7 +217,7 @@ mod tests {
     #[test]
     fn a_step_too_long_for_the_angle_is_ambiguous() {
         let (body, a) = body(3, 1.6);
-        let limit = Axisymmetric::new(3, 1e-6).unwrap().longest_step_s(0.8);
+        let limit = AxisymmetricRelation::new(3, 1e-6).unwrap().longest_step_s(0.8);
         let from = Vector3::new(0.3, 0.4, 0.8);
         assert_eq!(observe(&body, 3, from, Vector3::zeros(), limit * 1.01), Identification::Ambiguous);
         let seen = observe(&body, 3, from, Vector3::zeros(), limit * 0.99);
@@ -228,13 +228,13 @@ mod tests {
     #[test]
     fn other_axes_than_1_to_3_are_refused() {
         for axis in [0, 4] {
-            assert_eq!(Axisymmetric::new(axis, 1e-6), Err(AxisymmetricError::NoSuchAxis { axis }));
+            assert_eq!(AxisymmetricRelation::new(axis, 1e-6), Err(AxisymmetricError::NoSuchAxis { axis }));
         }
     }
 
     #[test]
     fn the_variance_of_the_angle_is_that_of_its_transverse_components() {
-        let relation = Axisymmetric::new(1, 1e-6).unwrap().with_variance(Vector3::new(9.0, 1e-6, 4e-6));
+        let relation = AxisymmetricRelation::new(1, 1e-6).unwrap().with_variance(Vector3::new(9.0, 1e-6, 4e-6));
         let at = |rate_rad_s| RateSample { rate_rad_s, torque_rad_s2: Vector3::zeros() };
         let rate = Vector3::new(0.5, 0.3, 0.4);
         let Identification::Excited(increment) = relation.observe(&at(rate), &at(rate), 1e-2) else { panic!() };

@@ -11,7 +11,7 @@
 
 use super::{HiddenRate, HiddenRateError, KalmanFilter, Observation, RateSample};
 use crate::model::{euler, rk4_step};
-use crate::state::{Persist, Weights, Words};
+use crate::state::{Persist, WeightWords, Words};
 use nalgebra::{Matrix3, Vector1, Vector3};
 
 /// The distance from the guard, in the guard's standard deviations, beyond which the estimate contradicts it.
@@ -174,6 +174,6 @@ impl Persist for GuardedKalman {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.guard.persist(words);
         self.state.persist(words);
-        self.covariance.persist(&mut Weights(words));
+        self.covariance.persist(&mut WeightWords(words));
     }
 }

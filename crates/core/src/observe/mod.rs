@@ -14,7 +14,7 @@ mod order;
 mod second_order;
 mod series;
 
-pub use axisymmetric::{Axisymmetric, AxisymmetricError};
+pub use axisymmetric::{AxisymmetricError, AxisymmetricRelation};
 pub use filter::{Increment, InvariantFilter, Span, StepAgain};
 pub use guarded::{GuardedKalman, RateNoise};
 pub use hidden_rate::{Conic, HiddenRate, HiddenRateError, Interval, Observation, RateSample, Regressor};

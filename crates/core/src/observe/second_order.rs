@@ -9,7 +9,7 @@
 //! known: the state is the residual r = φ − φ̂.
 
 use super::{Increment, StepAgain, series};
-use crate::state::{Persist, Weights, Words, persist_fields};
+use crate::state::{Persist, WeightWords, Words, persist_fields};
 use crate::vector::zeros;
 use nalgebra::SVector;
 
@@ -229,7 +229,7 @@ impl<const N: usize> Persist for KalmanFilter<N> {
     fn persist<W: Words>(&mut self, words: &mut W) {
         self.estimate.persist(words);
         self.residual.persist(words);
-        self.covariance.persist(&mut Weights(words));
+        self.covariance.persist(&mut WeightWords(words));
         self.based.persist(words);
     }
 }

@@ -1,7 +1,7 @@
 //! The identifier of the coefficients a of \[D\](2) from a body's motion: all three, or the one of an axisymmetric
 //! body.
 
-use crate::observe::{Axisymmetric, Filter, Identification, InertiaRelation, RateSample};
+use crate::observe::{AxisymmetricRelation, Filter, Identification, InertiaRelation, RateSample};
 use crate::sample::status;
 use crate::state::{Persist, Words};
 use crate::vector::zeros;
@@ -20,7 +20,7 @@ pub struct Identifier {
 #[derive(Debug, Clone)]
 enum Kind {
     Asymmetric { relation: InertiaRelation, filter: Filter<3> },
-    Axisymmetric { relation: Axisymmetric, filter: Filter<1>, axis: usize },
+    Axisymmetric { relation: AxisymmetricRelation, filter: Filter<1>, axis: usize },
 }
 
 impl Identifier {
@@ -30,7 +30,7 @@ impl Identifier {
     }
 
     /// Creates an identifier for a body with the symmetry axis `axis`, 1 to 3; `filter` is at the initial guess of a.
-    pub fn axisymmetric(relation: Axisymmetric, axis: usize, filter: Filter<1>, slowest_decay: f64) -> Self {
+    pub fn axisymmetric(relation: AxisymmetricRelation, axis: usize, filter: Filter<1>, slowest_decay: f64) -> Self {
         Self { kind: Kind::Axisymmetric { relation, filter, axis }, slowest_decay, excitation: 0.0 }
     }
 

@@ -1,6 +1,6 @@
 //! The synchronising law of one follower, which also computes its certificate at every tick.
 
-use crate::control::{Certificate, InFlight, InertiaAdaptation, Synchronizer, limited};
+use crate::control::{Certificate, InFlightCommands, InertiaAdaptation, Synchronizer, limited};
 use crate::role::Law;
 use crate::sample::{RateCommand, RateEstimate, RateMeasurement};
 use crate::state::persist_fields;
@@ -41,7 +41,7 @@ pub struct RateLaw {
     acceleration_max_rad_s2: f64,
     tick_s: f64,
     /// The commands of a predicting law that were sent and do not act yet, rad/s².
-    in_flight: InFlight<[f64; 3]>,
+    in_flight: InFlightCommands<[f64; 3]>,
 }
 
 impl RateLaw {
@@ -57,7 +57,7 @@ impl RateLaw {
             learned,
             acceleration_max_rad_s2,
             tick_s,
-            in_flight: InFlight::new(design.predicted_ticks, || [0.0; 3]),
+            in_flight: InFlightCommands::new(design.predicted_ticks, || [0.0; 3]),
         }
     }
 

@@ -474,7 +474,7 @@ mod tests {
         let mut kept = Vec::new();
         guard.persist(&mut Kept(&mut kept));
         let mut restored = self::guard();
-        restored.persist(&mut crate::state::Restore(&kept));
+        restored.persist(&mut crate::state::StoredWords(&kept));
         // The reason is not persistent: it is read only right after a rejection.
         restored.refusal = guard.refusal;
         assert_eq!(guard, restored);

@@ -11,7 +11,7 @@ use super::body::{BodyInfo, role_names};
 use super::checks::Checks;
 use super::nearest;
 use crate::bus::{Port, Signal};
-use crate::fault::{self, Action, Change, ContentFault, Fault, Interruption, Transport, Words};
+use crate::fault::{self, Action, Change, ContentFault, Fault, Interruption, Transport, WordRange};
 use crate::sample::FieldKind;
 use raw::Kind;
 
@@ -239,7 +239,7 @@ impl One<'_, '_, '_> {
     }
 
     /// The words of the field and component that are named; by default the first field, and all of its components.
-    fn words(&mut self, fields: &Fields) -> Option<(Words, FieldKind)> {
+    fn words(&mut self, fields: &Fields) -> Option<(WordRange, FieldKind)> {
         let raw = self.raw;
         let names: Vec<&str> = fields.all.iter().map(|(name, ..)| *name).collect();
         let name = raw.field.as_deref().unwrap_or(fields.first);
@@ -253,7 +253,7 @@ impl One<'_, '_, '_> {
             1 => format!("`{name}` has one component; give 1 or leave it out"),
             count => format!("`{name}` has no component {component}; give 1 to {count}"),
         })?;
-        Some((Words { first: words.first + component - 1, count: 1 }, kind))
+        Some((WordRange { first: words.first + component - 1, count: 1 }, kind))
     }
 
     fn lost_axis(&mut self, fields: &Fields) -> Option<ContentFault> {
@@ -267,16 +267,16 @@ impl One<'_, '_, '_> {
         self.require((1..=fields.axes).contains(&component), "component", "no-such-component", || {
             format!("there is no axis {component} to lose; give 1 to {}", fields.axes)
         })?;
-        let words = Words { first: fields.content.first + component - 1, count: 1 };
+        let words = WordRange { first: fields.content.first + component - 1, count: 1 };
         Some(ContentFault { change: Change::Lose { valid: valid.first }, words })
     }
 }
 
 /// The words of a signal's samples.
 struct Fields {
-    all: Vec<(&'static str, Words, FieldKind)>,
+    all: Vec<(&'static str, WordRange, FieldKind)>,
     first: &'static str,
-    content: Words,
+    content: WordRange,
     /// The number of leading components that its `valid` word tells of.
     axes: usize,
 }
@@ -287,6 +287,6 @@ impl Fields {
         let first = port.fields.iter().find(|field| field.kind == FieldKind::F64).map_or(VALID, |field| field.name);
         let names = port.fields.iter().map(|field| field.name).chain(["tick", "generation"]);
         let all = names.filter_map(|name| fault::field(&port.fields, name).map(|(words, kind)| (name, words, kind)));
-        Self { all: all.collect(), first, content: Words::content(port.size), axes }
+        Self { all: all.collect(), first, content: WordRange::content(port.size), axes }
     }
 }

@@ -3,8 +3,8 @@
 use super::form::{DataError, Meaning, Options};
 use super::log::{Counts, Entry, Log};
 use crate::identify::{
-    AxesFit, Finding, Motion, MotionSummary, Recursive, RecursiveAxisymmetric, RecursiveFit, Sample, TensorFit,
-    findings,
+    AxesFit, Finding, Motion, MotionSummary, RecursiveAxisymmetricIdentifier, RecursiveFit, RecursiveIdentifier,
+    Sample, TensorFit, findings,
 };
 use std::path::{Path, PathBuf};
 
@@ -106,8 +106,8 @@ pub fn identify_logs(paths: &[PathBuf], options: &Options, ways: &Ways) -> Resul
 
 /// The recursive filters.
 struct Filters {
-    all: Recursive,
-    symmetric: Option<RecursiveAxisymmetric>,
+    all: RecursiveIdentifier,
+    symmetric: Option<RecursiveAxisymmetricIdentifier>,
 }
 
 impl Filters {
@@ -116,11 +116,12 @@ impl Filters {
             let reason = format!("{decay} is no decay rate; give a number above 0");
             return Err(DataError::Option { name: "decay", reason });
         }
-        let symmetric = ways.symmetry_axis.map(|axis| RecursiveAxisymmetric::new(axis, ways.decay, damping_per_s));
+        let symmetric =
+            ways.symmetry_axis.map(|axis| RecursiveAxisymmetricIdentifier::new(axis, ways.decay, damping_per_s));
         let symmetric = symmetric.transpose();
         let symmetric =
             symmetric.map_err(|error| DataError::Option { name: "symmetry axis", reason: error.to_string() })?;
-        Ok(Self { all: Recursive::new(ways.decay, damping_per_s), symmetric })
+        Ok(Self { all: RecursiveIdentifier::new(ways.decay, damping_per_s), symmetric })
     }
 
     fn push(&mut self, sample: &Sample) {

@@ -20,7 +20,7 @@ mod tests {
     use crate::runtime::disturb::Disturbance;
     use crate::sample::RateCommand;
     use crate::scenario::Scenario;
-    use crate::state::{Persist, Restore, Words};
+    use crate::state::{Persist, StoredWords, Words};
     use crate::telemetry::{Ledger, LinkRead, LinkWritten};
 
     struct Ends {
@@ -76,7 +76,7 @@ mod tests {
         /// Opens the writing end of a successor and restores the committed state.
         fn successor(&self, committed: &Store) -> Output<MemoryBus, RateCommand> {
             let mut output = output(&self.bus, &self.ledger, 2);
-            output.persist(&mut Restore(&committed.0));
+            output.persist(&mut StoredWords(&committed.0));
             output
         }
     }
@@ -133,7 +133,7 @@ mod tests {
             if sent {
                 ends.output.dispatch().unwrap();
             }
-            let as_told = written(&mut Restore(&committed.0), "", WORDS, true, (&ends.ledger.reopened(), EXTENT));
+            let as_told = written(&mut StoredWords(&committed.0), "", WORDS, true, (&ends.ledger.reopened(), EXTENT));
             let mut successor = ends.successor(&committed);
             successor.dispatch().unwrap();
             successor.finish().unwrap();
@@ -171,8 +171,8 @@ mod tests {
         ends.input.persist(&mut state);
         let Ends { bus, mut output, .. } = ends;
         let mut input = Input::<_, RateCommand>::open(&bus, &topic(), Reader::Role).unwrap();
-        input.counters().persist(&mut Restore(&counters.0));
-        input.persist(&mut Restore(&state.0));
+        input.counters().persist(&mut StoredWords(&counters.0));
+        input.persist(&mut StoredWords(&state.0));
         input.repeated = true;
         // All samples again, as on a link with history; then a stale one and tick 5.
         for tick in [0, 1, 0, 2, 1, 5] {
@@ -259,8 +259,8 @@ mod tests {
                         input.persist(&mut state);
                         brings = MemoryBus::new(depths);
                         input = reader(&brings, 2);
-                        input.counters().persist(&mut Restore(&counters.0));
-                        input.persist(&mut Restore(&state.0));
+                        input.counters().persist(&mut StoredWords(&counters.0));
+                        input.persist(&mut StoredWords(&state.0));
                         input.expect_repeats();
                         bring(&brings, &sent[sent.len().saturating_sub(self.history)..]);
                     } else {
@@ -269,7 +269,7 @@ mod tests {
                     if self.writer_dies.is_some() {
                         ledger.reopened().take(1).set(0, sent.len() as u64 - unmarked);
                         output = writer(2, tick + 1);
-                        let mut words = Restore(&committed.0);
+                        let mut words = StoredWords(&committed.0);
                         output.persist(&mut words);
                         output.persist_late(&mut words);
                         output.dispatch().unwrap();

@@ -31,7 +31,7 @@ use crate::clock::Clock;
 use crate::config::{ClockKind, Settings};
 use crate::control::Watchdog;
 use crate::rig::{Fleet, Rig};
-use crate::state::{Persist, Restore};
+use crate::state::{Persist, StoredWords};
 use crate::telemetry::{Grant, Ledger, LedgerError, ReadCounters, RoleReport, StageReport, TickCounters, WatchReport};
 use context::{extent, words};
 use plant::PlantNode;
@@ -95,7 +95,7 @@ pub fn report(
     let (ports, ledger) = (ports(scenario, role), &ledger.reopened());
     // All counters are zero if the role has committed nothing.
     let record = ledger.record().unwrap_or_default();
-    let record_words = &mut Restore(&record);
+    let record_words = &mut StoredWords(&record);
     let (mut ticks, markers) = (TickCounters::default(), scenario.clock != ClockKind::Realtime);
     ticks.persist(record_words);
     let written = |port: &Port| {

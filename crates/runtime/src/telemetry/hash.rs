@@ -122,7 +122,7 @@ pub fn combine(hashes: impl IntoIterator<Item = u64>) -> u64 {
 mod tests {
     use super::*;
     use crate::sample::{Message, RateCommand, Stamp};
-    use crate::state::Restore;
+    use crate::state::StoredWords;
 
     fn sample(tick: u64, value: f64, sent_ns: u64) -> RateCommand {
         let stamp = Stamp { tick, sent_ns, origin_ns: sent_ns / 2, generation: sent_ns };
@@ -176,13 +176,13 @@ mod tests {
         let mut kept = [0; 2];
         for tick in 0..4 {
             let mut hash = StateHash::open(&ledger.reopened(), 9);
-            hash.persist(&mut Restore(&kept));
+            hash.persist(&mut StoredWords(&kept));
             hash.absorb(tick, sample(tick, tick as f64, 0).content());
             kept = [hash.value, hash.count];
         }
         let whole = self::hash(&[(0, 0.0, 0), (1, 1.0, 0), (2, 2.0, 0), (3, 3.0, 0)]);
         let mut hash = StateHash::open(&ledger.reopened(), 9);
-        hash.persist(&mut Restore(&kept));
+        hash.persist(&mut StoredWords(&kept));
         assert_eq!(hash.checkpoints(), whole);
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! The computations themselves are in `model`, `observe` and `control`.
 
-use crate::control::{InFlight, OrbitHold};
+use crate::control::{InFlightCommands, OrbitHold};
 use crate::model::{CentralField, Noise, OrbitState};
 use crate::observe::{Filter, OrbitSample, OrbitVelocity, to_inertial, to_polar};
 use crate::rig::filter::FilterDesign;
@@ -211,13 +211,13 @@ pub struct OrbitLaw {
     law: OrbitHold,
     aim: Aim,
     /// The commands that a predicting law has sent and that do not act yet, du/s².
-    in_flight: InFlight<[f64; 2]>,
+    in_flight: InFlightCommands<[f64; 2]>,
 }
 
 impl OrbitLaw {
     /// Creates the law of one body. A predicting law predicts its motion over `predicted_ticks`.
     pub(super) fn new(law: OrbitHold, aim: Aim, predicted_ticks: u64) -> Self {
-        Self { law, aim, in_flight: InFlight::new(predicted_ticks, || [0.0; 2]) }
+        Self { law, aim, in_flight: InFlightCommands::new(predicted_ticks, || [0.0; 2]) }
     }
 
     /// Returns the thrust. `None` asks for no thrust: the body is lost, or the leader is still unknown.

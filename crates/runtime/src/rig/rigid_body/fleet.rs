@@ -5,7 +5,7 @@
 
 use super::RigidBodyRig;
 use super::limits::Motion;
-use crate::control::{FleetLaw, InFlight};
+use crate::control::{FleetLaw, InFlightCommands};
 use crate::model::{RigidBody, flow_all, uniform};
 use crate::rig::Fleet;
 use crate::role::{Body, Bounds, Guard, Law, MotionCheck, Refusal};
@@ -110,7 +110,7 @@ impl Fleet<RateEstimate> for RateFleet {
 
     fn law(&self) -> FleetRateLaw {
         let ahead = if self.law.predicts() { zeros(self.count()) } else { Arrays::default() };
-        let in_flight = InFlight::new(self.delay_ticks, || zeros(self.count()));
+        let in_flight = InFlightCommands::new(self.delay_ticks, || zeros(self.count()));
         FleetRateLaw { law: self.law, learned: self.learned, ahead, in_flight }
     }
 
@@ -196,7 +196,7 @@ pub struct FleetRateLaw {
     /// Buffers of the predicted rates, if the law predicts.
     ahead: Arrays,
     /// The commands that were sent and do not act yet, rad/s², if the law predicts.
-    in_flight: InFlight<Arrays>,
+    in_flight: InFlightCommands<Arrays>,
 }
 
 impl Persist for FleetRateLaw {

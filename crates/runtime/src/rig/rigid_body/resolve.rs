@@ -9,7 +9,7 @@ use super::plant::Outage;
 use super::playback::{self, Playback};
 use crate::config::{Checks, ConfigError, Document};
 use crate::model::{Inertia, Noise};
-use crate::observe::{Axisymmetric, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
+use crate::observe::{AxisymmetricRelation, Filter, HiddenRate, Hurwitz, InertiaRelation, InvariantFilter};
 use crate::rate::{Identifier, LearnerDesign};
 use crate::rig::filter::{FilterDesign, SURE_DEVIATIONS, UNKNOWN_DEVIATION};
 use crate::rig::{BodyInfo, Context};
@@ -289,7 +289,7 @@ fn design_identifier(
     if observer.kind == Kind::AxisymmetricInertia {
         let axis = observer.symmetry_axis?;
         check_symmetry(leader, inertia, axis, floor_rad_s, checks);
-        let relation = checks.accept("observer.symmetry_axis", Axisymmetric::new(axis, floor_rad_s))?;
+        let relation = checks.accept("observer.symmetry_axis", AxisymmetricRelation::new(axis, floor_rad_s))?;
         let design = match (&observer.identifier_decay, observer.identifier_bandwidth) {
             (Some(IdentifierDecay::Rates(rates)), _) => FilterDesign::First([rates[0]]),
             (_, Some(bandwidth)) => FilterDesign::Second([bandwidth[0]]),

@@ -11,7 +11,7 @@ use crate::config::SHIPPED;
 use crate::runtime::disturb::{Disturbance, LateSamples};
 use crate::sample::{FleetLayout, RateCommand, Sample};
 use crate::scenario::Scenario;
-use crate::state::{Persist, Restore};
+use crate::state::{Persist, StoredWords};
 use crate::telemetry::{Ledger, LinkRead, LinkWritten};
 use proptest::prelude::*;
 use std::cell::{Cell, RefCell};
@@ -167,8 +167,8 @@ impl<B: Bus> Reading<B> {
                 if let [counters, state] = &self.committed
                     && !state.0.is_empty()
                 {
-                    self.input.counters().persist(&mut Restore(&counters.0));
-                    self.input.persist(&mut Restore(&state.0));
+                    self.input.counters().persist(&mut StoredWords(&counters.0));
+                    self.input.persist(&mut StoredWords(&state.0));
                 }
                 self.input.expect_repeats();
             }
@@ -251,7 +251,7 @@ fn run<B: Bus + 'static>(schedule: &Schedule, bus: &Rc<B>, service: u64, reader:
                 (0..3).for_each(|_| look());
                 generation += 1;
                 output = writer(generation, tick + 1);
-                let mut words = Restore(&committed.0);
+                let mut words = StoredWords(&committed.0);
                 output.persist(&mut words);
                 output.persist_late(&mut words);
                 output.dispatch().unwrap();

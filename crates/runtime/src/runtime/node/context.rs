@@ -9,7 +9,7 @@ use crate::runtime::disturb::{Disturbance, Interruptions, LateSamples, extra_sam
 use crate::runtime::link::{AcceptedTicks, Extent, Input, Output, RetainedSamples};
 use crate::runtime::role_id::RoleId;
 use crate::runtime::window_ticks;
-use crate::state::{Persist, Restore};
+use crate::state::{Persist, StoredWords};
 use crate::telemetry::{Ledger, TickCounters};
 
 /// Pause between two polls of a device's line, ns.
@@ -155,6 +155,6 @@ pub(super) fn extent(scenario: &Settings) -> Extent {
 /// Returns the next tick of a role according to its ledger.
 pub fn next_tick(ledger: &Ledger) -> u64 {
     let mut ticks = TickCounters::default();
-    ticks.persist(&mut Restore(&ledger.record().unwrap_or_default()));
+    ticks.persist(&mut StoredWords(&ledger.record().unwrap_or_default()));
     ticks.next()
 }

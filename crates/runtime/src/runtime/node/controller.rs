@@ -351,10 +351,10 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
         for (quantity, monitor) in R::monitors().iter().enumerate() {
             match monitor.watched {
                 Watched::Constant(quantity_of) if self.watchdog.watches(quantity, tick) => {
-                    self.watchdog.constant(quantity, tick, quantity_of(&self.rig, estimate));
+                    self.watchdog.check_constant(quantity, tick, quantity_of(&self.rig, estimate));
                 }
                 Watched::Small(quantity_of) if self.watchdog.watches(quantity, tick) => {
-                    self.watchdog.magnitude(quantity, tick, quantity_of(&self.rig, estimate));
+                    self.watchdog.check_magnitude(quantity, tick, quantity_of(&self.rig, estimate));
                 }
                 _ => {}
             }
@@ -369,7 +369,7 @@ impl<R: Rig, B: Bus> ControllerNode<R, B> {
                 && watchdog.watches(quantity, tick)
                 && let Some(value) = quantity_of(command)
             {
-                watchdog.magnitude(quantity, tick, value);
+                watchdog.check_magnitude(quantity, tick, value);
             }
         }
     }

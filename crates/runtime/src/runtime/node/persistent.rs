@@ -1,7 +1,7 @@
 //! The persistent state of a node: committed to its ledger and restored from it.
 
 use crate::runtime::hooks::{self, Failpoint};
-use crate::state::{Count, Restore, Words};
+use crate::state::{StoredWords, WordCount, Words};
 use crate::telemetry::{Ledger, LedgerError};
 
 /// A node with persistent state.
@@ -45,7 +45,7 @@ pub(super) fn commit_last(node: &mut impl Persistent) {
 }
 
 pub(super) fn length(node: &mut impl Persistent) -> usize {
-    let mut count = Count::default();
+    let mut count = WordCount::default();
     node.pass(&mut count);
     count.0
 }
@@ -66,7 +66,7 @@ pub(super) fn restore(node: &mut impl Persistent) -> Result<Inherited, LedgerErr
     let ledger = node.ledger().reopened();
     ledger.reserve(length(node))?;
     let Some(record) = ledger.record() else { return Ok(Inherited::Nothing) };
-    let mut words = Restore(&record);
+    let mut words = StoredWords(&record);
     node.counters(&mut words);
     if ledger.discards_state() {
         return Ok(Inherited::Counters);
