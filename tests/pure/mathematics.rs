@@ -59,7 +59,7 @@ impl Motion {
         Self { coefficients: *body.coefficients(), torque, steps, rates }
     }
 
-    /// A torque-free motion sampled at every tick.
+    /// Returns a torque-free motion sampled at every tick.
     fn free(moments: [f64; 3], start: [f64; 3], tick_s: f64, duration_s: f64) -> Self {
         let ticks = (duration_s / tick_s).round() as usize;
         Self::new(moments, start.into(), Vector3::zeros(), tick_s, std::iter::repeat_n(1, ticks))
@@ -69,7 +69,7 @@ impl Motion {
         HiddenRate::new(&self.coefficients, axis, BLIND_RAD_S).unwrap()
     }
 
-    /// The time of each sample, s.
+    /// Returns the time of each sample, s.
     fn times(&self) -> impl Iterator<Item = f64> {
         std::iter::once(0.0).chain(self.steps.iter().scan(0.0, |time, step| {
             *time += step;

@@ -188,7 +188,7 @@ impl HostSession {
         let (repeat_ns, free_ns) = (self.repeat_ns(), self.free_ns());
         let due = |request: &&mut Request| now_ns >= request.due_ns && (request.sent > 0 || now_ns >= free_ns);
         let request = self.request.as_mut().filter(due)?;
-        // Twice as long after each time: a line that is too slow for what is asked of it must not be asked more.
+        // The interval doubles after each repetition, so that a slow line is not overloaded.
         request.due_ns = now_ns + (repeat_ns << request.sent.min(8)).min(LONGEST_REPEAT_NS.max(repeat_ns));
         request.sent += 1;
         self.counters.repeats += u64::from(request.sent > 1);
@@ -199,12 +199,12 @@ impl HostSession {
         Some(self.send(Message::Tick(Tick { tick, inputs: Samples { present, bytes: &inputs[..length] } })))
     }
 
-    /// The frame that ends the run for the device.
+    /// Returns the frame that ends the run for the device.
     pub fn stop(&mut self) -> &[u8] {
         self.send(Message::Stop)
     }
 
-    /// Takes a byte that has arrived, and tells what it completes.
+    /// Processes one received byte. Returns the event that it completes, if any.
     pub fn push(&mut self, byte: u8, now_ns: u64) -> Option<DeviceEvent<'_>> {
         let Self { terms, decoder, newest_sequence, counters, .. } = self;
         let payload = decoder.push(byte)?;
